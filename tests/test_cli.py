@@ -286,7 +286,7 @@ def test_odd_names(clpipe, write_exr, tmp_path):
 def test_an_output_folder_that_cannot_be_written(clpipe, small, tmp_path):
     (tmp_path / "file").write_text("in the way")
     result = clpipe("run", small, "-o", "file/out", status=2)
-    assert "cannot write there" in result.stderr
+    assert "file is a file; name a folder to write to" in result.stderr
 
 
 def test_nothing_is_left_half_written(clpipe, small, tmp_path, monkeypatch):

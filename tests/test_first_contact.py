@@ -119,3 +119,43 @@ def test_formats_have_other_names(clpipe, folder, name):
     clpipe(*RUN, "--device", "numpy", "--format", name)
     record = json.loads(Path("out/render.json").read_text())
     assert record["request"]["formats"] == [usual]
+
+
+@pytest.mark.parametrize("command", ["run render.exr", "dataset renders", "emva --camera canon-6d"])
+@pytest.mark.parametrize("output", ["in_the_way", "in_the_way/out"])
+def test_a_file_in_the_place_of_a_folder_is_named(clpipe, folder, command, output):
+    Path("in_the_way").touch()
+    said = clpipe(*command.split(), "-o", output, status=2).stderr
+    assert said == "clpipe: --output: in_the_way is a file; name a folder to write to\n"
+
+
+@pytest.mark.parametrize(
+    "words", ["run {} -o out", "explore {}", "measure {0} {0}", "match {} -o a.toml"]
+)
+def test_an_array_of_numpy_is_called_one(clpipe, folder, words):
+    clpipe(*RUN, "--device", "numpy", "--format", "npy")
+    words = words.format("out/render.npy")
+    said = clpipe(*words.split(), status=2).stderr
+    assert said.startswith("clpipe: out/render.npy: it is an array of NumPy")
+    assert "numpy.load" in said
+
+
+@pytest.mark.parametrize("name", ["render.png", "render.exr"])
+def test_the_explorer_starts_with_an_image_that_can_be_read(clpipe, folder, name):
+    pytest.importorskip("uvicorn", reason="needs uvicorn, in the extra explore")
+    Path(name).write_bytes(b"no image")
+    said = clpipe("explore", name, "--device", "numpy", status=2).stderr
+    assert said.startswith(f"clpipe: {name}: cannot be read as an image")
+    assert "clpipe explore takes what clpipe run takes" in said and said.count("\n") == 1
+
+
+def test_one_image_is_counted_as_one(clpipe, folder):
+    run = (*RUN, "--device", "numpy")
+    clpipe(*run)
+    assert "1 of 1 image done (it was there already), 0 failed" in clpipe(*run).stderr
+
+
+def test_a_layer_that_is_not_there(clpipe, folder):
+    said = clpipe(*RUN, "--device", "numpy", "--carry", "Depth", status=1).stderr
+    expected = "the file has no layers besides the picture, and there is no render_Depth.exr next"
+    assert f"--carry: no layer 'Depth'; {expected}" in said

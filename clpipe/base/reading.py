@@ -16,7 +16,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.errors import ImageError, MissingError
+from clpipe.base.errors import ImageError, MissingError, RequestError
 from clpipe.base.memory import in_words
 from clpipe.base.text import alike
 
@@ -73,6 +73,21 @@ def check_exists(path: Path) -> None:
     near = _similar(place)
     hint = f"; did you mean {near / rest}?" if near else ""
     raise MissingError(str(path), f"{path}: there is no such file or folder{hint}")
+
+
+def check_input(path: Path) -> None:
+    """See that a file or folder that was named as an input exists and is no array of NumPy.
+
+    Raises:
+        MissingError: it does not exist.
+        RequestError: it is an array, which clpipe writes and does not read.
+    """
+    check_exists(path)
+    if path.suffix.lower() == ".npy":
+        raise RequestError(
+            f"{path}: it is an array of NumPy, as --format npy writes it, which clpipe does not "
+            "read. Load it with numpy.load, or write a file that clpipe reads with --format exr"
+        )
 
 
 def _similar(path: Path) -> Path | None:

@@ -11,6 +11,7 @@ import click
 from rich.console import Console
 
 from clpipe.base.errors import RequestError
+from clpipe.base.files import check_folder
 from clpipe.batch.run_log import Summary
 from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
@@ -158,6 +159,7 @@ def dataset(
     clpipe dataset scene.blend -o film --frames 1-48 --iso 1600
     clpipe dataset renders/ -o set --iso 100,800 --camera sony-a7r2 --camera canon-5d2
     """
+    check_folder(output)
     series = Series(cameras, parse_isos(isos) if isos is not None else (), always=True)
     said = {name: options.pop(name) for name in ("licence", "author")}
     rendering = {name: options.pop(name) for name in RENDER_OPTIONS}

@@ -17,7 +17,7 @@ from click.core import ParameterSource
 from clpipe.base.buckets import is_url
 from clpipe.base.errors import MissingError, RequestError
 from clpipe.base.memory import parse_size
-from clpipe.base.reading import check_exists
+from clpipe.base.reading import check_input
 from clpipe.images.dump import TYPES
 from clpipe.inputs.spool import place_of_url
 
@@ -171,7 +171,7 @@ class ExistingPath(click.Path):
     """A file or folder that is read."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        check_exists(Path(value))
+        check_input(Path(value))
         return super().convert(value, param, ctx)
 
 

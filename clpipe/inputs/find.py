@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from clpipe.base.buckets import check_url, is_glob, is_url, listed, url_of
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.reading import check_exists
+from clpipe.base.reading import check_input
 from clpipe.base.text import printable, whole_number
 from clpipe.chain.rendition import Rendition
 from clpipe.images.raw import RAW_SUFFIXES
@@ -161,7 +161,7 @@ def find_jobs(
                 raise RequestError(f"{text}: no file matches")
             jobs += [Job(Path(m), Path(m).name) for m in matches if m not in excluded]
         else:
-            check_exists(path)
+            check_input(path)
             jobs.append(Job(path, path.name))
     for pattern in excluded.unused:
         log.warning("--exclude %s: matches nothing", pattern)

@@ -9,7 +9,7 @@ import numpy as np
 
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.reading import check_exists
+from clpipe.base.reading import check_input
 from clpipe.base.text import one_line
 from clpipe.base.types import Floats
 from clpipe.camera.profile import Matrix
@@ -120,7 +120,7 @@ def find_frames(inputs: Sequence[str]) -> list[Path]:
         elif glob.has_magic(text) and not path.exists():
             files = _frames_among(Path(p) for p in glob.glob(text, recursive=True))
         else:
-            check_exists(path)
+            check_input(path)
             files = [path]
         if not files:
             raise RequestError(f"{text}: no mosaic or raw file there")
