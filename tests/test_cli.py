@@ -587,10 +587,13 @@ def test_many_images_have_a_line_every_so_often(small, clpipe, monkeypatch):
 @pytest.mark.parametrize("name", ["run", "dataset"])
 def test_help_is_short_and_there_is_all_of_it(clpipe, name):
     short, whole = (clpipe(name, option).output for option in ("--help", "--help-all"))
-    assert len(short.splitlines()) <= 60
+    assert len(short.splitlines()) <= 70
+    assert re.search(r"-o, --output .*\[required\]", short)
     command = main.get_command(click.Context(main), name)
     options = [o.opts[-1] for o in command.params if isinstance(o, click.Option)]
     assert [o for o in options if not re.search(rf"^  (-\w, )?{o}\b", whole, re.M)] == []
     shown = [o for o in options if re.search(rf"^  (-\w, )?{o}\b", short, re.M)]
     assert {"--iso", "--camera", "--set", "--truth", "--output"} <= set(shown) < set(options)
     assert "--help-all" in short
+    choices = [o for o in command.params if o.name in {"truth", "redo"}]
+    assert all(f"({value})" in short for o in choices for value in o.type.choices)

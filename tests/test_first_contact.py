@@ -3,8 +3,11 @@
 import json
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
+
+from clpipe.commands.main import COMMANDS, main
 
 RUN = ("run", "render.exr", "-o", "out")
 IS_MISSING = "there is no such file or folder"
@@ -14,7 +17,7 @@ IS_MISSING = "there is no such file or folder"
 def folder(write_exr):
     """A render, a folder of renders and a folder of PNGs."""
     for name in ("render.exr", "renders/a.exr"):
-        write_exr(name, np.full((8, 8, 3), 0.2))
+        write_exr(name, np.full((32, 48, 3), 0.2))
     Path("pngs").mkdir()
     for name in "abc":
         Path(f"pngs/{name}.png").touch()
@@ -159,3 +162,34 @@ def test_a_layer_that_is_not_there(clpipe, folder):
     said = clpipe(*RUN, "--device", "numpy", "--carry", "Depth", status=1).stderr
     expected = "the file has no layers besides the picture, and there is no render_Depth.exr next"
     assert f"--carry: no layer 'Depth'; {expected}" in said
+
+
+def test_every_command_has_a_form_for_programs():
+    for name in COMMANDS:
+        command = main.get_command(click.Context(main), name)
+        options = {option for each in command.params for option in each.opts}
+        wanted = "--json-lines" if name in {"run", "dataset"} else "--json"
+        assert wanted in options, name
+
+
+def test_answers_are_json(clpipe, folder):
+    def answer(*words):
+        return json.loads(clpipe(*words, "--json").stdout)
+
+    numpy = ("--device", "numpy")
+    clpipe(*RUN, *numpy, "--format", "png", "--format", "dng")
+    again = answer("replay", "out/render.json", "-o", "again", *numpy)
+    assert again["picture"] == "again/render.png" and again["same"]
+    imported = answer("cameras", "import", "out/render.dng")
+    assert imported["profile"] is None and 'model = "' in imported["toml"]
+    pictures = ("out/render.png", "again/render.png")
+    compared = answer("compare", *pictures, "-o", "a.svg", "--crop", "sky=0,0,4x4")
+    assert compared["figures"] == ["a.svg"] and compared["places"][0]["name"] == "sky"
+    pytest.importorskip("jinja2", reason="needs jinja2, in the extra report")
+    assert answer("report", "out")["report"] == "out/report.html"
+
+
+def test_a_dataset_prints_its_log(clpipe, folder):
+    said = clpipe("dataset", "renders", "-o", "set", "--device", "numpy", "--json-lines")
+    lines = [json.loads(line) for line in said.stdout.splitlines()]
+    assert len(lines) == 3 and lines[1]["status"] == "done"

@@ -56,7 +56,8 @@ UNKNOWN = "unknown"
     "--camera", metavar="NAME", help="Which camera of a noiseprofiles.json, by make and model."
 )
 @output_option("FILE.toml", "Write the profile there. [default: print it]", required=False)
-def import_command(path: Path, camera: str | None, output: Path | None) -> None:
+@json_option
+def import_command(path: Path, camera: str | None, output: Path | None, as_json: bool) -> None:
     """Make a camera profile of a noise model from elsewhere.
 
     FILE is a DNG with a NoiseProfile, an Android noise model (the text that CameraITS generates and
@@ -70,6 +71,10 @@ def import_command(path: Path, camera: str | None, output: Path | None) -> None:
     from clpipe.analysis.noise_models.read import import_camera
 
     text, made = import_camera(path, camera, output)
+    if as_json:
+        written = {"profile": None if output is None else str(output), "toml": text}
+        show_json(written | {"make": made.make, "model": made.model, "iso_range": made.iso_range})
+        return
     if output is None:
         click.echo(text, nl=False)
         return

@@ -199,6 +199,11 @@ carry_option = click.option(
     "May be repeated.",
 )
 
+TRUTHS_HELP = (
+    "Write next to each picture the same without noise (development), without noise and denoising "
+    "(clean), the mosaic without noise (mosaic), the variance of the mosaic's noise (variance)"
+)
+
 truth_at_option = click.option(
     "--truth-at",
     type=click.Choice(MOMENTS),

@@ -8,8 +8,8 @@ from clpipe.analysis.comparison import Comparison
 from clpipe.analysis.comparison import compare as compare_pictures
 from clpipe.analysis.crops import FOUND, HEIGHT, WIDTH
 from clpipe.base.extras import require
-from clpipe.commands.options import EXISTING, Command, output_option
-from clpipe.commands.printing import number, show
+from clpipe.commands.options import EXISTING, Command, json_option, output_option
+from clpipe.commands.printing import number, show, show_json
 
 
 @click.command("compare", cls=Command)
@@ -52,6 +52,7 @@ from clpipe.commands.printing import number, show
     type=click.IntRange(1, 32),
     help="The side of a picture's pixel, in pixels of 300 dpi.",
 )
+@json_option
 def compare(
     pictures: tuple[Path, ...],
     outputs: tuple[Path, ...],
@@ -60,6 +61,7 @@ def compare(
     truths: tuple[Path, ...],
     difference: bool,
     zoom: int,
+    as_json: bool,
 ) -> None:
     """Compare pictures: labelled crops side by side, as papers print them.
 
@@ -84,6 +86,9 @@ def compare(
     found = compare_pictures(pictures, crops, labels, truths, difference)
     for output in outputs:
         draw(found, output, zoom)
+    if as_json:
+        show_json({"figures": [str(output) for output in outputs], **found.record()})
+        return
     show(("place", "crop"), [(place.name, place.box) for place in found.places])
     if found.noise:
         click.echo()

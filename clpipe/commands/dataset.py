@@ -1,7 +1,7 @@
 """``clpipe dataset``: a scene or a folder of renders becomes a dataset."""
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -19,17 +19,18 @@ from clpipe.chain.panorama import projection_of
 from clpipe.chain.registry import stage_in
 from clpipe.chain.rendition import CLEAN, TRUTHS
 from clpipe.chain.request import Request
-from clpipe.commands.chain_options import carry_option, format_option, series_options
+from clpipe.commands.chain_options import TRUTHS_HELP, carry_option, format_option, series_options
 from clpipe.commands.input_options import poses_option
 from clpipe.commands.options import (
     EXISTING,
     GroupedCommand,
     device_option,
+    json_lines_option,
     options_set,
     output_option,
     quiet_option,
 )
-from clpipe.commands.progress import Reporter, follow
+from clpipe.commands.progress import Reporter, follow, print_line
 from clpipe.inputs.around import wide_of
 from clpipe.inputs.series import Series, parse_isos
 from clpipe.reference.panorama import CUBE
@@ -114,7 +115,7 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
     default=(CLEAN,),
     show_default=True,
     type=click.Choice(TRUTHS),
-    help="Write beside each picture its truth, as clpipe run does; may be repeated.",
+    help=f"{TRUTHS_HELP}. May be repeated.",
 )
 @click.option(
     "--licence",
@@ -132,6 +133,7 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
 @format_option
 @device_option
 @quiet_option
+@json_lines_option
 def dataset(
     source: Path,
     output: Path,
@@ -142,6 +144,7 @@ def dataset(
     lens_model: str | None,
     assignments: tuple[str, ...],
     quiet: bool,
+    json_lines: bool,
     **options: Any,
 ) -> None:
     """Make a dataset of a Blender scene, or of a folder of renders that exist.
@@ -188,7 +191,9 @@ def dataset(
             renders = from_folder(source, output, poses)
         request = replace(request, carry=request.carry or renders.layers)
         said = keep_said(output, said)
-        summary = develop(renders, request, output, series, selector, quiet, said)
+        echo = print_line if json_lines else None
+        quiet |= json_lines
+        summary = develop(renders, request, output, series, selector, quiet, said, echo)
     if renders.failure:
         raise renders.failure
     sys.exit(summary.exit_status)
@@ -269,6 +274,7 @@ def develop(
     selector: str | None,
     quiet: bool,
     said: Mapping[str, str],
+    echo: Callable[[bytes], None] | None,
 ) -> Summary:
     """Develop the renders as they come, and write the dataset's card behind them.
 
@@ -278,7 +284,7 @@ def develop(
     found = renders.jobs() or ()
     images = Images(renders.inputs, poses=renders.poses, series=series, found=found)
     where = Where(output, () if selector is None else (selector,))
-    made = Run(request, images, where, arguments=sys.argv[1:])
+    made = Run(request, images, where, arguments=sys.argv[1:], echo=echo)
     reporter = Reporter(made, Console(stderr=True), quiet)
     tell = (lambda text: None) if quiet else reporter.print
 

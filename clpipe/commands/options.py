@@ -144,20 +144,28 @@ class GroupedCommand(Command):
 
 
 def brief(text: str) -> str:
-    """The first part of a help text, with its default.
+    """The first part of a help text, with its default, or that the option is required.
 
     >>> brief("A stage, whole; may be repeated. Others follow. [default: a; else b]")
     'A stage, whole. [default: a]'
+    >>> brief("The folder; it is made.  [required]")
+    'The folder. [required]'
     """
     first = re.split(r"[.;:](?=\s|$)", text)[0]
-    default = re.search(r"\[default: ([^];]+)", text)
-    return f"{first}.{f' [default: {default[1]}]' if default else ''}"
+    end = re.search(r"\[(default: [^];]+|required)", text)
+    return f"{first}.{f' [{end[1]}]' if end else ''}"
 
 
 ALL = "clpipe.help_all"  # of a context: every option is shown
 ARGUMENTS = "clpipe.arguments"  # of a context: as they were written
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+
+json_lines_option = click.option(
+    "--json-lines",
+    is_flag=True,
+    help="Print the lines of the log on stdout, for programs: the start, each image, the end.",
+)
 
 device_option = click.option(
     "--device",
