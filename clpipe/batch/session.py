@@ -35,6 +35,7 @@ from clpipe.engine.device import Device, open_devices
 from clpipe.images.claims import Claim
 from clpipe.images.read import PICTURE_SUFFIXES
 from clpipe.inputs.find import Job, Shard, find_jobs
+from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.poses import with_views
 from clpipe.inputs.series import Series
@@ -148,6 +149,8 @@ class Run:
         if note := draw_note(self._loader.settings):
             log.info("%s", note)
         self._chain = self._loader.first_chain(self.jobs)
+        for note in lens_notes(self._loader.settings, self.jobs):
+            log.warning("%s", note)
         check_render_options(request, self._chain.source)
         self._request = request.with_outputs(self._chain)
         self.writer = OutputWriter(where.output, self._request)

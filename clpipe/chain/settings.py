@@ -192,6 +192,11 @@ class Settings:
         draw = self.draws.get("camera")
         return list(draw.choice) if isinstance(draw, Choice) else [self.camera]
 
+    def lenses(self) -> list[str]:
+        """The lens that is named, or all that it is drawn from; none where there is none."""
+        draw = self.draws.get("lens")
+        return list(draw.choice) if isinstance(draw, Choice) else [self.lens] * bool(self.lens)
+
     def isos(self) -> Limits:
         """The ISOs that all :meth:`cameras` have.
 

@@ -15,6 +15,7 @@ from clpipe.commands.options import Command, device_option, dump_option, json_op
 from clpipe.commands.printing import show_json
 from clpipe.engine.device import open_device
 from clpipe.inputs.find import find_jobs
+from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
 
 
@@ -60,6 +61,8 @@ def explore(
     jobs = loader.exposures(find_jobs(inputs, Path(os.devnull), loader.endings()))
     loader.first_chain(jobs)  # a wrong request is refused here
     explorer = Explorer(jobs, request, open_device(selector))
+    for note in lens_notes(loader.settings, jobs):
+        click.echo(f"clpipe: {note}", err=True)
     try:
         explorer.check()
     except ImageError as error:

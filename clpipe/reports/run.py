@@ -19,7 +19,10 @@ from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, values_in
 
 TAR = ".tar"
 # What is kept of sidecars, of which there may be hundreds of thousands.
-KEYS = ("clpipe", "sha256", "iso", "camera", "width", "height", "noise", "clipped", "warnings")
+KEYS = (
+    *("clpipe", "sha256", "iso", "camera", "lens", "width", "height", "noise", "clipped"),
+    "warnings",
+)
 ALIKE = ("device", "versions")  # which most of them share
 STAGES, STAGES_END = b'\n  "stages": [\n', b"\n  ],\n"  # as json_text writes them
 LOGS = "run*.jsonl"
