@@ -71,6 +71,15 @@ def test_packages_that_are_missing_are_named(clpipe, monkeypatch, command, messa
     assert f"{message}; pip install {packages}\n" in error
 
 
+def test_no_text_installs_another_project_of_that_name():
+    """On the public index, clpipe is a package of somebody else."""
+    places = ("clpipe/**/*.py", "docs/**/*.md", "docs/*.ipynb", "tools/**/*.py", "*.md")
+    for path in (found for place in places for found in ROOT.glob(place)):
+        assert not re.search(r"pip install[^`\n]*\bclpipe\b(?!/|\.txt)", path.read_text("utf-8")), (
+            path
+        )
+
+
 @pytest.mark.parametrize(
     ("system", "machine", "expected"),
     [
@@ -158,6 +167,7 @@ def test_the_citation_is_of_this_version_and_of_the_paper():
     assert cited["message"] and cited["authors"] == [{"name": "The clpipe developers"}]
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert (cited["version"], cited["license"]) == (__version__, project["license"])
+    assert f"\n## {__version__} (" in (ROOT / "CHANGELOG.md").read_text("utf-8")
     paper = cited["preferred-citation"]
     assert paper["title"] in " ".join((ROOT / "docs" / "paper.md").read_text("utf-8").split())
     assert [author["family-names"] for author in paper["authors"]] == [

@@ -107,8 +107,8 @@ def name_note(name: str) -> str:
     if not _left_out(lens, _words(name)):
         return ""
     return (
-        f"warning: lens: '{one_line(name)}' is a part of a name, and {_full(lens)} is taken; to be sure of "
-        "the lens, name it in full"
+        f"warning: lens: '{one_line(name)}' is a part of a name, and {_full(lens)} is taken; to be "
+        "sure of the lens, name it in full"
     )
 
 
