@@ -19,6 +19,7 @@ def folder(write_exr):
     for name in ("render.exr", "renders/a.exr"):
         write_exr(name, np.full((32, 48, 3), 0.2))
     Path("pngs").mkdir()
+    Path("a.json").touch()
     for name in "abc":
         Path(f"pngs/{name}.png").touch()
 
@@ -53,6 +54,11 @@ def folder(write_exr):
             "200: {}. To give --iso several values, use --iso 1",
         ),
         ((*RUN, "--skip", "gamma", "noise"), "several values, use --skip gamma --skip noise"),
+        ((*RUN, "--lens", "Canon", "50mm"), "For a value with spaces, use --lens 'Canon 50mm'"),
+        (("explore", "render.exr", "--iso", "100", "200"), "200: {}. --iso takes one value"),
+        (("run", "a.json", "-o", "out"), "to make the picture of a sidecar again, use 'clpipe rep"),
+        ((*RUN, "--camera", "pngs/a.png"), "to make one of a DNG or a noise model, use 'clpipe ca"),
+        ((*RUN, "--set", "camera.iso=800"), "use --iso 800"),
         (("run", "rendr.exr", "-o", "out"), "rendr.exr: {}; did you mean render.exr?"),
         (("run", "rendrs/a.exr", "-o", "out"), "rendrs/a.exr: {}; did you mean renders/a.exr?"),
         (("run", "pngs", "-o", "out"), "the folder has 3 .png. Finished pictures are not linear"),
@@ -80,6 +86,7 @@ def test_help_is_a_command(clpipe):
 def test_a_part_of_a_name_lists_the_cameras(clpipe):
     assert len(json.loads(clpipe("cameras", "Canon 5D Mark", "--json").stdout)) == 3
     assert "canon-80d" in clpipe("cameras", "canon").stdout
+    assert "Var[y]" in clpipe("cameras", "nikon", "d850", "--iso", 800).stdout
     assert "canon-80d" not in clpipe("cameras", "nikon").stdout
 
 
@@ -116,9 +123,9 @@ def test_a_missing_input_has_one_status_and_one_line(clpipe, folder, words):
     assert len(said.splitlines()) == 1
 
 
-@pytest.mark.parametrize("name", ["jpeg", "TIFF", "tiff16"])
+@pytest.mark.parametrize("name", ["jpeg", "TIFF", "tiff16", ".JPG"])
 def test_formats_have_other_names(clpipe, folder, name):
-    usual = {"jpeg": "jpg", "TIFF": "tif", "tiff16": "tif16"}[name]
+    usual = {"TIFF": "tif", "tiff16": "tif16"}.get(name, "jpg")
     clpipe(*RUN, "--device", "numpy", "--format", name)
     record = json.loads(Path("out/render.json").read_text())
     assert record["request"]["formats"] == [usual]

@@ -5,11 +5,14 @@ from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
+LONG = 4  # letters of a word that may stand for a name
 
-def alike(text: str, names: Iterable[str], cutoff: float = 0.5) -> list[str]:
+
+def alike(text: str, names: Iterable[str], cutoff: float = 0.55) -> list[str]:
     """The names that a shortened or misspelt one may stand for, in their order.
 
-    These are all that have its words. If there is none, it is the most similar one.
+    These are all that have its words. If there is none, it is the most similar one, or those that
+    have the most similar word.
 
     Args:
         text: what was written.
@@ -20,9 +23,15 @@ def alike(text: str, names: Iterable[str], cutoff: float = 0.5) -> list[str]:
     ['canon-5d2', 'canon-5d3']
     >>> alike("Demosiac", ["mosaic", "demosaic"])
     ['demosaic']
+    >>> alike("noize", ["normalize", "row_noise", "column_noise"])
+    ['row_noise', 'column_noise']
     """
     by_lower = {name.lower(): name for name in names}
-    near = with_words(text, by_lower) or get_close_matches(text.lower(), by_lower, 1, cutoff)
+    near = with_words(text, by_lower)
+    if not near:
+        words = {word for name in by_lower for word in _words(name) if len(word) >= LONG}
+        best = get_close_matches(text.lower(), [*by_lower, *sorted(words)], 1, cutoff)
+        near = best if best and best[0] in by_lower else with_words("".join(best), by_lower)
     return [by_lower[name] for name in near]
 
 

@@ -190,10 +190,10 @@ def _found(database: Any, name: str, crop: float | None) -> Any:
         names = sorted({_full(lens) for lens in database.lenses})
         by_lower = {each.lower(): each for each in names}
         near = [by_lower[each] for each in get_close_matches(name.lower(), by_lower, 3, 0.3)]
-        raise KeyedError(
-            "lens",
-            f"lens: lensfun knows no '{one_line(name)}'; the nearest are {', '.join(near)}",
+        nearest = (
+            f"the nearest are {', '.join(near)}" if near else "name one by its maker and model"
         )
+        raise KeyedError("lens", f"lens: lensfun knows no '{one_line(name)}'; {nearest}")
     fewest = min(count for count, _ in having)
     best = [lens for count, lens in having if count == fewest]
     models = sorted({_full(lens) for lens in best})

@@ -307,7 +307,8 @@ def cameras_called(name: str) -> list[str]:
 def similar_cameras(name: str) -> list[str]:
     """The built-in cameras that a shortened or misspelt name may stand for."""
     by_name = camera_names()
-    return cameras_called(name) or [by_name[n] for n in alike(comparable(name), by_name)]
+    near = (by_name[found] for found in alike(comparable(name), by_name))
+    return cameras_called(name) or list(dict.fromkeys(near))
 
 
 @cache
@@ -346,6 +347,11 @@ def load_camera(name: str) -> Camera:
     if own := built_in.get(built_in_name(name) or ""):
         return _built_in(own)
     path = Path(name)
+    if path.suffix != ".toml" and path.is_file():
+        raise RequestError(
+            f"{path}: it is no camera profile, which ends in .toml; to make one of a DNG or a "
+            "noise model, use 'clpipe cameras import'"
+        )
     if path.suffix != ".toml":
         near = similar_cameras(name)
         hint = f" (most similar: {', '.join(near)})" if near else ""

@@ -23,7 +23,7 @@ def parse_assignment(text: str) -> tuple[str, str, Any]:
         RequestError: the text does not have that form; the message suggests one that has.
     """
     match = re.fullmatch(r"\s*(\w+)\.(\w+)\s*=\s*(.*)", text)
-    if not match:
+    if not match or (match[1] in KEYS and match[2] in KEYS):  # "iso.uniform" is a draw
         raise RequestError(f"--set {text}: expected stage.parameter=value{_suggestion(text)}")
     return match[1], match[2], toml_value(match[3])
 
@@ -37,6 +37,8 @@ def _suggestion(text: str) -> str:
     "; did you mean 'denoise.luma_strength=2'?"
     """
     name, equals, value = map(str.strip, text.partition("="))
+    stage, _, parameter = name.partition(".")
+    name = parameter if stage in KEYS and parameter in KEYS else name
     if name in KEYS and name != CODE:
         return f"; use --{name.replace('_', '-')} {value or 'VALUE'}"
     if name in all_stages():

@@ -39,7 +39,7 @@ def format_named(text: str) -> str:
     >>> format_named("JPEG"), format_named("tiff16"), format_named("webp")
     ('jpg', 'tif16', 'webp')
     """
-    name = text.lower()
+    name = text.lower().removeprefix(".")
     return OTHER_NAMES.get(name, name if name in EVERY_FORMAT else text)
 
 

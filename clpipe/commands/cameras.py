@@ -99,10 +99,10 @@ class CamerasCommand(Command):
 
 
 @click.command("cameras", cls=CamerasCommand)
-@click.argument("name", required=False, metavar="[NAME|FILE]", shell_complete=cameras_or_import)
+@click.argument("names", nargs=-1, metavar="[NAME|FILE]", shell_complete=cameras_or_import)
 @click.option("--iso", type=float, help="The ISO. [default: all that were measured]")
 @json_option
-def cameras(name: str | None, iso: float | None, as_json: bool) -> None:
+def cameras(names: tuple[str, ...], iso: float | None, as_json: bool) -> None:
     """List the cameras, show the noise of one, or make one of a noise model (cameras import).
 
     NAME is that of the list, or a make and model; a part of it lists all that match. Noise is
@@ -112,7 +112,8 @@ def cameras(name: str | None, iso: float | None, as_json: bool) -> None:
     clpipe cameras "Canon 5D Mark III" --iso 3200
     clpipe cameras import photo.dng -o my_camera.toml
     """
-    if name is None:
+    name = " ".join(names)
+    if not name:
         if iso is not None:
             raise RequestError("--iso: it needs the name of a camera")
         show_cameras(map(load_camera, built_in_cameras()), as_json)

@@ -8,7 +8,7 @@ from clpipe.images.read import TRANSFERS
 
 transfer_option = click.option(
     "--transfer",
-    type=click.Choice(list(TRANSFERS)),
+    type=click.Choice(list(TRANSFERS), case_sensitive=False),
     help="The transfer curve of renders in whole numbers (PNG, TIFF of 8 or 16 bits).",
 )
 

@@ -112,7 +112,7 @@ def meant(text: str) -> str:
     if camera := built_in_name(text):
         return f" It is a camera; to see its noise, use 'clpipe cameras {camera}'."
     stages = (f"stages {name}" for name in all_stages())
-    near = alike(text, (*COMMANDS, "cameras import", "--version", *stages), cutoff=0.62)
+    near = alike(text, (*COMMANDS, "cameras import", "--version"), 0.62) or alike(text, stages)
     if not near:
         return f" The commands are {', '.join(COMMANDS)}."
     return f" Did you mean {either(f'clpipe {name}' for name in near)}?"

@@ -80,10 +80,10 @@ class Command(click.Command):
 def several_values(
     options: Sequence[click.Parameter], arguments: Sequence[str], missing: str
 ) -> str:
-    """How the option takes several values whose value a missing input follows; "" if none does.
+    """How to write the values of the option that a missing input follows; "" if it follows none.
 
     >>> several_values([click.Option(["--skip"], multiple=True)], ["--skip", "a", "b"], "b")
-    '. To give --skip several values, use --skip a --skip b'
+    ". To give --skip several values, use --skip a --skip b; for one with spaces, --skip 'a b'"
     """
     place = arguments.index(missing) - 2 if missing in arguments else -1
     named = {name: option for option in options for name in option.opts}
@@ -96,12 +96,14 @@ def several_values(
             break
         values.append(value)
     name = arguments[place]
+    quoted = f"{name} '{' '.join(values)}'"
     if "," in (option.metavar or ""):
         return f". To give {name} several values, use {name} {','.join(values)}"
     if option.multiple:
         repeated = " ".join(f"{name} {value}" for value in values)
-        return f". To give {name} several values, use {repeated}"
-    return ""
+        return f". To give {name} several values, use {repeated}; for one with spaces, {quoted}"
+    is_text = isinstance(option.type, click.types.StringParamType)
+    return f". For a value with spaces, use {quoted}" if is_text else f". {name} takes one value"
 
 
 class GroupedCommand(Command):

@@ -27,7 +27,7 @@ def poses(folder: Path, as_json: bool) -> None:
     clpipe poses out
     """
     if not folder.is_dir():
-        raise RequestError(f"{folder}: there is no such folder; name the output folder of a run")
+        raise RequestError(f"{folder}: it is no folder; name the output folder of a run")
     written = write_camera_files(folder)
     if not written.files:
         reasons = "; ".join(written.left_out) or "found no sidecar of one"

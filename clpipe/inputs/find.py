@@ -26,6 +26,13 @@ T = TypeVar("T")
 
 log = logging.getLogger(__name__)
 
+# What files are that are no images, by their endings, and what to do with them.
+NO_IMAGES = {
+    ".json": "it is JSON, no image; to make the picture of a sidecar again, use 'clpipe replay'",
+    ".toml": "it is a configuration or a camera, no image; name it with -c or --camera",
+    ".blend": "it is a scene of Blender, no image; to render and develop it, use 'clpipe dataset'",
+}
+
 FINISHED = (
     "Finished pictures are not linear light. For renders, add --transfer srgb; for photographs, "
     "use -c unprocess"
@@ -162,6 +169,8 @@ def find_jobs(
             jobs += [Job(Path(m), Path(m).name) for m in matches if m not in excluded]
         else:
             check_input(path)
+            if no_image := NO_IMAGES.get(path.suffix.lower()):
+                raise RequestError(f"{path}: {no_image}")
             jobs.append(Job(path, path.name))
     for pattern in excluded.unused:
         log.warning("--exclude %s: matches nothing", pattern)

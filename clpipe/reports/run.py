@@ -190,7 +190,7 @@ def read_run(folder: Path) -> Run:
         RequestError: it is no folder, or has no sidecar of clpipe's.
     """
     if not folder.is_dir():
-        raise RequestError(f"{folder}: there is no such folder; name the output folder of a run")
+        raise RequestError(f"{folder}: it is no folder; name the output folder of a run")
     run = Run(folder)
     found = sorted(_in_folder(run), key=lambda made: (made.image, made.rendition.suffix))
     for made in found:
