@@ -171,9 +171,10 @@ class Pipeline(ReadOnly):
 
         Args:
             layer: (height, width[, channel]) of any type, as large as the image.
-            kind: "depth" and "label" are taken from the nearest pixel; a "normal" is blended, and
-                then as long as 1; so is a "flow", whose vectors in px to the right and down are
-                mapped at both ends; "colour" is blended.
+            kind: "depth" is interpolated linearly in 1/depth within a surface, a "normal"
+                bilinearly and then as long as 1, and so is a "flow", whose vectors in px to the
+                right and down are mapped at both ends. Between two surfaces these are taken from
+                the nearest pixel. A "label" always is; a "colour" is blended.
             key: the image's name, on which draws depend.
             overscan: as for :meth:`process`.
             **settings: as for :meth:`process`.

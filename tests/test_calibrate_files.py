@@ -209,8 +209,7 @@ def test_frames_that_do_not_belong_together(shots, tmp_path):
 def test_what_is_no_frame(shots, tmp_path):
     out = ("-o", tmp_path / "p.toml")
     assert "give --black-level" in call("calibrate", shots / "scene.exr", *out, status=2).stderr
-    assert "no such file" in call("calibrate", tmp_path / "x.exr", *out, status=1).stderr
-    assert "no such file" in call("calibrate", tmp_path / "x.nef", *out, status=1).stderr
+    assert "no such file" in call("calibrate", tmp_path / "x.nef", *out, status=2).stderr
     assert "no mosaic or raw" in call("calibrate", "nothing*.dng", *out, status=2).stderr
     assert "must end in .toml" in call("calibrate", shots, "-o", "p.png", status=2).stderr
     (tmp_path / "bad.cr2").write_bytes(b"not a raw" * 100)

@@ -232,7 +232,7 @@ def test_a_run_resumes_with_carried_files(clpipe, render):
     render(only=["R", "G", "B"])
     render("in/a_aux.exr", only=["View.Depth.Z", "View.IndexOB.X"])
     run = (*RUN, "in/a.exr", *HALF, *carrying("Depth:png"))
-    there = "were there already"
+    there = "was there already"
     clpipe(*run)
     files, before = written(Path("out")), OUT.read_bytes()
     assert files == ["a.Depth.png", "a.carried.exr", "a.jpg", "a.json"]
@@ -317,7 +317,7 @@ def test_a_pipeline_moves_arrays():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--carry", "Dpeth"), "no layer 'Dpeth' (did you mean 'Depth'?); there are: CryptoObject"),
+        (("--carry", "Dpeth"), "no layer 'Dpeth' (did you mean 'Depth'?); the file and a_"),
         (("--carry", "Depth:flow"), "its layer Depth has 1 channel, but flow has 2 or more"),
         (
             ("--carry", "odd"),

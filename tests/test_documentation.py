@@ -220,12 +220,26 @@ def test_every_camera_and_configuration_is_documented(generated):
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=name_of)
 def test_every_link_leads_somewhere(page, generated):
-    for target in re.findall(r"\]\(([^)#]+)", page.read_text()):
-        if target.startswith("https://"):
+    for link in re.findall(r"\]\(([^)]+)\)", page.read_text()):
+        if link.startswith("https://"):
             continue
-        path = (page.parent / target).resolve()
-        known = path.is_relative_to(DOCS) and path.relative_to(DOCS).as_posix() in generated
-        assert known or path.exists(), target
+        target, _, anchor = link.partition("#")
+        path = (page.parent / target).resolve() if target else page
+        made = generated.get(path.relative_to(DOCS).as_posix()) if DOCS in path.parents else None
+        assert made is not None or path.exists(), link
+        if anchor:
+            assert anchor in anchors(made or path.read_text()), link
+
+
+def anchors(text):
+    """The anchors of a page: headings behind an empty line, as MkDocs calls them, and objects."""
+    text = re.sub(r"^```.*?^```$", "", text, flags=re.DOTALL | re.MULTILINE)
+    found = re.findall(r"^::: (\S+)$", text, re.MULTILINE)
+    for heading in re.findall(r"(?:^|\n\n)#+ (.+)", text):
+        title, _, named = heading.partition(" { #")
+        words = re.sub(r"[^\w\s-]", "", title.lower()).split()
+        found.append(named.removesuffix(" }") or "-".join(words))
+    return found
 
 
 @pytest.mark.parametrize("name", architecture.PAGES)

@@ -253,7 +253,7 @@ def test_lenses_are_listed_or_the_extra_is_named(monkeypatch):
 
     monkeypatch.setattr("clpipe.camera.lens._loaded", missing)
     lens = key_controls()["lens"]
-    assert "suggested" not in lens and "pip install 'clpipe[lens]'" in lens["text"]
+    assert "suggested" not in lens and "pip install lensfunpy" in lens["text"]
 
 
 def test_every_lens_in_the_list_is_one():

@@ -62,13 +62,22 @@ def test_the_sdist_has_all_that_lies_beside_the_package():
         (("run", STILL_LIFE, "-o", "out", "--dask", "tcp://x:1"), "--dask needs distributed"),
     ],
 )
-def test_what_an_extra_installs_is_named_where_it_is_missing(clpipe, monkeypatch, command, message):
+def test_packages_that_are_missing_are_named(clpipe, monkeypatch, command, message):
     found = extras.find_spec
     absent = ("scipy", "matplotlib", "distributed")
     monkeypatch.setattr(extras, "find_spec", lambda name: None if name in absent else found(name))
     error = clpipe(*command, status=2).stderr
-    extra = "dask" if "--dask" in command else "calibrate"
-    assert f"{message}; pip install 'clpipe[{extra}]'" in error
+    packages = message.partition(" needs ")[2].replace(" and ", " ")
+    assert f"{message}; pip install {packages}\n" in error
+
+
+def test_no_text_installs_another_project_of_that_name():
+    """On the public index, clpipe is a package of somebody else."""
+    places = ("clpipe/**/*.py", "docs/**/*.md", "docs/*.ipynb", "tools/**/*.py", "*.md")
+    for path in (found for place in places for found in ROOT.glob(place)):
+        assert not re.search(r"pip install[^`\n]*\bclpipe\b(?!/|\.txt)", path.read_text("utf-8")), (
+            path
+        )
 
 
 @pytest.mark.parametrize(
@@ -158,6 +167,7 @@ def test_the_citation_is_of_this_version_and_of_the_paper():
     assert cited["message"] and cited["authors"] == [{"name": "The clpipe developers"}]
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert (cited["version"], cited["license"]) == (__version__, project["license"])
+    assert f"\n## {__version__} (" in (ROOT / "CHANGELOG.md").read_text("utf-8")
     paper = cited["preferred-citation"]
     assert paper["title"] in " ".join((ROOT / "docs" / "paper.md").read_text("utf-8").split())
     assert [author["family-names"] for author in paper["authors"]] == [

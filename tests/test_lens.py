@@ -235,7 +235,7 @@ def test_lensfun_says_the_same(camera, name, setting, size):
     ("setting", "said"),
     [
         ({"lens": "Cannon EF 24-71mm"}, "knows no 'Cannon EF 24-71mm'; the nearest are Canon EF"),
-        ({"lens": "24-70"}, "'24-70' may be .* or one of [0-9]+ others"),
+        ({"lens": "24-70"}, "'24-70' may be .*, or [0-9]+ more; name one of them in full"),
         ({"lens": "Canon EF 24-70mm f/2.8L"}, "is a zoom; set 24 to 70 mm"),
         (
             {"lens": "Canon EF 24-70mm f/2.8L", "focal_length": 85},
@@ -273,11 +273,26 @@ def test_a_lens_is_set_as_a_camera_is(clpipe, write_exr):
     assert again == clpipe("plan", *lens, "--json").stdout
 
 
+def test_a_lens_by_a_part_of_its_name_is_named(clpipe, write_exr):
+    pytest.importorskip("lensfunpy", reason="needs lensfunpy, in the extra lens")
+    pytest.importorskip("jinja2", reason="needs jinja2, in the extra report")
+    run = ("run", write_exr("a.exr", np.full((20, 30, 3), 0.5)), "--device", "numpy")
+    taken = "warning: lens: 'Canon 50mm' is a part of a name, and Canon EF 50mm f/1.8 is taken"
+    assert taken in clpipe(*run, "-o", "o", "--lens", "Canon 50mm").stderr
+    assert json.loads(Path("o/a.json").read_text())["lens"] == "Canon EF 50mm f/1.8"
+    clpipe("report", "o")
+    assert "sony-a7r2 with Canon EF 50mm f/1.8, ISO 100" in Path("o/report.html").read_text()
+    whole = clpipe(*run, "-o", "p", "--lens", "EF 50mm f/1.8")  # the maker is not needed
+    assert "is a part of a name" not in whole.stderr
+    Path("m.csv").write_text("path,lens\na.exr,Canon 50mm\n")
+    assert taken in clpipe("run", "m.csv", "-o", "q", "--device", "numpy").stderr
+
+
 def test_what_is_said_without_lensfunpy(clpipe, monkeypatch):
     by_name._loaded.cache_clear()
     monkeypatch.setitem(sys.modules, "lensfunpy", None)
     said = clpipe("plan", "--lens", "any", status=2).stderr
-    assert "lensfunpy, which is not here; pip install 'clpipe[lens]'" in said
+    assert "lensfunpy, which is not here; pip install lensfunpy" in said
 
 
 def test_kernels_are_not_refused_for_the_image_that_compiles_them(device):

@@ -367,7 +367,7 @@ def test_refusals(clpipe, tmp_path, write_exr):
         ((one, linear), 2, "linear.exr is rgb, 30x20"),
         ((one, "--truth", mosaic), 2, "mosaic that does not say its levels RGGB"),
         ((white, white), 1, "white.png: nothing to measure: every sample is clipped"),
-        ((one, tmp_path / "missing.png"), 1, "missing.png: no such file"),
+        ((one, tmp_path / "missing.png"), 2, "missing.png: there is no such file"),
         ((broken, broken), 1, "broken.jpg: "),
         ((one, one, "--pattern", "XYZ"), 2, "RGGB"),
     ):

@@ -267,7 +267,7 @@ def test_truths_and_brackets_have_it_too(clpipe, write_exr):
 def test_black_corners_are_told(clpipe, write_exr, around):
     write_render(write_exr, "in/a.exr", around)
     told = clpipe(*BEND, "--set", f"render.fx={FX}").stderr
-    (black,) = re.findall(r"([\d.]+) % of the picture are black", told) or ["0"]
+    (black,) = re.findall(r"([\d.]+) % of the picture is black", told) or ["0"]
     seen = read_image(Path("o/a.exr")).pixels.max(-1) < 0.5
     assert float(black) == pytest.approx(100 * seen.mean(), abs=1.5)
     assert ("set distortion.fit=true" in told) == (around == NO_MARGINS)

@@ -209,7 +209,7 @@ def test_a_run_in_parts_makes_the_same_bytes(clpipe, renders):
     # A second run makes nothing but the files; another pose makes its picture again.
     assert "(2 of them were there already)" in clpipe(*run, "-o", "o").stderr
     again = clpipe("run", renders, "-o", "o", "--poses", changed(t=[0, 0, 9.0]), *RUN, "exposure")
-    assert "(1 of them were there already)" in again.stderr
+    assert "(1 of them was there already)" in again.stderr
     assert json.loads(Path("o/cameras.json").read_text())["views"][0]["t"] == [0, 0, 9.0]
 
 

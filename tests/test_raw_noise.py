@@ -112,7 +112,7 @@ def test_values_that_are_not_allowed(raw):
         api.RequestError, match="found until, but it runs from crosstalk to normalize"
     ):
         noise(until="quantize")
-    with pytest.raises(api.RequestError, match="did you mean 'sony-a7r2'"):
+    with pytest.raises(api.RequestError, match="most similar: sony-a7r2"):
         api.RawNoise("sony-a7r22", ISO)
     with pytest.raises(api.RequestError, match="goes from 100 to 25600"):
         noise(50)

@@ -351,7 +351,8 @@ def test_renders_in_whole_numbers_with_a_stated_transfer(tmp_path, ending, trans
 
 
 def test_a_transfer_is_that_of_a_render(tmp_path):
-    command = ["run", "a.png", "-o", str(tmp_path), "--transfer", "srgb", "-c", "unprocess"]
+    (tmp_path / "a.png").touch()
+    command = ["run", str(tmp_path), "-o", "out", "--transfer", "srgb", "-c", "unprocess"]
     result = CliRunner().invoke(main, command)
     assert result.exit_code == 2 and "--transfer: it is for renders" in result.output
 

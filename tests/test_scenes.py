@@ -262,6 +262,7 @@ def test_scenes_that_cannot_be_rendered(clpipe, scene, blender, tmp_path, monkey
     said = clpipe("dataset", scene, "-o", "set", *blender, status=2).stderr
     assert said == f"clpipe: {scene}: it has no camera; add one\n"
     assert "no such file" in clpipe("dataset", "no.blend", "-o", "set", *blender, status=2).stderr
+    Path("no").touch()
     assert "expected a .blend, or a folder" in clpipe("dataset", "no", "-o", "s", status=2).stderr
     monkeypatch.setitem(sys.modules, "bpy", None)
     said = clpipe("dataset", scene, "-o", "set", status=2).stderr

@@ -250,7 +250,7 @@ def test_overlapping_views_and_what_no_view_shows(write, clpipe):
     Path("rig.json").write_text(json.dumps({"views": views}))
     options = options_of("kannala_brandt", views="rig.json")
     told = clpipe("run", "in", "-o", "o", *RUN, *options).output
-    assert "of the lens's field are black: no view shows what is there" in " ".join(told.split())
+    assert "of the lens's field is black: no view shows what is there" in " ".join(told.split())
     seen, lens = read_image(Path("o/a.exr")).pixels, lens_of("kannala_brandt")
     rays = places_of(lens)[2]
     shown = seen.any(-1)

@@ -1,14 +1,16 @@
 """Pictures compared: their crops beside each other, their differences, the noise of each."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from clpipe.analysis.crops import Place, choose_places
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import Picture, load_picture
+from clpipe.analysis.report import json_number
 from clpipe.analysis.signature import luma
 from clpipe.analysis.spatial import energy_left
 from clpipe.base.errors import RequestError
@@ -53,6 +55,16 @@ class Comparison:
     rows: tuple[Row, ...]
     noise: tuple[Noise, ...]  # of each picture; empty where it is not known
     notes: tuple[str, ...]
+
+    def record(self) -> dict[str, Any]:
+        """The figure's content but for its pixels, as JSON values; unknown numbers are None."""
+        noise = [{k: json_number(v) for k, v in asdict(each).items()} for each in self.noise]
+        return {
+            "labels": list(self.labels),
+            "places": [asdict(place) for place in self.places],
+            "noise": noise,
+            "notes": list(self.notes),
+        }
 
 
 def compare(

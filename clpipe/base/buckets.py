@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from clpipe.base.errors import ImageError, OutputError, RequestError
+from clpipe.base.extras import installing
 from clpipe.base.text import one_line
 
 T = TypeVar("T")
@@ -34,7 +35,7 @@ FIRST_WAIT = 0.25  # s; doubled each time
 
 # Of what fsspec needs beside itself, by the scheme.
 PACKAGES = {"s3": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs"}
-INSTALL = "pip install 'clpipe[cloud]'"
+PACKAGES |= {"http": "aiohttp", "https": "aiohttp"}
 
 # What file systems say of a file's content or time; what is first counts.
 CHANGES = ["ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime"]
@@ -270,13 +271,14 @@ def _opened(url: str) -> tuple[Any, str]:
     try:
         from fsspec.core import url_to_fs
     except ImportError:
-        raise RequestError(f"{url}: needs fsspec; {INSTALL}") from None
+        raise RequestError(f"{url}: needs fsspec; {installing('fsspec')}") from None
     scheme = url.partition("://")[0]
     try:
         system, path = url_to_fs(url)
-    except ImportError:
-        package = PACKAGES.get(scheme, "a package of fsspec's")
-        raise RequestError(f"{url}: needs {package}; {INSTALL}") from None
+    except ImportError as error:
+        package = PACKAGES.get(scheme)
+        needs = f"needs {package}; {installing(package)}" if package else _reason(error)
+        raise RequestError(f"{url}: {needs}") from None
     except ValueError as error:
         raise RequestError(f"{url}: {_reason(error)}") from None
     return system, path

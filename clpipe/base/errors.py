@@ -26,6 +26,17 @@ class RequestError(ClpipeError):
     exit_status = 2
 
 
+class MissingError(RequestError):
+    """A file or folder that was named does not exist; ``name`` is what was written."""
+
+    def __init__(self, name: str, message: str) -> None:
+        super().__init__(message)
+        self.name = name
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return MissingError, (self.name, *self.args)
+
+
 class KeyedError(RequestError):
     """A bad setting; ``key`` is its dotted name, such as ``sensor_noise.a``."""
 

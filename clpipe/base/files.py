@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from clpipe.base.cpu_time import CpuTimer
-from clpipe.base.errors import ImageError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_regular
 from clpipe.base.system import begin_writing, bring_to_disk, file_to_disk
 
@@ -237,6 +237,20 @@ def write_whole(path: Path, *parts: bytes | memoryview) -> Stored:
     return Stored(size, digest.hexdigest())
 
 
+def check_folder(folder: Path) -> None:
+    """See that no file stands where a folder is to be made, or above it.
+
+    Raises:
+        RequestError: one does.
+    """
+    if place := _file_among(folder):
+        raise RequestError(f"--output: {place} is a file; name a folder to write to")
+
+
+def _file_among(folder: Path) -> Path | None:
+    return next((place for place in (folder, *folder.parents) if os.path.isfile(place)), None)
+
+
 def make_folder_of(path: Path) -> None:
     """Make the folders above a file that is to be written, where they are missing.
 
@@ -246,7 +260,9 @@ def make_folder_of(path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ImageError(f"{path}: cannot be written: {error.strerror}") from None
+        place = _file_among(path.parent)
+        reason = f"{place} is a file, not a folder" if place else error.strerror
+        raise ImageError(f"{path}: cannot be written: {reason}") from None
 
 
 def write_new(path: Path, data: bytes) -> Stored:

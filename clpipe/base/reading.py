@@ -12,15 +12,19 @@ import stat
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.errors import ImageError
+from clpipe.base.errors import ImageError, MissingError, RequestError
 from clpipe.base.memory import in_words
+from clpipe.base.text import alike
 
 TEXT_BYTES = 16 * 2**20  # the largest text but a manifest: a configuration, a curve, a sidecar
 
 KEY_PARTS = 32  # of a dotted key; tomllib takes memory with their square
+
+SEARCHED = 20_000  # names in a folder, among which a similar one is looked for
 
 KINDS = {
     stat.S_IFDIR: "a folder",
@@ -48,6 +52,56 @@ def check_regular(path: Path) -> os.stat_result:
     if kind != stat.S_IFREG:
         raise OSError(errno.EINVAL, f"it is {KINDS.get(kind, 'something else')}, not a file")
     return status
+
+
+def check_exists(path: Path) -> None:
+    """See that a file or folder exists that was named.
+
+    Raises:
+        MissingError: it does not; the message suggests a name that is similar and exists.
+    """
+    try:
+        os.stat(path)
+        return
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except (OSError, ValueError):  # reading it tells why
+        return
+    place, rest = path, Path()
+    while not os.path.exists(place.parent) and place != place.parent:
+        place, rest = place.parent, place.name / rest
+    near = _similar(place)
+    hint = f"; did you mean {near / rest}?" if near else ""
+    raise MissingError(str(path), f"{path}: there is no such file or folder{hint}")
+
+
+def check_input(path: Path) -> None:
+    """See that a file or folder that was named as an input exists and is no array of NumPy.
+
+    Raises:
+        MissingError: it does not exist.
+        RequestError: it is an array, which clpipe writes and does not read.
+    """
+    check_exists(path)
+    if path.suffix.lower() == ".npy":
+        raise RequestError(
+            f"{path}: it is an array of NumPy, as --format npy writes it, which clpipe does not "
+            "read. Load it with numpy.load, or write a file that clpipe reads with --format exr"
+        )
+
+
+def _similar(path: Path) -> Path | None:
+    """What is called like a missing file, in its folder; one with its suffix comes first."""
+    try:
+        with os.scandir(path.parent) as entries:
+            names = [entry.name for entry in islice(entries, SEARCHED)]
+    except OSError:
+        return None
+    by_stem: dict[str, str] = {}
+    for name in sorted(names, key=lambda name: (Path(name).suffix != path.suffix, name)):
+        by_stem.setdefault(Path(name).stem, name)
+    near = alike(path.stem, by_stem, cutoff=0.7)
+    return path.with_name(by_stem[near[0]]) if near else None
 
 
 @contextmanager

@@ -1,8 +1,62 @@
 """Text for messages: suggestions for misspelt names, and text that is safe to print."""
 
+import re
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
+
+LONG = 4  # letters of a word that may stand for a name
+
+
+def alike(text: str, names: Iterable[str], cutoff: float = 0.55) -> list[str]:
+    """The names that a shortened or misspelt one may stand for, in their order.
+
+    These are all that have its words. If there is none, it is the most similar one, or those that
+    have the most similar word.
+
+    Args:
+        text: what was written.
+        names: those that there are.
+        cutoff: the least similarity, 0 to 1.
+
+    >>> alike("canon 5d", ["canon-5d2", "canon-6d", "canon-5d3"])
+    ['canon-5d2', 'canon-5d3']
+    >>> alike("Demosiac", ["mosaic", "demosaic"])
+    ['demosaic']
+    >>> alike("noize", ["normalize", "row_noise", "column_noise"])
+    ['row_noise', 'column_noise']
+    """
+    by_lower = {name.lower(): name for name in names}
+    near = with_words(text, by_lower)
+    if not near:
+        words = {word for name in by_lower for word in _words(name) if len(word) >= LONG}
+        best = get_close_matches(text.lower(), [*by_lower, *sorted(words)], 1, cutoff)
+        near = best if best and best[0] in by_lower else with_words("".join(best), by_lower)
+    return [by_lower[name] for name in near]
+
+
+def with_words(text: str, names: Iterable[str]) -> list[str]:
+    """The names that have all words of a text, and perhaps others, in their order.
+
+    >>> with_words("noise", ["sensor_noise", "denoise", "row_noise"])
+    ['sensor_noise', 'row_noise']
+    """
+    words = _words(text)
+    return [name for name in names if words and words <= _words(name)]
+
+
+def _words(text: str) -> set[str]:
+    return set(re.findall(r"[^\W\d_]+|\d+", text.lower()))
+
+
+def either(names: Iterable[str]) -> str:
+    """Names as alternatives.
+
+    >>> either(["a", "b", "c"])
+    "'a', 'b' or 'c'"
+    """
+    *others, last = (f"'{name}'" for name in names)
+    return f"{', '.join(others)} or {last}" if others else last
 
 
 def one_of(what: str, found: str, allowed: Iterable[str], nearest: str | None = None) -> str:
@@ -18,8 +72,8 @@ def one_of(what: str, found: str, allowed: Iterable[str], nearest: str | None = 
     "unknown stage 'demosiac' (did you mean 'demosaic'?); allowed: mosaic, demosaic"
     """
     names = list(map(one_line, allowed))
-    near = [nearest] if nearest else get_close_matches(found, names, n=1, cutoff=0.5)
-    hint = f" (did you mean '{near[0]}'?)" if near else ""
+    near = [nearest] if nearest else alike(found, names)
+    hint = f" (did you mean {either(near)}?)" if near else ""
     return f"unknown {what} '{one_line(found)}'{hint}; allowed: {', '.join(names) or 'none'}"
 
 

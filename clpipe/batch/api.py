@@ -11,7 +11,7 @@ from clpipe.base.types import plain
 from clpipe.base.validation import typed
 from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
-from clpipe.chain.formats import EVERY_FORMAT
+from clpipe.chain.formats import EVERY_FORMAT, format_named
 from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.rendition import parse_bracket
 from clpipe.chain.request import Request
@@ -108,7 +108,8 @@ def run(
             raise RequestError(f"found {name} {number}; expected 1 to {MOST[name]}")
     if not str(output):
         raise RequestError("output: it is empty; name a folder")
-    for each in several(format):
+    formats = tuple(map(format_named, several(format)))
+    for each in formats:
         if each not in EVERY_FORMAT:
             raise RequestError(one_of("format", each, EVERY_FORMAT))
     if isinstance(memory, int) and memory < 1:
@@ -127,7 +128,7 @@ def run(
         values=values,
         start_at=start_at,
         until=until,
-        formats=several(format),
+        formats=formats,
         keep=several(keep),
         carry=several(carry),
         truth=several(truth),

@@ -16,11 +16,12 @@ from clpipe.base.cpu_time import CpuTimer, CpuTimes
 from clpipe.base.errors import ImageError
 from clpipe.base.memory import peak_memory
 from clpipe.base.processors import available_processors
+from clpipe.base.types import Array
 from clpipe.batch.outcome import DONE, STEPS, Span
 from clpipe.batch.threads import Batch
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.request import Request
-from clpipe.engine.bench import scene
+from clpipe.engine.bench import input_of, scene
 from clpipe.engine.device import Device
 from clpipe.images.write import write_exr
 from clpipe.inputs.find import find_jobs
@@ -100,10 +101,11 @@ def bench_batch(device: Device, request: Request, load: Load) -> BatchSpeed:
     """
     with tempfile.TemporaryDirectory(prefix="clpipe-bench-") as name:
         folder = Path(name)
-        write_renders(folder / "in", load)
+        chain = request.chain()
+        picture = input_of(chain, load.width, load.height)
+        write_images(folder / "in", load, picture, chain.source)
         loader = ImageLoader(request)
         jobs = find_jobs([str(folder / "in")], folder / "out")
-        chain = loader.first_chain(jobs)
         resolved = replace(request, formats=("jpg",)).with_outputs(chain)
         writer = OutputWriter(folder / "out", resolved)
 
@@ -162,18 +164,23 @@ def forget_peak_memory() -> None:
 
 
 def write_renders(folder: Path, load: Load) -> None:
-    """Write a folder of renders in half floats: :data:`DISTINCT` files, and links to them.
+    """Write a folder of renders in half floats, as :func:`write_images`."""
+    write_images(folder, load, scene(load.width, load.height), Kind.RGB)
+
+
+def write_images(folder: Path, load: Load, picture: Array, kind: Kind) -> None:
+    """Write a folder of images like one: :data:`DISTINCT` files, and links to them.
 
     They are copies where links cannot be made, as on Windows by most users.
     """
     folder.mkdir()
-    picture = scene(load.width, load.height)
+    attributes = {} if kind is Kind.RGB else {"kind": kind.label}
     digits = len(str(load.images - 1))
     for i in range(load.images):
         path = folder / f"{i:0{digits}}.exr"
         if i < DISTINCT:
             rolled = np.roll(picture, 37 * i, axis=1)
-            write_exr(path, rolled, Kind.RGB.channels, {}, half=True)
+            write_exr(path, rolled, kind.channels, attributes, half=picture.dtype == np.float16)
         else:
             first = f"{i % DISTINCT:0{digits}}.exr"
             try:

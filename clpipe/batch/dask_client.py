@@ -55,7 +55,7 @@ def connected(address: str, spec: DaskSpec) -> Iterator["Cluster"]:
         RequestError: distributed is not installed, the scheduler does not answer, it has no
             workers, or they have different versions of clpipe.
     """
-    require("--dask", "dask", "distributed")
+    require("--dask", "distributed")
     from distributed import Client
 
     try:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from clpipe.base.about import full_version
 from clpipe.base.buckets import upload, url_of
 from clpipe.base.errors import OutputError, RequestError
-from clpipe.base.files import discard
+from clpipe.base.files import check_folder, discard
 from clpipe.base.processors import available_processors
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.processes import Processes, usual_processes
@@ -35,6 +35,7 @@ from clpipe.engine.device import Device, open_devices
 from clpipe.images.claims import Claim
 from clpipe.images.read import PICTURE_SUFFIXES
 from clpipe.inputs.find import Job, Shard, find_jobs
+from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.poses import with_views
 from clpipe.inputs.series import Series
@@ -148,6 +149,8 @@ class Run:
         if note := draw_note(self._loader.settings):
             log.info("%s", note)
         self._chain = self._loader.first_chain(self.jobs)
+        for note in lens_notes(self._loader.settings, self.jobs):
+            log.warning("%s", note)
         check_render_options(request, self._chain.source)
         self._request = request.with_outputs(self._chain)
         self.writer = OutputWriter(where.output, self._request)
@@ -315,7 +318,7 @@ def check_processes(where: Where, dask: str | None, per_tar: int | None) -> None
 
 
 def check_output(folder: Path, per_tar: int | None = None) -> None:
-    """See that the name of the output folder is not that of a picture, and that a URL gets tars.
+    """See that the output folder is no file nor called like a picture, and that a URL gets tars.
 
     Raises:
         RequestError: it is, or gets pictures.
@@ -329,6 +332,7 @@ def check_output(folder: Path, per_tar: int | None = None) -> None:
             f"--output: found {folder}, the name of a picture; name the folder to write to: "
             "-o FOLDER"
         )
+    check_folder(folder)
 
 
 def check_render_options(request: Request, source: Kind) -> None:

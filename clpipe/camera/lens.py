@@ -11,10 +11,11 @@ from typing import Any
 from xml.etree import ElementTree
 
 from clpipe.base.errors import KeyedError, RequestError
+from clpipe.base.extras import installing
 from clpipe.base.text import one_line
 from clpipe.camera.profile import Camera
 
-INSTALL = "pip install 'clpipe[lens]'"
+INSTALL = installing("lensfunpy")
 FAR = 1000.0  # m, at which lensfun's calibrations for infinity stand
 OTHERS = 2  # words of a lens's name, beside the maker, that may be left out
 RECTILINEAR = "RECTILINEAR"  # lensfun's type of the lenses that are known here
@@ -96,6 +97,21 @@ def _calibration(
     return LensCalibration(_full(lens), focal, bend, falloff, own, is_smaller)
 
 
+def name_note(name: str) -> str:
+    """What is to be said of a lens that is named by a part of its name; "" if it is named in full.
+
+    Raises:
+        KeyedError: lensfunpy is not installed, or there is no such lens, or several.
+    """
+    lens = _found(_database(), name, None)
+    if not _left_out(lens, _words(name)):
+        return ""
+    return (
+        f"warning: lens: '{one_line(name)}' is a part of a name, and {_full(lens)} is taken; to be "
+        "sure of the lens, name it in full"
+    )
+
+
 def lens_names() -> list[str]:
     """All lenses of lensfun's database that :func:`calibration_of` takes, in their order.
 
@@ -174,20 +190,28 @@ def _found(database: Any, name: str, crop: float | None) -> Any:
         names = sorted({_full(lens) for lens in database.lenses})
         by_lower = {each.lower(): each for each in names}
         near = [by_lower[each] for each in get_close_matches(name.lower(), by_lower, 3, 0.3)]
-        raise KeyedError(
-            "lens",
-            f"lens: lensfun knows no '{one_line(name)}'; the nearest are {', '.join(near)}",
+        nearest = (
+            f"the nearest are {', '.join(near)}" if near else "name one by its maker and model"
         )
+        raise KeyedError("lens", f"lens: lensfun knows no '{one_line(name)}'; {nearest}")
     fewest = min(count for count, _ in having)
     best = [lens for count, lens in having if count == fewest]
     models = sorted({_full(lens) for lens in best})
-    others = fewest - len(set(_words(best[0].maker)) - set(wanted))
-    if len(models) > 1 or others > OTHERS:
+    if len(models) > 1 or _left_out(best[0], wanted) > OTHERS:
         models = sorted({_full(lens) for _, lens in having})
-        more = f" or one of {len(models) - 5} others" if len(models) > 5 else ""
-        raise KeyedError("lens", f"lens: '{one_line(name)}' may be {' or '.join(models[:5])}{more}")
+        more = f", or {len(models) - 5} more" if len(models) > 5 else ""
+        listed = " or ".join(models[:5])
+        raise KeyedError(
+            "lens", f"lens: '{one_line(name)}' may be {listed}{more}; name one of them in full"
+        )
     smaller = [lens for lens in best if crop and lens.crop_factor <= crop * SAME_CROP]
     return max(smaller or best, key=lambda lens: lens.crop_factor if smaller else -lens.crop_factor)
+
+
+def _left_out(lens: Any, wanted: Sequence[str]) -> int:
+    """How many words of a lens's name, beside the maker, are not among those that are wanted."""
+    maker = set(_words(lens.maker)) - set(wanted)
+    return len(_words(_full(lens))) - len(wanted) - len(maker)
 
 
 def _missing(wanted: Sequence[str], words: Sequence[str]) -> bool:

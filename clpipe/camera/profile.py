@@ -1,7 +1,6 @@
 """Camera profiles: what a sensor does at each ISO, from a TOML file that cites every number."""
 
 import re
-from difflib import get_close_matches
 from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
@@ -11,14 +10,15 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from clpipe.base.errors import RequestError
-from clpipe.base.reading import parse_toml, read_text
-from clpipe.base.text import one_of
+from clpipe.base.reading import check_exists, parse_toml, read_text
+from clpipe.base.text import alike, one_line, one_of, with_words
 from clpipe.base.types import Doubles
 from clpipe.base.validation import first_fault
 from clpipe.camera.gain_stage import GainStage, NotNegative, Offsets, Positive, TukeyLambda
 from clpipe.camera.noise import NoiseModel
 
 DEFAULT_CAMERA = "sony-a7r2"
+MOST_NAMED = 5  # cameras in a message
 PUSHED = 4.0  # times the highest ISO of a camera: two stops
 Coefficient = Annotated[float, Field(ge=-100, le=100)]
 Row = tuple[Coefficient, Coefficient, Coefficient]
@@ -238,7 +238,8 @@ class Camera(BaseModel):
         if not low <= iso <= high:
             low, high = self.iso_range
             raise RequestError(
-                f"iso: found {iso:g}, but camera {self.name} goes from {low:g} to {high:g}"
+                f"iso: found {iso:g}, but camera {self.name} goes from {low:g} to {high:g}; use "
+                f"{min(max(iso, low), high):g}{_cameras_beyond(self, iso)}"
             )
 
     def gain_stage(self, iso: float) -> GainStage:
@@ -291,6 +292,51 @@ def built_in_name(name: str) -> str | None:
     return None if name.endswith(".toml") else camera_names().get(comparable(name))
 
 
+def cameras_called(name: str) -> list[str]:
+    """The built-in cameras that have all words of a text in one of their names.
+
+    >>> cameras_called("nikon d8")
+    []
+    >>> cameras_called("canon 5d mark")
+    ['canon-5d2', 'canon-5d3', 'canon-5d4']
+    """
+    names = _full_names()
+    return list(dict.fromkeys(names[each] for each in with_words(name, names)))
+
+
+def similar_cameras(name: str) -> list[str]:
+    """The built-in cameras that a shortened or misspelt name may stand for."""
+    by_name = camera_names()
+    near = (by_name[found] for found in alike(comparable(name), by_name))
+    return cameras_called(name) or list(dict.fromkeys(near))
+
+
+@cache
+def _full_names() -> dict[str, str]:
+    """The built-in cameras by each of their names, with the maker."""
+    full: dict[str, str] = {}
+    for name in built_in_cameras():
+        camera = load_camera(name)
+        models = (f"{camera.make} {model}" for model in (camera.model, *camera.aliases))
+        full |= dict.fromkeys((name, *models), name)
+    return full
+
+
+def _cameras_beyond(camera: Camera, iso: float) -> str:
+    """Which built-in cameras have an ISO that another lacks, or come nearest, for its message."""
+    others = [load_camera(name) for name in built_in_cameras() if name != camera.name]
+    having = [o.name for o in others if o.iso_range[0] <= iso <= o.iso_range[1]]
+    if having:
+        more = f" or {len(having) - MOST_NAMED} others" if len(having) > MOST_NAMED else ""
+        return f", or a camera that has it: {', '.join(having[:MOST_NAMED])}{more}"
+    is_high = iso > camera.iso_range[1]
+    furthest = (max if is_high else min)(others, key=lambda other: other.iso_range[is_high])
+    end = furthest.iso_range[is_high]
+    if (end > camera.iso_range[1]) if is_high else (end < camera.iso_range[0]):
+        return f"; the built-in camera that goes furthest is {furthest.name}, to {end:g}"
+    return "; no built-in camera goes further"
+
+
 def load_camera(name: str) -> Camera:
     """Load a built-in camera by :func:`built_in_name`, or a file by its path (ending in .toml).
 
@@ -301,10 +347,20 @@ def load_camera(name: str) -> Camera:
     if own := built_in.get(built_in_name(name) or ""):
         return _built_in(own)
     path = Path(name)
+    if path.suffix != ".toml" and path.is_file():
+        raise RequestError(
+            f"{path}: it is no camera profile, which ends in .toml; to make one of a DNG or a "
+            "noise model, use 'clpipe cameras import'"
+        )
     if path.suffix != ".toml":
-        near = get_close_matches(comparable(name), camera_names(), n=1, cutoff=0.5)
-        nearest = camera_names()[near[0]] if near else None
-        raise RequestError(one_of("camera", name, built_in, nearest) + ", or a .toml file")
+        near = similar_cameras(name)
+        hint = f" (most similar: {', '.join(near)})" if near else ""
+        raise RequestError(
+            f"unknown camera '{one_line(name)}': it is not built in{hint}. 'clpipe cameras' lists "
+            "those that are. For another camera, make a profile with 'clpipe cameras import' or "
+            "'clpipe calibrate', and name its .toml file"
+        )
+    check_exists(path)
     try:
         text = read_text(path)
     except OSError as error:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import KeyedError, RequestError
-from clpipe.base.reading import parse_toml, read_text
+from clpipe.base.reading import check_exists, parse_toml, read_text
 from clpipe.base.text import one_of
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.keys import CODE, KEYS, LENS, TABLES, names_in
@@ -82,6 +82,7 @@ def load_config(name: str) -> Config:
     path = built_in.get(name, Path(name))
     if path.suffix != ".toml" and not path.is_file():
         raise RequestError(one_of("configuration", name, built_in) + ", or a .toml file")
+    check_exists(path)
     try:
         text = read_text(path)
         values = parse_toml(text)

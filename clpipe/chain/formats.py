@@ -29,6 +29,19 @@ DNG = "dng"  # of the raw
 
 EVERY_FORMAT = (*FORMATS, DNG)
 
+# What else formats are called.
+OTHER_NAMES = {"jpeg": "jpg", "tiff": "tif", "tiff16": "tif16", "tiff32": "tif32"}
+
+
+def format_named(text: str) -> str:
+    """The format of a name, however it is spelt; the text itself where there is none.
+
+    >>> format_named("JPEG"), format_named("tiff16"), format_named("webp")
+    ('jpg', 'tif16', 'webp')
+    """
+    name = text.lower().removeprefix(".")
+    return OTHER_NAMES.get(name, name if name in EVERY_FORMAT else text)
+
 
 def ending_of(format_: str) -> str:
     """The ending of the name of a file of a format, without a dot.

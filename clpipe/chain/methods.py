@@ -54,6 +54,15 @@ def stage_named(key: str, name: str) -> Stage:
     return all_stages()[name]
 
 
+def parameter_names() -> list[str]:
+    """The parameters of all stages and tables, each once, as ``stage.parameter``."""
+    models = [(stage.name, method) for stage in all_stages().values() for method in stage.methods]
+    pairs = [*models, *TABLE_MODELS.items()]
+    return list(
+        dict.fromkeys(f"{name}.{key}" for name, model in pairs for key in model.model_fields)
+    )
+
+
 def chosen_method(name: str, table: Mapping[str, Any]) -> Any:
     """The name of the method in a step's table; without one, that of the stage's default method."""
     stage = all_stages().get(base_name(name))

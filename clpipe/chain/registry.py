@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from clpipe.base.errors import ClpipeError, RequestError
-from clpipe.base.reading import check_regular
+from clpipe.base.reading import check_exists, check_regular
 from clpipe.chain.keys import NOISE
 from clpipe.stage import CompileTime, Context, Method, Stage, StageRole
 from clpipe.stages import own_stages
@@ -93,10 +93,9 @@ def _loaded_file(path: Path, where: Path) -> Stage:
         spec = spec_from_file_location(f"clpipe_stage_{path.stem}", where)
         if path.suffix != ".py" or spec is None or spec.loader is None:
             raise RequestError(f"{path}: a stage file is a Python file, ending in .py")
+        check_exists(path)
         try:
             check_regular(where)
-        except FileNotFoundError:
-            raise RequestError(f"{path}: no such file") from None
         except OSError as error:
             raise RequestError(f"{path}: cannot be read: {error.strerror}") from None
         module = module_from_spec(spec)

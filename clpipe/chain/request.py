@@ -13,6 +13,7 @@ from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of, several
 from clpipe.base.validation import first_fault
+from clpipe.chain.assignments import parse_assignment
 from clpipe.chain.carry import AovSpec, parse_carry
 from clpipe.chain.chain import Chain
 from clpipe.chain.files import load_configs
@@ -22,7 +23,6 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.registry import code_files, load_stage_file
 from clpipe.chain.rendition import BASELINES, MOSAIC, TRUTHS
 from clpipe.chain.settings import Settings, overlay
-from clpipe.chain.toml import parse_assignment
 from clpipe.chain.truth import noisy_mosaic
 from clpipe.stage import Kind
 

@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from clpipe.base.errors import KeyedError, RequestError
-from clpipe.base.text import one_of
+from clpipe.base.text import either, one_of
 from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_name, load_camera
 from clpipe.chain.drawing import draw_of, extremes_of, values_of
 from clpipe.chain.draws import TINY, Choice, Draw, Limits, limits_of
@@ -26,6 +26,7 @@ from clpipe.chain.methods import (
     make_method,
     make_table,
     method_named,
+    parameter_names,
     stage_named,
     unknown_parameter,
 )
@@ -191,6 +192,11 @@ class Settings:
         draw = self.draws.get("camera")
         return list(draw.choice) if isinstance(draw, Choice) else [self.camera]
 
+    def lenses(self) -> list[str]:
+        """The lens that is named, or all that it is drawn from; none where there is none."""
+        draw = self.draws.get("lens")
+        return list(draw.choice) if isinstance(draw, Choice) else [self.lens] * bool(self.lens)
+
     def isos(self) -> Limits:
         """The ISOs that all :meth:`cameras` have.
 
@@ -283,7 +289,9 @@ def _checked_plain(settings: Settings, plain: Mapping[str, Any]) -> dict[str, An
         if key == CODE:
             raise KeyedError(key, f"{key}: code comes from --stage-file or a configuration file")
         if key not in KEYS:
-            raise KeyedError(key, one_of("key", key, (*KEYS, *TABLES, *all_stages())))
+            having = [each for each in parameter_names() if each.endswith(f".{key}")]
+            hint = f"; did you mean {either(having)}?" if having else ""
+            raise KeyedError(key, one_of("key", key, (*KEYS, *TABLES, *all_stages())) + hint)
         check_type(key, value)
     for key in ("stages", "skip"):
         if key in plain:
@@ -291,9 +299,7 @@ def _checked_plain(settings: Settings, plain: Mapping[str, Any]) -> dict[str, An
             if key == "stages" and len(names) > MAX_STAGES:
                 raise KeyedError(key, f"{key}: found {len(names)}, but at most {MAX_STAGES} run")
             for name in names:
-                if (key, name) == ("skip", NOISE):
-                    continue
-                stage_named(key, name if key == "stages" else base_name(name))
+                _check_step(key, name)
             checked[key] = (*settings.skip, *names) if key == "skip" else names
     checked |= {key: convert(plain[key]) for key, convert in CONVERSIONS.items() if key in plain}
     if plain.get("dump"):
@@ -302,6 +308,18 @@ def _checked_plain(settings: Settings, plain: Mapping[str, Any]) -> dict[str, An
         except RequestError as error:
             raise KeyedError("dump", str(error)) from None
     return checked
+
+
+def _check_step(key: str, name: str) -> None:
+    """See that a name can stand under "stages" or "skip".
+
+    Raises:
+        KeyedError: it is no stage; to skip, "noise" will do.
+    """
+    if key == "stages":
+        stage_named(key, name)
+    elif name != NOISE and base_name(name) not in all_stages():
+        raise KeyedError(key, f"skip: {one_of('stage', name, (NOISE, *all_stages()))}")
 
 
 def _merged(settings: Settings, step: str, table: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,7 +5,6 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from clpipe.base.errors import RequestError
 from clpipe.base.reading import parse_toml
 
 
@@ -29,21 +28,6 @@ def line_of(text: str, key: str) -> int | None:
 
 POINTED = re.compile(r"[+-]?(\d+\.|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 PLAIN_NUMBER = re.compile(r"[+-]?(?:0|[1-9]\d{0,99})(\.\d+)?", re.ASCII)
-
-
-def parse_assignment(text: str) -> tuple[str, str, Any]:
-    """The three parts of ``stage.parameter=value``; the value as :func:`toml_value` has it.
-
-    >>> parse_assignment("sensor_noise.a=1e-4")
-    ('sensor_noise', 'a', 0.0001)
-
-    Raises:
-        RequestError: the text does not have that form.
-    """
-    match = re.fullmatch(r"(\w+)\.(\w+)=(.*)", text)
-    if not match:
-        raise RequestError(f"--set {text}: expected stage.parameter=value")
-    return match[1], match[2], toml_value(match[3])
 
 
 def toml_value(text: str) -> Any:

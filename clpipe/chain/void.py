@@ -42,7 +42,7 @@ def check_void(chain: Chain, width: int, height: int) -> str:
         return ""
     if projection_of(chain):
         return (
-            f"{100 * share:.1f} % of the lens's field are black: no view shows what is there; give "
+            f"{100 * share:.1f} % of the lens's field is black: no view shows what is there; give "
             "the other faces, or make field_of_view smaller"
         )
     bends = [step.name for step in chain.steps if hasattr(step.method, "fit")]
@@ -50,7 +50,7 @@ def check_void(chain: Chain, width: int, height: int) -> str:
     most = MOST_OVERSCAN * max(width, height)
     more = f"render {ceil(beyond)} px more on each side (overscan), or " if beyond < most else ""
     return (
-        f"{100 * share:.1f} % of the picture are black: there the lens shows what lies beside the "
+        f"{100 * share:.1f} % of the picture is black: there the lens shows what lies next to the "
         f"render; {more}{fit}"
     )
 

@@ -1,6 +1,6 @@
 """``clpipe bench``: how fast a chain, a stage's methods or whole batches are on a device."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import click
@@ -9,7 +9,8 @@ from clpipe.base.errors import RequestError
 from clpipe.base.processors import available_processors
 from clpipe.base.text import whole_number
 from clpipe.batch.bench import CPU_STEPS, BatchSpeed, bench_batch, loads
-from clpipe.chain.methods import stage_named
+from clpipe.chain.making import step_names
+from clpipe.chain.methods import base_name, stage_named
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import chain_options
 from clpipe.commands.completion import methods_of
@@ -60,8 +61,9 @@ def bench(
 ) -> None:
     """Time a chain and each of its launches on a device.
 
-    The image is in half floats when it enters, and in eight bits when it leaves; both stay on the
-    device.
+    The image is of the kind that the chain starts on: a render, or with --start-at a mosaic or a
+    raw. It is in half floats (a raw: floats) when it enters, and in eight bits when it leaves; both
+    stay on the device.
     """
     width, height = map(whole_number, size.partition("x")[::2])
     if min(width, height) < 1 or width * height > MAX_PIXELS:
@@ -70,6 +72,11 @@ def bench(
             f"at most {MAX_PIXELS} pixels"
         )
     request = Request.from_options(**options)
+    settings = request.settings()
+    if request.start_at is None and (names := step_names(settings)):
+        reads = stage_named("--stages", base_name(names[0])).reads
+        if len(reads.channels) == 1:  # such a chain has no renders as input
+            request = replace(request, start_at=names[0])
     chain = request.chain()
     device = open_device(selector)
     if device is None:

@@ -13,6 +13,7 @@ from clpipe.analysis.emva.files import measure_series, write_emva_profile
 from clpipe.base.errors import RequestError
 from clpipe.camera.text import check_profile_name
 from clpipe.commands.options import (
+    EXISTING,
     Command,
     dump_option,
     json_option,
@@ -43,7 +44,7 @@ WITH_EMVA = ("emva", "output", "iso", "as_json")  # what goes with --emva
 )
 @click.option(
     "--emva",
-    type=click.Path(path_type=Path),
+    type=EXISTING,
     metavar="EMVA1288_Data.txt",
     help="Instead of FRAMES: a series of uniform frames, as EMVA 1288 asks for it.",
 )

@@ -1,14 +1,21 @@
 """``clpipe cameras``: the built-in cameras, the noise of one, or a profile of a noise model."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import click
 
 from clpipe.base.errors import RequestError
-from clpipe.camera.profile import Camera, built_in_cameras, load_camera
+from clpipe.camera.profile import (
+    Camera,
+    built_in_cameras,
+    built_in_name,
+    cameras_called,
+    load_camera,
+)
 from clpipe.commands.completion import cameras_or_import
-from clpipe.commands.options import Command, json_option, output_option
+from clpipe.commands.options import EXISTING, Command, json_option, output_option
 from clpipe.commands.printing import Rows, short_text, show, show_json
 
 # What a camera has at every ISO, with units.
@@ -44,12 +51,13 @@ UNKNOWN = "unknown"
 
 
 @click.command("import", cls=Command)
-@click.argument("path", metavar="FILE", type=click.Path(path_type=Path))
+@click.argument("path", metavar="FILE", type=EXISTING)
 @click.option(
     "--camera", metavar="NAME", help="Which camera of a noiseprofiles.json, by make and model."
 )
 @output_option("FILE.toml", "Write the profile there. [default: print it]", required=False)
-def import_command(path: Path, camera: str | None, output: Path | None) -> None:
+@json_option
+def import_command(path: Path, camera: str | None, output: Path | None, as_json: bool) -> None:
     """Make a camera profile of a noise model from elsewhere.
 
     FILE is a DNG with a NoiseProfile, an Android noise model (the text that CameraITS generates and
@@ -63,6 +71,10 @@ def import_command(path: Path, camera: str | None, output: Path | None) -> None:
     from clpipe.analysis.noise_models.read import import_camera
 
     text, made = import_camera(path, camera, output)
+    if as_json:
+        written = {"profile": None if output is None else str(output), "toml": text}
+        show_json(written | {"make": made.make, "model": made.model, "iso_range": made.iso_range})
+        return
     if output is None:
         click.echo(text, nl=False)
         return
@@ -87,28 +99,28 @@ class CamerasCommand(Command):
 
 
 @click.command("cameras", cls=CamerasCommand)
-@click.argument("name", required=False, metavar="[NAME|FILE]", shell_complete=cameras_or_import)
+@click.argument("names", nargs=-1, metavar="[NAME|FILE]", shell_complete=cameras_or_import)
 @click.option("--iso", type=float, help="The ISO. [default: all that were measured]")
 @json_option
-def cameras(name: str | None, iso: float | None, as_json: bool) -> None:
+def cameras(names: tuple[str, ...], iso: float | None, as_json: bool) -> None:
     """List the cameras, show the noise of one, or make one of a noise model (cameras import).
 
-    NAME is that of the list, or a make and model. Noise is shown in three forms, with the source of
-    each figure.
+    NAME is that of the list, or a make and model; a part of it lists all that match. Noise is
+    shown in three forms, with the source of each figure.
 
     \b
     clpipe cameras "Canon 5D Mark III" --iso 3200
     clpipe cameras import photo.dng -o my_camera.toml
     """
-    if name is None:
+    name = " ".join(names)
+    if not name:
         if iso is not None:
             raise RequestError("--iso: it needs the name of a camera")
-        records = [camera_record(load_camera(n)) for n in built_in_cameras()]
-        if as_json:
-            show_json(records)
-            return
-        every = map(load_camera, built_in_cameras())
-        show(("camera", "make and model", "also called", "ISO"), map(camera_row, every))
+        show_cameras(map(load_camera, built_in_cameras()), as_json)
+        return
+    called = [] if built_in_name(name) else cameras_called(name)
+    if iso is None and len(called) > 1:
+        show_cameras(map(load_camera, called), as_json)
         return
     camera = load_camera(name)
     if as_json:
@@ -120,6 +132,14 @@ def cameras(name: str | None, iso: float | None, as_json: bool) -> None:
         click.echo("")
     for key, source in camera.sources.items():
         click.echo(f"{key}: {source}")
+
+
+def show_cameras(cameras: Iterable[Camera], as_json: bool) -> None:
+    """Print a list of cameras, as a table or as JSON."""
+    if as_json:
+        show_json(list(map(camera_record, cameras)))
+    else:
+        show(("camera", "make and model", "also called", "ISO"), map(camera_row, cameras))
 
 
 def make_and_model(camera: Camera) -> str:

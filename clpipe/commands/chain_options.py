@@ -8,7 +8,7 @@ import click
 from clpipe.base.errors import RequestError
 from clpipe.base.text import whole_number
 from clpipe.chain.files import built_in_configs
-from clpipe.chain.formats import EVERY_FORMAT
+from clpipe.chain.formats import EVERY_FORMAT, format_named
 from clpipe.chain.keys import ABOUT
 from clpipe.chain.request import DEFAULTS, MOMENTS, MOST_PATCHES
 from clpipe.commands.completion import (
@@ -199,6 +199,11 @@ carry_option = click.option(
     "May be repeated.",
 )
 
+TRUTHS_HELP = (
+    "Write next to each picture the same without noise (development), without noise and denoising "
+    "(clean), the mosaic without noise (mosaic), the variance of the mosaic's noise (variance)"
+)
+
 truth_at_option = click.option(
     "--truth-at",
     type=click.Choice(MOMENTS),
@@ -208,11 +213,19 @@ truth_at_option = click.option(
     "with the picture; all has the layers of its start and end, too.",
 )
 
+
+class FormatName(click.Choice[str]):
+    """A format by any of its names."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        return super().convert(format_named(value), param, ctx)
+
+
 format_option = click.option(
     "--format",
     "formats",
     multiple=True,
-    type=click.Choice(EVERY_FORMAT),
+    type=FormatName(EVERY_FORMAT),
     help="The format of the last image, or dng for the raw that quantize makes; may be repeated. "
     "npy holds float16, DN as uint16, and makes those of --keep .npy, too. "
     "[default: jpg; exr, or npy of patches, where --until ends the chain earlier]",

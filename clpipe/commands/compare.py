@@ -8,14 +8,12 @@ from clpipe.analysis.comparison import Comparison
 from clpipe.analysis.comparison import compare as compare_pictures
 from clpipe.analysis.crops import FOUND, HEIGHT, WIDTH
 from clpipe.base.extras import require
-from clpipe.commands.options import Command, output_option
-from clpipe.commands.printing import number, show
-
-FILE = click.Path(path_type=Path)
+from clpipe.commands.options import EXISTING, Command, json_option, output_option
+from clpipe.commands.printing import number, show, show_json
 
 
 @click.command("compare", cls=Command)
-@click.argument("pictures", nargs=-1, required=True, type=FILE, metavar="PICTURE...")
+@click.argument("pictures", nargs=-1, required=True, type=EXISTING, metavar="PICTURE...")
 @output_option(
     "FIGURE", "The figure to write, as .png, .pdf or .svg; may be repeated.", multiple=True
 )
@@ -38,7 +36,7 @@ FILE = click.Path(path_type=Path)
     "--truth",
     "truths",
     multiple=True,
-    type=FILE,
+    type=EXISTING,
     metavar="FILE",
     help="The same without noise: one for all PICTUREs, or one for each in the same order.",
 )
@@ -54,6 +52,7 @@ FILE = click.Path(path_type=Path)
     type=click.IntRange(1, 32),
     help="The side of a picture's pixel, in pixels of 300 dpi.",
 )
+@json_option
 def compare(
     pictures: tuple[Path, ...],
     outputs: tuple[Path, ...],
@@ -62,6 +61,7 @@ def compare(
     truths: tuple[Path, ...],
     difference: bool,
     zoom: int,
+    as_json: bool,
 ) -> None:
     """Compare pictures: labelled crops side by side, as papers print them.
 
@@ -78,7 +78,7 @@ def compare(
     clpipe run render.exr -o shots --iso 100,3200
     clpipe compare shots/iso100/render.jpg shots/iso3200/render.jpg -o figure.pdf
     """
-    require("clpipe compare", "calibrate", "matplotlib", "scipy")
+    require("clpipe compare", "matplotlib", "scipy")
     from clpipe.analysis.comparison_plot import check_name, draw
 
     for output in outputs:
@@ -86,6 +86,9 @@ def compare(
     found = compare_pictures(pictures, crops, labels, truths, difference)
     for output in outputs:
         draw(found, output, zoom)
+    if as_json:
+        show_json({"figures": [str(output) for output in outputs], **found.record()})
+        return
     show(("place", "crop"), [(place.name, place.box) for place in found.places])
     if found.noise:
         click.echo()

@@ -1,7 +1,7 @@
 """``clpipe dataset``: a scene or a folder of renders becomes a dataset."""
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +11,7 @@ import click
 from rich.console import Console
 
 from clpipe.base.errors import RequestError
+from clpipe.base.files import check_folder
 from clpipe.batch.run_log import Summary
 from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
@@ -18,16 +19,18 @@ from clpipe.chain.panorama import projection_of
 from clpipe.chain.registry import stage_in
 from clpipe.chain.rendition import CLEAN, TRUTHS
 from clpipe.chain.request import Request
-from clpipe.commands.chain_options import carry_option, format_option, series_options
+from clpipe.commands.chain_options import TRUTHS_HELP, carry_option, format_option, series_options
 from clpipe.commands.input_options import poses_option
 from clpipe.commands.options import (
+    EXISTING,
     GroupedCommand,
     device_option,
+    json_lines_option,
     options_set,
     output_option,
     quiet_option,
 )
-from clpipe.commands.progress import Reporter, follow
+from clpipe.commands.progress import Reporter, follow, print_line
 from clpipe.inputs.around import wide_of
 from clpipe.inputs.series import Series, parse_isos
 from clpipe.reference.panorama import CUBE
@@ -46,7 +49,7 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
 
 
 @click.command("dataset", cls=GroupedCommand)
-@click.argument("source", type=click.Path(path_type=Path), metavar="SCENE.blend|FOLDER")
+@click.argument("source", type=EXISTING, metavar="SCENE.blend|FOLDER")
 @output_option("DS", "The folder of the dataset; it is made where it is missing.")
 @click.option(
     "--views",
@@ -112,7 +115,7 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
     default=(CLEAN,),
     show_default=True,
     type=click.Choice(TRUTHS),
-    help="Write beside each picture its truth, as clpipe run does; may be repeated.",
+    help=f"{TRUTHS_HELP}. May be repeated.",
 )
 @click.option(
     "--licence",
@@ -130,6 +133,7 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
 @format_option
 @device_option
 @quiet_option
+@json_lines_option
 def dataset(
     source: Path,
     output: Path,
@@ -140,6 +144,7 @@ def dataset(
     lens_model: str | None,
     assignments: tuple[str, ...],
     quiet: bool,
+    json_lines: bool,
     **options: Any,
 ) -> None:
     """Make a dataset of a Blender scene, or of a folder of renders that exist.
@@ -157,6 +162,7 @@ def dataset(
     clpipe dataset scene.blend -o film --frames 1-48 --iso 1600
     clpipe dataset renders/ -o set --iso 100,800 --camera sony-a7r2 --camera canon-5d2
     """
+    check_folder(output)
     series = Series(cameras, parse_isos(isos) if isos is not None else (), always=True)
     said = {name: options.pop(name) for name in ("licence", "author")}
     rendering = {name: options.pop(name) for name in RENDER_OPTIONS}
@@ -185,7 +191,9 @@ def dataset(
             renders = from_folder(source, output, poses)
         request = replace(request, carry=request.carry or renders.layers)
         said = keep_said(output, said)
-        summary = develop(renders, request, output, series, selector, quiet, said)
+        echo = print_line if json_lines else None
+        quiet |= json_lines
+        summary = develop(renders, request, output, series, selector, quiet, said, echo)
     if renders.failure:
         raise renders.failure
     sys.exit(summary.exit_status)
@@ -266,6 +274,7 @@ def develop(
     selector: str | None,
     quiet: bool,
     said: Mapping[str, str],
+    echo: Callable[[bytes], None] | None,
 ) -> Summary:
     """Develop the renders as they come, and write the dataset's card behind them.
 
@@ -275,7 +284,7 @@ def develop(
     found = renders.jobs() or ()
     images = Images(renders.inputs, poses=renders.poses, series=series, found=found)
     where = Where(output, () if selector is None else (selector,))
-    made = Run(request, images, where, arguments=sys.argv[1:])
+    made = Run(request, images, where, arguments=sys.argv[1:], echo=echo)
     reporter = Reporter(made, Console(stderr=True), quiet)
     tell = (lambda text: None) if quiet else reporter.print
 

@@ -6,13 +6,16 @@ from typing import Any
 
 import click
 
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.extras import require
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import chain_options
 from clpipe.commands.input_options import layer_option, max_pixels_option, transfer_option
-from clpipe.commands.options import Command, device_option, dump_option
+from clpipe.commands.options import Command, device_option, dump_option, json_option
+from clpipe.commands.printing import show_json
 from clpipe.engine.device import open_device
 from clpipe.inputs.find import find_jobs
+from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
 
 
@@ -24,6 +27,7 @@ from clpipe.inputs.loader import ImageLoader
 @layer_option
 @max_pixels_option
 @device_option
+@json_option
 @click.option(
     "--port",
     type=click.IntRange(1, 65535),
@@ -31,7 +35,11 @@ from clpipe.inputs.loader import ImageLoader
     help="The port of the page, to be forwarded from another machine. [default: a free one]",
 )
 def explore(
-    inputs: tuple[str, ...], selector: str | None, port: int | None, **options: Any
+    inputs: tuple[str, ...],
+    selector: str | None,
+    as_json: bool,
+    port: int | None,
+    **options: Any,
 ) -> None:
     """Try a camera on renders: a page on this machine, developed live as settings change.
 
@@ -44,7 +52,7 @@ def explore(
     clpipe explore render.exr
     clpipe explore renders/ --iso 3200 -c paper
     """
-    require("clpipe explore", "explore", "starlette", "uvicorn", "matplotlib")
+    require("clpipe explore", "starlette", "uvicorn", "matplotlib")
     from clpipe.explorer.explorer import Explorer
     from clpipe.explorer.server import Server
 
@@ -53,6 +61,18 @@ def explore(
     jobs = loader.exposures(find_jobs(inputs, Path(os.devnull), loader.endings()))
     loader.first_chain(jobs)  # a wrong request is refused here
     explorer = Explorer(jobs, request, open_device(selector))
+    for note in lens_notes(loader.settings, jobs):
+        click.echo(f"clpipe: {note}", err=True)
+    try:
+        explorer.check()
+    except ImageError as error:
+        raise RequestError(
+            f"{error}. clpipe explore takes what clpipe run takes: linear renders, camera raws, "
+            "and photographs with -c unprocess"
+        ) from None
     server = Server(explorer, port or 0)
-    click.echo(f"{explorer.label}: open {server.address} in a browser; Ctrl-C ends")
+    if as_json:
+        show_json({"address": server.address, "images": len(jobs)})
+    else:
+        click.echo(f"{explorer.label}: open {server.address} in a browser; Ctrl-C ends")
     server.run()

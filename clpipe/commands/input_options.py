@@ -1,15 +1,14 @@
 """Options that say which images are read, and how."""
 
-from pathlib import Path
-
 import click
 
+from clpipe.commands.options import EXISTING
 from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS
 from clpipe.images.read import TRANSFERS
 
 transfer_option = click.option(
     "--transfer",
-    type=click.Choice(list(TRANSFERS)),
+    type=click.Choice(list(TRANSFERS), case_sensitive=False),
     help="The transfer curve of renders in whole numbers (PNG, TIFF and others).",
 )
 
@@ -28,7 +27,7 @@ max_pixels_option = click.option(
 
 poses_option = click.option(
     "--poses",
-    type=click.Path(path_type=Path),
+    type=EXISTING,
     metavar="FILE",
     help="The camera and the pose of each render: a cameras.json, a transforms.json (NeRF, "
     "nerfstudio), or a folder with COLMAP's text model. Those of the pictures are written to "
@@ -37,7 +36,7 @@ poses_option = click.option(
 
 annotations_option = click.option(
     "--annotations",
-    type=click.Path(path_type=Path),
+    type=EXISTING,
     metavar="PATH",
     help="COCO's, BOP's or KITTI's annotations of renders: a JSON file of COCO's, a scene_gt.json, "
     "or a folder of labels. They go through distortion, resizing and patches as the pixels do, "

@@ -4,6 +4,7 @@ import ast
 import gc
 import io
 import logging
+import os
 import re
 import sys
 import traceback
@@ -18,7 +19,7 @@ from clpipe.base.about import full_version
 from clpipe.base.errors import ClpipeError, DeviceError, OutputError, RequestError
 from clpipe.base.memory import check_addresses
 from clpipe.base.system import address_space, processors, save_addresses
-from clpipe.base.text import one_line
+from clpipe.base.text import alike, either, one_line
 from clpipe.commands.notices import NOTICES
 
 # By the headings of the help. Each is a module of this folder that defines a function of its name.
@@ -38,6 +39,22 @@ OF_THREAD = 10 << 20
 
 class LazyGroup(click.Group):
     """Commands that are imported on use. An error becomes one message and an exit status."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if args[:1] == ["help"]:
+            args = [*args[1:], "--help"]
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            hint = " Options follow the command, as in 'clpipe run --iso 800'."
+            ctx.fail(error.format_message() + hint * (not error.possibilities))
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args[0] not in COMMANDS and not ctx.resilient_parsing:
+            ctx.fail(f"No such command '{one_line(args[0])}'.{meant(args[0])}")
+        return super().resolve_command(ctx, args)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -81,6 +98,24 @@ class LazyGroup(click.Group):
             fail(refused(error))
         except MemoryError:
             fail(DeviceError("there is no memory left to go on; what was made is whole"))
+
+
+def meant(text: str) -> str:
+    """What was probably meant by a text in the place of a command, as the end of a message."""
+    from clpipe.camera.profile import built_in_name
+    from clpipe.chain.registry import all_stages
+
+    if os.path.exists(text):
+        return f" It is a file or folder; to develop it, use 'clpipe run {text} -o OUT'."
+    if text in all_stages():
+        return f" It is a stage; to see what it does, use 'clpipe stages {text}'."
+    if camera := built_in_name(text):
+        return f" It is a camera; to see its noise, use 'clpipe cameras {camera}'."
+    stages = (f"stages {name}" for name in all_stages())
+    near = alike(text, (*COMMANDS, "cameras import", "--version"), 0.62) or alike(text, stages)
+    if not near:
+        return f" The commands are {', '.join(COMMANDS)}."
+    return f" Did you mean {either(f'clpipe {name}' for name in near)}?"
 
 
 def prepare_memory() -> None:

@@ -132,7 +132,7 @@ def match(
     clpipe match a_frame.png b_frame.png --mean a_mean.png --mean b_mean.png -o camera-jpeg.toml
     clpipe run render.exr -o out -c camera-jpeg.toml
     """
-    require("clpipe match", "calibrate", "scipy", *(["matplotlib"] if plot else []))
+    require("clpipe match", "scipy", *(["matplotlib"] if plot else []))
     check_names(output, plot)
     follower = Follower(output, Console(stderr=True))
     try:

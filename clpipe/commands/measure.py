@@ -16,7 +16,7 @@ from clpipe.analysis.spatial import LAGS, LineNoise
 from clpipe.analysis.statistics import SIGMAS, gaussian_beyond
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
-from clpipe.commands.options import Command, json_option
+from clpipe.commands.options import EXISTING, Command, json_option
 from clpipe.commands.printing import Rows, number, show, show_json
 from clpipe.outputs.places import FLAT, HALVED, PICTURE
 from clpipe.reference.cfa import PATTERNS, Pattern
@@ -25,12 +25,8 @@ from clpipe.stages.picture_noise import UNKNOWN
 
 
 @click.command("measure", cls=Command)
-@click.argument(
-    "images", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE..."
-)
-@click.option(
-    "--truth", type=click.Path(path_type=Path), metavar="FILE", help="The same image without noise."
-)
+@click.argument("images", nargs=-1, required=True, type=EXISTING, metavar="IMAGE...")
+@click.option("--truth", type=EXISTING, metavar="FILE", help="The same image without noise.")
 @click.option(
     "--pattern",
     default="RGGB",
@@ -72,7 +68,7 @@ def measure(
     if plot is not None and plot.suffix != ".png":
         raise RequestError(f"--plot: found {plot}; expected a name that ends in .png")
     if plot is not None:
-        require("--plot", "calibrate", "matplotlib")
+        require("--plot", "matplotlib")
     bursts = bursts_in(images)
     if truth is not None and len(bursts) > 1:
         raise RequestError(f"--truth: one scene has it, but there are {len(bursts)} bursts")

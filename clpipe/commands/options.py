@@ -4,8 +4,10 @@ Options that need the stages are in chain_options.
 """
 
 import logging
+import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,8 +15,9 @@ import click
 from click.core import ParameterSource
 
 from clpipe.base.buckets import is_url
-from clpipe.base.errors import RequestError
+from clpipe.base.errors import MissingError, RequestError
 from clpipe.base.memory import parse_size
+from clpipe.base.reading import check_input
 from clpipe.images.dump import TYPES
 from clpipe.inputs.spool import place_of_url
 
@@ -37,9 +40,30 @@ GROUPS = {
 
 
 class Command(click.Command):
-    """Refuses an option that is given twice and can hold but one value."""
+    """Rejects an option that is given twice and can hold but one value.
+
+    If an input that does not exist follows the value of an option, the message says how that
+    option takes several values.
+    """
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        ctx.meta[ARGUMENTS] = tuple(args)
+        with self._explaining(ctx):
+            return self._parsed(ctx, args)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        with self._explaining(ctx):
+            return super().invoke(ctx)
+
+    @contextmanager
+    def _explaining(self, ctx: click.Context) -> Iterator[None]:
+        try:
+            yield
+        except MissingError as error:
+            hint = several_values(self.get_params(ctx), ctx.meta[ARGUMENTS], error.name)
+            raise RequestError(f"{error}{hint}") from None
+
+    def _parsed(self, ctx: click.Context, args: list[str]) -> list[str]:
         if not ctx.resilient_parsing:
             given = self.make_parser(ctx).parse_args(list(args))[2]
             options = (each for each in given if isinstance(each, click.Option))
@@ -51,6 +75,35 @@ class Command(click.Command):
                         "one value; give it once"
                     )
         return super().parse_args(ctx, args)
+
+
+def several_values(
+    options: Sequence[click.Parameter], arguments: Sequence[str], missing: str
+) -> str:
+    """How to write the values of the option that a missing input follows; "" if it follows none.
+
+    >>> several_values([click.Option(["--skip"], multiple=True)], ["--skip", "a", "b"], "b")
+    ". To give --skip several values, use --skip a --skip b; for one with spaces, --skip 'a b'"
+    """
+    place = arguments.index(missing) - 2 if missing in arguments else -1
+    named = {name: option for option in options for name in option.opts}
+    option = named.get(arguments[place]) if place >= 0 else None
+    if not isinstance(option, click.Option) or option.is_flag:
+        return ""
+    values = [arguments[place + 1]]
+    for value in arguments[place + 2 :]:
+        if value.startswith("-") or os.path.exists(value):
+            break
+        values.append(value)
+    name = arguments[place]
+    quoted = f"{name} '{' '.join(values)}'"
+    if "," in (option.metavar or ""):
+        return f". To give {name} several values, use {name} {','.join(values)}"
+    if option.multiple:
+        repeated = " ".join(f"{name} {value}" for value in values)
+        return f". To give {name} several values, use {repeated}; for one with spaces, {quoted}"
+    is_text = isinstance(option.type, click.types.StringParamType)
+    return f". For a value with spaces, use {quoted}" if is_text else f". {name} takes one value"
 
 
 class GroupedCommand(Command):
@@ -93,19 +146,28 @@ class GroupedCommand(Command):
 
 
 def brief(text: str) -> str:
-    """The first part of a help text, with its default.
+    """The first part of a help text, with its default, or that the option is required.
 
     >>> brief("A stage, whole; may be repeated. Others follow. [default: a; else b]")
     'A stage, whole. [default: a]'
+    >>> brief("The folder; it is made.  [required]")
+    'The folder. [required]'
     """
     first = re.split(r"[.;:](?=\s|$)", text)[0]
-    default = re.search(r"\[default: ([^];]+)", text)
-    return f"{first}.{f' [default: {default[1]}]' if default else ''}"
+    end = re.search(r"\[(default: [^];]+|required)", text)
+    return f"{first}.{f' [{end[1]}]' if end else ''}"
 
 
 ALL = "clpipe.help_all"  # of a context: every option is shown
+ARGUMENTS = "clpipe.arguments"  # of a context: as they were written
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+
+json_lines_option = click.option(
+    "--json-lines",
+    is_flag=True,
+    help="Print the lines of the log on stdout, for programs: the start, each image, the end.",
+)
 
 device_option = click.option(
     "--device",
@@ -114,11 +176,22 @@ device_option = click.option(
     help="An index or a part of a name from 'clpipe devices', or numpy.",
 )
 
+
+class ExistingPath(click.Path):
+    """A file or folder that is read."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        check_input(Path(value))
+        return super().convert(value, param, ctx)
+
+
+EXISTING = ExistingPath(path_type=Path)
+
 stage_file_option = click.option(
     "--stage-file",
     "stage_files",
     multiple=True,
-    type=click.Path(path_type=Path),
+    type=EXISTING,
     metavar="FILE.py",
     help="Load a stage of your own; may be repeated.",
 )

@@ -5,13 +5,13 @@ from pathlib import Path
 import click
 
 from clpipe.base.errors import RequestError
-from clpipe.commands.options import Command, json_option
+from clpipe.commands.options import EXISTING, Command, json_option
 from clpipe.commands.printing import show_json
 from clpipe.outputs.camera_files import write_camera_files
 
 
 @click.command("poses", cls=Command)
-@click.argument("folder", metavar="OUT", type=click.Path(path_type=Path))
+@click.argument("folder", metavar="OUT", type=EXISTING)
 @json_option
 def poses(folder: Path, as_json: bool) -> None:
     """Write the cameras and poses of a run's pictures, for COLMAP, nerfstudio and other programs.
@@ -27,7 +27,7 @@ def poses(folder: Path, as_json: bool) -> None:
     clpipe poses out
     """
     if not folder.is_dir():
-        raise RequestError(f"{folder}: there is no such folder; name the output folder of a run")
+        raise RequestError(f"{folder}: it is no folder; name the output folder of a run")
     written = write_camera_files(folder)
     if not written.files:
         reasons = "; ".join(written.left_out) or "found no sidecar of one"

@@ -186,7 +186,8 @@ class Reporter:
             hold = "images in folders hold" if len(without) > 1 else "image in a folder holds"
             self.print(f"left out: {len(without)} {hold} no picture, such as {without[0]}")
         if (kept := self._summary.counts[LEFT_OUT] - len(without)) > 0:
-            self.print(f"{kept} images in folders were kept after other stages and left out")
+            were = "image in a folder was" if kept == 1 else "images in folders were"
+            self.print(f"{kept} {were} kept after other stages and left out")
 
     def end(self) -> None:
         """Remove the bar and print the summary."""
@@ -203,9 +204,13 @@ class Reporter:
         failed = summary.failures
         if self._quiet or not (self._several or failed or counts[SKIPPED]):
             return
-        there = f" ({counts[SKIPPED]} of them were there already)" if counts[SKIPPED] else ""
+        were = "was" if counts[SKIPPED] == 1 else "were"
+        there = f" ({counts[SKIPPED]} of them {were} there already)" if counts[SKIPPED] else ""
+        if counts[SKIPPED] == summary.total == 1:
+            there = " (it was there already)"
         done = counts[DONE] + counts[SKIPPED]
-        text = f"{done} of {summary.total} images done{there}, {counts[FAILED]} failed"
+        images = "image" if summary.total == 1 else "images"
+        text = f"{done} of {summary.total} {images} done{there}, {counts[FAILED]} failed"
         if counts[LEFT_OUT]:
             text += f", {counts[LEFT_OUT]} left out"
         if left := summary.total - summary.finished:

@@ -11,25 +11,29 @@ from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
 from clpipe.commands.input_options import max_pixels_option
 from clpipe.commands.options import (
+    EXISTING,
     Command,
     device_option,
+    json_option,
     memory_option,
     out_option,
     quiet_option,
     stage_file_option,
 )
+from clpipe.commands.printing import show_json
 from clpipe.commands.progress import follow
 
 
 @click.command("replay", cls=Command)
-@click.argument("sidecar", type=click.Path(path_type=Path), metavar="SIDECAR")
-@click.argument("image", required=False, type=click.Path(path_type=Path), metavar="[INPUT]")
+@click.argument("sidecar", type=EXISTING, metavar="SIDECAR")
+@click.argument("image", required=False, type=EXISTING, metavar="[INPUT]")
 @out_option
 @stage_file_option
 @device_option
 @memory_option
 @max_pixels_option
 @quiet_option
+@json_option
 def replay(
     sidecar: Path,
     image: Path | None,
@@ -39,6 +43,7 @@ def replay(
     memory: int | None,
     max_pixels: int,
     quiet: bool,
+    as_json: bool,
 ) -> None:
     """Make a sidecar's picture again, byte for byte, or say what has changed.
 
@@ -58,7 +63,7 @@ def replay(
         made = Run(again.request, Images(found=[again.job]), where, arguments=sys.argv[1:])
     except RequestError as error:
         raise RequestError(f"{sidecar}: {error}") from None
-    follow(made, made.outcomes(made.jobs), quiet)
+    follow(made, made.outcomes(made.jobs), quiet or as_json)
     if made.summary.exit_status:
         sys.exit(made.summary.exit_status)
     (rendition,) = made.writer.renditions_of(again.job)
@@ -67,5 +72,9 @@ def replay(
         same, text = again.comparison(existing.sidecar)
     except ImageError as error:
         raise RequestError(str(error)) from None
-    click.echo(f"{existing.pictures[0]}: {text}", err=True)
+    picture = existing.pictures[0]
+    if as_json:
+        show_json({"picture": str(picture), "same": same, "text": text})
+    else:
+        click.echo(f"{picture}: {text}", err=True)
     sys.exit(0 if same else 1)

@@ -8,17 +8,17 @@ import click
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
 from clpipe.base.files import write_new
-from clpipe.commands.options import Command, output_option
+from clpipe.commands.options import EXISTING, Command, json_option, output_option
+from clpipe.commands.printing import show_json
 from clpipe.commands.progress import told
 from clpipe.outputs.existing import is_marked
 
 
 @click.command("report", cls=Command)
-@click.argument(
-    "folders", metavar="OUT [OUT2]", nargs=-1, required=True, type=click.Path(path_type=Path)
-)
+@click.argument("folders", metavar="OUT [OUT2]", nargs=-1, required=True, type=EXISTING)
 @output_option("FILE.html", "The file. [default: OUT/report.html]", required=False)
-def report(folders: tuple[Path, ...], output: Path | None) -> None:
+@json_option
+def report(folders: tuple[Path, ...], output: Path | None, as_json: bool) -> None:
     """Look at a run: its figures, pictures, noise and settings, in one HTML file.
 
     OUT is the output folder of clpipe run, finished or not, with tars or without. The file opens
@@ -39,7 +39,7 @@ def report(folders: tuple[Path, ...], output: Path | None) -> None:
         raise RequestError(
             f"{path}: clpipe did not write this file; move it, or name another with -o"
         )
-    require("clpipe report", "report", "jinja2", "matplotlib", "scipy")
+    require("clpipe report", "jinja2", "matplotlib", "scipy")
     from clpipe.reports.page import html
     from clpipe.reports.run import read_run
 
@@ -47,4 +47,7 @@ def report(folders: tuple[Path, ...], output: Path | None) -> None:
         tell("sidecars")
         page = html([read_run(folder) for folder in folders], tell).encode()
     size = write_new(path, page).size
-    click.echo(f"wrote {path} ({size / 2**20:.1f} MiB)")
+    if as_json:
+        show_json({"report": str(path), "bytes": size})
+    else:
+        click.echo(f"wrote {path} ({size / 2**20:.1f} MiB)")

@@ -14,6 +14,7 @@ from clpipe.batch.where import Where
 from clpipe.chain.rendition import BASELINES, TRUTHS, parse_bracket
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import (
+    TRUTHS_HELP,
     carry_option,
     format_option,
     keep_option,
@@ -32,6 +33,7 @@ from clpipe.commands.input_options import (
 from clpipe.commands.options import (
     GroupedCommand,
     dump_option,
+    json_lines_option,
     memory_option,
     out_option,
     quiet_option,
@@ -58,11 +60,9 @@ from clpipe.outputs.patches import PER_IMAGE
     "--truth",
     multiple=True,
     type=click.Choice([*TRUTHS, *BASELINES]),
-    help="Write beside each picture a truth or a baseline: the same development without noise, the "
-    "clean picture (without noise and denoising), its mosaic without noise, or the variance of the "
-    "noise in the mosaic; or the clean picture with independent noise of the same strength, "
-    "the same everywhere (iid) or following intensity, with the truths that it is made of. May be "
-    "repeated.",
+    help=f"{TRUTHS_HELP}, or the clean picture with independent noise of the same strength, equal "
+    "everywhere (iid) or by intensity (intensity). iid and intensity come with the truths that "
+    "they are made of. May be repeated.",
 )
 @carry_option
 @truth_at_option
@@ -92,9 +92,9 @@ from clpipe.outputs.patches import PER_IMAGE
     type=click.Choice([each.value for each in Redo]),
     default=Redo.OLD.value,
     show_default=True,
-    help="Which pictures that are there already are made again: none but what is missing or has "
-    "changed; those of another clpipe; those that are damaged, which takes reading all; or all, "
-    "also files of others.",
+    help="Make again pictures that are missing or asked for otherwise (missing), also those of "
+    "another clpipe (old), also damaged ones (damaged), or all, even files of others (all). To "
+    "find damaged ones, all files are read.",
 )
 @click.option(
     "--device",
@@ -139,11 +139,7 @@ from clpipe.outputs.patches import PER_IMAGE
     help="Run on the workers of a Dask scheduler (tcp://HOST:8786); they must see the same files.",
 )
 @quiet_option
-@click.option(
-    "--json-lines",
-    is_flag=True,
-    help="Print the lines of the log on stdout, for programs: the start, each image, the end.",
-)
+@json_lines_option
 @click.option(
     "--trace",
     type=click.Path(path_type=Path),
@@ -213,7 +209,7 @@ def read_annotations(path: Path, per_tar: int | None, shard: Shard) -> Annotatio
     Raises:
         RequestError: they cannot be read, or the run has not all of its pictures in its folder.
     """
-    require("--annotations", "annotations", "pycocotools", "shapely")
+    require("--annotations", "pycocotools", "shapely")
     if per_tar or shard.of > 1:
         raise RequestError(
             "--annotations: they are written of all pictures of a folder; leave --webdataset and "

@@ -11,6 +11,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.memory import parse_size
 from clpipe.chain.isos import draw_note
 from clpipe.inputs.find import Job, find_jobs
+from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
 
 log = logging.getLogger(__name__)
@@ -51,10 +52,12 @@ def jobs_of(
     loader.check(jobs)
     if note := draw_note(loader.settings):
         log.info("%s", note)
+    for note in lens_notes(loader.settings, jobs):
+        log.warning("%s", note)
     owners: dict[str, Job] = {}
     for job in jobs:
         if job.listed and not job.path.exists():  # those of a folder were found there
-            raise RequestError(f"{job.label}: no such file or folder")
+            raise RequestError(f"{job.label}: there is no such file or folder")
         other = owners.setdefault(job.key, job)
         if other is not job:
             raise RequestError(

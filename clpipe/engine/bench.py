@@ -15,7 +15,7 @@ from clpipe.engine.ir import Launch
 from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.runner import Runner
 from clpipe.engine.traffic import bytes_per_pixel, launch_bytes
-from clpipe.stage import Stage, variant_label, variants
+from clpipe.stage import Kind, Stage, variant_label, variants
 
 
 @dataclass(frozen=True)
@@ -67,16 +67,28 @@ def scene(width: int, height: int) -> Array:
     return ((shade + texture)[..., None] * colour).astype(np.float16)
 
 
+def input_of(chain: Chain, width: int, height: int) -> Array:
+    """An image to measure on that a chain starts on: half (DN: float), (height, width[, 3])."""
+    picture = scene(width, height)
+    if len(chain.source.channels) > 1:
+        return picture
+    mosaic = np.ascontiguousarray(picture[..., 1])
+    if chain.source is not Kind.RAW:
+        return mosaic
+    black, white = chain.camera.black_level, chain.camera.white_level
+    return np.rint(black + mosaic.astype(np.float32) * (white - black))
+
+
 def bench(
     device: Device, chain: Chain, width: int = 6000, height: int = 4000, repeat: int = 7
 ) -> BenchReport:
-    """Time a chain from half RGB on the device to eight-bit RGB on the device.
+    """Time a chain from its input on the device, see :func:`input_of`, to eight-bit RGB there.
 
     The chain is timed whole, with one wait at its end; its launches by the device's own events.
     Each figure is the best of ``repeat`` runs after a first one that compiles.
     """
     runner = Runner(chain, device)
-    image = scene(width, height)
+    image = input_of(chain, width, height)
     pixels = width * height
     start = time.perf_counter()
     runner.run(image, "bench")
@@ -94,7 +106,7 @@ def bench(
             for a, b in zip(timings, best or timings, strict=True)
         ]
     copy = device.copy_speed()
-    plan = runner.plan()
+    plan = runner.plan_for(image)
 
     def speed(name: str, seconds: float, touched: float) -> Speed:
         seconds = max(seconds, 1e-9)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from clpipe.base.errors import DeviceError
+from clpipe.base.extras import installing
 from clpipe.base.memory import available_memory, check_addresses
 from clpipe.base.system import processors
 from clpipe.base.text import one_of
@@ -182,7 +183,7 @@ def remedies() -> str:
     x86 = this_system.machine() in ("x86_64", "AMD64")
     ways = [
         "your GPU's driver",
-        *(["pip install 'clpipe[intel]'"] if linux and x86 else []),
+        *([installing("intel-opencl-rt", "intel-cmplr-lib-rt")] if linux and x86 else []),
         *(["apt-get install pocl-opencl-icd (Debian, Ubuntu)"] if linux else []),
     ]
     if name := forced_target():

@@ -114,6 +114,18 @@ class Explorer:
             raise RequestError(f"there is no image {image}; there are {len(self.jobs)}")
         return self.jobs[image]
 
+    def check(self) -> None:
+        """See that the first image can be read.
+
+        Raises:
+            ImageError: it cannot.
+        """
+        job, loader = self.jobs[0], ImageLoader(self.request(self.initial))
+        try:
+            self._source(0, loader.for_job(job))
+        except (ImageError, MemoryError) as error:
+            raise ImageError(loader.error_text(job, error)) from None
+
     def request(self, values: Mapping[str, Any]) -> Request:
         """The request of values, which hold in place of those at the start.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError
-from clpipe.base.text import one_of
+from clpipe.base.text import alike, either, one_line
 from clpipe.chain.carry import AovSpec
 from clpipe.images.kinds import CHANNELS, kind_named, vectors_of
 from clpipe.images.passes import LayerLocation, find_layers, kind_of
@@ -104,12 +104,15 @@ class Finder:
                 return [self._found(asked, file, each) for each in named]
         layers = [each.without_rank for file in self.layers for each in self._of(file)]
         names = dict.fromkeys(layer.rpartition(".")[2] for layer in layers if layer)
-        message = one_of("layer", asked.name, names).replace("unknown", "no")
-        files = [str(file) for file in self.layers if file != self.path]
-        beside = f" and in {', '.join(files)}" if files else ", and no companion was found"
+        near = alike(asked.name, names)
+        hint = f" (did you mean {either(near)}?)" if near else ""
+        files = [file.name for file in self.layers if file != self.path]
+        where = f"the file and {', '.join(files)} have" if files else "the file has"
+        expected = f"{self.path.stem}_{one_line(asked.name)}.exr"
         raise ImageError(
-            f"{self.path}: --carry: {message.replace('; allowed:', '; there are:')}; looked in it"
-            f"{beside}"
+            f"{self.path}: --carry: no layer '{one_line(asked.name)}'{hint}; {where} "
+            f"{', '.join(map(one_line, names)) or 'no layers besides the picture'}, and there is "
+            f"no {expected} next to it; render the layer into one of them"
         )
 
     def _check_alone(self, name: str, file: Path) -> None:

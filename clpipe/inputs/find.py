@@ -13,10 +13,11 @@ from typing import Any, TypeVar
 
 from clpipe.base.buckets import check_url, is_glob, is_url, listed, url_of
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.reading import check_input
 from clpipe.base.text import printable, whole_number
 from clpipe.chain.rendition import Rendition
 from clpipe.images.raw import RAW_SUFFIXES
-from clpipe.images.read import RENDER_SUFFIXES
+from clpipe.images.read import PICTURE_SUFFIXES, RENDER_SUFFIXES
 from clpipe.inputs.companions import owner_of
 from clpipe.inputs.manifest import MANIFEST_SUFFIXES, read_manifest
 from clpipe.inputs.spool import path_of, place_of_url
@@ -24,6 +25,18 @@ from clpipe.inputs.spool import path_of, place_of_url
 T = TypeVar("T")
 
 log = logging.getLogger(__name__)
+
+# What files are that are no images, by their endings, and what to do with them.
+NO_IMAGES = {
+    ".json": "it is JSON, no image; to make the picture of a sidecar again, use 'clpipe replay'",
+    ".toml": "it is a configuration or a camera, no image; name it with -c or --camera",
+    ".blend": "it is a scene of Blender, no image; to render and develop it, use 'clpipe dataset'",
+}
+
+FINISHED = (
+    "Finished pictures are not linear light. For renders, add --transfer srgb; for photographs, "
+    "use -c unprocess"
+)
 
 
 @dataclass(frozen=True)
@@ -112,8 +125,8 @@ def find_jobs(
     """The jobs of a run, in the order of its inputs.
 
     The key of a file in a folder is its path relative to that folder; that of a file which is
-    named or matches a glob is its name; a manifest's rows have their own. A missing file is a job,
-    too: it fails later, alone.
+    named or matches a glob is its name; a manifest's rows have their own. A row whose file is
+    missing is a job, which fails later without the others.
 
     Args:
         inputs: files, folders (all images in them, at any depth), globs and manifests.
@@ -126,6 +139,7 @@ def find_jobs(
     Raises:
         RequestError: no input, an empty name, a folder without images, or one that cannot be read,
             a glob that no file matches, or a manifest that is wrong.
+        MissingError: a file that is named does not exist.
     """
     jobs: list[Job] = []
     if not inputs:
@@ -139,13 +153,6 @@ def find_jobs(
             jobs += _jobs_behind(text, endings, excluded)
         elif os.path.isdir(text):
             files = images_in(path, output, endings, excluded)
-            if not files:
-                listed = ", ".join(e for e in endings if e not in RAW_SUFFIXES)
-                raws = " and camera raws" if set(RAW_SUFFIXES) & set(endings) else ""
-                left = " that are not excluded" if exclude else ""
-                raise RequestError(
-                    f"{path}: a folder without images{left} (looked for {listed}{raws})"
-                )
             jobs += [Job(p, p.relative_to(path).as_posix(), listed=False) for p in files]
         elif path.suffix.lower() in MANIFEST_SUFFIXES:
             jobs += [
@@ -161,6 +168,9 @@ def find_jobs(
                 raise RequestError(f"{text}: no file matches")
             jobs += [Job(Path(m), Path(m).name) for m in matches if m not in excluded]
         else:
+            check_input(path)
+            if no_image := NO_IMAGES.get(path.suffix.lower()):
+                raise RequestError(f"{path}: {no_image}")
             jobs.append(Job(path, path.name))
     for pattern in excluded.unused:
         log.warning("--exclude %s: matches nothing", pattern)
@@ -191,6 +201,9 @@ class Exclusion:
     def __init__(self, patterns: Sequence[str] = ()) -> None:
         self._patterns = patterns
         self.unused = dict.fromkeys(patterns)  # those that have matched nothing yet
+
+    def __bool__(self) -> bool:
+        return bool(self._patterns)
 
     def __contains__(self, path: str) -> bool:
         name = os.path.basename(path)
@@ -239,7 +252,7 @@ def images_in(
     fails later.
 
     Raises:
-        RequestError: a folder cannot be read.
+        RequestError: a folder cannot be read, or there is no image.
     """
     images: list[Path] = []
     others: Counter[str] = Counter()
@@ -254,12 +267,21 @@ def images_in(
                 images.append(path)
             else:
                 others["pipe or device" if suffix in endings else suffix or "without suffix"] += 1
-    if images and others:
+    ranked = sorted(others.items(), key=lambda item: (-item[1], item[0]))
+    kinds = [f"{count} {suffix}" for suffix, count in ranked[:5]]
+    kinds += ["others"] * (len(others) > len(kinds))
+    listed = printable(", ".join(kinds))
+    if not images:
+        left = " that are not excluded" if excluded else ""
+        looked = ", ".join(e for e in endings if e not in RAW_SUFFIXES)
+        raws = " and camera raws" if set(RAW_SUFFIXES) & set(endings) else ""
+        text = f"{folder}: this folder has no images{left}; clpipe looked for {looked}{raws}"
+        text += f", and the folder has {listed}" if listed else ""
+        if others.keys() & set(PICTURE_SUFFIXES):
+            text += f". {FINISHED}"
+        raise RequestError(text)
+    if others:
         are, were = ("file is", "was") if others.total() == 1 else ("files are", "were")
-        ranked = sorted(others.items(), key=lambda item: (-item[1], item[0]))
-        kinds = [f"{count} {suffix}" for suffix, count in ranked[:5]]
-        kinds += ["others"] * (len(others) > len(kinds))
-        listed = printable(", ".join(kinds))
         log.info("%s: %d %s no image and %s ignored: %s", folder, others.total(), are, were, listed)
     return sorted(images)
 

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from clpipe.base.buckets import beside, fetch, is_url
 from clpipe.base.errors import RequestError
-from clpipe.base.reading import read_bytes
+from clpipe.base.reading import check_exists, read_bytes
 from clpipe.base.text import one_of
 from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.isos import check_cameras
@@ -206,6 +206,7 @@ def _report(faults: Sequence[str]) -> None:
 
 def _text(path: Path) -> str:
     fetch(path)
+    check_exists(path)
     try:
         data = read_bytes(path, MANIFEST_BYTES)
     except OSError as error:

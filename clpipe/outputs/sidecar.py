@@ -115,6 +115,7 @@ def sidecar(
         "height": height,
         "camera": chain.camera.name,
         "iso": chain.iso,
+        **({"lens": lens.name} if (lens := chain.optics.calibration) else {}),
         "output": chain.settings.output.model_dump()
         | chain.settings.render.with_defaults(source.shot).model_dump(exclude=POSE),
         "intrinsics": intrinsics.record() if intrinsics else None,

@@ -261,7 +261,8 @@ def drawn(pictures: Sequence[Made], steps: Sequence[Step]) -> list[Parameter]:
     asked: set[str] = set().union(*(made.value("asked") or () for made in pictures))
     cameras = Counter(text_of(made.value("camera")) for made in pictures)
     isos = Counter(round(number(made.value("iso"))) for made in pictures)
-    facts = [Parameter("camera", cameras), Parameter("ISO", isos)]
+    lenses = Counter(text_of(made.value("lens") or "none") for made in pictures)
+    facts = [Parameter(*each) for each in (("camera", cameras), ("lens", lenses), ("ISO", isos))]
     facts += [
         Parameter(name, Counter(plain(made.value(*keys)) for made in pictures), False)
         for name, keys in (

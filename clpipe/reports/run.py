@@ -19,7 +19,10 @@ from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, values_in
 
 TAR = ".tar"
 # What is kept of sidecars, of which there may be hundreds of thousands.
-KEYS = ("clpipe", "sha256", "iso", "camera", "width", "height", "noise", "clipped", "warnings")
+KEYS = (
+    *("clpipe", "sha256", "iso", "camera", "lens", "width", "height", "noise", "clipped"),
+    "warnings",
+)
 ALIKE = ("device", "versions")  # which most of them share
 STAGES, STAGES_END = b'\n  "stages": [\n', b"\n  ],\n"  # as json_text writes them
 LOGS = "run*.jsonl"
@@ -187,7 +190,7 @@ def read_run(folder: Path) -> Run:
         RequestError: it is no folder, or has no sidecar of clpipe's.
     """
     if not folder.is_dir():
-        raise RequestError(f"{folder}: there is no such folder; name the output folder of a run")
+        raise RequestError(f"{folder}: it is no folder; name the output folder of a run")
     run = Run(folder)
     found = sorted(_in_folder(run), key=lambda made: (made.image, made.rendition.suffix))
     for made in found:

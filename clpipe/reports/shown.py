@@ -379,5 +379,6 @@ def _facts(made: Made) -> str:
     law = f"; variance {a:.3g} y + {b:.3g}"
     size = f"{number(made.value('width')):.0f} x {number(made.value('height')):.0f} px"
     iso, clipped = number(made.value("iso")), number(made.value("clipped"))
-    text = f"{size}, {made.value('camera')}, ISO {iso:.0f}, {clipped * 100:.2f} % clipped"
+    lens = f" with {made.value('lens')}" if made.value("lens") else ""
+    text = f"{size}, {made.value('camera')}{lens}, ISO {iso:.0f}, {clipped * 100:.2f} % clipped"
     return text + (law if made.value("noise", "signal") else "")

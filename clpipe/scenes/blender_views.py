@@ -193,7 +193,8 @@ def in_box(scene: Any, asked: Mapping[str, Any], start: Any, target: Any) -> tup
                 f"of {len(reasons) + len(found)} places in the box {len(found)} see enough: "
                 f"{most_of(reasons)}; say another --box"
             )
-    return found, f"{len(reasons)} views were drawn again: {most_of(reasons)}" if reasons else ""
+    views = "view was" if len(reasons) == 1 else "views were"
+    return found, f"{len(reasons)} {views} drawn again: {most_of(reasons)}" if reasons else ""
 
 
 def most_of(reasons: list[str]) -> str:

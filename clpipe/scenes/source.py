@@ -11,6 +11,7 @@ from typing import Any
 from clpipe.base.digests import digests
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import write_new
+from clpipe.base.reading import check_exists
 from clpipe.images.passes import find_layers, kind_of
 from clpipe.inputs.find import Job
 from clpipe.scenes.blender import Renderer, RenderError, Rendering, Scene
@@ -92,6 +93,7 @@ def from_folder(folder: Path, output: Path, poses: Path | None) -> Source:
     Raises:
         RequestError: there is no such folder, or the output folder has another dataset.
     """
+    check_exists(folder)
     if not folder.is_dir():
         raise RequestError(f"{folder}: expected a .blend, or a folder of renders")
     made_of = {"renders": folder.resolve().name}
@@ -142,7 +144,8 @@ def from_scene(stack: ExitStack, rendering: Rendering, output: Path, program: st
     path, views = rendering.scene, asked.pop("views")
     sha256 = digests([str(path)]).get(str(path))
     if sha256 is None:
-        raise RequestError(f"{path}: no such file")
+        check_exists(path)
+        raise RequestError(f"{path}: cannot be read")
     del asked["folder"]
     made_of = {**asked, "scene": path.name, "sha256": sha256, "views": made_by(views)}
     made_of = json.loads(json.dumps(made_of))

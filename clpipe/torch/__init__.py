@@ -1,9 +1,11 @@
 """A camera's raw noise on PyTorch's tensors, inside a training loop, on a CPU or a GPU.
 
-It is PyTorch alone: no OpenCL, no files, no processes of its own. It needs the extra ``train``.
+It is PyTorch alone: no OpenCL, no files, no processes of its own. It needs the package ``torch``.
 """
 
 from typing import TYPE_CHECKING, Any
+
+from clpipe.base.extras import installing
 
 if TYPE_CHECKING:
     from clpipe.torch.raw_noise import RawNoise
@@ -24,5 +26,5 @@ def __getattr__(name: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
-        raise ImportError("clpipe.torch needs torch; pip install 'clpipe[train]'") from None
+        raise ImportError(f"clpipe.torch needs torch; {installing('torch')}") from None
     return getattr(raw_noise, name)

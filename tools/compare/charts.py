@@ -12,7 +12,7 @@ INNER = SIDE // 4  # px from a patch's place to what counts of it: no neighbour 
 ROW = 6  # patches
 BACKGROUND = 0.18  # linear
 
-GREY = 21  # of CHART: the patch of 18 % reflectance
+GREY = 21  # of CHART: the grey patch, 19.5 % of white
 # sRGB levels of the 24 patches of a ColorChecker, row by row, after X-Rite, "Colorimetric values
 # for ColorChecker family of targets" (charts made before November 2014).
 CHART = (

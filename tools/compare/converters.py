@@ -333,7 +333,7 @@ def compare(comparison: Comparison, renders: Sequence[Path], isos: Sequence[floa
 
 
 NOISE_HEADS = ["render", "ISO", "", *(head for head, *_ in COLUMNS), "kurtosis, saturated", "dots"]
-COLOUR_HEADS = ["", "18 % grey (122)", "mean L*", "hue, degrees: median / largest", "chroma"]
+COLOUR_HEADS = ["", "grey patch (122)", "mean L*", "hue, degrees: median / largest", "chroma"]
 EDGE_HEADS = ["image", "", "PSNR", "dE > 20", "dots in 10,000"]
 
 

@@ -38,7 +38,7 @@ class ColourErrors:
     Hue and chroma are of the patches whose own chroma is at least 10; others have no hue to keep.
     """
 
-    grey: float  # level of green that the 18 % grey comes out as; 122 in the chart
+    grey: float  # level of green of the grey patch; 122 in the chart
     lightness: float  # mean difference of L*
     hue: float  # median error, degrees
     largest_hue: float  # degrees

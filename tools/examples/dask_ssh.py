@@ -4,8 +4,9 @@
     HOSTS="node1 node2 node3" python tools/examples/dask_ssh.py /data/frames -o /data/out --iso 3200
 
 All arguments go to clpipe run. Each host starts a worker, the first one the scheduler too. They
-need a login by key (and to be in known_hosts), the same clpipe[dask] in a Python at the same path
-as here, inputs, output and the current folder at the same paths, and OpenCL devices of one kind.
+need a login by key (and to be in known_hosts), the same clpipe and distributed in a Python at the
+same path as here, inputs, output and the current folder at the same paths, and OpenCL devices of
+one kind.
 """
 
 import os

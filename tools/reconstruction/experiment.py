@@ -3,9 +3,9 @@
     tools/run reconstruction experiment -o OUT [--iso ISO ...] [--seeds N] [-c CONFIG] [--pmvs PATH]
         [--colmap PATH] [--data FOLDER] [--render BLENDER]
 
-It needs pip install 'clpipe[calibrate,compare]'. This is the experiment of section 3.2 of the paper
-(Bielova, Haensch, Ley and Hellwich, CVPR Workshops 2019), on a scene whose depth is known; see
-docs/reconstruction.md for what was found.
+It needs pip install '.[calibrate,compare]' in the checkout. This is the experiment of section 3.2
+of the paper (Bielova, Haensch, Ley and Hellwich, CVPR Workshops 2019), on a scene whose depth is
+known; see docs/reconstruction.md for what was found.
 
 clpipe develops the views (pictures.py): clean; clean and denoised; with the camera's
 noise; with independent noise of the same variance, the same everywhere or following intensity,

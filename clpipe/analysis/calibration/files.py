@@ -35,11 +35,11 @@ def calibrate_files(
         ISO.
 
     Raises:
-        RequestError: the frames do not belong together, needed metadata is missing, or the extra
-            "calibrate" is not installed.
+        RequestError: the frames do not belong together, needed metadata is missing, or SciPy or
+            matplotlib is not installed.
         ImageError: a file cannot be read, or the frames do not allow an estimate.
     """
-    require("clpipe calibrate", "calibrate", "scipy", "matplotlib")
+    require("clpipe calibrate", "scipy", "matplotlib")
     overrides.check()
     dark_paths = find_frames(dark)
     without_light = {os.path.realpath(path) for path in dark_paths}

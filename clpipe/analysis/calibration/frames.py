@@ -9,6 +9,7 @@ import numpy as np
 
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.reading import check_input
 from clpipe.base.text import one_line
 from clpipe.base.types import Floats
 from clpipe.camera.profile import Matrix
@@ -119,6 +120,7 @@ def find_frames(inputs: Sequence[str]) -> list[Path]:
         elif glob.has_magic(text) and not path.exists():
             files = _frames_among(Path(p) for p in glob.glob(text, recursive=True))
         else:
+            check_input(path)
             files = [path]
         if not files:
             raise RequestError(f"{text}: no mosaic or raw file there")
@@ -154,8 +156,6 @@ def read_frame(path: Path, overrides: FrameOverrides) -> CalibrationFrame:
         for name in ("black_level", "white_level", "pattern", "iso")
         if getattr(overrides, name) is None
     ]
-    if not path.is_file():
-        raise ImageError(f"{path}: no such file")
     if missing:
         raise RequestError(f"{path}: does not say how it was taken; give {', '.join(missing)}")
     assert overrides.pattern and overrides.iso is not None

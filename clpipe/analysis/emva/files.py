@@ -22,9 +22,9 @@ def measure_series(path: Path) -> tuple[Moments, Figures]:
 
     Raises:
         RequestError: the text or a frame cannot be read or does not fit, or the series does not
-            allow an estimate; the extra "calibrate" is not installed.
+            allow an estimate; SciPy or matplotlib is not installed.
     """
-    require("clpipe calibrate", "calibrate", "scipy", "matplotlib")
+    require("clpipe calibrate", "scipy", "matplotlib")
     moments = read_moments(read_series(path))
     try:
         return moments, figures(moments)

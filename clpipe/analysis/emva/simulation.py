@@ -10,7 +10,7 @@ import numpy as np
 from clpipe.analysis.emva.sensor import noisiest_light
 from clpipe.analysis.emva.series import NAME, NS, PAIR, Exposure, Series, series_text
 from clpipe.base.errors import RequestError
-from clpipe.base.files import make_folder_of, write_new
+from clpipe.base.files import check_folder, make_folder_of, write_new
 from clpipe.camera.profile import Camera, load_camera
 from clpipe.chain.identity import image_key, noise_key
 from clpipe.chain.making import make_chain
@@ -71,6 +71,7 @@ def simulate(
         ImageError: a file cannot be written.
     """
     sensor = load_camera(camera)
+    check_folder(folder)
     text = folder / NAME
     if text.exists():
         raise RequestError(f"{text}: there is a series already; name another folder")

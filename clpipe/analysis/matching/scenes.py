@@ -20,6 +20,7 @@ from clpipe.analysis.matching.columns import (
 )
 from clpipe.analysis.signature import BRIGHTEST, DRIFT, flat_places, luma
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.reading import check_input
 from clpipe.base.types import Doubles, Floats, Mask
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding
 from clpipe.images.read import read_finished
@@ -121,6 +122,8 @@ def expand(patterns: Sequence[str], what: str) -> list[Path]:
         names = sorted(glob.glob(pattern)) if is_glob else [pattern]
         if not names:
             raise RequestError(f"{what}: nothing matches {pattern}")
+        if not is_glob:
+            check_input(Path(pattern))
         found += map(Path, names)
     return found
 

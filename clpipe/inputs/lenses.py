@@ -1,0 +1,18 @@
+"""What is to be said of the lenses that a run names."""
+
+from collections.abc import Sequence
+
+from clpipe.camera.lens import name_note
+from clpipe.chain.settings import Settings
+from clpipe.inputs.find import Job
+
+
+def lens_notes(settings: Settings, jobs: Sequence[Job]) -> list[str]:
+    """A note for each lens that settings or jobs name by a part of its name.
+
+    Raises:
+        KeyedError: as :func:`clpipe.camera.lens.name_note`.
+    """
+    named = [*settings.lenses(), *(job.values.get("lens") for job in jobs if job.values)]
+    names = dict.fromkeys(name for name in named if isinstance(name, str) and name)
+    return list(filter(None, map(name_note, names)))
