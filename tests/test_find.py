@@ -144,7 +144,7 @@ def test_a_depth_file_in_a_folder_is_left_out(clpipe, write_exr):
     lines = map(json.loads, Path("out/run.jsonl").read_text("utf-8").splitlines())
     left_out = [line for line in lines if line.get("status") == "left out"]
     assert {line["error"] for line in left_out} == {None}
-    assert all(line["reason"].endswith("found Z") for line in left_out)
+    assert all("found Z" in line["reason"] for line in left_out)
     assert "1 of 2" in clpipe(*run, "in/*.exr", status=1).output  # b_depth.exr alone fails
     for inputs in ("in/a_depth.exr", "in/*_depth.exr"):
         assert "no R, G and B channels; found Z" in clpipe(*run, inputs, status=1).output
