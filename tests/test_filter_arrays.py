@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.camera.profile import load_camera
 from clpipe.chain.making import make_chain
+from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import settings_from
 from clpipe.dataset import Dataset
 from clpipe.engine.check import ARRAYS, NOISE, compare, laid
@@ -19,6 +20,7 @@ from clpipe.engine.runner import Runner
 from clpipe.images.raw import read_facts, read_raw
 from clpipe.images.read import read_image
 from clpipe.pipeline import Pipeline
+from clpipe.reference.cfa import PATTERNS
 from clpipe.reference.directional_mmse import directional_mmse
 from clpipe.reference.filter_array import NAMED, beyond, parse_array, tiled
 from clpipe.reference.linear_mmse import linear_mmse
@@ -176,6 +178,17 @@ def test_flat_colours_stay(array):
         flat = np.ones((13, 17, 1), np.float32) * np.float32(colour)
         for method in (linear_mmse, directional_mmse):
             assert method(mosaic_of(flat, own), own) == pytest.approx(flat, abs=2e-6)
+
+
+@pytest.mark.parametrize("method", all_stages()["demosaic"].methods, ids=lambda each: each.method)
+def test_flat_gray_stays_in_strips(method):
+    """A row or a column of a Bayer pattern lacks a colour, and a single pixel lacks two."""
+    for array in (*PATTERNS, *(ARRAYS if method.any_array else ())):
+        chain = on(array, stages=["mosaic", "demosaic"], demosaic={"method": method.method})
+        runner = Runner(chain, None, encode=False, final=True)
+        for size in ((1, 1), (1, 2), (2, 1), (1, 33), (33, 1)):
+            found = runner.run(np.full((*size, 3), 0.4, np.float32), "k").final
+            assert found == pytest.approx(0.4, abs=1e-5), (array, size)
 
 
 def test_beyond_an_edge_an_array_goes_on():
