@@ -3,6 +3,7 @@
 from itertools import product
 from pathlib import Path
 
+import exifread
 import numpy as np
 import pytest
 import rawpy
@@ -19,10 +20,13 @@ from clpipe.engine.check import ARRAYS, NOISE, compare, laid
 from clpipe.engine.runner import Runner
 from clpipe.images.raw import read_facts, read_raw
 from clpipe.images.read import read_image
+from clpipe.outputs.annotated import Way
 from clpipe.pipeline import Pipeline
+from clpipe.reference.carried import Layer, warp
 from clpipe.reference.cfa import PATTERNS
 from clpipe.reference.directional_mmse import directional_mmse
 from clpipe.reference.filter_array import NAMED, beyond, parse_array, tiled
+from clpipe.reference.geometry import NO_MARGINS
 from clpipe.reference.linear_mmse import linear_mmse
 from clpipe.stages import DEFAULT_CHAIN
 from clpipe.stages.mosaic import responses_of
@@ -393,6 +397,47 @@ def test_cells_are_binned_to_a_bayer_pattern(device):
     assert green[1].std() == pytest.approx(green[0].std() / 2, rel=0.06)  # a mean of four
     noise = chain.step_named("demosaic").context.noise
     assert noise.a == pytest.approx(chain.camera.noise(800).a / 4)
+
+
+@pytest.mark.parametrize(
+    ("array", "factor", "size"),
+    [("quad-RGGB", 2, (101, 67)), ("nona-RGGB", 3, (101, 67)), ("nona-RGGB", 3, (100, 2))],
+)
+def test_places_follow_the_cells_that_are_binned(array, factor, size):
+    """Of sizes that are no multiple of a cell: brightness tells where each pixel comes from."""
+    width, height = size
+    chain = on(array, stages=["mosaic", "remosaic"], remosaic={"method": "binning"})
+    runner = Runner(chain, None, encode=False, final=True)
+    y, x = np.mgrid[:height, :width].astype(np.float32) + 0.5
+    seen = [runner.run(np.repeat(each[..., None], 3, 2), "k").final for each in (x, y)]
+    rows, columns = seen[0].shape
+    picture_y, picture_x = np.mgrid[:rows, :columns] + 0.5
+    origins = chain.geometry.origins(picture_x, picture_y, width, height)
+    np.testing.assert_allclose(origins, seen, rtol=1e-6)
+    layer = Layer("colour", np.stack([x, y], -1))
+    (carried,), _ = warp([layer], chain.geometry, width, height)
+    np.testing.assert_allclose(np.moveaxis(carried, -1, 0), seen, rtol=1e-6)
+    down = min(factor, height)  # a side that is shorter than a cell is one
+    camera = chain.intrinsics(width, height, {"fx": 90.0, "cx": 48.5})
+    assert (camera.width, camera.height) == (width // factor, height // down)
+    found = camera.fx, camera.fy, camera.cx, camera.cy
+    assert found == pytest.approx((90 / factor, 90 / down, 48.5 / factor, height / 2 / down))
+    way = Way(chain.geometry, width, height, NO_MARGINS, (columns, rows))
+    assert way.places([[31.7, 1.3]]) == pytest.approx(np.array([[31.7 / factor, 1.3 / down]]))
+
+
+def test_exif_tells_of_the_pixels_that_are_left(clpipe, write_exr):
+    write_exr("a.exr", np.full((67, 101, 3), 0.2, np.float16))
+    Path("bins.toml").write_text(f"stages = {WITH_REMOSAIC}\n[remosaic]\nmethod = 'binning'\n")
+    options = ("--set", "mosaic.method=array", "--set", "mosaic.array=nona-RGGB", "-c", "bins.toml")
+    shot = ("--set", "render.focal_length=50", "--set", "render.sensor_width=10.1")
+    formats = ("--format", "jpg", "--format", "dng")
+    clpipe("run", "a.exr", "-o", "o", *options, *shot, *formats, "--device", "numpy")
+    for name, pitch in (("jpg", 0.3), ("dng", 0.1)):  # mm; the DNG is written before the binning
+        with Path(f"o/a.{name}").open("rb") as file:
+            exif = exifread.process_file(file, details=False)
+        per_cm = float(exif["EXIF FocalPlaneXResolution"].values[0])
+        assert per_cm == pytest.approx(10 / pitch)
 
 
 @pytest.mark.slow
