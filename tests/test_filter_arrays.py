@@ -21,6 +21,7 @@ from clpipe.engine.runner import Runner
 from clpipe.images.raw import read_facts, read_raw
 from clpipe.images.read import read_image
 from clpipe.outputs.annotated import Way
+from clpipe.outputs.patches import pattern_of
 from clpipe.pipeline import Pipeline
 from clpipe.reference.carried import Layer, warp
 from clpipe.reference.cfa import PATTERNS
@@ -134,7 +135,7 @@ def test_a_polarised_array_has_no_colours():
     with pytest.raises(KeyedError, match=r"mosaic.array: .*polarised.*; skip inverse_color_matrix"):
         on("polarised")
     chain = on("polarised", skip=["inverse_color_matrix"])
-    assert "polarised" in chain.array.name
+    assert chain.filters.name == "polarised"
     flat = np.full((12, 12, 3), 0.2, np.float32)  # unpolarised light is gray
     stages = ["mosaic", "inverse_white_balance", "white_balance", "demosaic"]
     gray = Runner(on("polarised", stages=stages), None, final=True, encode=False).run(flat, "k")
@@ -500,6 +501,16 @@ def test_a_remosaiced_picture_is_as_the_array_saw_it(develop):
         result = develop(light, mosaic=mosaic, remosaic=remosaic, numpy=True, **options).final
         error = np.mean((np.clip(result, 0, 1) - np.clip(light, 0, 1)) ** 2)
         assert -10 * np.log10(error) > least, array
+
+
+def test_the_array_of_a_raw_is_that_of_its_pixels():
+    quad, wanted = "RRGG/RRGG/GGBB/GGBB", {"method": "linear_mmse", "pattern": "GBRG"}
+    assert pattern_of(remosaiced("quad-RGGB", "binning")) == quad
+    assert pattern_of(remosaiced("quad-RGGB", "linear_mmse")) == quad
+    assert pattern_of(on("RGGB", stages=WITH_REMOSAIC, remosaic=wanted)) == "RGGB"
+    charge = [*DEFAULT_CHAIN]
+    charge.insert(charge.index("mosaic") + 1, "remosaic")
+    assert pattern_of(on("quad-RGGB", stages=charge, remosaic={"method": "binning"})) == "RGGB"
 
 
 @pytest.mark.parametrize("array", ["x-trans", "RGGB"])
