@@ -6,7 +6,7 @@ from functools import partial
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
 from clpipe.camera.lens import calibration_of
-from clpipe.camera.optics import Optics
+from clpipe.camera.optics import IN_PIXELS, Optics
 from clpipe.camera.profile import Camera, load_camera
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.exposures import check_exposures
@@ -15,6 +15,7 @@ from clpipe.chain.keys import LENS, NOISE, RENDER
 from clpipe.chain.methods import base_name, numbered, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
+from clpipe.reference.geometry import Scaling
 from clpipe.stage import (
     Context,
     FromLens,
@@ -157,6 +158,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
         kind, before = stage.writes, name
     if not takes_lens:
         raise KeyedError("lens", _unused_lens(settings, methods))
+    _check_pixels(steps)
     return steps
 
 
@@ -209,6 +211,25 @@ def _check_behind(wide: str, name: str, method: Method) -> None:
             f"perspective, but {wide} makes that of a wide lens; leave it out, or take a method "
             "that counts in px or in the picture's size",
         )
+
+
+def _check_pixels(steps: list[Step]) -> None:
+    """See that steps which count in the render's pixels get these, not fewer and larger ones.
+
+    Raises:
+        KeyedError: one does not.
+    """
+    moving = [step for step in steps if type(step.method).geometry is not Method.geometry]
+    scaled = next((step for step in moving if isinstance(step.method.geometry(), Scaling)), None)
+    for step in steps[steps.index(scaled) + 1 :] if scaled else ():
+        stated = next((each for each in IN_PIXELS if getattr(step.method, each, None)), None)
+        if stated and step.passes:
+            raise KeyedError(
+                f"{step.name}.{stated}",
+                f"{step.name}.{stated}: found {getattr(step.method, stated):g}, which counts in "
+                f"pixels of the render, but {scaled.name} before it makes fewer of them; put "
+                f"{step.name} before {scaled.name}",
+            )
 
 
 def _check_array(name: str, method: Method, context: Context) -> None:
