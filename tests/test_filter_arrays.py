@@ -26,7 +26,7 @@ from clpipe.pipeline import Pipeline
 from clpipe.reference.carried import Layer, warp
 from clpipe.reference.cfa import PATTERNS
 from clpipe.reference.directional_mmse import directional_mmse
-from clpipe.reference.filter_array import NAMED, beyond, parse_array, tiled
+from clpipe.reference.filter_array import NAMED, PASSES, beyond, parse_array, tiled
 from clpipe.reference.geometry import NO_MARGINS
 from clpipe.reference.linear_mmse import linear_mmse
 from clpipe.stages import DEFAULT_CHAIN
@@ -183,6 +183,58 @@ def test_flat_colours_stay(array):
         flat = np.ones((13, 17, 1), np.float32) * np.float32(colour)
         for method in (linear_mmse, directional_mmse):
             assert method(mosaic_of(flat, own), own) == pytest.approx(flat, abs=2e-6)
+
+
+MIXING = ("RGBW", "RYYB", "CMYG", "RGGB-IR")  # arrays with W, Y, C, M and I
+LIGHTS = [{}, {"red_gain": 2.0, "blue_gain": 1.6}, {"red_gain": {"uniform": [1.2, 3.0]}}]
+
+
+@pytest.mark.parametrize("light", LIGHTS, ids=["camera", "set", "drawn"])
+def test_filters_of_several_colours_add_up_what_the_light_gives_each(device, light):
+    flat = np.full((8, 8, 3), 1, np.float32) * np.float32([0.2, 0.3, 0.4])
+    for array in MIXING if light else MIXING[:1]:
+        chain = on(array, stages=["mosaic", "inverse_white_balance"], inverse_white_balance=light)
+        chain = make_chain(chain.settings.drawn("k")) if chain.draws else chain
+        red, blue = chain.steps[-1].method.gains
+        if not light:
+            assert (red, blue) == chain.camera.white_balance_gains
+        own = parse_array(array)
+        white, seen = ((np.array(each) / (red, 1, blue)) for each in ((1, 1, 1), (0.2, 0.3, 0.4)))
+        passed = {letter: np.array(PASSES[letter]) for letter in own.channels}
+        largest = max(row @ white for row in passed.values())
+        expected = own.spread({k: row @ seen / largest for k, row in passed.items()}, (8, 8))
+        for each in (None, *([device] if array == "RGBW" else [])):
+            raw = Runner(chain, each, encode=False, final=True).run(flat, "k").final
+            np.testing.assert_allclose(raw, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("stages", "settings"),
+    [
+        ("inverse_white_balance white_balance", {"white_balance": {"method": "gains"}}),
+        ("inverse_white_balance white_balance", {"white_balance": {"method": "none"}}),
+        ("inverse_white_balance", {}),
+        ("white_balance", {}),  # of a mosaic in which white is 1 already
+        ("remosaic", {"remosaic": {"method": "linear_mmse"}}),
+        ("inverse_white_balance remosaic", {"remosaic": {"method": "linear_mmse"}}),
+    ],
+)
+def test_flat_colours_stay_under_any_white_balance(stages, settings):
+    """As on a Bayer pattern, but for a factor by which clear filters make a camera expose less."""
+    flat = np.full((24, 24, 3), 1, np.float32) * np.float32([0.2, 0.3, 0.4])
+    light = {"red_gain": 1.2, "blue_gain": 3.0}
+    if "inverse" in stages:
+        settings = {**settings, "inverse_white_balance": light}
+    made = {}
+    for array in ("RGGB", *MIXING, "RCCB"):
+        chain = on(array, stages=["mosaic", *stages.split(), "demosaic"], **settings)
+        made[array] = Runner(chain, None, encode=False, final=True).run(flat, "k").final
+    colour = made["RGGB"][12, 12]
+    for array in (*MIXING, "RCCB"):
+        factor = made[array][12, 12, 1] / colour[1]
+        assert made[array][8:16, 8:16] == pytest.approx(
+            np.broadcast_to(factor * colour, (8, 8, 3)), abs=1e-5
+        ), array
 
 
 @pytest.mark.parametrize("method", all_stages()["demosaic"].methods, ids=lambda each: each.method)

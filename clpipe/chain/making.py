@@ -13,7 +13,7 @@ from clpipe.chain.exposures import check_exposures
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import LENS, NOISE, RENDER
 from clpipe.chain.methods import base_name, numbered, validation_errors
-from clpipe.chain.registry import all_stages, check_passes, user_code_errors
+from clpipe.chain.registry import all_stages, check_passes, stage_in, user_code_errors
 from clpipe.chain.settings import Settings
 from clpipe.reference.geometry import Scaling
 from clpipe.stage import (
@@ -23,6 +23,7 @@ from clpipe.stage import (
     Method,
     OfPanorama,
     Stage,
+    StageRole,
     Unchanged,
 )
 from clpipe.stage.context import asks_for_noise
@@ -119,7 +120,8 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     methods = {name: settings.method(name) for name in step_names(settings)}
     optics = optics_of(settings, camera, methods)
     time = optics.exposure_time
-    context = Context(camera=camera, iso=settings.iso, optics=optics, exposure_time=time)
+    light = light_of(methods, camera)
+    context = Context(camera, settings.iso, light=light, optics=optics, exposure_time=time)
     steps: list[Step] = []
     before, takes_lens = "the input", not settings.lens
     wide = ""  # the step behind which the picture is no longer in perspective
@@ -160,6 +162,13 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
         raise KeyedError("lens", _unused_lens(settings, methods))
     _check_pixels(steps)
     return steps
+
+
+def light_of(methods: Mapping[str, Method], camera: Camera) -> tuple[float, float]:
+    """The gains of red and blue that the light lacks: those that are set, else the camera's."""
+    method = methods.get(stage_in(StageRole.BALANCE_OF_LIGHT).name)
+    red, blue = camera.white_balance_gains
+    return getattr(method, "red_gain", None) or red, getattr(method, "blue_gain", None) or blue
 
 
 def optics_of(settings: Settings, camera: Camera, methods: Mapping[str, Method]) -> Optics:
@@ -221,7 +230,9 @@ def _check_pixels(steps: list[Step]) -> None:
     """
     moving = [step for step in steps if type(step.method).geometry is not Method.geometry]
     scaled = next((step for step in moving if isinstance(step.method.geometry(), Scaling)), None)
-    for step in steps[steps.index(scaled) + 1 :] if scaled else ():
+    if scaled is None:
+        return
+    for step in steps[steps.index(scaled) + 1 :]:
         stated = next((each for each in IN_PIXELS if getattr(step.method, each, None)), None)
         if stated and step.passes:
             raise KeyedError(

@@ -55,7 +55,7 @@ def negative_of(chain: Chain) -> Negative:
             f"--format dng: found a white level of {white:.0f}, but it holds DN of 16 bits; use "
             "--format npy, or fewer bits"
         )
-    array = replace(context.filters, gains=gains)
+    array = replace(context.filters, gains=gains, is_balanced=True)
     check_array(array)
     return Negative(
         step=None if is_input else makers[-1].name,

@@ -11,7 +11,7 @@ import numpy as np
 
 from clpipe.base.types import Array
 from clpipe.reference.intrinsics import Intrinsics
-from clpipe.reference.resample import AlongAxis, sizes
+from clpipe.reference.resample import Bins, Resampling, sizes
 
 
 class Margins(NamedTuple):
@@ -101,7 +101,7 @@ class Scaling:
     ((4, 6), (np.float64(1.0), np.float64(0.5)))
     """
 
-    resamplings: tuple[AlongAxis, ...]
+    resamplings: tuple[Resampling | Bins, ...]
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """See :meth:`Geometry.size`."""
