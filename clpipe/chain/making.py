@@ -79,6 +79,7 @@ def make_chain(
         source = steps[first].stage.reads
     chain = Chain(tuple(steps[first:last]), source, camera, settings, tuple(names), draws)
     check_exposures(chain)
+    _check_curve(chain)
     noiseless = NOISE in settings.skip and any(step.adds_noise for step in chain.steps)
     return chain.without_noise() if noiseless else chain
 
@@ -220,6 +221,24 @@ def _check_behind(wide: str, name: str, method: Method) -> None:
             f"perspective, but {wide} makes that of a wide lens; leave it out, or take a method "
             "that counts in px or in the picture's size",
         )
+
+
+def _check_curve(chain: Chain) -> None:
+    """See that DN go back along a curve only where one made them fewer.
+
+    Raises:
+        KeyedError: the chain makes linear DN, and goes back along a curve.
+    """
+    is_made = False
+    for step in chain.steps:
+        is_levels = is_made and step.stage.role is StageRole.LEVELS and not step.context.knots
+        if is_levels and getattr(step.method, "knots", None):
+            raise KeyedError(
+                f"{step.name}.knots",
+                f"{step.name}.knots: found a curve, but the DN were not made fewer by one; set it "
+                "as quantize.knots with quantize.method=pwl, and leave it out here",
+            )
+        is_made |= step.stage.writes is Kind.RAW
 
 
 def _check_pixels(steps: list[Step]) -> None:
