@@ -18,10 +18,13 @@ from clpipe.chain.settings import settings_from
 from clpipe.dataset import Dataset
 from clpipe.engine.check import ARRAYS, NOISE, compare, laid
 from clpipe.engine.runner import Runner
+from clpipe.images.dng import write_dng
 from clpipe.images.raw import read_facts, read_raw
 from clpipe.images.read import read_image
+from clpipe.images.tags import Tags
 from clpipe.outputs.annotated import Way
-from clpipe.outputs.patches import pattern_of
+from clpipe.outputs.negative import dng_of
+from clpipe.outputs.patches import facts_of, pattern_of
 from clpipe.pipeline import Pipeline
 from clpipe.reference.carried import Layer, warp
 from clpipe.reference.cfa import PATTERNS
@@ -346,10 +349,28 @@ def test_a_dng_of_another_array(clpipe, array):
     assert np.abs(one - two).mean() < 0.5
 
 
-def test_an_array_that_no_dng_holds(clpipe):
-    options = ("--set", "mosaic.method=array", "--set", "mosaic.array=RGGB-IR")
+NO_DNG = {
+    "RGGB-IR": "RGGB-IR has the channel I, which DNG does not know",
+    "RCCC": "RCCC has the channels R and W only, and LibRaw opens no DNG of two channels",
+    "RG": "RG has the channels R and G only",
+}
+
+
+@pytest.mark.parametrize("array", NO_DNG)
+def test_an_array_that_no_dng_holds(clpipe, array):
+    options = ("--set", "mosaic.method=array", "--set", f"mosaic.array={array}")
     result = clpipe("run", STILL_LIFE, "-o", "out", "--format", "dng", *options, status=2)
-    assert "RGGB-IR has the channel I, which DNG does not know" in result.stderr
+    assert NO_DNG[array] in result.stderr
+    assert "cfa" in facts_of(on(array)) or array == "RGGB-IR"
+
+
+@pytest.mark.parametrize("array", [each for each in NAMED if each not in (*NO_DNG, "polarised")])
+def test_libraw_opens_the_dng_of_an_array(tmp_path, array):
+    negative = dng_of(make_chain(settings_from({"mosaic": {"method": "array", "array": array}})))
+    dn = np.random.default_rng(0).integers(512, 16000, (36, 48)).astype(np.float32)
+    write_dng(tmp_path / "a.dng", dn, negative, Tags("a", "b", 100))
+    with rawpy.imread(str(tmp_path / "a.dng")) as raw:
+        assert np.array_equal(raw.raw_image, dn)
 
 
 @pytest.mark.slow

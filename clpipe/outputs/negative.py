@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from clpipe.base.errors import RequestError
 from clpipe.camera.noise import NoiseModel
 from clpipe.chain.chain import Chain
-from clpipe.images.dng import Negative, check_array, xyz_to_camera
+from clpipe.images.dng import Negative, check_array, check_channels, xyz_to_camera
 from clpipe.stage import Context, Kind, StageRole, run_reference
 from clpipe.stages.tone_curve.neutral import Neutral
 
@@ -66,6 +66,17 @@ def negative_of(chain: Chain) -> Negative:
         noise=_of_white(context),
         tone=partial(run_reference, Neutral()),
     )
+
+
+def dng_of(chain: Chain) -> Negative:
+    """The raw of a chain, as :func:`negative_of`, to be written as a DNG.
+
+    Raises:
+        RequestError: as there, or converters would not open it.
+    """
+    negative = negative_of(chain)
+    check_channels(negative.array)
+    return negative
 
 
 def _of_white(context: Context) -> NoiseModel | None:
