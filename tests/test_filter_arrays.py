@@ -137,6 +137,8 @@ def test_a_polarised_array_measures_degree_and_angle(device, method):
 def test_a_polarised_array_has_no_colours():
     with pytest.raises(KeyedError, match=r"mosaic.array: .*polarised.*; skip inverse_color_matrix"):
         on("polarised")
+    with pytest.raises(RequestError, match=r"method=camera: .* polarised, whose channels are no"):
+        on("polarised", skip=["inverse_color_matrix"], color_matrix={"method": "camera"})
     chain = on("polarised", skip=["inverse_color_matrix"])
     assert chain.filters.name == "polarised"
     flat = np.full((12, 12, 3), 0.2, np.float32)  # unpolarised light is gray
@@ -243,7 +245,7 @@ def test_flat_colours_stay_under_any_white_balance(stages, settings):
 @pytest.mark.parametrize("method", all_stages()["demosaic"].methods, ids=lambda each: each.method)
 def test_flat_gray_stays_in_strips(method):
     """A row or a column of a Bayer pattern lacks a colour, and a single pixel lacks two."""
-    for array in (*PATTERNS, *(ARRAYS if method.any_array else ())):
+    for array in method.only_arrays or (*PATTERNS, *(ARRAYS if method.any_array else ())):
         chain = on(array, stages=["mosaic", "demosaic"], demosaic={"method": method.method})
         runner = Runner(chain, None, encode=False, final=True)
         for size in ((1, 1), (1, 2), (2, 1), (1, 33), (33, 1)):
@@ -277,6 +279,12 @@ def test_beyond_an_edge_an_array_goes_on():
             {"white_balance": {"method": "gray_world"}},
             "white_balance.method=gray_world: .*take white_balance.method=as_shot or gains or none",
         ),
+        (
+            "x-trans",
+            {"demosaic": {"method": "gray"}},
+            "one channel, but the mosaic is x-trans; lea",
+        ),
+        ("GRBG", {"demosaic": {"method": "gray"}}, "of one channel, but the mosaic is GRBG; leave"),
         ("q", {}, "unknown filter array 'q'"),
     ],
 )
@@ -435,6 +443,17 @@ def test_stripes_of_any_direction_stay(angle):
         for method in (linear_mmse, directional_mmse)
     }
     assert error[directional_mmse] < error[linear_mmse] / 3, error
+
+
+@pytest.mark.parametrize("array", ["GBRG", "GB/RG"])
+def test_a_bayer_pattern_as_an_array_is_one(array):
+    laid_as_array = {"method": "array", "array": array}
+    settings = {"white_balance": {"method": "gray_world"}, "demosaic": {"method": "menon2007"}}
+    for each in ({}, settings):
+        chains = [on(array, **each, mosaic=own) for own in (laid_as_array, laid("GBRG"))]
+        image = np.random.default_rng(0).random((12, 14, 3)).astype(np.float32)
+        one, two = (Runner(chain, None, final=True).run(image, "k").final for chain in chains)
+        np.testing.assert_allclose(one, two, rtol=1e-6)
 
 
 def test_settings_that_draw_an_array(clpipe):

@@ -160,8 +160,7 @@ class RawLoader:
         name = name_of(StageRole.PATTERN)
         own = settings.parameters.get(name, {})
         pattern = own.get("array") or own.get("pattern", "RGGB")
-        context = chain.steps[0].context
-        if pattern != (context.array.name if context.array else context.pattern):
+        if parse_array(pattern).rows != chain.steps[0].context.filters.rows:
             raise ImageError(
                 f"{path}: its pattern is {pattern}, which the {name} stage says, but the chain has "
                 f"none; list {name} and what makes DN first (they are not run on a raw)"

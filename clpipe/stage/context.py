@@ -66,6 +66,11 @@ class Context:
         vars(other).update(changes)
         return other
 
+    def with_array(self, array: FilterArray) -> "Context":
+        """The context of a mosaic of another array, which may have a Bayer pattern."""
+        bayer = array.bayer
+        return self.but(array=None, pattern=bayer) if bayer else self.but(array=array)
+
     def without_view(self) -> "Context":
         """The context of a picture that is no longer in the render's perspective."""
         return self.but(optics=self.optics.without_view())

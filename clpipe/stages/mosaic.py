@@ -108,7 +108,7 @@ class AnyArray(Method):
         return parse_array(self.array).with_gains(context.gains_of_light)
 
     def next_context(self, context: Context) -> Context:
-        return context.but(array=self._laid(context))
+        return context.with_array(self._laid(context))
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("filter_array", arguments=("responses", *PERIOD)),)
