@@ -517,6 +517,8 @@ def test_places_follow_the_cells_that_are_binned(array, factor, size):
     assert found == pytest.approx((90 / factor, 90 / down, 48.5 / factor, height / 2 / down))
     way = Way(chain.geometry, width, height, NO_MARGINS, (columns, rows))
     assert way.places([[31.7, 1.3]]) == pytest.approx(np.array([[31.7 / factor, 1.3 / down]]))
+    corner = [[float(columns * factor), float(rows * down)]]  # the last one that is not cut off
+    assert way.places(corner).tolist() == [[columns, rows]]
 
 
 def test_exif_tells_of_the_pixels_that_are_left(clpipe, write_exr):

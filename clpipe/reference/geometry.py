@@ -91,7 +91,7 @@ class Destined:
 
 
 @dataclass(frozen=True)
-class Scaling:
+class Scaling(Destined):
     """Rows and columns made fewer, each by one resampling at most; the first edges stay.
 
     >>> import numpy as np
@@ -124,6 +124,14 @@ class Scaling:
         columns, rows = self.size(width, height)
         across, down = self.shown(width, height)
         return x * (across / columns), y * (down / rows)
+
+    def destinations(
+        self, x: Array, y: Array, at: tuple[Array, Array], width: int, height: int
+    ) -> tuple[Array, Array]:
+        """See :meth:`Destined.destinations`; exact at the edges."""
+        columns, rows = self.size(width, height)
+        across, down = self.shown(width, height)
+        return x * columns / across, y * rows / down
 
     def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
         """See :meth:`Geometry.intrinsics`."""
