@@ -10,8 +10,8 @@ INLINE vf between(vf v, vf a, vf b) { return vmin(vmax(v, vmin(a, b)), vmax(a, b
 
 // Green as Hamilton and Adams (1997) interpolate it, in both directions; each is kept between its two
 // neighbours, and weighs by the other's squared gradient. `even` is the square of a gradient below
-// which both directions are alike. The result is one plane: green at green sites, R-G at red sites
-// and B-G at blue sites.
+// which both directions are alike. The result is one plane: R-G at red sites, B-G at blue sites, and 0
+// at green sites. In an image of one row or column, the taps for the missing colour find green sites.
 INLINE vf bounded_green(site at, image roots, cfa pattern, float even) {
 #pragma OPENCL FP_CONTRACT ON
     const vf centre = tap_mosaic(roots, 0, 0);
@@ -25,7 +25,7 @@ INLINE vf bounded_green(site at, image roots, cfa pattern, float even) {
     const vf green_y = between((north + south) * 0.5f + bend_y * 0.25f, north, south);
     const vf weight_x = gradient_y * gradient_y + even, weight_y = gradient_x * gradient_x + even;
     const vf green = (green_x * weight_x + green_y * weight_y) / (weight_x + weight_y);
-    return by_site(at, pattern, centre - green, centre, centre - green);
+    return by_site(at, pattern, centre - green, (vf)(0.0f), centre - green);
 }
 
 typedef struct { vf low, high; } bounds;

@@ -17,9 +17,9 @@ INLINE pair directional_differences(site at, src_image src, cfa pattern) {
 }
 
 // Chooses the direction in which differences change less: horizontal ones along five rows, vertical
-// ones along five columns; the row where both are equal. The first plane is the chosen difference
-// (green at green sites), the second is 1 where the row was chosen, else 0.
-INLINE pair decide(site at, src_image src, image both, cfa pattern) {
+// ones along five columns; the row where both are equal. The first plane is the chosen difference, 0 at
+// green sites, and the second is 1 where the row was chosen, else 0.
+INLINE pair decide(site at, image both) {
 #define CHANGE_X(x0, x1, y) magnitude(tap_pair(both, x0, y).first - tap_pair(both, x1, y).first)
 #define CHANGE_Y(y0, y1, x) magnitude(tap_pair(both, x, y0).second - tap_pair(both, x, y1).second)
     const vf change_x = 3.0f * (CHANGE_X(-2, 0, 0) + CHANGE_X(0, 2, 0)) +
@@ -34,9 +34,7 @@ INLINE pair decide(site at, src_image src, image both, cfa pattern) {
 #undef CHANGE_Y
     const vi in_row = change_y >= change_x;
     const pair here = tap_pair(both, 0, 0);
-    const vf chosen = in_row ? here.first : here.second;
-    const pair v = {by_site(at, pattern, chosen, src_tap(src, 0, 0), chosen),
-                    in_row ? (vf)(1.0f) : (vf)(0.0f)};
+    const pair v = {in_row ? here.first : here.second, in_row ? (vf)(1.0f) : (vf)(0.0f)};
     return v;
 }
 
@@ -84,7 +82,6 @@ INLINE rgb interpolate(site at, src_image src, image chosen, image refined, cfa 
     const vf in_column = (tap_mosaic(refined, 0, -1) + tap_mosaic(refined, 0, 1)) * 0.5f;
     const pair colours =
         red_and_blue(at, pattern, centre, centre + in_row, centre + in_column, other);
-    const vf green = centre - here.first;
-    const rgb v = {colours.first, by_site(at, pattern, green, centre, green), colours.second};
+    const rgb v = {colours.first, centre - here.first, colours.second};
     return v;
 }

@@ -3,6 +3,7 @@
 from itertools import product
 from pathlib import Path
 
+import exifread
 import numpy as np
 import pytest
 import rawpy
@@ -12,15 +13,24 @@ from scipy.ndimage import gaussian_filter
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.camera.profile import load_camera
 from clpipe.chain.making import make_chain
+from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import settings_from
 from clpipe.dataset import Dataset
 from clpipe.engine.check import ARRAYS, NOISE, compare, laid
 from clpipe.engine.runner import Runner
+from clpipe.images.dng import write_dng
 from clpipe.images.raw import read_facts, read_raw
 from clpipe.images.read import read_image
+from clpipe.images.tags import Tags
+from clpipe.outputs.annotated import Way
+from clpipe.outputs.negative import dng_of
+from clpipe.outputs.patches import facts_of, pattern_of
 from clpipe.pipeline import Pipeline
+from clpipe.reference.carried import Layer, warp
+from clpipe.reference.cfa import PATTERNS
 from clpipe.reference.directional_mmse import directional_mmse
-from clpipe.reference.filter_array import NAMED, beyond, parse_array, tiled
+from clpipe.reference.filter_array import NAMED, PASSES, beyond, parse_array, tiled
+from clpipe.reference.geometry import NO_MARGINS
 from clpipe.reference.linear_mmse import linear_mmse
 from clpipe.stages import DEFAULT_CHAIN
 from clpipe.stages.mosaic import responses_of
@@ -127,8 +137,10 @@ def test_a_polarised_array_measures_degree_and_angle(device, method):
 def test_a_polarised_array_has_no_colours():
     with pytest.raises(KeyedError, match=r"mosaic.array: .*polarised.*; skip inverse_color_matrix"):
         on("polarised")
+    with pytest.raises(RequestError, match=r"method=camera: .* polarised, whose channels are no"):
+        on("polarised", skip=["inverse_color_matrix"], color_matrix={"method": "camera"})
     chain = on("polarised", skip=["inverse_color_matrix"])
-    assert "polarised" in chain.array.name
+    assert chain.filters.name == "polarised"
     flat = np.full((12, 12, 3), 0.2, np.float32)  # unpolarised light is gray
     stages = ["mosaic", "inverse_white_balance", "white_balance", "demosaic"]
     gray = Runner(on("polarised", stages=stages), None, final=True, encode=False).run(flat, "k")
@@ -178,6 +190,69 @@ def test_flat_colours_stay(array):
             assert method(mosaic_of(flat, own), own) == pytest.approx(flat, abs=2e-6)
 
 
+MIXING = ("RGBW", "RYYB", "CMYG", "RGGB-IR")  # arrays with W, Y, C, M and I
+LIGHTS = [{}, {"red_gain": 2.0, "blue_gain": 1.6}, {"red_gain": {"uniform": [1.2, 3.0]}}]
+
+
+@pytest.mark.parametrize("light", LIGHTS, ids=["camera", "set", "drawn"])
+def test_filters_of_several_colours_add_up_what_the_light_gives_each(device, light):
+    flat = np.full((8, 8, 3), 1, np.float32) * np.float32([0.2, 0.3, 0.4])
+    for array in MIXING if light else MIXING[:1]:
+        chain = on(array, stages=["mosaic", "inverse_white_balance"], inverse_white_balance=light)
+        chain = make_chain(chain.settings.drawn("k")) if chain.draws else chain
+        red, blue = chain.steps[-1].method.gains
+        if not light:
+            assert (red, blue) == chain.camera.white_balance_gains
+        own = parse_array(array)
+        white, seen = ((np.array(each) / (red, 1, blue)) for each in ((1, 1, 1), (0.2, 0.3, 0.4)))
+        passed = {letter: np.array(PASSES[letter]) for letter in own.channels}
+        largest = max(row @ white for row in passed.values())
+        expected = own.spread({k: row @ seen / largest for k, row in passed.items()}, (8, 8))
+        for each in (None, *([device] if array == "RGBW" else [])):
+            raw = Runner(chain, each, encode=False, final=True).run(flat, "k").final
+            np.testing.assert_allclose(raw, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("stages", "settings"),
+    [
+        ("inverse_white_balance white_balance", {"white_balance": {"method": "gains"}}),
+        ("inverse_white_balance white_balance", {"white_balance": {"method": "none"}}),
+        ("inverse_white_balance", {}),
+        ("white_balance", {}),  # of a mosaic in which white is 1 already
+        ("remosaic", {"remosaic": {"method": "linear_mmse"}}),
+        ("inverse_white_balance remosaic", {"remosaic": {"method": "linear_mmse"}}),
+    ],
+)
+def test_flat_colours_stay_under_any_white_balance(stages, settings):
+    """As on a Bayer pattern, but for a factor by which clear filters make a camera expose less."""
+    flat = np.full((24, 24, 3), 1, np.float32) * np.float32([0.2, 0.3, 0.4])
+    light = {"red_gain": 1.2, "blue_gain": 3.0}
+    if "inverse" in stages:
+        settings = {**settings, "inverse_white_balance": light}
+    made = {}
+    for array in ("RGGB", *MIXING, "RCCB"):
+        chain = on(array, stages=["mosaic", *stages.split(), "demosaic"], **settings)
+        made[array] = Runner(chain, None, encode=False, final=True).run(flat, "k").final
+    colour = made["RGGB"][12, 12]
+    for array in (*MIXING, "RCCB"):
+        factor = made[array][12, 12, 1] / colour[1]
+        assert made[array][8:16, 8:16] == pytest.approx(
+            np.broadcast_to(factor * colour, (8, 8, 3)), abs=1e-5
+        ), array
+
+
+@pytest.mark.parametrize("method", all_stages()["demosaic"].methods, ids=lambda each: each.method)
+def test_flat_gray_stays_in_strips(method):
+    """A row or a column of a Bayer pattern lacks a colour, and a single pixel lacks two."""
+    for array in method.only_arrays or (*PATTERNS, *(ARRAYS if method.any_array else ())):
+        chain = on(array, stages=["mosaic", "demosaic"], demosaic={"method": method.method})
+        runner = Runner(chain, None, encode=False, final=True)
+        for size in ((1, 1), (1, 2), (2, 1), (1, 33), (33, 1)):
+            found = runner.run(np.full((*size, 3), 0.4, np.float32), "k").final
+            assert found == pytest.approx(0.4, abs=1e-5), (array, size)
+
+
 def test_beyond_an_edge_an_array_goes_on():
     array = parse_array("x-trans")
     for size, period in product((6, 7, 11), (3, 6)):
@@ -204,6 +279,12 @@ def test_beyond_an_edge_an_array_goes_on():
             {"white_balance": {"method": "gray_world"}},
             "white_balance.method=gray_world: .*take white_balance.method=as_shot or gains or none",
         ),
+        (
+            "x-trans",
+            {"demosaic": {"method": "gray"}},
+            "one channel, but the mosaic is x-trans; lea",
+        ),
+        ("GRBG", {"demosaic": {"method": "gray"}}, "of one channel, but the mosaic is GRBG; leave"),
         ("q", {}, "unknown filter array 'q'"),
     ],
 )
@@ -276,10 +357,28 @@ def test_a_dng_of_another_array(clpipe, array):
     assert np.abs(one - two).mean() < 0.5
 
 
-def test_an_array_that_no_dng_holds(clpipe):
-    options = ("--set", "mosaic.method=array", "--set", "mosaic.array=RGGB-IR")
+NO_DNG = {
+    "RGGB-IR": "RGGB-IR has the channel I, which DNG does not know",
+    "RCCC": "RCCC has the channels R and W only, and LibRaw opens no DNG of two channels",
+    "RG": "RG has the channels R and G only",
+}
+
+
+@pytest.mark.parametrize("array", NO_DNG)
+def test_an_array_that_no_dng_holds(clpipe, array):
+    options = ("--set", "mosaic.method=array", "--set", f"mosaic.array={array}")
     result = clpipe("run", STILL_LIFE, "-o", "out", "--format", "dng", *options, status=2)
-    assert "RGGB-IR has the channel I, which DNG does not know" in result.stderr
+    assert NO_DNG[array] in result.stderr
+    assert "cfa" in facts_of(on(array)) or array == "RGGB-IR"
+
+
+@pytest.mark.parametrize("array", [each for each in NAMED if each not in (*NO_DNG, "polarised")])
+def test_libraw_opens_the_dng_of_an_array(tmp_path, array):
+    negative = dng_of(make_chain(settings_from({"mosaic": {"method": "array", "array": array}})))
+    dn = np.random.default_rng(0).integers(512, 16000, (36, 48)).astype(np.float32)
+    write_dng(tmp_path / "a.dng", dn, negative, Tags("a", "b", 100))
+    with rawpy.imread(str(tmp_path / "a.dng")) as raw:
+        assert np.array_equal(raw.raw_image, dn)
 
 
 @pytest.mark.slow
@@ -346,6 +445,17 @@ def test_stripes_of_any_direction_stay(angle):
     assert error[directional_mmse] < error[linear_mmse] / 3, error
 
 
+@pytest.mark.parametrize("array", ["GBRG", "GB/RG"])
+def test_a_bayer_pattern_as_an_array_is_one(array):
+    laid_as_array = {"method": "array", "array": array}
+    settings = {"white_balance": {"method": "gray_world"}, "demosaic": {"method": "menon2007"}}
+    for each in ({}, settings):
+        chains = [on(array, **each, mosaic=own) for own in (laid_as_array, laid("GBRG"))]
+        image = np.random.default_rng(0).random((12, 14, 3)).astype(np.float32)
+        one, two = (Runner(chain, None, final=True).run(image, "k").final for chain in chains)
+        np.testing.assert_allclose(one, two, rtol=1e-6)
+
+
 def test_settings_that_draw_an_array(clpipe):
     choices = "{choice=['x-trans','RCCB']}"
     options = ("--set", "mosaic.method=array", "--set", f"mosaic.array={choices}")
@@ -380,6 +490,49 @@ def test_cells_are_binned_to_a_bayer_pattern(device):
     assert green[1].std() == pytest.approx(green[0].std() / 2, rel=0.06)  # a mean of four
     noise = chain.step_named("demosaic").context.noise
     assert noise.a == pytest.approx(chain.camera.noise(800).a / 4)
+
+
+@pytest.mark.parametrize(
+    ("array", "factor", "size"),
+    [("quad-RGGB", 2, (101, 67)), ("nona-RGGB", 3, (101, 67)), ("nona-RGGB", 3, (100, 2))],
+)
+def test_places_follow_the_cells_that_are_binned(array, factor, size):
+    """Of sizes that are no multiple of a cell: brightness tells where each pixel comes from."""
+    width, height = size
+    chain = on(array, stages=["mosaic", "remosaic"], remosaic={"method": "binning"})
+    runner = Runner(chain, None, encode=False, final=True)
+    y, x = np.mgrid[:height, :width].astype(np.float32) + 0.5
+    seen = [runner.run(np.repeat(each[..., None], 3, 2), "k").final for each in (x, y)]
+    rows, columns = seen[0].shape
+    picture_y, picture_x = np.mgrid[:rows, :columns] + 0.5
+    origins = chain.geometry.origins(picture_x, picture_y, width, height)
+    np.testing.assert_allclose(origins, seen, rtol=1e-6)
+    layer = Layer("colour", np.stack([x, y], -1))
+    (carried,), _ = warp([layer], chain.geometry, width, height)
+    np.testing.assert_allclose(np.moveaxis(carried, -1, 0), seen, rtol=1e-6)
+    down = min(factor, height)  # a side that is shorter than a cell is one
+    camera = chain.intrinsics(width, height, {"fx": 90.0, "cx": 48.5})
+    assert (camera.width, camera.height) == (width // factor, height // down)
+    found = camera.fx, camera.fy, camera.cx, camera.cy
+    assert found == pytest.approx((90 / factor, 90 / down, 48.5 / factor, height / 2 / down))
+    way = Way(chain.geometry, width, height, NO_MARGINS, (columns, rows))
+    assert way.places([[31.7, 1.3]]) == pytest.approx(np.array([[31.7 / factor, 1.3 / down]]))
+    corner = [[float(columns * factor), float(rows * down)]]  # the last one that is not cut off
+    assert way.places(corner).tolist() == [[columns, rows]]
+
+
+def test_exif_tells_of_the_pixels_that_are_left(clpipe, write_exr):
+    write_exr("a.exr", np.full((67, 101, 3), 0.2, np.float16))
+    Path("bins.toml").write_text(f"stages = {WITH_REMOSAIC}\n[remosaic]\nmethod = 'binning'\n")
+    options = ("--set", "mosaic.method=array", "--set", "mosaic.array=nona-RGGB", "-c", "bins.toml")
+    shot = ("--set", "render.focal_length=50", "--set", "render.sensor_width=10.1")
+    formats = ("--format", "jpg", "--format", "dng")
+    clpipe("run", "a.exr", "-o", "o", *options, *shot, *formats, "--device", "numpy")
+    for name, pitch in (("jpg", 0.3), ("dng", 0.1)):  # mm; the DNG is written before the binning
+        with Path(f"o/a.{name}").open("rb") as file:
+            exif = exifread.process_file(file, details=False)
+        per_cm = float(exif["EXIF FocalPlaneXResolution"].values[0])
+        assert per_cm == pytest.approx(10 / pitch)
 
 
 @pytest.mark.slow
@@ -442,6 +595,16 @@ def test_a_remosaiced_picture_is_as_the_array_saw_it(develop):
         result = develop(light, mosaic=mosaic, remosaic=remosaic, numpy=True, **options).final
         error = np.mean((np.clip(result, 0, 1) - np.clip(light, 0, 1)) ** 2)
         assert -10 * np.log10(error) > least, array
+
+
+def test_the_array_of_a_raw_is_that_of_its_pixels():
+    quad, wanted = "RRGG/RRGG/GGBB/GGBB", {"method": "linear_mmse", "pattern": "GBRG"}
+    assert pattern_of(remosaiced("quad-RGGB", "binning")) == quad
+    assert pattern_of(remosaiced("quad-RGGB", "linear_mmse")) == quad
+    assert pattern_of(on("RGGB", stages=WITH_REMOSAIC, remosaic=wanted)) == "RGGB"
+    charge = [*DEFAULT_CHAIN]
+    charge.insert(charge.index("mosaic") + 1, "remosaic")
+    assert pattern_of(on("quad-RGGB", stages=charge, remosaic={"method": "binning"})) == "RGGB"
 
 
 @pytest.mark.parametrize("array", ["x-trans", "RGGB"])

@@ -148,6 +148,25 @@ def test_px_and_mm_that_contradict_each_other_are_named(clpipe, write_exr):
         pipeline.process(np.ones((40, 60, 3), np.float32), "a")
 
 
+@pytest.mark.parametrize(
+    ("later", "parameter"),
+    [
+        ({"vignetting": {"method": "cosine_fourth"}}, "fx"),
+        ({"distortion": {"method": "poly3", "k1": -0.03}}, "cx"),
+        ({"motion_blur": {"method": "linear", "rotation": 1.0}}, "fx"),
+        ({"motion_blur": {"method": "perspective", "rotation": 1.0}}, "fx"),
+    ],
+)
+def test_what_counts_in_the_renders_pixels_comes_before_a_smaller_picture(later, parameter):
+    (name,) = later
+    settings = {"render": {"fx": 300.0, "cx": 90.0}, "resize": {"scale": 0.5}, **later}
+    said = f"{name}.{parameter}: found .*; put {name} before resize$"
+    with pytest.raises(RequestError, match=said):
+        make_chain(settings_from({**settings, "stages": ["resize", name]}))
+    make_chain(settings_from({**settings, "stages": [name, "resize"]}))
+    make_chain(settings_from({**settings, "stages": ["resize", name], "resize": {"scale": 1.0}}))
+
+
 # A point that is 1.5 m away, with a focus at 3 m: f^2 (3 - 1.5) / (N 1.5 (3 - f)), and its square.
 def disc(focal_length, f_number, pitch):
     return focal_length**2 * 1500 / (f_number * 1500 * (3000 - focal_length)) / pitch

@@ -188,6 +188,14 @@ def test_options_and_configuration_win_over_the_file(tmp_path):
     assert sidecar(tmp_path / "a.json")["iso"] == 100
 
 
+def test_a_curve_for_the_dn_of_renders_is_not_that_of_a_camera(tmp_path):
+    write_dng(tmp_path / "a.dng", mosaic())
+    for folder, options in (("plain", ()), ("curve", ("--set", "quantize.method=pwl"))):
+        clpipe("run", tmp_path / "a.dng", "-o", tmp_path / folder, *MEASURE, *options)
+    one, two = (np.asarray(Image.open(tmp_path / each / "a.jpg")) for each in ("plain", "curve"))
+    assert np.array_equal(one, two)
+
+
 @pytest.mark.slow
 def test_raws_and_renders_of_a_folder_go_their_own_ways(tmp_path):
     folder = tmp_path / "in"

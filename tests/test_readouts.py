@@ -146,6 +146,9 @@ def test_a_companded_raw(clpipe):
     assert "has fewer DN by a curve" in result.stderr
 
 
+KNOTS = "[[0,0],[4096,1024],[16383,4095]]"
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -154,6 +157,16 @@ def test_a_companded_raw(clpipe):
         (("quantize.method=pwl", "quantize.knots=[[0,0],[16383,5000]]"), "12 bits do not hold"),
         (("quantize.method=pwl", "quantize.knots=[[0,0],[99,50]]"), "but the white level is 16383"),
         (("normalize.method=pwl",), "no knots are known"),
+        (("normalize.method=pwl", f"normalize.knots={KNOTS}"), "were not made fewer by one"),
+        (
+            ("quantize.method=pwl", "normalize.method=linear"),
+            "set normalize.method=pwl, which goes",
+        ),
+        (("quantize.method=pwl", "normalize.white_level=9000"), "set normalize.method=pwl"),
+        (
+            ("quantize.method=pwl", "normalize.method=pwl", f"normalize.knots={KNOTS}"),
+            "but those of quantize are .*leave normalize.knots out",
+        ),
         (("sensor_noise.method=dual_gain",), "found a white level of 262143, but it holds DN of"),
         (("quantize.method=pwl",), "by a curve"),
     ],

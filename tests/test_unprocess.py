@@ -89,6 +89,12 @@ def test_white_is_where_the_sensor_clips():
     assert tinted.process(smooth(), "p").image[22:48, 22:48].min() < 8000
 
 
+def test_highlights_are_restored_for_the_light_that_is_taken_out():
+    light = {"red_gain": 2.0, "blue_gain": 1.6}
+    chain = Pipeline("unprocess", inverse_white_balance=light).chain
+    assert chain.step_named("restore_highlights").method.gains == (2.0, 1.6)
+
+
 @pytest.mark.slow
 def test_another_camera_has_its_own_noise():
     noisy = Pipeline("unprocess", camera="canon-5d2", iso=3200, until="normalize")

@@ -109,12 +109,16 @@ class Chain:
         return last.context.optics.set_to(last.method.optics())
 
     @property
-    def array(self) -> FilterArray | None:
-        """The filter array of its raw, where that has no Bayer pattern."""
-        last = self.steps[-1]
-        after = last.method.next_context(last.context)
-        arrays = (each.array for each in (*(step.context for step in self.steps), after))
-        return next((array for array in arrays if array), None)
+    def filters(self) -> FilterArray:
+        """The filter array of its raw, or of its mosaic where it makes no raw."""
+        raws = [step for step in self.steps if step.stage.writes is Kind.RAW]
+        if raws or self.result is Kind.MOSAIC:
+            step = (raws or self.steps)[-1]
+        elif self.source in (Kind.RAW, Kind.MOSAIC):
+            return self.steps[0].context.filters
+        else:
+            step = self.step_in(StageRole.PATTERN) or self.steps[-1]
+        return step.method.next_context(step.context).filters
 
     @property
     def result(self) -> Kind:

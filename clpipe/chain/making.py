@@ -6,15 +6,16 @@ from functools import partial
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
 from clpipe.camera.lens import calibration_of
-from clpipe.camera.optics import Optics
+from clpipe.camera.optics import IN_PIXELS, Optics
 from clpipe.camera.profile import Camera, load_camera
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.exposures import check_exposures
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import LENS, NOISE, RENDER
 from clpipe.chain.methods import base_name, numbered, validation_errors
-from clpipe.chain.registry import all_stages, check_passes, user_code_errors
+from clpipe.chain.registry import all_stages, check_passes, stage_in, user_code_errors
 from clpipe.chain.settings import Settings
+from clpipe.reference.geometry import Scaling
 from clpipe.stage import (
     Context,
     FromLens,
@@ -22,6 +23,7 @@ from clpipe.stage import (
     Method,
     OfPanorama,
     Stage,
+    StageRole,
     Unchanged,
 )
 from clpipe.stage.context import asks_for_noise
@@ -77,6 +79,7 @@ def make_chain(
         source = steps[first].stage.reads
     chain = Chain(tuple(steps[first:last]), source, camera, settings, tuple(names), draws)
     check_exposures(chain)
+    _check_curve(chain)
     noiseless = NOISE in settings.skip and any(step.adds_noise for step in chain.steps)
     return chain.without_noise() if noiseless else chain
 
@@ -118,7 +121,8 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     methods = {name: settings.method(name) for name in step_names(settings)}
     optics = optics_of(settings, camera, methods)
     time = optics.exposure_time
-    context = Context(camera=camera, iso=settings.iso, optics=optics, exposure_time=time)
+    light = light_of(methods, camera)
+    context = Context(camera, settings.iso, light=light, optics=optics, exposure_time=time)
     steps: list[Step] = []
     before, takes_lens = "the input", not settings.lens
     wide = ""  # the step behind which the picture is no longer in perspective
@@ -157,7 +161,15 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
         kind, before = stage.writes, name
     if not takes_lens:
         raise KeyedError("lens", _unused_lens(settings, methods))
+    _check_pixels(steps)
     return steps
+
+
+def light_of(methods: Mapping[str, Method], camera: Camera) -> tuple[float, float]:
+    """The gains of red and blue that the light lacks: those that are set, else the camera's."""
+    method = methods.get(stage_in(StageRole.BALANCE_OF_LIGHT).name)
+    red, blue = camera.white_balance_gains
+    return getattr(method, "red_gain", None) or red, getattr(method, "blue_gain", None) or blue
 
 
 def optics_of(settings: Settings, camera: Camera, methods: Mapping[str, Method]) -> Optics:
@@ -209,6 +221,45 @@ def _check_behind(wide: str, name: str, method: Method) -> None:
             f"perspective, but {wide} makes that of a wide lens; leave it out, or take a method "
             "that counts in px or in the picture's size",
         )
+
+
+def _check_curve(chain: Chain) -> None:
+    """See that DN go back along a curve only where one made them fewer.
+
+    Raises:
+        KeyedError: the chain makes linear DN, and goes back along a curve.
+    """
+    is_made = False
+    for step in chain.steps:
+        is_levels = is_made and step.stage.role is StageRole.LEVELS and not step.context.knots
+        if is_levels and getattr(step.method, "knots", None):
+            raise KeyedError(
+                f"{step.name}.knots",
+                f"{step.name}.knots: found a curve, but the DN were not made fewer by one; set it "
+                "as quantize.knots with quantize.method=pwl, and leave it out here",
+            )
+        is_made |= step.stage.writes is Kind.RAW
+
+
+def _check_pixels(steps: list[Step]) -> None:
+    """See that steps which count in the render's pixels get these, not fewer and larger ones.
+
+    Raises:
+        KeyedError: one does not.
+    """
+    moving = [step for step in steps if type(step.method).geometry is not Method.geometry]
+    scaled = next((step for step in moving if isinstance(step.method.geometry(), Scaling)), None)
+    if scaled is None:
+        return
+    for step in steps[steps.index(scaled) + 1 :]:
+        stated = next((each for each in IN_PIXELS if getattr(step.method, each, None)), None)
+        if stated and step.passes:
+            raise KeyedError(
+                f"{step.name}.{stated}",
+                f"{step.name}.{stated}: found {getattr(step.method, stated):g}, which counts in "
+                f"pixels of the render, but {scaled.name} before it makes fewer of them; put "
+                f"{step.name} before {scaled.name}",
+            )
 
 
 def _check_array(name: str, method: Method, context: Context) -> None:

@@ -55,10 +55,10 @@ class SampleSpec:
                 f"found patch {patches.size}; a packed raw has planes of half the size, so give an "
                 "even one"
             )
-        if self.arrays.raw == "packed" and chain.array:
+        if self.arrays.raw == "packed" and not chain.filters.bayer:
             raise RequestError(
                 f"raw='packed': its planes are of a Bayer pattern, but the mosaic is "
-                f"{chain.array.name}; say raw='mosaic'"
+                f"{chain.filters.name}; say raw='mosaic'"
             )
         self.arrays.check(chain.result)
         if self.truth:

@@ -96,6 +96,19 @@ def check_array(array: FilterArray) -> None:
         )
 
 
+def check_channels(array: FilterArray) -> None:
+    """See that converters open the DNG of a filter array; LibRaw opens none of two channels.
+
+    Raises:
+        RequestError: they do not.
+    """
+    if len(array.channels) == 2:
+        raise RequestError(
+            f"--format dng: {array.name} has the channels {' and '.join(array.channels)} only, and "
+            "LibRaw opens no DNG of two channels; use --format npy, or --keep quantize"
+        )
+
+
 def xyz_to_camera(colours: Doubles, array: FilterArray) -> Doubles:
     """The ColorMatrix of a raw, (channel, 3): CIE XYZ under D65 to its channels, not balanced.
 

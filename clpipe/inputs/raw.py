@@ -14,6 +14,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import sha256_of
 from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_name, load_camera
 from clpipe.chain.chain import Chain
+from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages, stage_in
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
@@ -125,6 +126,10 @@ class RawLoader:
         if balance in warnings and own.parameters.get(balance):
             del parameters[balance]  # the user's own replaces what stands in for the file's
         settings = self.request.settings(replace(embedded, parameters=parameters)).drawn("")
+        if isinstance(facts, RawFacts):  # whose DN are linear, whatever a render's become
+            made = [name for name in settings.parameters if writes_raw(name)]
+            left = {k: own for k, own in settings.parameters.items() if k not in made}
+            settings = replace(settings, parameters=left)
         camera = load_camera(settings.camera)
         low, high = camera.iso_range
         iso = min(max(settings.iso, low), high)
@@ -155,8 +160,7 @@ class RawLoader:
         name = name_of(StageRole.PATTERN)
         own = settings.parameters.get(name, {})
         pattern = own.get("array") or own.get("pattern", "RGGB")
-        context = chain.steps[0].context
-        if pattern != (context.array.name if context.array else context.pattern):
+        if parse_array(pattern).rows != chain.steps[0].context.filters.rows:
             raise ImageError(
                 f"{path}: its pattern is {pattern}, which the {name} stage says, but the chain has "
                 f"none; list {name} and what makes DN first (they are not run on a raw)"
@@ -188,6 +192,11 @@ def _remaining(warnings: dict[str, str], chain: Chain, embedded: Settings) -> li
         same = settings.parameters.get(name) == embedded.parameters.get(name)
         is_current[name] = same and name in stages
     return [text for about, text in warnings.items() if is_current.get(about, True)]
+
+
+def writes_raw(step: str) -> bool:
+    """Whether a step makes DN, so that a raw enters after it."""
+    return all_stages()[base_name(step)].writes is Kind.RAW
 
 
 def first_raw_step(settings: Settings) -> str:

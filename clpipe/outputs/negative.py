@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from clpipe.base.errors import RequestError
 from clpipe.camera.noise import NoiseModel
 from clpipe.chain.chain import Chain
-from clpipe.images.dng import Negative, check_array, xyz_to_camera
+from clpipe.images.dng import Negative, check_array, check_channels, xyz_to_camera
 from clpipe.stage import Context, Kind, StageRole, run_reference
 from clpipe.stages.tone_curve.neutral import Neutral
 
@@ -55,7 +55,7 @@ def negative_of(chain: Chain) -> Negative:
             f"--format dng: found a white level of {white:.0f}, but it holds DN of 16 bits; use "
             "--format npy, or fewer bits"
         )
-    array = replace(context.filters, gains=gains)
+    array = replace(context.filters, gains=gains, is_balanced=True)
     check_array(array)
     return Negative(
         step=None if is_input else makers[-1].name,
@@ -66,6 +66,17 @@ def negative_of(chain: Chain) -> Negative:
         noise=_of_white(context),
         tone=partial(run_reference, Neutral()),
     )
+
+
+def dng_of(chain: Chain) -> Negative:
+    """The raw of a chain, as :func:`negative_of`, to be written as a DNG.
+
+    Raises:
+        RequestError: as there, or converters would not open it.
+    """
+    negative = negative_of(chain)
+    check_channels(negative.array)
+    return negative
 
 
 def _of_white(context: Context) -> NoiseModel | None:

@@ -243,11 +243,8 @@ def without_patch(name: str) -> str:
 
 
 def pattern_of(chain: Chain) -> str:
-    """The filter array of a chain's mosaic: a Bayer pattern, such as "RGGB", or rows of letters."""
-    if chain.array:
-        return chain.array.pattern
-    last = chain.steps[-1]
-    return last.method.next_context(last.context).filters.pattern
+    """The filter array of a chain's raw: a Bayer pattern, such as "RGGB", or rows of letters."""
+    return chain.filters.pattern
 
 
 def every_patch(patches: Patches, chain: Chain, width: int, height: int, key: str) -> list[Patch]:

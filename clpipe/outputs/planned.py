@@ -23,7 +23,7 @@ from clpipe.inputs.companions import CARRIED
 from clpipe.inputs.find import Job
 from clpipe.outputs.carried import png_ending
 from clpipe.outputs.existing import Existing
-from clpipe.outputs.negative import negative_of
+from clpipe.outputs.negative import dng_of
 from clpipe.outputs.patches import Patches, patch_name, variance_steps
 from clpipe.outputs.recipes import RenditionPlan
 from clpipe.outputs.sealed import SIDECAR
@@ -155,7 +155,7 @@ class PlannedOutputs:
                 "end it with normalize or a later stage, or use --format dng, npy or exr"
             )
         if DNG in self.formats:
-            negative_of(chain)  # refuses a chain without a raw
+            dng_of(chain)  # refuses a chain without a raw
         for plan in {self.plan_of(job) for job in jobs}:
             plan.recipes(chain, "")  # refuses a chain that has no such truth
         if self.patches:

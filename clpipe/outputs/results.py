@@ -24,14 +24,14 @@ def results_of(chain: Chain, formats: Sequence[str], keep: Sequence[str]) -> Res
         keep: names of steps; those that the chain has not are left out.
 
     Raises:
-        RequestError: the raw is needed, and the chain has none.
+        RequestError: a DNG is needed, and the chain has no raw for one.
     """
     last = [FORMATS[name] for name in formats if name != DNG]
     steps = [step.name for step in chain.steps if step.name in keep]
     if DNG in formats:
-        from clpipe.outputs.negative import negative_of  # and all that writes DNGs
+        from clpipe.outputs.negative import dng_of  # and all that writes DNGs
 
-        if raw := negative_of(chain).step:
+        if raw := dng_of(chain).step:
             steps.append(raw)
     return Results(
         tuple(dict.fromkeys(steps)),

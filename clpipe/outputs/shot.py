@@ -3,10 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
+
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.photometry import Estimates, exposure_of
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import TAG_ATTRIBUTES, Tags, exposed_attributes
+from clpipe.reference.geometry import Scaling
 from clpipe.stage import StageRole
 
 
@@ -57,6 +60,25 @@ def sensor_of(chain: Chain, source: SourceImage, own: Mapping[str, float]) -> fl
     width, height = source.margins.inside(*source.pixels.shape[1::-1])
     camera = chain.intrinsics_of_render(width, height, source.shot)
     return length / camera.fx * max(width, height) if camera else None
+
+
+def shown_tags(chain: Chain, source: SourceImage, tags: Tags) -> Tags:
+    """The tags of the image that a chain makes; binning cuts a part of the sensor off.
+
+    Args:
+        chain: of the image.
+        source: the image that entered.
+        tags: with the width of the whole sensor.
+    """
+    if not tags.sensor_width or not chain.geometry:
+        return tags
+    size = source.pixels.shape[1::-1]
+    longer, share = int(np.argmax(size)), 1.0
+    for part in chain.geometry.parts:
+        if isinstance(part, Scaling):
+            share *= part.shown(*size)[longer] / size[longer]
+        size = part.size(*size)
+    return replace(tags, sensor_width=tags.sensor_width * share)
 
 
 def kept_tags(chain: Chain, step: Step, source: SourceImage, tags: Tags) -> dict[str, str]:

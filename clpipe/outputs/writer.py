@@ -26,7 +26,7 @@ from clpipe.outputs.planned import PlannedOutputs
 from clpipe.outputs.recipes import Recipe
 from clpipe.outputs.results import results_of
 from clpipe.outputs.sealed import SIDECAR, remove_sidecar
-from clpipe.outputs.shot import kept_tags, tags_of
+from clpipe.outputs.shot import kept_tags, shown_tags, tags_of
 from clpipe.reference.geometry import NO_MARGINS
 from clpipe.stage import Kind
 
@@ -162,7 +162,11 @@ class OutputWriter(PlannedOutputs):
             elif format_ == DNG:
                 negative = negative_of(chain)
                 raw = result.kept[negative.step] if negative.step else source.pixels
-                outputs[path] = write_dng(path, raw, negative, tags, source_orientation)
+                if negative.step:
+                    tags_of_raw = shown_tags(chain.through([negative.step]), source, tags)
+                else:
+                    tags_of_raw = tags
+                outputs[path] = write_dng(path, raw, negative, tags_of_raw, source_orientation)
             elif FORMATS[format_].ending == "exr":
                 assert result.final is not None
                 carried_tags = kept_tags(chain, chain.steps[-1], source, tags)
@@ -174,7 +178,7 @@ class OutputWriter(PlannedOutputs):
                 outputs[path] = write_exr(path, image, chain.result.channels, attributes, half)
             else:
                 pixels = upright(samples(result, FORMATS[format_]), orientation)
-                outputs[path] = write_display(path, pixels, tags)
+                outputs[path] = write_display(path, pixels, shown_tags(chain, source, tags))
         return outputs
 
     def _make_folder_of(self, job: Job) -> None:

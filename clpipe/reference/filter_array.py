@@ -4,7 +4,7 @@ The four Bayer patterns are :mod:`clpipe.reference.cfa`'s; their kernels know th
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -71,6 +71,8 @@ class FilterArray:
         name: of :data:`NAMED`, or its rows.
         rows: the letters of one period, of :data:`LETTERS`.
         gains: white balance gains of red and blue (green = 1): raw red of white is 1/gain of green.
+        is_balanced: whether white is 1 in all channels of the mosaic; otherwise its colours are the
+            raw ones, and what a filter passes adds up.
 
     A camera exposes for the channel that saturates first: white at EV 0 fills it, and the others
     less, by :meth:`levels`. So a clear pixel saturates while its neighbours have room.
@@ -79,6 +81,7 @@ class FilterArray:
     name: str
     rows: tuple[str, ...]
     gains: tuple[float, float] = (1.0, 1.0)
+    is_balanced: bool = True
 
     @property
     def period(self) -> tuple[int, int]:
@@ -121,9 +124,30 @@ class FilterArray:
         """Whether reflect-101 gives a pixel beyond the edge another channel than the array has."""
         return max(self.period) > MIRRORED
 
+    def with_gains(self, gains: tuple[float, float], is_balanced: bool = True) -> "FilterArray":
+        """The array of a mosaic whose colours depend on other gains.
+
+        It is the same where no channel mixes colours, so its filters are computed once.
+
+        >>> parse_array("x-trans").with_gains((2.0, 1.6)) == parse_array("x-trans")
+        True
+        """
+        mixes = any(np.count_nonzero(PASSES[letter]) > 1 for letter in self.channels)
+        if not mixes or self.is_polarised:
+            return self
+        return replace(self, gains=gains, is_balanced=is_balanced)
+
     @cached_property
     def responses(self) -> dict[str, Doubles]:
-        """What each channel sees of white-balanced red, green and blue; the sum is 1."""
+        """What each channel sees of red, green and blue as they are in the mosaic.
+
+        The sum is 1 in a balanced one.
+
+        >>> parse_array("RCCB").with_gains((2.0, 1.6), is_balanced=False).responses["W"].tolist()
+        [1.0, 1.0, 1.0]
+        """
+        if not self.is_balanced:
+            return {letter: np.array(PASSES[letter], np.float64) for letter in self.channels}
         raw = {letter: self._raw(letter) for letter in self.channels}
         return {letter: row / row.sum() for letter, row in raw.items()}
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from clpipe.base.types import Array
 from clpipe.reference.intrinsics import Intrinsics
-from clpipe.reference.resample import Resampler, sizes
+from clpipe.reference.resample import Bins, Resampling, sizes
 
 
 class Margins(NamedTuple):
@@ -91,8 +91,8 @@ class Destined:
 
 
 @dataclass(frozen=True)
-class Scaling:
-    """Rows and columns made fewer; the edges stay where they are.
+class Scaling(Destined):
+    """Rows and columns made fewer, each by one resampling at most; the first edges stay.
 
     >>> import numpy as np
     >>> from clpipe.reference.resample import Resampling, overlap
@@ -101,20 +101,41 @@ class Scaling:
     ((4, 6), (np.float64(1.0), np.float64(0.5)))
     """
 
-    resamplings: tuple[Resampler, ...]
+    resamplings: tuple[Resampling | Bins, ...]
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """See :meth:`Geometry.size`."""
         return sizes(self.resamplings, width, height)[-1]
 
+    def shown(self, width: int, height: int) -> tuple[int, int]:
+        """The columns and rows of the image that the result shows, from the upper left corner.
+
+        >>> from clpipe.reference.resample import Bins
+        >>> Scaling((Bins("rows", 2), Bins("columns", 2))).shown(611, 407)
+        (610, 406)
+        """
+        found = {"columns": width, "rows": height}
+        for each in self.resamplings:
+            found[each.axis] = each.shown(found[each.axis])
+        return found["columns"], found["rows"]
+
     def origins(self, x: Array, y: Array, width: int, height: int) -> tuple[Array, Array]:
         """See :meth:`Geometry.origins`."""
         columns, rows = self.size(width, height)
-        return x * (width / columns), y * (height / rows)
+        across, down = self.shown(width, height)
+        return x * (across / columns), y * (down / rows)
+
+    def destinations(
+        self, x: Array, y: Array, at: tuple[Array, Array], width: int, height: int
+    ) -> tuple[Array, Array]:
+        """See :meth:`Destined.destinations`; exact at the edges."""
+        columns, rows = self.size(width, height)
+        across, down = self.shown(width, height)
+        return x * columns / across, y * rows / down
 
     def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
         """See :meth:`Geometry.intrinsics`."""
-        return before and before.scaled(*self.size(width, height))
+        return before and before.scaled(*self.size(width, height), self.shown(width, height))
 
 
 @dataclass(frozen=True)

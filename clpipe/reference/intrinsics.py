@@ -97,9 +97,14 @@ class Intrinsics:
         cx, cy = shot.get("cx", width / 2), shot.get("cy", height / 2)
         return cls(width, height, fx, shot.get("fy", fx), cx, cy)
 
-    def scaled(self, width: int, height: int) -> "Intrinsics":
-        """The intrinsics of the picture made another size, its edges staying where they are."""
-        x, y = width / self.width, height / self.height
+    def scaled(self, width: int, height: int, shown: tuple[int, int]) -> "Intrinsics":
+        """The intrinsics of the picture made another size.
+
+        Args:
+            width, height: of the result.
+            shown: the columns and rows that it shows, from the upper left corner.
+        """
+        x, y = width / shown[0], height / shown[1]
         places = self.fx * x, self.fy * y, self.cx * x, self.cy * y
         residual = self.residual * max(x, y)
         return Intrinsics(width, height, *places, self.model, self.distortion, residual)

@@ -101,7 +101,7 @@ def best(seen: Doubles, between: Doubles, centre: Doubles, chroma: float, noise:
     lacking = exact.T - lit.T @ free
     made = np.asarray(free + flat @ np.linalg.solve(lit.T @ flat, lacking))
     middle = len(seen) // 2
-    if 1 in seen[middle].tolist():  # a colour that is there
+    if 1 in seen[middle].tolist() and np.isclose(seen[middle].sum(), 1):  # a colour that is there
         made[:, seen[middle].argmax()] = np.arange(len(seen)) == middle
     return made
 

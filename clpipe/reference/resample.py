@@ -1,8 +1,9 @@
 """Smaller images: where the pixels of one lie in the larger, and of which it is a weighted mean.
 
-A resampling makes the rows or the columns of an image fewer. The first and the last edge stay where
-they are, so the field of view does too: place x of ``size`` becomes x * smaller / size, counted in
-pixels from the edge, in depth maps and other companions as well.
+A resampling makes the rows or the columns of an image fewer. Its ``shown`` lines, counted from the
+first edge, become ``smaller`` lines: place x becomes x * smaller / shown, counted in pixels from
+that edge, in depth maps and other companions as well. A :class:`Resampling` shows all of them, so
+the field of view stays. :class:`Bins` cuts off the lines after the last whole bin.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -104,6 +105,10 @@ class AlongAxis:
         """The new number of rows or columns, at least 1."""
         raise NotImplementedError(type(self).__name__)
 
+    def shown(self, size: int) -> int:
+        """How many of an image's rows or columns, from the first on, the new ones show."""
+        return size
+
     def taps(self, size: int) -> Taps:
         """What the new rows or columns of an image of ``size`` are made of."""
         raise NotImplementedError(type(self).__name__)
@@ -191,6 +196,14 @@ class Bins(AlongAxis):
         [1, 1, 2]
         """
         return max(size // self.factor, 1)
+
+    def shown(self, size: int) -> int:
+        """See :meth:`AlongAxis.shown`.
+
+        >>> [Bins("rows", 3).shown(n) for n in (2, 3, 8)]
+        [2, 3, 6]
+        """
+        return self.size(size) * min(self.factor, size)
 
     def taps(self, size: int) -> Taps:
         """See :meth:`Resampling.taps`."""

@@ -43,6 +43,7 @@ class Context:
     iso: float
     pattern: Pattern = "RGGB"
     array: FilterArray | None = None  # of a mosaic that has no Bayer pattern
+    light: tuple[float, float] | None = None  # red, blue: to be taken out; None is the camera's
     gains: tuple[float, float] = (1.0, 1.0)  # red, blue: taken out by inverse_white_balance
     applied_gains: tuple[float, float] = (1.0, 1.0)  # red, blue: put back by white_balance
     exposure_time: float | None = None  # s, where exposure knows it
@@ -65,6 +66,11 @@ class Context:
         vars(other).update(changes)
         return other
 
+    def with_array(self, array: FilterArray) -> "Context":
+        """The context of a mosaic of another array, which may have a Bayer pattern."""
+        bayer = array.bayer
+        return self.but(array=None, pattern=bayer) if bayer else self.but(array=array)
+
     def without_view(self) -> "Context":
         """The context of a picture that is no longer in the render's perspective."""
         return self.but(optics=self.optics.without_view())
@@ -76,6 +82,11 @@ class Context:
             return 0.0, 0.0
         model = self.noise or self.camera.noise(self.iso)
         return model.a, model.b
+
+    @property
+    def gains_of_light(self) -> tuple[float, float]:
+        """The gains of red and blue that the light lacks, which inverse_white_balance takes out."""
+        return self.light or self.camera.white_balance_gains
 
     @property
     def filters(self) -> FilterArray:

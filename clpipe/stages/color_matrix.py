@@ -147,6 +147,16 @@ class CameraToSrgb(FixedMatrix):
     )
 
     def resolve(self, context: Context) -> "CameraToSrgb":
+        """The method with a matrix.
+
+        Raises:
+            RequestError: the camera has none, or the channels are no colours.
+        """
+        if context.array and context.array.is_polarised:
+            raise RequestError(
+                f"color_matrix.method=camera: the mosaic is {context.array.name}, whose channels "
+                "are no colours; leave color_matrix.method out, or skip color_matrix"
+            )
         if self.matrix is not None:
             return self
         inverse = np.linalg.inv(srgb_to_camera(context.camera))

@@ -68,10 +68,10 @@ class AnyArray(Method):
 
     Channels are R, G, B, W (clear), Y, C, M, I (near infrared) and L (no filter at all), or
     the polarisers H, D, V and A (0, 45, 90 and 135 degrees), for which a render's red, green and
-    blue are what polarisers at 0, 60 and 120 degrees pass. What each
-    sees of white-balanced red, green and blue follows from the camera's white balance; white is 1
-    in all of them. Behind inverse_white_balance white fills the most sensitive channel, as that is
-    what a camera exposes for.
+    blue are what polarisers at 0, 60 and 120 degrees pass. What each sees of white-balanced
+    red, green and blue follows from the gains of inverse_white_balance, or else the camera's. White
+    is 1 in all of them. After inverse_white_balance, white fills the most sensitive channel,
+    because a camera exposes for that one.
 
     >>> from clpipe.stage import run_reference
     >>> image = np.float32([1, 2, 3]) * np.ones((1, 4, 1), np.float32)
@@ -105,10 +105,10 @@ class AnyArray(Method):
         return self
 
     def _laid(self, context: Context) -> FilterArray:
-        return parse_array(self.array, context.camera.white_balance_gains)
+        return parse_array(self.array).with_gains(context.gains_of_light)
 
     def next_context(self, context: Context) -> Context:
-        return context.but(array=self._laid(context))
+        return context.with_array(self._laid(context))
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("filter_array", arguments=("responses", *PERIOD)),)

@@ -64,6 +64,19 @@ class Linear(Method):
         return self
 
     def resolve(self, context: Context) -> "Linear":
+        """The method with its levels.
+
+        Raises:
+            RequestError: quantize made the DN fewer by a curve.
+        """
+        if context.knots:
+            raise RequestError(
+                "normalize.method=linear: quantize.method=pwl made the DN fewer by a curve; set "
+                "normalize.method=pwl, which goes back along it, or quantize.method=linear"
+            )
+        return self._with_levels(context)
+
+    def _with_levels(self, context: Context) -> "Linear":
         camera = context.camera
         black = camera.black_level if context.black_level is None else context.black_level
         white = camera.white_level if context.white_level is None else context.white_level
@@ -122,11 +135,21 @@ class Pwl(Linear):
         return self
 
     def resolve(self, context: Context) -> "Linear":
-        filled = super().resolve(context)
+        """The method with its levels and knots.
+
+        Raises:
+            RequestError: no knots are known, or quantize has others.
+        """
+        filled = self._with_levels(context)
         if self.knots is None and not context.knots:
             raise RequestError(
                 "normalize.method=pwl: no knots are known; set normalize.knots, or quantize with "
                 "quantize.method=pwl"
+            )
+        if self.knots and context.knots and knots_in(self.knots) != context.knots:
+            raise RequestError(
+                f"normalize.knots: found {self.knots}, but those of quantize are "
+                f"{[list(pair) for pair in context.knots]}; leave normalize.knots out"
             )
         return filled.with_defaults(knots=[list(pair) for pair in context.knots])
 

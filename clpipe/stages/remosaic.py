@@ -71,7 +71,7 @@ class Binning(Method):
         assert array
         of_one, noise = self._factor**2, context.noise
         less = noise and replace(noise, a=noise.a / of_one, b=noise.b / of_one)
-        return with_array(context, array).but(noise=less)
+        return context.with_array(array).but(noise=less)
 
     @property
     def bins(self) -> tuple[Bins, Bins]:
@@ -107,12 +107,6 @@ def binned(array: FilterArray, factor: int) -> FilterArray | None:
         return None
     text = "/".join("".join(row) for row in few)
     return parse_array(text, array.gains)
-
-
-def with_array(context: Context, array: FilterArray) -> Context:
-    """The context of a mosaic of another array, which may have a Bayer pattern."""
-    bayer = array.bayer
-    return context.but(array=None, pattern=bayer) if bayer else context.but(array=array)
 
 
 class LinearMmse(Method):

@@ -5,7 +5,7 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stage
+from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stage, parameter
 from clpipe.stages.white_balance.gains import CameraGains
 
 
@@ -27,6 +27,17 @@ class Brooks2019(CameraGains):
     method: ClassVar = "brooks2019"
     kernel: ClassVar = "restore_highlights"
     summary: ClassVar = "raise red and blue of nearly white pixels by the gains"
+
+    red_gain: float | None = parameter(
+        None, "Gain of red, green = 1.", auto="as inverse_white_balance uses it", gt=0, le=64
+    )
+    blue_gain: float | None = parameter(
+        None, "Gain of blue, green = 1.", auto="as inverse_white_balance uses it", gt=0, le=64
+    )
+
+    def resolve(self, context: Context) -> CameraGains:
+        red, blue = context.gains_of_light
+        return self.with_defaults(red_gain=red, blue_gain=blue)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("restore_highlights", arguments=("red_gain", "blue_gain")),)

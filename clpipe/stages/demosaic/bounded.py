@@ -49,7 +49,7 @@ def between(values: Floats, *neighbours: Floats) -> Floats:
 
 
 def green_or_difference(roots: Floats, pattern: Pattern) -> Floats:
-    """Green at green sites, R-G at red sites and B-G at blue sites, (height, width), in roots.
+    """R-G at red sites, B-G at blue sites and 0 at green sites, (height, width), in roots.
 
     At red and blue sites green is interpolated along the row and along the column as Hamilton and
     Adams do (US patent 5,629,734, 1997), and kept between its two neighbours. Both are averaged,
@@ -65,7 +65,7 @@ def green_or_difference(roots: Floats, pattern: Pattern) -> Floats:
     weight_y = np.square(abs(west - east) + abs(bend_x)) + EVEN
     weight_x = np.square(abs(north - south) + abs(bend_y)) + EVEN
     green = (green_x * weight_x + green_y * weight_y) / (weight_x + weight_y)
-    return by_site(roots.shape, pattern, roots - green, roots, roots - green)
+    return by_site(roots.shape, pattern, roots - green, np.float32(0), roots - green)
 
 
 SETS = (

@@ -32,7 +32,7 @@ Classifier = typing.Literal["hamilton_adams", "laroche_prescott", "hibbard"]
 
 
 def green_or_difference(image: Floats, pattern: Pattern, classifier: Classifier) -> Floats:
-    """Green at green sites, R-G at red sites and B-G at blue sites, (height, width), from a mosaic.
+    """R-G at red sites, B-G at blue sites and 0 at green sites, (height, width), from a mosaic.
 
     At red and blue sites, green is the mean of its two neighbours in the direction with the smaller
     gradient, or of all four where the gradients are equal. The classifier defines the gradient in a
@@ -46,7 +46,7 @@ def green_or_difference(image: Floats, pattern: Pattern, classifier: Classifier)
 
     >>> edge = np.repeat(np.float32([[0, 0, 0, 8, 8, 8]]), 6, axis=0)
     >>> green_or_difference(edge, "RGGB", "hibbard")[2].tolist()
-    [0.0, 0.0, 0.0, 8.0, 0.0, 8.0]
+    [0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     """
     change_x = abs(tap(image, -1, 0) - tap(image, 1, 0))
     change_y = abs(tap(image, 0, -1) - tap(image, 0, 1))
@@ -64,7 +64,7 @@ def green_or_difference(image: Floats, pattern: Pattern, classifier: Classifier)
     either = (green_x + green_y) * HALF
     not_x = np.where(gradient_y < gradient_x, green_y, either)
     green = np.where(gradient_x < gradient_y, green_x, not_x)
-    return by_site(image.shape, pattern, image - green, image, image - green)
+    return by_site(image.shape, pattern, image - green, np.float32(0), image - green)
 
 
 class EdgeDirected(Method):

@@ -1,10 +1,11 @@
 """Demosaicing for any filter array."""
 
 from functools import lru_cache
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
+from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.reference.filter_array import FilterArray, kernel_table
 from clpipe.reference.linear_mmse import RADIUS, filters, linear_mmse
@@ -55,8 +56,10 @@ class LinearMmse(Method):
 class Gray(Method):
     """The mosaic in red, green and blue alike: for a sensor without filters.
 
-    >>> from clpipe.stage import run_reference
-    >>> run_reference(Gray(), np.float32([[0.25]])).tolist()
+    >>> from clpipe.camera.profile import load_camera
+    >>> from clpipe.reference.filter_array import parse_array
+    >>> context = Context(load_camera("sony-a7r2"), 100, array=parse_array("mono"))
+    >>> Gray().reference(np.float32([[0.25]]), ReferenceContext(context, {}, {})).tolist()
     [[[0.25, 0.25, 0.25]]]
     """
 
@@ -64,6 +67,20 @@ class Gray(Method):
     kernel: ClassVar = "demosaic_gray"
     summary: ClassVar = "no colours: for a sensor without filters"
     any_array: ClassVar = True
+    only_arrays: ClassVar = ("mono",)
+
+    def resolve(self, context: Context) -> Self:
+        """The method itself.
+
+        Raises:
+            RequestError: the sensor has filters of several kinds.
+        """
+        if not context.filters.is_gray:
+            raise RequestError(
+                f"demosaic.method=gray: it is for sensors of one channel, but the mosaic is "
+                f"{context.filters.name}; leave demosaic.method out, or choose another one"
+            )
+        return self
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("gray", Pointwise()),)

@@ -55,7 +55,7 @@ def along(sparse: Floats, in_row: Mask) -> tuple[tuple[Floats, Floats], tuple[Fl
     """Differences at the two green neighbours of each red or blue site, in its chosen direction.
 
     Args:
-        sparse: (height, width), own minus green at red and blue sites, green at green sites.
+        sparse: (height, width), own minus green at red and blue sites, 0 at green sites.
         in_row: (height, width), True where the chosen direction is the row.
 
     Returns:
@@ -83,14 +83,13 @@ def menon2007(image: Floats, pattern: Pattern) -> Floats:
     by_row, by_column = directional_differences(image, pattern)
     in_row = change(by_row) <= change(by_column.T).T
     chosen = np.where(in_row, by_row, by_column)
-    chosen = by_site(image.shape, pattern, chosen, image, chosen)
     # A first estimate of own minus other; it is refined after green.
     (left, right), (left_other, right_other) = along(chosen, in_row)
     own_other = (left_other + right_other) * HALF
     # Refine green: own minus green becomes the mean of three along the direction.
     refined = (left + chosen + right) * THIRD
-    refined = by_site(image.shape, pattern, refined, image, refined)
-    green = by_site(image.shape, pattern, image - refined, image, image - refined)
+    refined = by_site(image.shape, pattern, refined, chosen, refined)
+    green = image - refined
     # Refine the other colour likewise; red and blue at green sites are bilinear.
     _, (left_other, right_other) = along(refined, in_row)
     other = image - (left_other + own_other + right_other) * THIRD
@@ -108,15 +107,12 @@ class Menon2007(Method):
     summary: ClassVar = "green in both directions, the better one chosen and refined (Menon et al.)"
 
     def passes(self) -> tuple[Pass, ...]:
-        def stencil(function: str, radius: int, *reads: str, writes: str = "dst") -> Pass:
-            kind = None if writes == "dst" else Kind.PAIR
-            return Pass(function, Stencil(radius), ("pattern",), reads, writes, kind)
-
+        given = ("pattern",)
         return (
-            stencil("directional_differences", 2, "src", writes="both"),
-            stencil("decide", 2, "src", "both", writes="chosen"),
-            stencil("refine", 2, "chosen", writes="refined"),
-            stencil("interpolate", 2, "src", "chosen", "refined"),
+            Pass("directional_differences", Stencil(2), given, writes="both", kind=Kind.PAIR),
+            Pass("decide", Stencil(2), reads=("both",), writes="chosen", kind=Kind.PAIR),
+            Pass("refine", Stencil(2), given, ("chosen",), writes="refined", kind=Kind.PAIR),
+            Pass("interpolate", Stencil(2), given, ("src", "chosen", "refined")),
         )
 
     def arguments(self, context: Context) -> Arguments:

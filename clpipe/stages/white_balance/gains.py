@@ -8,7 +8,7 @@ from pydantic import PrivateAttr
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
-from clpipe.reference.filter_array import FilterArray, tiled
+from clpipe.reference.filter_array import FilterArray, parse_array, tiled
 from clpipe.stage import (
     PERIOD,
     Arguments,
@@ -22,6 +22,8 @@ from clpipe.stage import (
     parameter,
     period_of,
 )
+
+ALIKE = parse_array("G")  # a filter array whose pixels are all of one level
 
 
 def apply_gains(image: Floats, context: Context, red: np.float32, blue: np.float32) -> Floats:
@@ -97,6 +99,10 @@ class OfArray(CameraGains):
         made._array = replace(array, gains=own.gains)
         return made
 
+    def next_context(self, context: Context) -> Context:
+        array = self._array.with_gains(self.gains, self.inverse)
+        return super().next_context(context).but(array=array)
+
     def passes(self) -> tuple[Pass, ...]:
         return (Pass(self.function, arguments=("factors", *PERIOD)),)
 
@@ -165,11 +171,18 @@ class AsShot(Gains):
     def resolve(self, context: Context) -> CameraGains:
         red, blue = context.gains
         own = self.with_defaults(red_gain=red, blue_gain=blue)
-        return ArrayAsShot.on(context.array, own) if context.array else own
+        if context.array is None:
+            return own
+        is_white = context.array.is_balanced and own.gains == (1.0, 1.0)
+        return ArrayAsShot.on(ALIKE if is_white else context.array, own)
 
 
 class ArrayAsShot(OfArray, AsShot):
-    """The same, on any filter array."""
+    """The same, on any filter array; of a mosaic in which white is 1, no channel changes."""
+
+    def next_context(self, context: Context) -> Context:
+        after = super().next_context(context)
+        return after.but(array=context.array) if self._array == ALIKE else after
 
 
 class Unbalanced(Unchanged):
