@@ -91,8 +91,8 @@ class PageRunner:
     Args:
         folder: the working directory; it holds what the page takes for granted.
         clpipe: runs the command line in this process, and checks its exit status.
-        numpy: have ``clpipe run`` and ``replay`` develop in NumPy if a line names no device, which saves compiling
-            the kernels of chains that occur only here.
+        numpy: have ``clpipe run`` and ``replay`` develop in NumPy if a line names no device, which
+            saves compiling the kernels of chains that occur only here.
     """
 
     def __init__(self, folder: Path, clpipe: Callable[..., Any], numpy: bool = False) -> None:
