@@ -91,11 +91,14 @@ class PageRunner:
     Args:
         folder: the working directory; it holds what the page takes for granted.
         clpipe: runs the command line in this process, and checks its exit status.
+        numpy: have ``clpipe run`` and ``replay`` develop in NumPy if a line names no device, which
+            saves compiling the kernels of chains that occur only here.
     """
 
-    def __init__(self, folder: Path, clpipe: Callable[..., Any]) -> None:
+    def __init__(self, folder: Path, clpipe: Callable[..., Any], numpy: bool = False) -> None:
         self._folder = folder
         self._clpipe = clpipe
+        self._numpy = numpy
         self._names: dict[str, Any] = {"__name__": "page"}
         self._tools = folder / ".bin"
         self._tools.mkdir()
@@ -149,6 +152,8 @@ class PageRunner:
         target = ""
         if ">" in words:
             words, (target,) = words[: words.index(">")], words[words.index(">") + 1 :]
+        if self._numpy and words[0] in ("run", "replay") and not {"--device", "--dask"} & {*words}:
+            words += ["--device", "numpy"]
         result = self._clpipe(*words)
         if target:
             (self._folder / target).write_text(result.stdout)

@@ -12,16 +12,16 @@ from clpipe.engine.check import chain_for
 METHODS = [(stage, method) for stage in all_stages().values() for method in stage.methods]
 
 
-def accesses(stage, method):
-    """Return how the passes of a method touch pixels."""
-    chain = chain_for(stage, method, {}, "GRBG")
-    own = [pass_.access for pass_ in chain.steps[0].method.passes()]
-    shapes = [getattr(each, name, 0) > 0 for each in own for name in ("bins", "vectors_per_row")]
-    return *map(type, own), *shapes
+def ways(stage, method):
+    """Return how the passes of a method touch pixels, and whether it is for any filter array."""
+    accesses = [pass_.access for pass_ in chain_for(stage, method, {}, "GRBG").steps[0].passes]
+    shapes = ("bins", "vectors_per_row")
+    touched = {(type(a), *(getattr(a, name, 0) > 0 for name in shapes)) for a in accesses}
+    return frozenset(touched), method.any_array
 
 
 # The first of each way.
-REPRESENTATIVES = {*{accesses(*each): each for each in reversed(METHODS)}.values()}
+REPRESENTATIVES = [*{ways(*each): each for each in reversed(METHODS)}.values()]
 
 ALL = [
     pytest.param(
@@ -32,3 +32,4 @@ ALL = [
     )
     for stage, method in METHODS
 ]
+ONE_OF_EACH_WAY = [each for each in ALL if not each.marks]

@@ -29,7 +29,7 @@ from clpipe.batch.run_log import read_log
 from clpipe.batch.threads import Batch
 from clpipe.batch.trace import Trace
 from clpipe.batch.work import ImageWorker
-from clpipe.chain.formats import EVERY_FORMAT, ending_of
+from clpipe.chain.formats import ending_of
 from clpipe.chain.request import Request
 from clpipe.commands.progress import Reporter
 from clpipe.engine.runner import Runner
@@ -665,9 +665,9 @@ def test_a_sidecar_that_was_cut_off_is_none(clpipe, renders, kept):
     assert contents("out") == whole
 
 
-@pytest.mark.parametrize("format_", EVERY_FORMAT)
+@pytest.mark.parametrize("format_", ["jpg", "exr", "npy", "dng"])  # of each way to mark a file
 def test_a_picture_of_another_hand_is_not_written_over(clpipe, renders, format_):
-    run = ("run", renders(1), *RUN, "--format", format_)
+    run = ("run", renders(1), *RUN, "--device", "numpy", "--format", format_)
     clpipe(*run)
     Path("out/r000.json").unlink()
     clpipe(*run)  # as a killed run may have left it

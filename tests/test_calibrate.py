@@ -11,7 +11,7 @@ from clpipe.analysis.calibration.repeats import Sensor, neighbours
 from clpipe.analysis.calibration.result import Calibration
 from clpipe.base.errors import ImageError
 from clpipe.camera.profile import load_camera
-from clpipe.reference.cfa import PATTERNS, sites
+from clpipe.reference.cfa import sites
 
 SENSOR = Sensor("RGGB", 512, 16383)
 
@@ -60,9 +60,7 @@ def off(estimate: Estimate | None, truth: float) -> tuple[float, float]:
     return abs(estimate.value / truth - 1), abs(estimate.value - truth) / estimate.error
 
 
-@pytest.mark.parametrize(
-    ("pattern", "iso"), list(zip(PATTERNS, (100, 640, 3200, 12800), strict=True))
-)
+@pytest.mark.parametrize(("pattern", "iso"), [("RGGB", 100), ("GBRG", 12800)])
 def test_what_clpipe_puts_in_comes_back(pattern, iso):
     camera = load_camera("sony-a7r2")
     noise = camera.noise(iso)

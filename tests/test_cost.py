@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from unittest import mock
 
@@ -48,12 +49,18 @@ class Counter:
         if self._counting and event in {"call", "c_call"}:
             next(self._calls)
 
-    def of(self, work: Callable[[], object]) -> tuple[int, int]:
-        """Return the calls and launches of a function."""
-        self._calls, self._launches, self._counting = itertools.count(), itertools.count(), True
-        work()
-        self._counting = False
-        return next(self._calls), next(self._launches)
+    def of(self, *works: Callable[[], object]) -> tuple[int, int]:
+        """Return the calls and launches of a function, or of the cheapest of several like it.
+
+        After kernels have been compiled, other threads may still be busy with them.
+        """
+        counts = []
+        for work in works:
+            self._calls, self._launches, self._counting = itertools.count(), itertools.count(), True
+            work()
+            self._counting = False
+            counts.append((next(self._calls), next(self._launches)))
+        return min(counts)
 
 
 def measured(folder: Path) -> dict[str, tuple[float, float]]:
@@ -76,12 +83,14 @@ def measured(folder: Path) -> dict[str, tuple[float, float]]:
 
     samples = clpipe.Dataset(folder / "in", patch=64)
     samples[0], samples[1]
-    found["sample"] = count.of(lambda: samples[2])
+    found["sample"] = count.of(*(partial(samples.__getitem__, i) for i in range(2, 5)))
 
     camera, image = clpipe.Pipeline(), rng.random((64, 64, 3), np.float32)
     camera.process(image, "a"), camera.process(image, "a", iso=1000)
-    found["process"] = count.of(lambda: camera.process(image, "b"))
-    found["process with settings"] = count.of(lambda: camera.process(image, "b", iso=1100))
+    keys = "bcd"
+    found["process"] = count.of(*(partial(camera.process, image, key) for key in keys))
+    changed = (partial(camera.process, image, key, iso=1100) for key in keys)
+    found["process with settings"] = count.of(*changed)
 
     (folder / "out").mkdir()
     worker, jobs = worker_of(folder)
@@ -109,13 +118,14 @@ def costs(device, tmp_path_factory):
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("work", "calls", "launches"),
     [
         # Noisy and clean, raw and picture, of 16 patches, a camera and an ISO drawn for each.
         ("drawn sample", 10_100, 49 / 16),
-        ("sample", 7_700, 12),
-        ("process", 3_600, 7),
+        ("sample", 2_430, 12),
+        ("process", 930, 7),
         ("process with settings", 6_000, 7),
         ("image of run", 4_000, 7),
     ],

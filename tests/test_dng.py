@@ -71,7 +71,7 @@ def strip(path):
 @pytest.mark.parametrize("size", [(24, 30), (37, 51)])
 def test_libraw_reads_the_very_dn(scene, tmp_path, pattern, size):
     options = ("--iso", 3200, "--set", f"mosaic.pattern={pattern}", "--keep", "quantize")
-    options += ("--set", "exposure.ev=1.5")  # so that some samples are white
+    options += ("--set", "exposure.ev=1.5", "--device", "numpy")  # so that some samples are white
     clpipe("run", scene(*size), "-o", tmp_path / "o", *options, "--format", "dng")
     kept = read_image(tmp_path / "o" / "scene.quantize.exr", mosaic=True).pixels
     path = tmp_path / "o" / "scene.dng"
@@ -156,9 +156,9 @@ def test_its_matrix_is_read_as_that_of_a_camera(tmp_path, method):
 
 
 def blocks(picture):
-    """The means of 20 times 30 blocks of a picture of any size, (20, 30, 3)."""
+    """The means of 10 times 15 blocks of a picture of any size, (10, 15, 3)."""
     height, width = picture.shape[:2]
-    return picture.reshape(20, height // 20, 30, width // 30, 3).mean((1, 3))
+    return picture.reshape(10, height // 10, 15, width // 15, 3).mean((1, 3))
 
 
 @pytest.mark.parametrize(
@@ -170,17 +170,19 @@ def blocks(picture):
         ("-c", "canon-5d2-jpeg", "--iso", 100),
     ],
 )
-def test_a_converter_gives_the_colours_of_our_own_picture(tmp_path, options):
-    formats = ("--format", "dng", "--format", "exr")
-    clpipe("run", STILL_LIFE, "-o", tmp_path, *LINEAR, *formats, *options)
-    ours = read_image(tmp_path / "still_life.exr").pixels
-    with rawpy.imread(str(tmp_path / "still_life.dng")) as raw:
+def test_a_converter_gives_the_colours_of_our_own_picture(tmp_path, write_exr, options):
+    half = read_image(STILL_LIFE).pixels.astype(np.float32).reshape(320, 2, 480, 2, 3)
+    render = write_exr("half.exr", half.mean((1, 3)))
+    formats = ("--format", "dng", "--format", "exr", "--device", "numpy")
+    clpipe("run", render, "-o", tmp_path / "o", *LINEAR, *formats, *options)
+    ours = read_image(tmp_path / "o" / "half.exr").pixels
+    with rawpy.imread(str(tmp_path / "o" / "half.dng")) as raw:
         theirs = raw.postprocess(
             gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True
         ) / np.float32(65535)
     means = [blocks(x) for x in (ours, theirs)]
     usable = (means[0].max(-1) < 0.9) & (means[0].min(-1) > 0.03)
-    assert usable.sum() > 400
+    assert usable.sum() > 100
     ratio = means[1][usable] / means[0][usable]
     assert np.abs(np.median(ratio, axis=0) - 1).max() < 0.002
     assert np.abs(np.percentile(ratio, [5, 95], axis=0) - 1).max() < 0.03
@@ -366,7 +368,8 @@ def test_one_that_cannot_be_written_leaves_nothing(scene, tmp_path):
 def test_a_cameras_raw_as_a_dng_loses_nothing(tmp_path, pattern):
     dn = np.random.default_rng(4).integers(400, 16384, (46, 62)).astype(np.uint16)
     write_raw(tmp_path / "shot.dng", dn, pattern, orientation=6)
-    clpipe("run", tmp_path / "shot.dng", "-o", tmp_path / "out", "--format", "dng")
+    to_dng = ("--format", "dng", "--device", "numpy")
+    clpipe("run", tmp_path / "shot.dng", "-o", tmp_path / "out", *to_dng)
     again = tmp_path / "out" / "shot.dng"
     assert np.array_equal(read_dn(again), dn)
     with rawpy.imread(str(tmp_path / "shot.dng")) as one, rawpy.imread(str(again)) as other:

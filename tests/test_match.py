@@ -46,7 +46,7 @@ from clpipe.chain.settings import Settings, overlay
 from clpipe.commands.match import Follower
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding, through_jpeg
 from clpipe.pipeline import Pipeline
-from tests.conftest import DATA, ROOT
+from tests.conftest import DATA, ROOT, run_cli
 
 SIZE, FRAMES = 128, 6
 KNOWN = {
@@ -133,36 +133,35 @@ def test_noise_against_the_mean_of_a_burst_is_that_of_a_frame(burst):
             assert abs(column.residual(against_mean[name], against_truth[name])) < 0.06, name
 
 
+def matched(frames, folder, *options):
+    """What clpipe match finds for frames: its JSON. Its files are in the folder."""
+    saved(folder, **{f"frame{k}": frame for k, frame in enumerate(frames)})
+    files = ("-o", folder / "look.toml", "--plot", folder / "look.png")
+    words = (folder / "frame?.png", *files, *options, "--device", "numpy", "--json")
+    result = run_cli("match", *words)
+    return json.loads(result.stdout)
+
+
 @pytest.fixture(scope="module")
 def found(burst, tmp_path_factory):
-    """What clpipe match finds for the burst: its JSON, and the folder of its files."""
-    from click.testing import CliRunner
-
-    from clpipe.commands.main import main
-
+    """What a search of some steps finds for the burst, and the configuration that it writes."""
     folder = tmp_path_factory.mktemp("match")
-    names = saved(folder, **{f"frame{k}": frame for k, frame in enumerate(burst)})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(match, "space_for", lambda *_: SMALL)
         patch.setattr(search, "FULL", 4)
-        options = ["-o", folder / "look.toml", "--plot", folder / "look.png", "--device", "numpy"]
-        words = ["match", str(folder / "frame?.png"), *map(str, options), "--json"]
-        result = CliRunner().invoke(main, words, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    assert len(names) == FRAMES
-    return json.loads(result.stdout), folder
+        return matched(burst, folder), load_settings(str(folder / "look.toml"))
 
 
 @pytest.mark.slow
 def test_a_known_development_comes_back(found):
-    report, _ = found
+    report, settings = found
     for name, column in report["columns"].items():
         row = column["searched"]
         if name != "beyond_4_sigma" and row["residual"] is not None:
             assert abs(row["residual"]) < 0.03 + 2 * row["error"], (name, row)
             assert row["error"] < 0.3, name
     # A steeper tone curve makes as much noise of a lower ISO.
-    assert report["searched"]["iso"] == pytest.approx(KNOWN["iso"], rel=0.2)
+    assert report["searched"]["iso"] == settings.iso == pytest.approx(KNOWN["iso"], rel=0.2)
     strength = report["searched"]["denoise.luma_strength"]
     assert strength == pytest.approx(KNOWN["denoise"]["luma_strength"], rel=0.2)
 
@@ -175,33 +174,37 @@ def test_crops_that_were_not_searched_prove_it(found):
         assert abs(row["residual"]) < 0.03 + 2 * row["error"], (name, row)
 
 
-def test_the_configuration_develops_what_was_measured(found):
-    report, folder = found
-    settings = load_settings(str(folder / "look.toml"))
+@pytest.mark.usefixtures("quick", "ambiguous")
+def test_the_configuration_develops_what_was_measured(burst, tmp_path):
+    report = matched(burst[:3], tmp_path, "--iso", 3200)
+    assert report["ambiguities"] == [{"names": ["iso"], "correlation": None}]
+    assert report["ended_by_range"] == "iso stopped"
+    settings = load_settings(str(tmp_path / "look.toml"))
     assert (
         settings.parameters["denoise"]["luma_strength"]
         == (report["searched"]["denoise.luma_strength"])
     )
-    assert settings.iso == report["searched"]["iso"]
+    assert settings.iso == 3200
     assert settings.output.jpeg_subsampling == "4:4:4"
-    picture = Pipeline(folder / "look.toml", device="numpy").process(scene(), "a").image
+    picture = Pipeline(tmp_path / "look.toml", device="numpy").process(scene(), "a").image
     assert picture.shape == (SIZE, SIZE, 3)
-    assert (folder / "look.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "look.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.fixture
+def ambiguous(monkeypatch):
+    """Searches find that nothing tells the ISO, and that it stopped."""
+    result = "clpipe.analysis.matching.result"
+    monkeypatch.setattr(f"{result}.ambiguities", lambda *_: (Ambiguity(("iso",)),))
+    monkeypatch.setattr(f"{result}.ended_by", lambda *_: "iso stopped")
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("quick")
-def test_the_table(found, clpipe, monkeypatch, tmp_path):
-    _, folder = found
+@pytest.mark.usefixtures("quick", "ambiguous")
+def test_the_table(burst, clpipe, monkeypatch, tmp_path):
     monkeypatch.setattr("clpipe.commands.match.EVERY", 0.0)
-    one = "clpipe.analysis.matching.result.ambiguities"
-    monkeypatch.setattr(one, lambda *_: (Ambiguity(("iso",)),))
-    monkeypatch.setattr("clpipe.analysis.matching.result.ended_by", lambda *_: "iso stopped")
-    frames = [folder / f"frame{k}.png" for k in range(3)]
+    frames = saved(tmp_path, **{f"{k}": frame for k, frame in enumerate(burst[:3])})
     words = [*frames, "-o", tmp_path / "a.toml", "--iso", 3200, "--device", "numpy"]
-    told = json.loads(clpipe("match", *words, "--json").stdout)
-    assert told["ambiguities"] == [{"names": ["iso"], "correlation": None}]
-    assert told["ended_by_range"] == "iso stopped"
     result = clpipe("match", *words)
     assert "warning: iso is not told: a factor of 2" in result.stdout
     assert "warning: iso stopped\n" in result.stdout

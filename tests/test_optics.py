@@ -175,17 +175,17 @@ def disc(focal_length, f_number, pitch):
 def spread_of(path):
     """The diameter of the disc that a point in the middle became: its mean square is d^2 / 8."""
     seen = read_image(path).pixels[..., 1].astype(np.float64)
-    y, x = np.indices(seen.shape) - np.array([120, 180])[:, None, None]
+    y, x = np.indices(seen.shape) - np.array([24, 180])[:, None, None]
     return np.sqrt(8 * (seen * (x**2 + y**2)).sum() / seen.sum())
 
 
 @pytest.fixture
 def point(write_exr):
     """A render of a point at 1.5 m: 360 px across, of 36 mm, so 0.1 mm apart."""
-    image = np.zeros((240, 360, 3), np.float32)
-    image[120, 180] = 1
+    image = np.zeros((48, 360, 3), np.float32)
+    image[24, 180] = 1
     write_exr("in/a.exr", image)
-    write_exr("in/a_depth.exr", np.full((240, 360, 1), 1.5), "Z")
+    write_exr("in/a_depth.exr", np.full((48, 360, 1), 1.5), "Z")
 
 
 RUN = ("run", "in/a.exr", "--stages", "defocus", "--format", "exr", "--device", "numpy")
@@ -194,7 +194,7 @@ ZOOM = ("--lens", "Canon EF 24-70mm f/2.8L", "--focal-length", 70, "--aperture",
 FOCAL = ("--set", "motion_blur.method=perspective", "--set", "motion_blur.focal_length=35")
 DEFOCUS = (*THIN, "--aperture", 0.5)
 POSE = {"R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "t": [0, 0, 0]}
-VIEW = {"file": "a.exr", "K": [[350, 0, 180], [0, 350, 120], [0, 0, 1]], **POSE}
+VIEW = {"file": "a.exr", "K": [[350, 0, 180], [0, 350, 24], [0, 0, 1]], **POSE}
 
 
 @pytest.mark.slow

@@ -63,7 +63,7 @@ def check_against_whole(whole, patches):
 
 
 def test_all_that_a_sample_has_is_that_of_the_whole_picture(renders):
-    given = {"iso": ISO, "truth": "clean", "raw": "mosaic", "keep": "exposure"}
+    given = {"iso": ISO, "truth": "clean", "raw": "mosaic"}
     for number, key in ((0, "r0.exr"), (1, "r1.exr")):
         (whole,) = api.Dataset(f"in/{key}", **given)
         patches = api.Dataset(
@@ -71,7 +71,7 @@ def test_all_that_a_sample_has_is_that_of_the_whole_picture(renders):
         ).__getitems__(range(60 * number, 60 * number + 60))
         assert {patch["key"] for patch in patches} == {key}
         assert check_against_whole(whole, patches) == set(FLIPS)
-        assert {"image", "truth", "raw", "truth.raw", "exposure"} <= patches[0].keys()
+        assert {"image", "truth", "raw", "truth.raw"} <= patches[0].keys()
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
@@ -123,10 +123,11 @@ def test_places_are_everywhere_and_fit():
 
 
 def test_each_patch_has_draws_of_its_own(renders):
+    few = {"device": "numpy", "until": "mosaic"}
     options = {"iso": {"log_uniform": [200, 6400]}, "patch": api.Patches(16, per_image=6)}
     isos = {}
     for draws in (None, "patch", "image"):
-        dataset = api.Dataset(renders, device="numpy", draws=draws, epochs=2, **options)
+        dataset = api.Dataset(renders, draws=draws, epochs=2, **few, **options)
         isos[draws] = [(s["key"], s["epoch"], s["iso"]) for s in dataset]
         by_number = [dataset[i] for i in (0, 7, 1)]
         assert [(s["key"], s["epoch"], s["iso"]) for s in by_number] == [
@@ -136,7 +137,7 @@ def test_each_patch_has_draws_of_its_own(renders):
     images = {sample[:2] for sample in isos["image"]}
     assert len({*isos["image"]}) == len(images)
     grid = {**options, "patch": api.Patches(16, per_image="grid")}
-    assert len({s["iso"] for s in api.Dataset(renders, device="numpy", **grid)}) == len(images) / 2
+    assert len({s["iso"] for s in api.Dataset(renders, **few, **grid)}) == len(images) / 2
 
 
 def test_a_patch_with_draws_of_its_own_is_of_the_picture_with_these(renders):

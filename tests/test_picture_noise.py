@@ -265,6 +265,7 @@ def test_the_matched_curve_is_measured_again(loop):
         assert off[enough].max() < 0.15  # next to a peak the bins, means, differ more
 
 
+@pytest.mark.slow
 def test_baselines_have_the_size_but_not_the_shape_of_camera_noise(loop):
     for name in ("R", "G", "B", "Y", "Cb", "Cr"):
         camera = loop["camera"]["channels"][name]

@@ -26,8 +26,9 @@ PINNED = Path(__file__).with_name("pinned.json")
 # Options behind "clpipe run render.exr".
 RUNS = {
     "default": "--format dng --format npy --truth mosaic --truth variance --keep quantize",
-    "pictures": "--format png --frames 2 --bracket -1,1 --truth clean --truth development",
-    "paper": "-c paper --format png --format dng --truth iid --iso 3200",
+    "pictures": "--format png --frames 2 --bracket -1,1 --truth clean --truth development"
+    " --truth iid",
+    "paper": "-c paper --format png --iso 3200",
     "syb3r": "-c syb3r --format png",
     "nikon": "-c nikon-d800-jpeg --format png --iso 1600",
     "lens": "--format png --carry Depth --set distortion.method=brown_conrady"

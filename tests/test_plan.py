@@ -3,7 +3,6 @@
 import pytest
 
 from clpipe.base.errors import RequestError
-from clpipe.chain.files import load_config
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.bindings import EncodedCurves
@@ -179,9 +178,7 @@ def texts(plan):
 
 CHAINS = {
     "default": {},
-    "gray_world": GRAY_WORLD,
     "white_patch": {"white_balance": {"method": "white_patch"}},
-    "paper": load_config("paper").values,
     "slow": {"demosaic": {"method": "menon2007"}, "denoise": {"method": "non_local_means"}},
 }
 

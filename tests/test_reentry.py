@@ -16,6 +16,7 @@ from clpipe.stages.sharpen import Unsharp
 from tests.conftest import STILL_LIFE, written
 from tests.conftest import cli_output as clpipe
 
+NUMPY = ("--device", "numpy")  # where a test is not about kernels
 OPTIONS = ("--iso", "3200", "--seed", "5", "--set", "mosaic.pattern=GBRG")
 OPTIONS += ("--set", "white_balance.method=gray_world", "--set", "row_noise.sigma=0.01")
 OPTIONS += ("--set", "sharpen.radius=2.1", "--set", "gamma.method=power")
@@ -69,7 +70,7 @@ def test_going_on_with_some_stages_gives_the_same_images(kept, tmp_path):
 
 
 def test_options_given_again_win_over_those_of_the_kept_image(kept, tmp_path):
-    entry = (kept / "crop.color_matrix.exr", "--start-at", "sharpen", "--format", "png")
+    entry = (kept / "crop.color_matrix.exr", "--start-at", "sharpen", "--format", "png", *NUMPY)
     clpipe("run", *entry, "-o", tmp_path / "a")
     clpipe("run", *entry, "-o", tmp_path / "b", "--set", "sharpen.radius=2.0")
     clpipe("run", *entry, "-o", tmp_path / "c", "-c", "default")
@@ -86,7 +87,7 @@ def test_what_was_edited_is_honoured(kept, tmp_path):
 
     path = edited(kept / "crop.denoise.exr", tmp_path / "crop.exr", darken)
     out = tmp_path / "out"
-    clpipe("run", path, "-o", out, "--start-at", "color_matrix", "--format", "png")
+    clpipe("run", path, "-o", out, "--start-at", "color_matrix", "--format", "png", *NUMPY)
     made, whole = (
         oiio.ImageBuf(str(p)).get_pixels() for p in (out / "crop.png", kept / "crop.jpg")
     )
@@ -107,7 +108,8 @@ def test_a_mosaic_from_elsewhere_enters_with_pattern_and_levels(kept, tmp_path, 
     settings = ("mosaic.pattern=GBRG", "normalize.black_level=64", "normalize.white_level=2047")
     options = [o for s in settings for o in ("--set", s)]
     out = tmp_path / "out"
-    clpipe("run", path, "-o", out, "--start-at", "normalize", *options, "--keep", "normalize")
+    enter = (*NUMPY, "--start-at", "normalize", "--keep", "normalize")
+    clpipe("run", path, "-o", out, *enter, *options)
     expected = (dn - np.float32(64)) * np.float32(1 / (2047 - 64))
     kept_image = read_image(out / "raw.normalize.exr", mosaic=True).pixels
     assert np.array_equal(kept_image, expected.astype(np.float32))
@@ -145,7 +147,7 @@ def test_an_image_of_another_kind_is_refused_and_the_others_go_on(
 ):
     right = DEFAULT_CHAIN[DEFAULT_CHAIN.index(start_at) - 1]
     files = (kept / f"crop.{after}.exr", kept / f"crop.{right}.exr")
-    output = clpipe("run", *files, "-o", tmp_path, "--start-at", start_at, status=1)
+    output = clpipe("run", *files, "-o", tmp_path, "--start-at", start_at, *NUMPY, status=1)
     assert f"crop.{after}.exr: " in output
     assert re.search(message, output), output
     assert (tmp_path / f"crop.{right}.jpg").is_file()
@@ -153,7 +155,7 @@ def test_an_image_of_another_kind_is_refused_and_the_others_go_on(
 
 
 def test_a_folder_gives_what_was_kept_right_before(kept, tmp_path):
-    output = clpipe("run", kept, "-o", tmp_path, "--start-at", "denoise")
+    output = clpipe("run", kept, "-o", tmp_path, "--start-at", "denoise", *NUMPY)
     assert written(tmp_path) == ["crop.demosaic.jpg", "crop.demosaic.json"]
     assert (
         f"{len(DEFAULT_CHAIN) - 1} images in folders were kept after other stages and left out"
@@ -163,7 +165,8 @@ def test_a_folder_gives_what_was_kept_right_before(kept, tmp_path):
 
 
 def test_entering_elsewhere_than_right_after_is_told(kept, tmp_path):
-    output = clpipe("run", kept / "crop.denoise.exr", "-o", tmp_path, "--start-at", "denoise")
+    enter = ("--start-at", "denoise", *NUMPY)
+    output = clpipe("run", kept / "crop.denoise.exr", "-o", tmp_path, *enter)
     assert "was kept after denoise; entering at denoise repeats stages or leaves" in output
 
 
@@ -184,7 +187,8 @@ def test_a_kept_mosaic_is_no_render(kept, tmp_path):
 def test_what_looks_wrong_with_a_mosaic_is_told(tmp_path, level, start_at, options, messages):
     write_exr(tmp_path / "m.exr", np.full((8, 8), level, np.float32), ("Y",), {})
     output = clpipe(
-        "run", tmp_path / "m.exr", "-o", tmp_path / "out", "--start-at", start_at, *options
+        *("run", tmp_path / "m.exr", "-o", tmp_path / "out", "--start-at", start_at),
+        *(*options, *NUMPY),
     )
     assert output.count("warning: ") == len(messages)
     for message in messages:
@@ -208,7 +212,8 @@ def test_settings_that_an_image_carries_may_be_of_no_use(kept, tmp_path):
         attributes = {**image.attributes, "settings": settings}
         path = tmp_path / f"{number}.exr"
         write_exr(path, image.pixels, ("R", "G", "B"), attributes)
-        output = clpipe("run", path, "-o", tmp_path / "out", "--start-at", "tone_curve", status=1)
+        enter = ("--start-at", "tone_curve", *NUMPY)
+        output = clpipe("run", path, "-o", tmp_path / "out", *enter, status=1)
         assert f"{number}.exr: what it was made with cannot be used" in output
 
 
@@ -230,15 +235,15 @@ def test_a_part_that_cannot_be_run(kept, tmp_path, options, message):
 
 def test_until_gives_a_float_image_unless_it_is_the_end(tmp_path):
     image = crop(tmp_path)
-    clpipe("run", image, "-o", tmp_path / "a", "--until", "white_balance")
+    clpipe("run", image, "-o", tmp_path / "a", "--until", "white_balance", *NUMPY)
     assert written(tmp_path / "a") == ["crop.exr", "crop.json"]
     assert read_image(tmp_path / "a" / "crop.exr", mosaic=True).attributes["kind"] == "mosaic"
-    clpipe("run", image, "-o", tmp_path / "b", "--until", "gamma")
+    clpipe("run", image, "-o", tmp_path / "b", "--until", "gamma", *NUMPY)
     assert (tmp_path / "b" / "crop.jpg").is_file()
 
 
 def test_a_kept_image_that_is_taken_for_a_render_is_told(kept, tmp_path):
-    output = clpipe("run", kept / "crop.demosaic.exr", "-o", tmp_path)
+    output = clpipe("run", kept / "crop.demosaic.exr", "-o", tmp_path, *NUMPY)
     assert "was kept after demosaic; is it a render? See --start-at" in output
 
 

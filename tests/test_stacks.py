@@ -17,12 +17,23 @@ from clpipe.engine.runner import Result, Runner, cut_out
 from clpipe.engine.submission import submit_together
 from clpipe.stage import Kind
 
-# Of each kind of launch: lines, stencils, sums, a histogram, a resampling, a mosaic with a period.
+# Of each kind of launch: lines and stencils; a resampling, sums, a mosaic with a period.
 CHAINS = {
     "default": {"row_noise": {"sigma": 0.002}},
-    "estimates": {"exposure": {"method": "auto"}, "white_balance": {"method": "gray_world"}},
-    "resampled": {"distortion": {"method": "brown_conrady", "k1": -0.1, "fx": 60.0}},
-    "x-trans": {"mosaic": {"method": "array", "array": "x-trans"}},
+    "others": {
+        "stages": [
+            "distortion",
+            "exposure",
+            "mosaic",
+            "quantize",
+            "normalize",
+            "demosaic",
+            "gamma",
+        ],
+        "distortion": {"method": "brown_conrady", "k1": -0.1, "fx": 60.0},
+        "exposure": {"method": "auto"},
+        "mosaic": {"method": "array", "array": "x-trans"},
+    },
 }
 SIZES = [(40, 48), (23, 61), (70, 33)]
 
@@ -104,6 +115,7 @@ def test_patches_of_one_image_and_of_others_go_together(on, launches):
     assert {size[2:] for size in launches} == {(9,)}
 
 
+@pytest.mark.slow
 def test_the_check_of_a_device_tries_them(on, launches):
     result = check_stack(on)
     assert result.passed and result.difference.differing == 0 and result.cases == 7
