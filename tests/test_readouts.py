@@ -157,7 +157,10 @@ KNOTS = "[[0,0],[4096,1024],[16383,4095]]"
         (("quantize.method=pwl", "quantize.knots=[[0,0],[16383,5000]]"), "12 bits do not hold"),
         (("quantize.method=pwl", "quantize.knots=[[0,0],[99,50]]"), "but the white level is 16383"),
         (("normalize.method=pwl",), "no knots are known"),
-        (("normalize.method=pwl", f"normalize.knots={KNOTS}"), "were not made fewer by one"),
+        (
+            ("normalize.method=pwl", f"normalize.knots={KNOTS}"),
+            "but quantize.method=linear made the DN",
+        ),
         (
             ("quantize.method=pwl", "normalize.method=linear"),
             "set normalize.method=pwl, which goes",

@@ -229,16 +229,17 @@ def _check_curve(chain: Chain) -> None:
     Raises:
         KeyedError: the chain makes linear DN, and goes back along a curve.
     """
-    is_made = False
+    maker = None
     for step in chain.steps:
-        is_levels = is_made and step.stage.role is StageRole.LEVELS and not step.context.knots
-        if is_levels and getattr(step.method, "knots", None):
+        is_levels = step.stage.role is StageRole.LEVELS and not step.context.knots
+        if maker and is_levels and getattr(step.method, "knots", None):
+            made = maker.name
             raise KeyedError(
                 f"{step.name}.knots",
-                f"{step.name}.knots: found a curve, but the DN were not made fewer by one; set it "
-                "as quantize.knots with quantize.method=pwl, and leave it out here",
+                f"{step.name}.knots: found a curve, but {made}.method={maker.method.method} made "
+                f"the DN; set {made}.method=pwl and {made}.knots, and leave {step.name}.knots out",
             )
-        is_made |= step.stage.writes is Kind.RAW
+        maker = step if step.stage.writes is Kind.RAW else maker
 
 
 def _check_pixels(steps: list[Step]) -> None:
