@@ -114,7 +114,7 @@ def test_the_dng_that_clpipe_writes_has_the_noise_of_its_camera(
         ((1e-4, 1e-7, 1e-4), {}, "its NoiseProfile has 3 numbers"),
         ((1e-4, -1e-7), {}, "b = -1e-07 for green; both must be above 0"),
         ((float("nan"), 1e-7), {}, "a = nan"),
-        ((1e-4, 1e-7), {"shape": (32, 32, 3)}, "holds every colour at every pixel .a LinearRaw"),
+        ((1e-4, 1e-7), {"shape": (32, 32, 3)}, "has every colour at every pixel .a LinearRaw"),
         ((1e-4, 1e-7), {"black": (9000,) * 4, "white": 500}, "levels cannot be right"),
     ],
 )

@@ -302,7 +302,7 @@ def test_a_lens_that_is_fitted_for_nerfstudio(clpipe, renders):
         ({"K": [[-9, 0, 3], [0, 9, 3], [0, 0, 1]]}, "render.fx: found -9.0"),
         ({"distortion": {"k1": 0.1}}, "has distortion (k1 0.1), but a render is straight"),
         ({"model": "OPENCV_FISHEYE"}, "is of the model OPENCV_FISHEYE"),
-        ({"width": WIDTH / 2, "height": HEIGHT / 2}, "its camera in --poses is of 120x80"),
+        ({"width": WIDTH / 2, "height": HEIGHT / 2}, "its camera in --poses has 120x80"),
     ],
 )
 def test_a_view_that_is_wrong_fails_alone(clpipe, renders, changes, message):

@@ -21,9 +21,9 @@ ADDITIONAL = {
     "bep_truncated.cr2": "damaged, or not a raw that LibRaw knows",
     "exiftool_DNG.dng": "holds no pixels",
     "exiftool_Nikon.nef": "damaged, or not a raw that LibRaw knows",
-    "magicknet_DSC8695.dng": "holds every colour at every pixel",
+    "magicknet_DSC8695.dng": "has every colour at every pixel",
     "magicknet_RAW_KODAK_DC50.KDC": (512, 768, 3),
-    "mei_issue247-1.nef": "it is a JPEG, not a camera's raw",
+    "mei_issue247-1.nef": "it is a JPEG, not a camera raw",
 }
 
 

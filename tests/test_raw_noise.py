@@ -96,7 +96,7 @@ def test_an_iso_is_drawn_for_each_raw():
         (np.zeros((0, 4), np.float32), r"shape \(0, 4\)"),
         (np.zeros(4, np.float32), r"shape \(4,\)"),
         (np.zeros((4, 4), np.uint16), "found uint16; .* raws in DN less the black level"),
-        ([[0.5, 0.5]], "raw: found list; expected an array: numpy.asarray"),
+        ([[0.5, 0.5]], "raw is a list, but an array is expected. Pass numpy.asarray"),
         (np.full((4, 4), np.nan), "NaN"),
     ],
 )

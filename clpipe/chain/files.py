@@ -1,5 +1,6 @@
 """Configurations: TOML files in, and a chain as such a file out."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -80,7 +81,7 @@ def load_config(name: str) -> Config:
     """
     built_in = built_in_configs()
     path = built_in.get(name, Path(name))
-    if path.suffix != ".toml" and not path.is_file():
+    if path.suffix != ".toml" and not os.path.isfile(path):
         raise RequestError(one_of("configuration", name, built_in) + ", or a .toml file")
     check_exists(path)
     try:

@@ -96,13 +96,11 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
         part_name = str(spec.getattribute("oiio:subimagename") or "") if several_parts else ""
         stated = spec.getattribute("view") or spec.getattribute("multiView") or ()
         views += [stated] if isinstance(stated, str) else [str(each) for each in stated]
-        if mosaic:
-            channel = mosaic_channel(names)
-            pictures += [PictureLocation(part - 1, *channel)] if channel else []
-            continue
-        found = list(_layers(names, kept))
-        if kept and not found:
+        channel = mosaic_channel(names) if mosaic else None
+        found = [] if mosaic else list(_layers(names, kept))
+        if kept and not (found or channel):
             raise KindError(path, own_attributes(spec))
+        pictures += [PictureLocation(part - 1, *channel)] if channel else []
         for own_name, channels, xyz in found:
             full = full_name(part_name, own_name)
             refusals += (problem := _whole_numbers(spec, full, channels))
