@@ -1,5 +1,6 @@
 """Camera profiles: what a sensor does at each ISO, from a TOML file that cites every number."""
 
+import os
 import re
 from functools import cache, lru_cache
 from importlib import resources
@@ -347,7 +348,7 @@ def load_camera(name: str) -> Camera:
     if own := built_in.get(built_in_name(name) or ""):
         return _built_in(own)
     path = Path(name)
-    if path.suffix != ".toml" and path.is_file():
+    if path.suffix != ".toml" and os.path.isfile(path):
         raise RequestError(
             f"{path}: it is no camera profile, which ends in .toml; to make one of a DNG or a "
             "noise model, use 'clpipe cameras import'"
