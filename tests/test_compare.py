@@ -189,7 +189,7 @@ def test_mosaics_are_grey(tmp_path):
     ("arguments", "message"),
     [
         (("a.png", "-o", "f.png"), "a.png: one picture has nothing to be compared with"),
-        (("a.png", "no.png", "-o", "f.png"), "no.png: no such file"),
+        (("a.png", "no.png", "-o", "f.png"), "no.png: there is no such file"),
         (("a.png", "small.png", "-o", "f.png"), "small.png is 50x40, but a.png is 120x80"),
         (("a.png", "b.png", "-o", "f.gif"), "-o: found f.gif; expected a name that ends in .png,"),
         (("a.png", "b.png", "-o", "./b.png"), "b.png is one of the pictures"),

@@ -341,7 +341,7 @@ def test_many_pictures_are_sampled_within_the_budget(out, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere"], "nowhere: there is no such folder"),
+        (["nowhere"], "nowhere: there is no such file or folder"),
         (["."], "has no picture of clpipe's with its sidecar"),
         ([".", "-o", "x.pdf"], "-o: found x.pdf; expected a name that ends in .html"),
         ([".", ".", "."], "found 3 folders; one is reported on, or two are compared"),

@@ -67,6 +67,7 @@ def check_exists(path: Path) -> None:
         pass
     except (OSError, ValueError):  # reading it tells why
         return
+    os.getcwd()  # where that has gone, it is what is wrong
     place, rest = path, Path()
     while not os.path.exists(place.parent) and place != place.parent:
         place, rest = place.parent, place.name / rest

@@ -348,7 +348,7 @@ def load_camera(name: str) -> Camera:
     if own := built_in.get(built_in_name(name) or ""):
         return _built_in(own)
     path = Path(name)
-    if path.suffix != ".toml" and os.path.isfile(path):  # which no name makes fail
+    if path.suffix != ".toml" and os.path.isfile(path):
         raise RequestError(
             f"{path}: it is no camera profile, which ends in .toml; to make one of a DNG or a "
             "noise model, use 'clpipe cameras import'"

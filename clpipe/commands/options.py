@@ -181,7 +181,8 @@ class ExistingPath(click.Path):
     """A file or folder that is read."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        check_input(Path(value))
+        if not (ctx and ctx.resilient_parsing):
+            check_input(Path(value))
         return super().convert(value, param, ctx)
 
 
