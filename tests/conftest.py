@@ -197,6 +197,23 @@ def write_exr(tmp_path: Path) -> Callable[..., Path]:
     return write
 
 
+@pytest.fixture
+def renders(
+    write_exr: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., str]:
+    """Write small renders of two sizes into a folder of the working directory, an empty one."""
+    monkeypatch.chdir(tmp_path)
+
+    def write(count: int = 6, folder: str = "in") -> str:
+        rng = np.random.default_rng(0)
+        for i in range(count):
+            size = (24, 32) if i % 2 else (17, 40)
+            write_exr(f"{folder}/r{i:03}.exr", rng.random((*size, 3)).astype(np.float32))
+        return folder
+
+    return write
+
+
 @pytest.fixture(scope="session")
 def two_renders(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two small renders, one of them in a folder of the folder."""

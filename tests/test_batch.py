@@ -57,20 +57,6 @@ from tests.held import (
 RUN = ("-o", "out", "--iso", 3200)
 
 
-@pytest.fixture
-def renders(write_exr):
-    """A folder of small renders of two sizes."""
-
-    def write(count=6, folder="in"):
-        rng = np.random.default_rng(0)
-        for i in range(count):
-            size = (24, 32) if i % 2 else (17, 40)
-            write_exr(f"{folder}/r{i:03}.exr", rng.random((*size, 3)).astype(np.float32))
-        return folder
-
-    return write
-
-
 def worker_of(folder):
     """A worker that makes PNGs of the renders in a folder, and its jobs."""
     loader = ImageLoader(Request.from_options(formats=("png",)))

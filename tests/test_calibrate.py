@@ -131,14 +131,13 @@ def test_standard_errors_are_the_scatter_of_repetitions():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("poisson", [False, True])
-def test_two_noisy_frames_give_no_flat_line(poisson):
+def test_two_noisy_frames_give_no_flat_line():
     # The mean of two frames is as noisy as can be; a plain least-squares line through it would be
     # several per cent too flat.
     light = np.full((256, 256), 0.1)
     light[:, 128:] = 0.02
     many = [
-        calibrate(100, frames(light, 2, 40.0, 40.0, poisson=poisson, seed=s), None, SENSOR)
+        calibrate(100, frames(light, 2, 40.0, 40.0, poisson=True, seed=s), None, SENSOR)
         for s in range(15)
     ]
     gains = np.array([c.pooled.gain.value for c in many])
@@ -311,11 +310,10 @@ def test_frames_that_cannot_tell_are_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("gain", "read"), [(0.5, 3.0), (40.0, 41.0)])
-def test_a_single_image(gain, read):
-    found = calibrate(100, frames(scene(384, 512), 1, gain, read), None, SENSOR)
-    assert off(found.pooled.gain, gain)[0] < 0.06
-    assert off(found.read_noise, read)[0] < 0.15
+def test_a_single_image():
+    found = calibrate(100, frames(scene(384, 512), 1, 0.5, 3.0), None, SENSOR)
+    assert off(found.pooled.gain, 0.5)[0] < 0.06
+    assert off(found.read_noise, 3.0)[0] < 0.15
     assert found.row_noise is None and found.hot is None
 
 

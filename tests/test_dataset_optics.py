@@ -56,8 +56,9 @@ def depth_of(write_exr, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("device", [None, "numpy"])
-@pytest.mark.parametrize("kind", WHOLE)
+@pytest.mark.parametrize(
+    ("device", "kind"), [("numpy", "defocus"), ("numpy", "overscan"), (None, "both")]
+)
 @pytest.mark.filterwarnings("ignore:.*pixels are spread")
 def test_samples_and_patches_are_what_a_run_and_a_pipeline_make(clpipe, depth_of, device, kind):
     depth, settings = depth_of(), WHOLE[kind]

@@ -37,20 +37,6 @@ ImageWorker.decode = planted
 """
 
 
-@pytest.fixture
-def renders(write_exr, tmp_path, monkeypatch):
-    """A folder of small renders of two sizes."""
-    monkeypatch.chdir(tmp_path)
-
-    def write(count):
-        rng = np.random.default_rng(0)
-        for i in range(count):
-            size = (24, 32) if i % 2 else (17, 40)
-            write_exr(f"in/r{i:03}.exr", rng.random((*size, 3)).astype(np.float32))
-
-    return write
-
-
 def is_running(pid):
     """Whether a process exists and is no zombie, which has no command any more."""
     try:
@@ -93,37 +79,37 @@ def test_two_processes_make_the_bytes_of_one(clpipe, renders):
 
 
 def test_a_process_that_is_killed_takes_nothing_with_it(clpipe, renders):
-    renders(60)
+    renders(30)
     clpipe("run", "in", "-o", "whole", *RUN[2:])
     process, others = held_run()
     os.kill(others[0], signal.SIGKILL)
     Path(GO).touch()
-    assert "60 of 60 images done" in finish(process)
+    assert "30 of 30 images done" in finish(process)
     assert process.returncode == 0
     assert contents("out") == contents("whole")
     assert not [name for name in written(Path("out")) if ".part." in name]
 
 
 def test_processes_end_with_the_one_that_started_them(clpipe, renders):
-    renders(60)
+    renders(30)
     process, others = held_run()
     process.kill()
     finish(process)
     wait_until(lambda: not any(map(is_running, others)), "the end of the other processes")
     assert pictures() <= 20
     told = clpipe("run", "in", *RUN)
-    assert "60 of 60 images done (" in told.stderr
+    assert "30 of 30 images done (" in told.stderr
 
 
 def test_stopped_once_what_is_begun_is_finished(renders):
-    renders(100)
+    renders(60)
     process, _ = held_run()
     interrupt(process)
     Path(GO).touch()
     assert "not begun" in finish(process)
     assert process.returncode == 130
     found = written(Path("out"))
-    assert 2 * (20 + 2) <= len(found) < 200
+    assert 2 * (20 + 2) <= len(found) < 120
     assert {Path(n).stem for n in found if n.endswith("json")} == {
         Path(n).stem for n in found if n.endswith("jpg")
     }
@@ -207,7 +193,7 @@ ImageWorker.decode = lambda *arguments: os._exit(9)
 
 
 def test_processes_that_all_die_end_the_run(renders, monkeypatch):
-    renders(60)
+    renders(20)
     monkeypatch.setattr(processes, "START", f"exec({ALWAYS!r}); {processes.START}")
     monkeypatch.setattr(processes, "FUTILE", 4)
     with pytest.raises(DeviceError, match=r"4 processes in a row ended before .* with status 9"):

@@ -148,8 +148,8 @@ def test_6_a_batch_goes_on_and_the_terminal_is_safe(clpipe, render):
 @pytest.mark.slow
 def test_faults_of_all_kinds_in_small():
     """A few of the faults of tools/stress/faults.py; the whole of it takes an hour."""
-    command = [sys.executable, "-m", "tools.stress.faults", "--images", "8", "--repeats", "2"]
+    command = [sys.executable, "-m", "tools.stress.faults", "--images", "8", "--repeats", "1"]
     faults = ("full", "power")
     done = subprocess.run([*map(str, command), "--device", "numpy", *faults], capture_output=True)
     assert done.returncode == 0, done.stdout.decode()[-2000:] + done.stderr.decode()[-2000:]
-    assert done.stdout.count(b"2 times") == len(faults)
+    assert done.stdout.count(b"1 times") == len(faults)

@@ -102,13 +102,15 @@ def test_every_module_loads(tmp_path):
     [(TAKE_AWAY, ("--device", "numpy"), ("1/2", "2/2")), (FOR_POCL, (), ("1/1",))],
     ids=["numpy", "default"],
 )
-def test_a_batch_runs_resumes_and_has_the_same_bytes(tmp_path, write_exr, taken, device, shards):
+def test_a_batch_runs_resumes_and_has_the_same_bytes(
+    tmp_path, clpipe, write_exr, taken, device, shards
+):
     random = np.random.default_rng(3)
     for name in ("in/a.exr", "in/b/c.exr"):
         write_exr(name, random.random((12, 16, 3), np.float32))
     noise, files = ("--iso", 3200, "--seed", 5), ("--truth", "clean", "--keep", "quantize")
     run = ("run", "in", *noise, *files, "--format", "png", *device, "-o")
-    python(RUN, *run, "usual", cwd=tmp_path)
+    clpipe(*run, "usual")
     for shard in shards:
         python(taken + RUN, *run, "out", "--shard", shard, cwd=tmp_path)
     again = python(taken + RUN, *run, "out", cwd=tmp_path)
