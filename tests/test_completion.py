@@ -106,6 +106,7 @@ IMPORTS = {
     "import clpipe.commands.plan": ("numpy", "pydantic"),
     "import clpipe.commands.devices": ("numpy", "pydantic", "pyopencl"),
     "import clpipe.pipeline": ("numpy", "pydantic", "pyopencl"),
+    "import clpipe.commands.match": {*HEAVY} - {"matplotlib"},
 }
 
 

@@ -155,24 +155,20 @@ def test_a_polarised_array_has_no_colours():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("array", ["x-trans", "RGBW"])
-def test_the_raw_is_the_same_bit_for_bit(device, scalar_device, array):
+@pytest.mark.parametrize(("array", "lanes"), [("x-trans", "many"), ("RGBW", "one")])
+def test_the_raw_is_the_same_bit_for_bit(device, scalar_device, array, lanes):
     until = {"stages": [*settings_from({}).stages[:25]], **NOISE}
     chain = on(array, **until)
     assert chain.steps[-1].name == "quantize"
-    for each in (device, scalar_device):
-        found = compare(each, chain, [(37, 53), (1, 40), (40, 1)], half=True)
-        assert (found.largest, found.differing) == (0, 0)
+    on_device = scalar_device if lanes == "one" else device
+    found = compare(on_device, chain, [(37, 53), (1, 40), (40, 1)], half=True)
+    assert (found.largest, found.differing) == (0, 0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("array", "method"),
-    [
-        ("x-trans", "linear_mmse"),
-        ("RGB/GBR/BRG", "linear_mmse"),
-        ("x-trans", "directional_mmse"),
-    ],
+    [("RGB/GBR/BRG", "linear_mmse"), ("x-trans", "directional_mmse")],
 )
 def test_tiles_and_patches_have_the_bits_of_the_whole(device, monkeypatch, array, method):
     stages = ["mosaic", "inverse_white_balance", "white_balance", "demosaic"]

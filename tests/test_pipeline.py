@@ -38,8 +38,8 @@ def runner(settings, device, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("settings", SETTINGS)
-@pytest.mark.parametrize("shape", [(67, 101), (1, 40), (3, 3)])
+@pytest.mark.parametrize("settings", SETTINGS[1::2])
+@pytest.mark.parametrize("shape", [(67, 101), (1, 40)])
 def test_what_is_kept_changes_no_bit(device, still_life, settings, shape):
     image = np.ascontiguousarray(still_life[200 : 200 + shape[0], 300 : 300 + shape[1]])
     plain = runner(settings, device)
@@ -280,7 +280,7 @@ def judged(device, still_life):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("iso", [1600, 3200, 12800])
+@pytest.mark.parametrize("iso", [1600, 12800])
 def test_non_local_means_is_the_best_denoiser(judged, iso):
     noisy = judged(iso, skip=["denoise"])
     others = {name: judged(iso, denoise={"method": name}) for name in ("mean", "median")}
