@@ -134,7 +134,8 @@ def read_image(
     pixels, stated = decoded.pixels, decoded.stated
     warnings = list(stated.warnings_with("linear"))
     if count := make_finite(pixels):
-        warnings.append(f"{count} samples were NaN or infinite and were set to 0")
+        were = "sample was" if count == 1 else "samples were"
+        warnings.append(f"{count} {were} NaN or infinite and {were.split()[1]} set to 0")
     if pixels.ndim == 2 and not mosaic:
         pixels = np.stack([pixels] * 3, axis=-1)
         warnings.append(GREY)
