@@ -284,6 +284,17 @@ def test_grey_pictures(tmp_path, ending):
     assert np.asarray(Image.open(tmp_path / "out" / "a.png")).shape == (HEIGHT, WIDTH, 3)
 
 
+def test_a_grey_picture_of_eight_bits_is_measured(tmp_path):
+    random = np.random.default_rng(0)
+    for name in ("truth", "noisy"):
+        pixels = np.full((64, 64), 128.0) + (name == "noisy") * random.normal(0, 8, (64, 64))
+        Image.fromarray(pixels.round().astype(np.uint8)).save(tmp_path / f"{name}.png")
+    truth = ("--truth", tmp_path / "truth.png", "--json")
+    report = json.loads(run_cli("measure", tmp_path / "noisy.png", *truth).stdout)
+    sigma = report["channels"]["R"]["sigma_picture"]
+    assert sigma * 255 == pytest.approx(8, rel=0.05)
+
+
 def test_one_bit_and_sixteen_bits_in_grey(tmp_path):
     Image.fromarray(X > 3).save(tmp_path / "bit.png")
     assert np.array_equal(read(tmp_path / "bit.png", "srgb").pixels[..., 0], X > 3)

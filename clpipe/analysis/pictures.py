@@ -71,9 +71,9 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
             f"{path}: a camera raw, which is not read here; give what 'clpipe run' makes of it: "
             "'--format png' develops it, '--keep normalize' keeps its mosaic"
         )
-    finished = read_finished(path)
+    iso, bits = photograph_facts(path)
+    finished = read_finished(path, grey=bits == 8)  # grey of more bits may be a mosaic
     if finished is not None:
-        iso, bits = photograph_facts(path)
         step = 1 / (2**bits - 1)
         return Picture(path, "display", finished.pixels, black=0.0, white=1.0, iso=iso, step=step)
     mosaic = holds_mosaic(path)
