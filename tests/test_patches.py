@@ -158,6 +158,8 @@ def test_a_grid_covers_the_picture(augment):
     cutting = Cutting(8, 37, 24, "RGGB", augment)
     covered = np.zeros((24, 37), int)
     for patch in cutting.in_grid(range(cutting.count), "owner"):
+        place = first_place("RGGB", patch.orientation, 8)
+        assert (patch.left % 2, patch.top % 2) == place
         covered[patch.top : patch.top + 8, patch.left : patch.left + 8] += 1
     assert cutting.count == 15
     assert augment or (covered[:, :36].all() and not covered[:, 36].any())

@@ -5,7 +5,7 @@ import pytest
 
 import clpipe
 from clpipe.images.read import read_image
-from tests.conftest import STILL_LIFE
+from tests.conftest import ROOT, STILL_LIFE
 from tests.photographs import photographs
 from tools.pages import quality
 
@@ -35,6 +35,12 @@ def test_every_published_method_is_compared():
 def test_demosaicing_is_as_good_as_independent_implementations(name, figure):
     choice, _ = quality.DEMOSAIC[name]
     assert quality.demosaicing(photographs(), choice) == pytest.approx(figure, abs=0.02)
+
+
+@pytest.mark.parametrize("name", ["linear_mmse", "malvar2004", "directional_mmse"])
+def test_the_page_says_what_the_photographs_show(name):
+    found = quality.demosaicing(photographs(), {"method": name})
+    assert f"{found:.2f} dB" in (ROOT / "docs/quality.md").read_text()
 
 
 def test_cpsnr():
