@@ -298,7 +298,11 @@ def test_compressions(tmp_path, compression, tile, format_):
     assert file.open(str(path), spec)
     assert file.write_image(pixels.astype(np.float32))
     assert file.close()
-    assert np.allclose(read_image(path).pixels, pixels, atol=0.01)
+    stored = oiio.ImageInput.open(str(path)).spec()
+    assert stored.tile_width == tile
+    assert stored.getattribute("compression").split(":")[0] == compression
+    lossy = compression in ("b44", "b44a", "dwaa", "dwab")
+    assert np.abs(read_image(path).pixels - pixels).max() < (0.01 if lossy else 6e-4)
 
 
 def test_pfm_stands_on_its_feet(tmp_path):
@@ -355,26 +359,3 @@ def test_a_transfer_is_that_of_a_render(tmp_path):
     command = ["run", str(tmp_path), "-o", "out", "--transfer", "srgb", "-c", "unprocess"]
     result = CliRunner().invoke(main, command)
     assert result.exit_code == 2 and "--transfer: it is for renders" in result.output
-
-
-@pytest.mark.parametrize(
-    "compression", ["none", "rle", "zip", "zips", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab"]
-)
-@pytest.mark.parametrize("tiled", [False, True])
-def test_every_compression_in_scanlines_and_tiles(tmp_path, compression, tiled):
-    path = tmp_path / "render.exr"
-    y, x = np.mgrid[0:40, 0:56] / 56
-    pixels = np.stack([x, y, 0.5 + 0 * x], axis=-1).astype(np.float32)
-    spec = oiio.ImageSpec(56, 40, 3, oiio.HALF)
-    spec.attribute("compression", compression)
-    buffer = oiio.ImageBuf(spec)
-    assert buffer.set_pixels(oiio.ROI(), pixels)
-    if tiled:
-        buffer.set_write_tiles(16, 16)
-    assert buffer.write(str(path)), buffer.geterror()
-    written = oiio.ImageInput.open(str(path)).spec()
-    assert (written.tile_width == 16) is tiled
-    assert written.getattribute("compression").split(":")[0] == compression
-    found = read_image(path).pixels.astype(np.float32)
-    lossy = compression in ("b44", "b44a", "dwaa", "dwab")
-    assert np.abs(found - pixels).max() < (0.03 if lossy else 6e-4)
