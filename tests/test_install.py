@@ -58,7 +58,7 @@ def test_the_sdist_has_all_that_lies_beside_the_package():
     ("command", "message"),
     [
         (("calibrate", "a.dng", "-o", "c.toml"), "clpipe calibrate needs scipy and matplotlib"),
-        (("measure", "a.exr", "--plot", "a.png"), "--plot needs matplotlib"),
+        (("measure", STILL_LIFE, "--plot", "a.png"), "--plot needs matplotlib"),
         (("run", STILL_LIFE, "-o", "out", "--dask", "tcp://x:1"), "--dask needs distributed"),
     ],
 )

@@ -172,6 +172,19 @@ def test_whatever_a_forged_sidecar_holds_no_command_ends_in_a_traceback(made, cl
             assert "unexpected" not in again.stderr, (key, odd)
 
 
+FORGED = [
+    *(("photometry", value) for value in ([1], {}, {"response": 3})),
+    *(("motion", value) for value in ([1], {"first_row": 1}, {"exposure_time": 1.0})),
+]
+
+
+@pytest.mark.parametrize(("key", "value"), FORGED)
+def test_forged_light_and_motion_leave_a_picture_out(made, clpipe, key, value):
+    made()
+    reseal(Path("out/a.json"), {**read_sidecar(Path("out/a.json")), key: value})
+    assert "damaged or of another version" in clpipe("poses", "out", status=(0, 1, 2)).output
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("key", ["iso", "noise", "width", "camera", "outputs"])
 def test_a_card_goes_without_what_a_forged_sidecar_holds(clpipe, write_exr, key):

@@ -26,6 +26,7 @@ CHANGED = "a sidecar that was changed since clpipe wrote it"
 CAMERA = TypeAdapter(Intrinsics)
 
 POSE: TypeAdapter[tuple[Matrix, Vector]] = TypeAdapter(tuple[Matrix, Vector])
+TABLE: TypeAdapter[dict[str, Any] | None] = TypeAdapter(dict[str, Any] | None)
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
                 r_and_t = pose and POSE.validate_python((pose["R"], pose["t"]))
                 depth = _depth_of(path, values)
                 below = depth.relative_to(folder).as_posix() if depth else ""
-                told = values["photometry"], values.get("motion"), str(values["name"]), below
+                told = *_light_and_motion(values), str(values["name"]), below
                 yield Photograph(shown, role, simplest(camera), r_and_t, *told)
             except SidecarError:
                 left_out[f"{CHANGED}, so not used; the same clpipe run makes it again"].append(
@@ -95,6 +96,25 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
                 continue
             except (KeyError, TypeError, ValueError):
                 left_out["a sidecar that is damaged or of another version"].append(shown)
+
+
+def _light_and_motion(
+    values: Mapping[str, Any],
+) -> tuple[Mapping[str, Any] | None, Mapping[str, Any] | None]:
+    """The photometry of a sidecar's picture, and the motion while it was exposed.
+
+    Raises:
+        KeyError, TypeError, ValueError: the values are damaged.
+    """
+    photometry = TABLE.validate_python(values["photometry"])
+    motion = TABLE.validate_python(values.get("motion"))
+    if photometry is not None:
+        TABLE.validate_python(photometry["response"])
+    if motion:
+        for name in ("first_row", "last_row"):
+            POSE.validate_python((motion[name]["R"], motion[name]["t"]))
+        float(motion["exposure_time"]), float(motion["readout_time"])
+    return photometry, motion
 
 
 def picture_of(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
