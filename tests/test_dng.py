@@ -95,6 +95,8 @@ def test_libraw_reads_the_very_dn(scene, tmp_path, pattern, size):
 def test_what_it_says_of_itself(tmp_path):
     shot = {"focal_length": 24, "sensor_width": 18, "exposure_time": 0.008}
     options = [o for k, v in shot.items() for o in ("--set", f"render.{k}={v}")]
+    # The picture's own balance does not reach the raw.
+    options += ("--set", "white_balance.method=gains", "--set", "white_balance.red_gain=2")
     clpipe("run", STILL_LIFE, "-o", tmp_path, "--iso", 1600, "--format", "dng", *options)
     path = tmp_path / "still_life.dng"
     first, raw = directories(path)

@@ -22,7 +22,7 @@ CHAINS = {
     "default": {"row_noise": {"sigma": 0.002}},
     "others": {
         "stages": [
-            "distortion",
+            "resize",
             "exposure",
             "mosaic",
             "quantize",
@@ -30,7 +30,7 @@ CHAINS = {
             "demosaic",
             "gamma",
         ],
-        "distortion": {"method": "brown_conrady", "k1": -0.1, "fx": 60.0},
+        "resize": {"scale": 0.5},
         "exposure": {"method": "auto"},
         "mosaic": {"method": "array", "array": "x-trans"},
     },
