@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 import clpipe as clpipe_api
+from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.camera import lens as by_name
 from clpipe.camera.optics import Optics
@@ -261,6 +262,7 @@ def lensfun(monkeypatch):
     """A database of one lens."""
 
     def use(calibration):
+        monkeypatch.setattr("clpipe.chain.families.FAMILIES", BoundedCache(8))  # of other lenses
         monkeypatch.setattr("clpipe.chain.making.calibration_of", lambda *given: calibration)
 
     use(CALIBRATED)

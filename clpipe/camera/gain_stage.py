@@ -1,10 +1,15 @@
 """A gain stage: what was measured of a sensor at the ISOs that share one conversion gain."""
 
+import math
+from bisect import bisect_right
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from clpipe.base.tracing import call
 
 LARGEST = 1e9  # figure of a sensor; its square is a number, too
 Positive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False)]
@@ -49,21 +54,27 @@ class GainStage(BaseModel):
         The table is converted to electrons and interpolated linearly in log ISO; outside the
         table, the value in electrons stays that of the nearest end.
         """
-        electrons = self.between(iso, tuple(np.divide(values, self.system_gain)))
+        per_gain = zip(values, self.system_gain, strict=True)
+        electrons = self.between(iso, [value / gain for value, gain in per_gain])
         return electrons * self.gain_at(iso)
 
-    def between(self, iso: float, values: tuple[float, ...]) -> float:
+    def between(self, iso: float, values: Sequence[float]) -> float:
         """The value of a table without a unit at an ISO: linear in log ISO, level beyond its ends.
 
         >>> stage = GainStage(iso=(100, 400), system_gain=(1, 4), read_noise=(2, 3))
         >>> round(stage.between(200, (0.1, 0.2)), 6), stage.between(800, (0.1, 0.2))
         (0.15, 0.2)
         """
-        return float(np.interp(np.log(iso), np.log(self.iso), values))
+        return call(_interpolated, iso, self.iso, self._logs, values)
+
+    @cached_property
+    def _logs(self) -> list[float]:
+        return [math.log(iso) for iso in self.iso]
 
     def gain_at(self, iso: float) -> float:
         """The system gain in DN/e-, interpolated in proportion to the ISO."""
-        return self.between(iso, tuple(np.divide(self.system_gain, self.iso))) * iso
+        per_iso = zip(self.system_gain, self.iso, strict=True)
+        return self.between(iso, [gain / of for gain, of in per_iso]) * iso
 
     @cached_property
     def adc_noise(self) -> float:
@@ -79,3 +90,15 @@ class GainStage(BaseModel):
         terms = np.stack([np.square(self.system_gain) / read2, 1 / read2], axis=1)
         _, after2 = np.linalg.lstsq(terms, np.ones(len(read2)))[0]
         return float(np.sqrt(np.clip(after2, 0, read2.min())))
+
+
+def _interpolated(
+    iso: float, isos: Sequence[float], logs: Sequence[float], values: Sequence[float]
+) -> float:
+    """The value at an ISO of a table; see :meth:`GainStage.between`."""
+    after = bisect_right(isos, iso)
+    if after in (0, len(isos)):
+        return values[0 if after == 0 else -1]
+    x, y = logs[after - 1], values[after - 1]
+    slope = (values[after] - y) / (logs[after] - x)
+    return slope * (math.log(iso) - x) + y

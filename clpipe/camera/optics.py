@@ -75,8 +75,9 @@ class Optics:
             first = places.setdefault(name, place)
             in_px = name in IN_PIXELS
             tolerance, least = (PLACES, 0.01) if in_px else (ROUNDING, 0.0)
-            if not math.isclose(value, known, rel_tol=tolerance, abs_tol=least):
-                raise KeyedError(place, f"{place}: {value:g}, but {first}: {known:g}; set one")
+            if value is known or math.isclose(value, known, rel_tol=tolerance, abs_tol=least):
+                continue
+            raise KeyedError(place, f"{place}: {value:g}, but {first}: {known:g}; set one")
         return cls(**values, places=places)
 
     def with_lens(self, lens: LensCalibration) -> "Optics":

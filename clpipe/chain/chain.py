@@ -1,11 +1,13 @@
 """A chain: settings resolved for a camera, an ISO and each stage's place, ready to plan."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
+from clpipe.base.tracing import NotTraceableError, Trace, altered
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.optics import Optics
 from clpipe.camera.profile import Camera
@@ -19,6 +21,7 @@ from clpipe.reference.intrinsics import Intrinsics
 from clpipe.reference.random import Stream, stream_of
 from clpipe.reference.resample import Resampler, sizes
 from clpipe.stage import (
+    Arguments,
     Context,
     Kind,
     Method,
@@ -29,6 +32,9 @@ from clpipe.stage import (
     Stage,
     StageRole,
 )
+
+if TYPE_CHECKING:
+    from clpipe.chain.families import Family
 
 
 @dataclass(frozen=True)
@@ -50,9 +56,19 @@ class Step:
         return self.method.passes()
 
     @cached_property
+    def arguments(self) -> Arguments:
+        """The kernel arguments of its method, by name."""
+        return self.method.arguments(self.context)
+
+    @cached_property
     def adds_noise(self) -> bool:
         """Whether it adds noise, as its method says."""
         return self.method.without_noise() is not self.method
+
+    def is_equal(self, other: "Step") -> bool:
+        """Whether another step does the same, with the same numbers."""
+        optics = self.context.optics, other.context.optics
+        return self == other and optics[0] == optics[1] and self.passes == other.passes
 
     def __repr__(self) -> str:
         return f"Step({self.name}, {self.method.method})"
@@ -72,6 +88,11 @@ class Chain:
     names: tuple[str, ...]  # of all steps, with those before start_at and after until
     draws: Mapping[str, Draw] = field(default_factory=dict)  # the settings are an example of these
     margins: Margins = NO_MARGINS  # of what enters, beyond the picture
+    # Of a chain that was computed as one of a family: see clpipe.chain.families.
+    family: "Family | None" = field(default=None, init=False)
+    numbers: Sequence[Any] = field(default=(), init=False)
+    # Steps of which a part is the same in chains that share this object; None is only this chain.
+    structure: object = field(default=None, init=False)
 
     def __repr__(self) -> str:
         return f"Chain({self.settings.label}, {self.label})"
@@ -173,6 +194,39 @@ class Chain:
         """Whether a step draws random numbers."""
         return any(p.random for s in self.steps for p in s.passes)
 
+    def in_family(self, family: "Family", numbers: Sequence[Any]) -> "Chain":
+        """The chain as one of a family, with its numbers."""
+        return altered(self, {"family": family, "numbers": numbers})
+
+    def with_settings(self, settings: Settings) -> "Chain":
+        """The chain with the settings that it was made of."""
+        return altered(self, {"settings": settings})
+
+    def settled(self, trace: Trace) -> "Chain":
+        """The chain with all that is computed of its steps, as far as it can be traced."""
+        is_whole = True
+        for step in self.steps:
+            is_whole &= not trace.holds(step.passes)
+            _ = step.adds_noise
+            try:
+                with trace.attempt():
+                    _ = step.arguments
+            except NotTraceableError:
+                vars(step).pop("arguments", None)
+                is_whole = False
+        _ = self.geometry, self._resamplings
+        return altered(self, {"structure": object() if is_whole else None})
+
+    def is_equal(self, other: "Chain") -> bool:
+        """Whether another chain has the same steps, with the same numbers."""
+        return len(self.steps) == len(other.steps) and all(
+            map(Step.is_equal, self.steps, other.steps)
+        )
+
+    def _derived(self, make: Callable[["Chain"], "Chain"]) -> "Chain":
+        """Return ``make(self)``, computed where the chain is one of a family."""
+        return self.family.derived(make, self) if self.family else make(self)
+
     def without_noise(self) -> "Chain":
         """The chain without the noise of its steps.
 
@@ -181,6 +235,9 @@ class Chain:
         Raises:
             RequestError: no step adds noise.
         """
+        return self._derived(Chain._without_noise)
+
+    def _without_noise(self) -> "Chain":
         left = [(step, step.method.without_noise()) for step in self.steps]
         if all(method is step.method for step, method in left):
             raise RequestError(
@@ -195,6 +252,9 @@ class Chain:
         Raises:
             RequestError: a user's stage does not allow it.
         """
+        return self._derived(Chain._cleaned)
+
+    def _cleaned(self) -> "Chain":
         left = []
         for step in self.steps:
             name, folder = step.name, step.stage.folder

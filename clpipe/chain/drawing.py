@@ -7,13 +7,11 @@ import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from clpipe.base.errors import KeyedError
 from clpipe.base.text import one_of
 from clpipe.chain.draws import Choice, Draw, Limits, parse_draw
 from clpipe.chain.keys import DRAWABLE, KEYS
-from clpipe.reference.random import philox, stream_of
+from clpipe.reference.random import philox_rounds, stream_of
 
 LimitsOf = Callable[[str], Limits | None]  # by the dotted name of a value
 
@@ -107,9 +105,8 @@ def uniforms(owner: str, names: Iterable[str]) -> dict[str, float]:
     >>> {name: round(u, 3) for name, u in uniforms("draw:0:a.exr", ["iso", "camera"]).items()}
     {'iso': 0.282, 'camera': 0.608}
     """
-    listed = list(names)
-    stage = np.array([zlib.crc32(name.encode()) for name in listed], np.uint32)
-    zero = np.zeros(1, np.uint32)
-    high, low, *_ = philox(zero, zero, zero, stage, stream_of(owner, ""))
-    bits = (high.astype(np.uint64) << np.uint64(20)) | (low.astype(np.uint64) >> np.uint64(12))
-    return dict(zip(listed, ((bits + 0.5) * 2.0**-52).tolist(), strict=True))
+    stream, numbers = stream_of(owner, ""), {}
+    for name in names:
+        high, low, *_ = philox_rounds(0, 0, 0, zlib.crc32(name.encode()), stream)
+        numbers[name] = ((high << 20 | low >> 12) + 0.5) * 2.0**-52
+    return numbers

@@ -5,14 +5,16 @@ from functools import partial
 
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
+from clpipe.base.tracing import altered
 from clpipe.camera.lens import calibration_of
 from clpipe.camera.optics import IN_PIXELS, Optics
 from clpipe.camera.profile import Camera, load_camera
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.exposures import check_exposures
+from clpipe.chain.families import chain_of_family
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import LENS, NOISE, RENDER
-from clpipe.chain.methods import base_name, numbered, validation_errors
+from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, stage_in, user_code_errors
 from clpipe.chain.settings import Settings
 from clpipe.reference.geometry import Scaling
@@ -56,6 +58,23 @@ def make_chain(
     check_cameras(settings)
     draws, settings = settings.draws, settings.drawn("")
     camera = load_camera(settings.camera)
+    ends = source, start_at, until
+
+    def made(settings: Settings) -> Chain:
+        return _made(settings, camera, *ends)
+
+    chain = chain_of_family(settings, camera, ends, made)
+    return altered(chain, {"draws": draws}) if draws else chain
+
+
+def _made(
+    settings: Settings,
+    camera: Camera,
+    source: Kind | None,
+    start_at: str | None,
+    until: str | None,
+) -> Chain:
+    """See :func:`make_chain`; of settings without draws."""
     steps = resolved_steps(settings, camera, source or (None if start_at else entry(settings)))
     names = [step.name for step in steps]
     for name in settings.parameters:
@@ -77,7 +96,7 @@ def make_chain(
         )
     if source is None:
         source = steps[first].stage.reads
-    chain = Chain(tuple(steps[first:last]), source, camera, settings, tuple(names), draws)
+    chain = Chain(tuple(steps[first:last]), source, camera, settings, tuple(names))
     check_exposures(chain)
     _check_curve(chain)
     noiseless = NOISE in settings.skip and any(step.adds_noise for step in chain.steps)
@@ -96,15 +115,6 @@ def entry(settings: Settings) -> Kind:
     return Kind.DISPLAY if first and first.reads is Kind.DISPLAY else Kind.RGB
 
 
-def step_names(settings: Settings) -> list[str]:
-    """The names of the steps that are not skipped; a repeated stage gets a number.
-
-    >>> step_names(Settings(stages=("exposure", "mosaic", "exposure"), skip=("mosaic",)))
-    ['exposure', 'exposure_2']
-    """
-    return [name for name in numbered(settings.stages) if name not in settings.skip]
-
-
 def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:
     """The steps of settings, in order, each resolved with what the steps before it did.
 
@@ -118,7 +128,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     Raises:
         RequestError: image kinds do not fit.
     """
-    methods = {name: settings.method(name) for name in step_names(settings)}
+    methods = {name: settings.method(name) for name in settings.step_names}
     optics = optics_of(settings, camera, methods)
     time = optics.exposure_time
     light = light_of(methods, camera)

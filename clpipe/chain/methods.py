@@ -39,6 +39,12 @@ def numbered(stages: Sequence[str]) -> list[str]:
     return [f"{stage}_{count + 1}" if count else stage for stage, count in pairs]
 
 
+@lru_cache(maxsize=64)
+def step_names(stages: tuple[str, ...], skip: tuple[str, ...]) -> tuple[str, ...]:
+    """See :attr:`clpipe.chain.settings.Settings.step_names`."""
+    return tuple(name for name in numbered(stages) if name not in skip)
+
+
 def stage_named(key: str, name: str) -> Stage:
     """The stage of that name.
 

@@ -28,6 +28,7 @@ from clpipe.chain.methods import (
     method_named,
     parameter_names,
     stage_named,
+    step_names,
     unknown_parameter,
 )
 from clpipe.chain.paths import file_parameters, from_folder
@@ -146,6 +147,15 @@ class Settings:
         if model is None or validated is not table:
             model = make_method(stage_named(step, base_name(step)), step, table)
         return model
+
+    @property
+    def step_names(self) -> tuple[str, ...]:
+        """The names of the steps that are not skipped; a repeated stage gets a number.
+
+        >>> Settings(stages=("exposure", "mosaic", "exposure"), skip=("mosaic",)).step_names
+        ('exposure', 'exposure_2')
+        """
+        return step_names(self.stages, self.skip)
 
     @property
     def dump_format(self) -> Dump | None:

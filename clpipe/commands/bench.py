@@ -9,7 +9,6 @@ from clpipe.base.errors import RequestError
 from clpipe.base.processors import available_processors
 from clpipe.base.text import whole_number
 from clpipe.batch.bench import CPU_STEPS, BatchSpeed, bench_batch, loads
-from clpipe.chain.making import step_names
 from clpipe.chain.methods import base_name, stage_named
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import chain_options
@@ -73,7 +72,7 @@ def bench(
         )
     request = Request.from_options(**options)
     settings = request.settings()
-    if request.start_at is None and (names := step_names(settings)):
+    if request.start_at is None and (names := settings.step_names):
         reads = stage_named("--stages", base_name(names[0])).reads
         if len(reads.channels) == 1:  # such a chain has no renders as input
             request = replace(request, start_at=names[0])

@@ -114,12 +114,11 @@ class Runner:
         self.encode = encode
         self.final = final
         self.incremental = incremental
-        self._arguments = {s.name: s.method.arguments(s.context) for s in chain.steps}
+        self._arguments = {step.name: step.arguments for step in chain.steps}
         self._exposures = exposures_of(chain)
-        self._own_plans: dict[tuple[bool, ...], Plan] = {}
         self._estimates: BoundedCache[dict[str, dict[str, float]]] = BoundedCache(32)  # by size
         # Shared with the runners of other chains, by a chain's structure.
-        self._plans: BoundedCache[Plan] = BoundedCache(64)
+        self._plans: BoundedCache[Plan] = BoundedCache(256)
         self._tables: BoundedCache[Array] = BoundedCache(32)
 
     def for_chain(self, chain: Chain) -> "Runner":
@@ -143,13 +142,15 @@ class Runner:
     def plan(self, half: bool = True, fold: bool = True, planar: bool = False) -> Plan:
         """The plan for a source of half floats or floats, interleaved or in planes."""
         chain, key = self.chain, (half, fold, planar)
-        if key not in self._own_plans:
+
+        def plan() -> Plan:
             ops = chain_ops(chain, self._arguments)
             structure = (*key, chain.source, chain.result, ops)
             results = self.keep, self.encode, self.final
             options = chain, half, *results, fold, planar, self.incremental
-            self._own_plans[key] = self._plans.get(structure, lambda: make_plan(*options))
-        return self._own_plans[key]
+            return self._plans.get(structure, lambda: make_plan(*options))
+
+        return self._plans.get((*key, Identity(chain.structure or chain)), plan)
 
     def plan_for(self, image: Array) -> Plan:
         """The plan for an image."""

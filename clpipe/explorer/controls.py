@@ -10,7 +10,6 @@ from clpipe.base.errors import KeyedError
 from clpipe.camera.lens import INSTALL, lens_names
 from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.keys import ABOUT, LENS, TYPES
-from clpipe.chain.making import step_names
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
@@ -93,6 +92,6 @@ def camera_controls(others: Sequence[str]) -> list[dict[str, Any]]:
 
 def steps_of(settings: Settings) -> list[dict[str, Any]]:
     """All steps of settings in their order, those that are skipped as well, with their stages."""
-    on = set(step_names(settings))
-    every = step_names(Settings(stages=settings.stages))
+    on = set(settings.step_names)
+    every = Settings(stages=settings.stages).step_names
     return [{"name": name, "stage": base_name(name), "on": name in on} for name in every]

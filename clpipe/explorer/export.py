@@ -7,7 +7,6 @@ from typing import Any
 
 from clpipe.chain.files import config_text
 from clpipe.chain.keys import KEYS, TABLES
-from clpipe.chain.making import step_names
 from clpipe.chain.request import Request
 from clpipe.chain.toml import value_text
 from clpipe.explorer.explorer import Explorer
@@ -25,7 +24,7 @@ def exported(explorer: Explorer, image: int, values: Mapping[str, Any]) -> dict[
         ClpipeError: the values are not allowed.
     """
     request = explorer.request(values)
-    steps = step_names(request.settings())
+    steps = request.settings().step_names
     used = {key: v for key, v in values.items() if key in (*KEYS, *TABLES, *steps)}
     job, reading = explorer.job(image), _reading(request)
     files = [Path(file) for file in request.stage_files]

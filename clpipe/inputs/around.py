@@ -10,7 +10,6 @@ from clpipe.base.digests import joint_digest
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import unchanged
 from clpipe.base.types import Array
-from clpipe.chain.making import step_names
 from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import Settings
 from clpipe.images.read import SourceImage
@@ -74,7 +73,7 @@ class Rig:
 def wide_of(settings: Settings) -> Wide | None:
     """The wide lens that makes pictures of what is all around; None where there is none."""
     name = stage_in(StageRole.VIEW).name
-    if name not in step_names(settings):
+    if name not in settings.step_names:
         return None
     method = settings.method(name)
     return method if isinstance(method, Wide) else None

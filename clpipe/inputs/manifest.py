@@ -15,7 +15,6 @@ from clpipe.base.text import one_of
 from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import TABLES, check_type
-from clpipe.chain.making import step_names
 from clpipe.chain.methods import TABLE_MODELS, base_name
 from clpipe.chain.paths import from_folder
 from clpipe.chain.registry import all_stages
@@ -165,7 +164,7 @@ def check_rows(
         RequestError: a value that is not allowed, a camera or ISO that does not exist, or a stage
             that is not in the chain; the message is as for :func:`read_manifest`.
     """
-    steps = step_names(settings)
+    steps = settings.step_names
     faults: list[str] = []
     checked: list[Settings] = []
     known: dict[tuple[str, bool], Settings] = {}  # rows may share their values

@@ -12,7 +12,6 @@ from clpipe.base.digests import joint_digest
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import unchanged
 from clpipe.base.types import Array, Doubles, Floats
-from clpipe.chain.making import step_names
 from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import Settings
 from clpipe.images.read import SourceImage
@@ -30,7 +29,7 @@ def shutter_of(settings: Settings) -> Rows | None:
         RequestError: how many frames it averages is drawn.
     """
     name = stage_in(StageRole.SHUTTER).name
-    if name not in step_names(settings):
+    if name not in settings.step_names:
         return None
     if f"{name}.subframes" in settings.draws:
         raise RequestError(

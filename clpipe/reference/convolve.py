@@ -7,6 +7,7 @@ made of, so they are its mirror image.
 
 import numpy as np
 
+from clpipe.base.tracing import traceable
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.image import tap
 
@@ -35,6 +36,7 @@ def taps_of(spread: Doubles) -> Floats:
     return np.ascontiguousarray(np.hstack([places, weights]), np.float32)
 
 
+@traceable
 def reach_of(taps: Floats) -> int:
     """The largest distance of a tap along a row or a column, in px."""
     return int(abs(taps[:, :2]).max())

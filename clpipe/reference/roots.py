@@ -7,6 +7,7 @@ offset, in signal units, keeps the slope of the root finite at black.
 
 import numpy as np
 
+from clpipe.base.tracing import traceable
 from clpipe.base.types import Floats
 
 
@@ -40,6 +41,7 @@ def in_steps(root: Floats) -> Floats:
     return (np.maximum(root, np.float32(0)) + np.float32(12)) - np.float32(12)
 
 
+@traceable
 def noise_in_roots(sigma: float, level: float, offset: float) -> float:
     """The standard deviation in roots of noise of ``sigma`` at a level, all in signal units.
 

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.random import philox
 from clpipe.stage import (
@@ -82,10 +83,10 @@ class Sine(Method):
     def frequency(self) -> np.float32:
         """Of the wave, in turns a row."""
         assert self.period is not None
-        return np.float32(1 / self.period)
+        return float32(1 / self.period)
 
     def arguments(self, context: Context) -> Arguments:
-        return {"frequency": self.frequency, "amplitude": np.float32(self.amplitude)}
+        return {"frequency": self.frequency, "amplitude": float32(self.amplitude)}
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
         return before + np.float32(self.amplitude) ** 2 / np.float32(2)

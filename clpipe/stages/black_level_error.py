@@ -5,6 +5,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import BeforeValidator
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.random import normal_of_line
 from clpipe.stage import (
@@ -81,7 +82,7 @@ class Offsets(Method):
 
     def _places(self, pattern: str) -> dict[tuple[int, int], np.float32]:
         """The fixed offset of each place, by its column and row in the filter array."""
-        red, with_red, with_blue, blue = map(np.float32, self.bias or (0.0,) * 4)
+        red, with_red, with_blue, blue = map(float32, self.bias or (0.0,) * 4)
         green = with_red if "R" in pattern[:2] else with_blue
         others = with_blue if "R" in pattern[:2] else with_red
         own = {"R": (red, red), "B": (blue, blue), "G": (green, others)}
@@ -93,7 +94,7 @@ class Offsets(Method):
             "column_0": CompileTime("0u"),
             "column_1": CompileTime("1u"),
             **{f"bias_{column}{row}": bias for (column, row), bias in places.items()},
-            "sigma": np.float32(self.sigma),
+            "sigma": float32(self.sigma),
         }
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:

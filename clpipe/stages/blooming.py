@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.image import tap
 from clpipe.stage import (
@@ -64,8 +65,8 @@ class Column(Method):
         return (Pass("blooming", Stencil(REACH), ("full", "first", "spill")),)
 
     def arguments(self, context: Context) -> Arguments:
-        first, spill = np.float32((1 - self.spill) / 2), np.float32(self.spill)
-        return {"full": np.float32(self.full_signal), "first": first, "spill": spill}
+        first, spill = float32((1 - self.spill) / 2), float32(self.spill)
+        return {"full": float32(self.full_signal), "first": first, "spill": spill}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         full, spill = np.float32(self.full_signal), np.float32(self.spill)

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.image import tap
 from clpipe.stage import (
@@ -54,7 +55,7 @@ class Neighbours(Method):
         return (Pass("crosstalk", Stencil(1), ("share",)),) if self.share else ()
 
     def arguments(self, context: Context) -> Arguments:
-        return {"share": np.float32(self.share)}
+        return {"share": float32(self.share)}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         across = tap(image, -1, 0) + tap(image, 1, 0)

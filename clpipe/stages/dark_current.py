@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.math import negative_log, square_root
 from clpipe.reference.random import normal_at, word_at
@@ -105,7 +106,7 @@ class Thermal(Method):
             return 0.0
         warmer = (self.temperature or 0.0) - (self.reference_temperature or 0.0)
         factor = 2.0 ** (warmer / self.doubling) if self.doubling else 1.0
-        return float(self.current * factor * self.exposure_time)
+        return self.current * factor * self.exposure_time
 
     def passes(self) -> tuple[Pass, ...]:
         if not self.electrons:
@@ -131,7 +132,7 @@ class Thermal(Method):
         """The mean charge, its standard deviation over pixels, and an electron, in signal."""
         assert self.spread is not None and self.per_electron is not None
         mean = self.electrons * self.per_electron
-        return np.float32(mean), np.float32(mean * self.spread), np.float32(self.per_electron)
+        return float32(mean), float32(mean * self.spread), float32(self.per_electron)
 
     def arguments(self, context: Context) -> Arguments:
         mean, spread, electron = self._charge

@@ -10,6 +10,7 @@ from pydantic import field_validator
 
 from clpipe.base.errors import ImageError
 from clpipe.base.reading import check_regular
+from clpipe.base.tracing import float32
 from clpipe.base.types import Array, Floats
 from clpipe.reference.random import Stream, normal_of, philox
 from clpipe.stage import (
@@ -124,12 +125,12 @@ class Smooth(Method):
     def _amplitudes(self, iso: float) -> tuple[np.float32, np.float32]:
         """Of each product of the two maps, so that the standard deviation is what was said."""
         assert self.slope is not None and self.offset is not None
-        return np.float32(self.slope * iso / sqrt(2)), np.float32(self.offset / sqrt(2))
+        return float32(self.slope * iso / sqrt(2)), float32(self.offset / sqrt(2))
 
     @property
     def _per_px(self) -> np.float32:
         assert self.length is not None
-        return np.float32(1 / self.length)
+        return float32(1 / self.length)
 
     def arguments(self, context: Context) -> Arguments:
         slope, offset = self._amplitudes(context.iso)
@@ -237,7 +238,7 @@ class File(Method):
         own = self._map(context.iso)
         height, width = own.shape
         sizes = {"width": np.int32(width), "height": np.int32(height)}
-        return {"map": own, **sizes, "per_px": np.float32(1 / self.block)}
+        return {"map": own, **sizes, "per_px": float32(1 / self.block)}
 
     def without_noise(self) -> Method | None:
         return None if self.passes() else self

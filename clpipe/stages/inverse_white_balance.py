@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import by_site
 from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stage, StageRole
@@ -27,7 +28,7 @@ class Gains(CameraGains):
     def factors(self) -> tuple[np.float32, np.float32]:
         """The factors of red and blue."""
         red, blue = self.gains
-        return np.float32(1 / red), np.float32(1 / blue)
+        return float32(1 / red), float32(1 / blue)
 
     def resolve(self, context: Context) -> CameraGains:
         own = super().resolve(context)

@@ -1,11 +1,11 @@
 """Denoising before demosaicing, where the noise of different samples is still independent."""
 
-from math import sqrt
 from typing import ClassVar
 
 import numpy as np
 from pydantic import field_validator
 
+from clpipe.base.tracing import float32, sqrt
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import by_site
 from clpipe.reference.image import tap
@@ -123,13 +123,13 @@ class NonLocalMeans(Method):
         red, blue = context.applied_gains
         offset = max(0.375 * self.a**2 + self.b, 1e-12)
         return {
-            "red_inverse": np.float32(1 / red),
-            "blue_inverse": np.float32(1 / blue),
-            "red_gain": np.float32(red),
-            "blue_gain": np.float32(blue),
-            "a": np.float32(self.a),
-            "offset": np.float32(offset),
-            "root_of_offset": np.float32(sqrt(offset)),
+            "red_inverse": float32(1 / red),
+            "blue_inverse": float32(1 / blue),
+            "red_gain": float32(red),
+            "blue_gain": float32(blue),
+            "a": float32(self.a),
+            "offset": float32(offset),
+            "root_of_offset": float32(sqrt(offset)),
             "bias": bias_of(self.strength),
             "scale": decay_of(FACTOR * self.strength),
         }

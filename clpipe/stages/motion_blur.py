@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.errors import RequestError
+from clpipe.base.tracing import traceable
 from clpipe.base.types import Floats
 from clpipe.reference.convolve import convolve, reach_of, taps_of
 from clpipe.reference.turning import BILINEAR, Turning
@@ -29,6 +30,7 @@ LONGEST = 200.0  # px
 PARTS = 64  # of a pixel of a streak's length, that are placed one by one
 
 
+@traceable
 @lru_cache(maxsize=64)
 def streak(length: float, angle: float) -> Floats:
     """The taps of a straight streak, light at rest for the same time all along it.

@@ -6,6 +6,7 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.errors import RequestError
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.companding import along_pieces, knots_in, pieces_of
 from clpipe.stage import (
@@ -96,8 +97,8 @@ class Linear(Method):
 
     def arguments(self, context: Context) -> Arguments:
         assert self.black_level is not None and self.white_level is not None
-        scale = np.float32(1 / (self.white_level - self.black_level))
-        return {"black_level": np.float32(self.black_level), "scale": scale}
+        scale = float32(1 / (self.white_level - self.black_level))
+        return {"black_level": float32(self.black_level), "scale": scale}
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
         assert self.black_level is not None and self.white_level is not None

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import field_validator
 
 from clpipe.base.errors import ImageError
+from clpipe.base.tracing import int32, traceable
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.convolve import NEGLIGIBLE, blur, convolve, reach_of, taps_of
 from clpipe.stage import (
@@ -119,6 +120,7 @@ def measured(path: str) -> Doubles:
     return np.asarray(pixels / total)
 
 
+@traceable
 @lru_cache(maxsize=64)
 def half_of(sigma: float, low_pass: float, pixel_area: float) -> Floats:
     """The middle and one side of :func:`along`, without what is negligible; the whole of sum 1.
@@ -133,6 +135,7 @@ def half_of(sigma: float, low_pass: float, pixel_area: float) -> Floats:
     return np.asarray(kept / (2 * kept.sum() - kept[0]), np.float32)
 
 
+@traceable
 @lru_cache(maxsize=64)
 def line_taps(sigma: float, low_pass: float, pixel_area: float) -> tuple[Floats, Floats]:
     """The taps of :func:`half_of` along a row, and those along a column."""
@@ -141,6 +144,7 @@ def line_taps(sigma: float, low_pass: float, pixel_area: float) -> tuple[Floats,
     return taps_of(row), taps_of(row.transpose(1, 0, 2))
 
 
+@traceable
 @lru_cache(maxsize=64)
 def lens_taps(
     sigma: float, low_pass: float, pixel_area: float, f_number: float, pitch: float, psf: str
@@ -274,12 +278,12 @@ class Lens(Method):
     def arguments(self, context: Context) -> Arguments:
         lines = self._by_lines
         if lines is None:
-            return {"taps": self._taps, "count": np.int32(len(self._taps))}
+            return {"taps": self._taps, "count": int32(len(self._taps))}
         weights = half_of(*lines)
         if len(weights) - 1 <= UNROLLED:
             return {"reach": CompileTime(str(len(weights) - 1)), "weights": weights}
         across, down = line_taps(*lines)
-        return {"across": across, "down": down, "count": np.int32(len(across))}
+        return {"across": across, "down": down, "count": int32(len(across))}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         own = self.resolve(given.context)

@@ -15,6 +15,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import check_regular, parse_json, read_bytes
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.correlated import correlated_normals, mixing
 from clpipe.reference.curve import to_8_bit
@@ -209,7 +210,7 @@ class IidGaussian(IndependentNoise):
 
     def arguments(self, context: Context) -> Arguments:
         assert self.sigma is not None
-        sigmas = zip(("red", "green", "blue"), map(np.float32, self.sigma), strict=True)
+        sigmas = zip(("red", "green", "blue"), map(float32, self.sigma), strict=True)
         return {**dict(sigmas), **self.mixing_arguments()}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.tracing import float32, int32
 from clpipe.base.types import Floats
 from clpipe.reference.math import negative_log
 from clpipe.reference.random import word_at
@@ -80,11 +81,11 @@ class TwoLevels(Method):
         """The words below which a pixel is chosen, and 1 over their number."""
         assert self.share is not None
         limit = round(self.share * WORDS)
-        return np.int32(limit), np.float32(1 / max(limit, 1))
+        return int32(limit), float32(1 / max(limit, 1))
 
     def arguments(self, context: Context) -> Arguments:
         limit, scale = self._chosen
-        return {"limit": limit, "scale": scale, "amplitude": np.float32(self.amplitude)}
+        return {"limit": limit, "scale": scale, "amplitude": float32(self.amplitude)}
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
         """The mean variance over the sensor: share * E[A^2] / 4, E[A^2] = 2 amplitude^2."""

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stage, parameter
 from clpipe.stages.white_balance.gains import CameraGains
@@ -43,7 +44,7 @@ class Brooks2019(CameraGains):
         return (Pass("restore_highlights", arguments=("red_gain", "blue_gain")),)
 
     def arguments(self, context: Context) -> Arguments:
-        red, blue = map(np.float32, self.gains)
+        red, blue = map(float32, self.gains)
         return {"red_gain": red, "blue_gain": blue}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

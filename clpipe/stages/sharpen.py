@@ -5,6 +5,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
+from clpipe.base.tracing import float32, traceable
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.reference.image import tap
@@ -42,6 +43,7 @@ def blur_step(radius: float) -> int:
     return 1 if radius < 2 else 2
 
 
+@traceable
 @lru_cache(maxsize=64)
 def blur_weights(radius: float) -> Floats:
     """The weights of a Gaussian blur 0, 1, 2... steps away, to twice the radius, rounded.
@@ -132,10 +134,10 @@ class Unsharp(Method):
             "reach": CompileTime(str(self.reach)),
             "step": CompileTime(str(blur_step(self.radius))),
             "weights": blur_weights(self.radius),
-            "amount": np.float32(self.amount),
-            "threshold": np.float32(self.threshold),
-            "limit": np.float32(self.limit),
-            "offset": np.float32(self.offset),
+            "amount": float32(self.amount),
+            "threshold": float32(self.threshold),
+            "limit": float32(self.limit),
+            "offset": float32(self.offset),
         }
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

@@ -6,6 +6,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from pydantic import PrivateAttr
 
+from clpipe.base.tracing import float32, traceable
 from clpipe.base.types import Doubles, Floats
 from clpipe.camera.optics import USUAL_TIME
 from clpipe.stage import (
@@ -21,6 +22,11 @@ from clpipe.stage import (
     StageRole,
     parameter,
 )
+
+
+@traceable
+def _sinc(x: float) -> float:
+    return float(np.sinc(x))
 
 
 class Rows(InTime):
@@ -182,7 +188,7 @@ class Rows(InTime):
     def swing(self) -> float:
         """The flicker that is left after a row's exposure has averaged it."""
         if not self.flicker_duty:
-            return self.depth * float(np.sinc(self.cycles))
+            return self.depth * _sinc(self.cycles)
         return self.depth * (1 - self.flicker_duty) * (self.cycles % 1) / self.cycles
 
     def passes(self) -> tuple[Pass, ...]:
@@ -201,16 +207,16 @@ class Rows(InTime):
         start = self.flicker_frequency * self._longest * self._span.start
         start += self.flicker_phase / 360 - self.margins.top * step  # the picture's first row
         if not self.flicker_duty:
-            middle = np.float32((start + self.cycles / 2) % 1)
-            return {"step": np.float32(step), "start": middle, "swing": np.float32(self.swing)}
+            middle = float32((start + self.cycles / 2) % 1)
+            return {"step": float32(step), "start": middle, "swing": float32(self.swing)}
         whole = float(np.floor(self.cycles))
         return {
             "step": _turn(step),
             "start": _turn(start),
-            "rest": np.float32(self.cycles - whole),
-            "duty": np.float32(self.flicker_duty),
-            "steady": np.float32(1 - self.depth + self.depth * whole / self.cycles),
-            "scale": np.float32(self.depth / self.flicker_duty / self.cycles),
+            "rest": float32(self.cycles - whole),
+            "duty": float32(self.flicker_duty),
+            "steady": float32(1 - self.depth + self.depth * whole / self.cycles),
+            "scale": float32(self.depth / self.flicker_duty / self.cycles),
         }
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

@@ -5,6 +5,7 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 from pydantic import Field
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.camera.lens import LensCalibration
 from clpipe.reference.math import inverse_root
@@ -75,7 +76,7 @@ class Pa(Method):
         return (Pass("vignetting_pa", arguments=("extent", "k1", "k2", "k3")),)
 
     def arguments(self, context: Context) -> Arguments:
-        ks = {name: np.float32(getattr(self, name)) for name in ("k1", "k2", "k3")}
+        ks = {name: float32(getattr(self, name)) for name in ("k1", "k2", "k3")}
         return {"extent": CompileTime("e"), **ks}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
@@ -130,9 +131,9 @@ class CosineFourth(InFocalLengths, AboutAxis):
     def _units(self) -> tuple[np.float32, np.float32]:
         """1 over the squared focal length in px, or in longer sides; the other is 0."""
         if self.fx:
-            return np.float32(self.fx**-2), np.float32(0)
+            return float32(self.fx**-2), float32(0)
         assert self.focal_length and self.sensor_width
-        return np.float32(0), np.float32((self.sensor_width / self.focal_length) ** 2)
+        return float32(0), float32((self.sensor_width / self.focal_length) ** 2)
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         per_px, per_side = self._units()
@@ -152,7 +153,7 @@ def _squared_radius(image: Floats, cx: float | None = None, cy: float | None = N
 
 def _place(centre: float | None, side: str) -> Argument:
     """A coordinate of the principal point; None is the middle, which a kernel knows."""
-    return CompileTime(f"0.5f * (float)e.{side}") if centre is None else np.float32(centre)
+    return CompileTime(f"0.5f * (float)e.{side}") if centre is None else float32(centre)
 
 
 def _reciprocal(x: Floats) -> Floats:

@@ -12,7 +12,7 @@ from clpipe.analysis.matching.space import RESIZE
 from clpipe.base.cache import BoundedCache
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain
-from clpipe.chain.making import make_chain, step_names
+from clpipe.chain.making import make_chain
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
@@ -53,7 +53,7 @@ class Simulator:
             key: what the noise is made of.
             count: how many frames; None is as many as the scene has.
         """
-        seen = [name for name in step_names(settings) if base_name(name) in SEEN]
+        seen = [name for name in settings.step_names if base_name(name) in SEEN]
         chain = make_chain(replace(settings, skip=(*settings.skip, *seen)))
         keys = [f"{key}:{scene.name}:{number}" for number in range(count or len(scene.frames))]
         with self._lock:  # a device is for one thread

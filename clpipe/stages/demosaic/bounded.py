@@ -1,10 +1,10 @@
 """Demosaicing within bounds that the samples around set."""
 
-from math import sqrt
 from typing import ClassVar, Self
 
 import numpy as np
 
+from clpipe.base.tracing import float32, sqrt
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
@@ -136,7 +136,7 @@ class Bounded(Method):
     def doubt(self) -> np.float32:
         """The noise that green may have, in roots: three sigma, and what no eye would see."""
         assert self.noise is not None and self.offset is not None
-        return np.float32(0.01 + 3 * noise_in_roots(self.noise, MID_GREY, self.offset))
+        return float32(0.01 + 3 * noise_in_roots(self.noise, MID_GREY, self.offset))
 
     def passes(self) -> tuple[Pass, ...]:
         return (
@@ -164,7 +164,7 @@ class Bounded(Method):
             "pattern": context.cfa,
             "even": EVEN,
             "noise": self.doubt,
-            "offset": np.float32(self.offset),
+            "offset": float32(self.offset),
         }
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.reference.image import tap
@@ -82,4 +83,4 @@ def bilateral(planes: Floats, reach: int, spatial_scale: np.float32, scale: np.f
 
 def gaussian_scale(sigma: float) -> np.float32:
     """The factor c for which exp(-x^2 / (2 sigma^2)) = 2^(c * x^2)."""
-    return np.float32(-log2(e) / (2 * max(sigma, 1e-6) ** 2))
+    return float32(-log2(e) / (2 * max(sigma, 1e-6) ** 2))

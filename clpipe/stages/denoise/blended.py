@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.stage import Context, ReferenceContext
@@ -24,7 +25,7 @@ def blend_share(amount: float) -> np.float32:
     >>> [round(float(blend_share(s)), 2) for s in (0, 0.002, 0.01, 0.05)]
     [0.0, 0.01, 0.2, 0.86]
     """
-    return np.float32(amount**2 / (amount**2 + DETAIL**2))
+    return float32(amount**2 / (amount**2 + DETAIL**2))
 
 
 class BlendedFilter(WindowDenoiser):

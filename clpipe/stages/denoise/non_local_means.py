@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.reference.image import tap
@@ -77,10 +78,10 @@ class NonLocalMeans(WindowDenoiser):
         at_grey = variance.at(MID_GREY)
         slope, offset = variance.slope / at_grey, variance.offset / at_grey
         return {
-            "luma_unit": np.float32(luma_unit),
-            "chroma_unit": np.float32(chroma_unit),
-            "noise_slope": np.float32(slope * luma_unit / PATCH),
-            "noise_offset": np.float32(max(offset, 1e-6)),
+            "luma_unit": float32(luma_unit),
+            "chroma_unit": float32(chroma_unit),
+            "noise_slope": float32(slope * luma_unit / PATCH),
+            "noise_offset": float32(max(offset, 1e-6)),
             "luma_bias": bias_of(self.luma_strength),
             "chroma_bias": bias_of(self.chroma_strength),
             "luma_scale": decay_of(FACTOR * self.luma_strength),

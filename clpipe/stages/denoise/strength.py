@@ -7,14 +7,14 @@ luma noise in a grey of level v is linear in v. Its value at mid grey, one numbe
 of every method; chroma likewise.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import sqrt
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from pydantic import field_validator
 
+from clpipe.base.tracing import sqrt
 from clpipe.reference.colour import LUMA
 from clpipe.stage import (
     Arguments,
@@ -30,6 +30,11 @@ from clpipe.stage import (
 )
 
 MID_GREY = 0.18  # signal units
+_WEIGHTS = np.asarray(LUMA, float)
+_CB, _CR = 0.564 * (np.eye(3)[2] - _WEIGHTS), 0.713 * (np.eye(3)[0] - _WEIGHTS)
+# Squares of the weights of red, green and blue in luma, and in Cb and Cr together.
+LUMA_SQUARES: list[float] = (_WEIGHTS**2).tolist()
+CHROMA_SQUARES: list[float] = (_CB**2 + _CR**2).tolist()
 PREDICTED = "the {} noise at mid grey that a, b and the gains predict"
 
 
@@ -63,16 +68,14 @@ def noise_of_colours(context: Context) -> tuple[Variance, Variance, Variance]:
 
 def noise_of_luma_and_chroma(context: Context) -> tuple[Variance, Variance]:
     """The variances of luma and of Cb + Cr together in a grey, in signal units squared."""
-    luma = np.asarray(LUMA, float)
-    cb, cr = 0.564 * (np.eye(3)[2] - luma), 0.713 * (np.eye(3)[0] - luma)
     colours = noise_of_colours(context)
 
-    def mixed(squares: np.ndarray) -> Variance:
+    def mixed(squares: Sequence[float]) -> Variance:
         slope = sum(w * c.slope for w, c in zip(squares, colours, strict=True))
         offset = sum(w * c.offset for w, c in zip(squares, colours, strict=True))
-        return Variance(float(slope), float(offset))
+        return Variance(slope, offset)
 
-    return mixed(luma**2), mixed(cb**2 + cr**2)
+    return mixed(LUMA_SQUARES), mixed(CHROMA_SQUARES)
 
 
 def predicted_noise(context: Context) -> tuple[float, float]:

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, parameter
 
@@ -50,7 +51,7 @@ class Gain(Method):
     @property
     def gain(self) -> np.float32:
         """The factor."""
-        return np.float32(2.0 ** (self.ev - self.headroom))
+        return float32(2.0 ** (self.ev - self.headroom))
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("exposure", arguments=("gain",)),)

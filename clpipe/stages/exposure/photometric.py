@@ -5,6 +5,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.camera.optics import USUAL_TIME
 from clpipe.stage import Arguments, Context, ReferenceContext, parameter
@@ -72,7 +73,7 @@ class Photometric(Gain):
         """The value of a render's unit, over the sensor's full scale, at an ISO."""
         assert self.f_number and self.exposure_time
         exposure = self.q * self.scale * self.exposure_time / self.f_number**2  # lx s
-        return np.float32(exposure * iso / SATURATION * 2.0 ** (self.ev - self.headroom))
+        return float32(exposure * iso / SATURATION * 2.0 ** (self.ev - self.headroom))
 
     def gain_at(self, iso: float) -> float:
         return float(self.factor(iso))

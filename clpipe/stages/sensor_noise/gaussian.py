@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.math import square_root
 from clpipe.reference.random import normal_at
@@ -44,10 +45,10 @@ class Gaussian(SensorNoise):
         return super().variance(before, signal, context)
 
     def numbers(self) -> dict[str, np.float32]:
-        full = np.float32(or_default(self.full_signal, NEVER_FULL))
-        numbers = {"a": np.float32(self.a), "full_well": full}
+        full = float32(or_default(self.full_signal, NEVER_FULL))
+        numbers = {"a": float32(self.a), "full_well": full}
         if self.tukey_lambda is None:
-            return {**numbers, "b": np.float32(self.b)}
+            return {**numbers, "b": float32(self.b)}
         return {**numbers, **self.read_noise_numbers()}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

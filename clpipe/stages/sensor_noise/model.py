@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.errors import RequestError
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.camera.noise import Emva, NoiseModel, Paper
 from clpipe.reference.random import normal_at, word_at
@@ -171,7 +172,7 @@ class SensorNoise(Method):
 
     def without_noise(self) -> Method | None:
         full = self.full_signal
-        return None if full is None else NoNoise(full_signal=full)
+        return None if full is None else NoNoise.model_construct(full_signal=full)
 
     @property
     def full_signal(self) -> float | None:
@@ -197,7 +198,7 @@ class SensorNoise(Method):
     def read_noise_numbers(self) -> dict[str, np.float32]:
         """The kernel's arguments for read noise: sigma and, unless Gaussian, shape and scale."""
         assert self.b is not None
-        sigma = {"read_noise": np.float32(self.b**0.5)}
+        sigma = {"read_noise": float32(self.b**0.5)}
         if self.tukey_lambda is None:
             return sigma
         shape, scale = shape_and_scale(self.tukey_lambda)

@@ -5,6 +5,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from clpipe.base.errors import RequestError
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.poisson import poisson_of
 from clpipe.reference.random import word_at
@@ -55,9 +56,9 @@ class Poisson(SensorNoise):
     def numbers(self) -> dict[str, np.float32]:
         assert self.a
         return {
-            "chi": np.float32(1 / self.a),
-            "full_well": np.float32(self.full_well or NEVER_FULL),
-            "a": np.float32(self.a),
+            "chi": float32(1 / self.a),
+            "full_well": float32(self.full_well or NEVER_FULL),
+            "a": float32(self.a),
             **self.read_noise_numbers(),
         }
 

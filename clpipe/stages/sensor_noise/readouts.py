@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from clpipe.base.errors import RequestError
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.camera.profile import Camera
 from clpipe.reference.math import square_root
@@ -153,10 +154,10 @@ class Readouts(SensorNoise):
 
     def numbers(self) -> dict[str, np.float32]:
         return {
-            "a": np.float32(self.a),
-            "full_well": np.float32(or_default(self.full_signal, NEVER_FULL)),
-            "range": np.float32(self._range),
-            "unit": np.float32(1 / self._range),
+            "a": float32(self.a),
+            "full_well": float32(or_default(self.full_signal, NEVER_FULL)),
+            "range": float32(self._range),
+            "unit": float32(1 / self._range),
         }
 
     @property

@@ -6,6 +6,7 @@ from typing import ClassVar, Self
 import numpy as np
 from pydantic import field_validator
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.stage import (
     Arguments,
@@ -59,7 +60,7 @@ class Linear(Method):
     def gain(self) -> np.float32:
         """The factor."""
         assert self.headroom is not None
-        return np.float32(2.0**self.headroom)
+        return float32(2.0**self.headroom)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("exposure", arguments=("gain",)),) if self.headroom else ()

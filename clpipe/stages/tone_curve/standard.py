@@ -5,6 +5,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, parameter
 from clpipe.stages.tone_curve.hue import inside_of
@@ -115,8 +116,8 @@ class Standard(Method):
     def numbers(self, grey: float) -> Arguments:
         """The kernel's arguments; ``grey`` is where the pieces meet, before or after the curve."""
         numbers = (grey, *(x for p in self.pieces for x in (p.a, p.b, p.c, p.d)))
-        named = dict(zip(NAMES, map(np.float32, numbers), strict=True))
-        return {**named, "saturation": np.float32(self.saturation)}
+        named = dict(zip(NAMES, map(float32, numbers), strict=True))
+        return {**named, "saturation": float32(self.saturation)}
 
     def arguments(self, context: Context) -> Arguments:
         return self.numbers(GREY)

@@ -6,6 +6,7 @@ from typing import ClassVar, Self
 import numpy as np
 from pydantic import PrivateAttr
 
+from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.filter_array import FilterArray, parse_array, tiled
@@ -144,7 +145,7 @@ class Gains(CameraGains):
         return (APPLY,)
 
     def arguments(self, context: Context) -> Arguments:
-        red, blue = map(np.float32, self.gains)
+        red, blue = map(float32, self.gains)
         return {"pattern": context.cfa, "red_gain": red, "blue_gain": blue}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

@@ -1,0 +1,386 @@
+"""Tracing: run code once on numbers that remember what is computed from them, then repeat that.
+
+The code runs on a :class:`Traced` in place of each float. Each operation becomes a line of a Python
+function, and each comparison a guard. The function repeats the computation for other numbers, in
+the same order and precision, without the code around it. Where a guard fails, the code would have
+taken another path, and has to be traced again. PyTorch's Dynamo and JAX work in this way.
+"""
+
+import math
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial, wraps
+from types import FunctionType, MethodType
+from typing import Any, TypeVar
+
+import numpy as np
+from pydantic import BaseModel
+
+T = TypeVar("T")
+Repeat = Callable[[Sequence[Any]], Any]
+
+INFIX: dict[Callable[..., Any], str] = {
+    operator.add: "+",
+    operator.sub: "-",
+    operator.mul: "*",
+    operator.truediv: "/",
+    operator.pow: "**",
+    operator.mod: "%",
+    operator.lt: "<",
+    operator.le: "<=",
+    operator.gt: ">",
+    operator.ge: ">=",
+    operator.eq: "==",
+    operator.ne: "!=",
+}
+UFUNCS = {np.add: operator.add, np.subtract: operator.sub, np.multiply: operator.mul}
+PLAIN = float, int, np.number
+
+
+class NotTraceableError(Exception):
+    """A result holds traced numbers where they cannot be replaced, such as in a closure."""
+
+
+class Traced:
+    """A number of which a :class:`Trace` knows how it was computed.
+
+    It has the operators of a float. NumPy's functions of scalars are traced, and :func:`call`
+    traces any other function. Code that needs a plain float gets the value, and a guard then allows
+    no other one. It has no hash, so that no cache keeps it.
+    """
+
+    __slots__ = ("name", "trace", "value")
+    __hash__ = None  # type: ignore[assignment]
+
+    def __init__(self, trace: "Trace", name: str, value: Any) -> None:
+        self.trace = trace
+        self.name = name
+        self.value = value
+
+    def _calculated(self, function: Callable[..., Any], other: Any, swapped: bool = False) -> Any:
+        if not isinstance(other, (Traced, *PLAIN)):
+            return NotImplemented
+        return call(function, other, self) if swapped else call(function, self, other)
+
+    def _compared(self, function: Callable[..., Any], other: Any) -> Any:
+        if not isinstance(other, (Traced, *PLAIN)):
+            return NotImplemented
+        return self.trace.guard(function, self, other)
+
+    def __add__(self, other: Any) -> Any:
+        return self._calculated(operator.add, other)
+
+    def __radd__(self, other: Any) -> Any:
+        return self._calculated(operator.add, other, swapped=True)
+
+    def __sub__(self, other: Any) -> Any:
+        return self._calculated(operator.sub, other)
+
+    def __rsub__(self, other: Any) -> Any:
+        return self._calculated(operator.sub, other, swapped=True)
+
+    def __mul__(self, other: Any) -> Any:
+        return self._calculated(operator.mul, other)
+
+    def __rmul__(self, other: Any) -> Any:
+        return self._calculated(operator.mul, other, swapped=True)
+
+    def __truediv__(self, other: Any) -> Any:
+        return self._calculated(operator.truediv, other)
+
+    def __rtruediv__(self, other: Any) -> Any:
+        return self._calculated(operator.truediv, other, swapped=True)
+
+    def __pow__(self, other: Any) -> Any:
+        return self._calculated(operator.pow, other)
+
+    def __rpow__(self, other: Any) -> Any:
+        return self._calculated(operator.pow, other, swapped=True)
+
+    def __mod__(self, other: Any) -> Any:
+        return self._calculated(operator.mod, other)
+
+    def __neg__(self) -> Any:
+        return call(operator.neg, self)
+
+    def __abs__(self) -> Any:
+        return call(operator.abs, self)
+
+    def __lt__(self, other: Any) -> Any:
+        return self._compared(operator.lt, other)
+
+    def __le__(self, other: Any) -> Any:
+        return self._compared(operator.le, other)
+
+    def __gt__(self, other: Any) -> Any:
+        return self._compared(operator.gt, other)
+
+    def __ge__(self, other: Any) -> Any:
+        return self._compared(operator.ge, other)
+
+    def __eq__(self, other: object) -> Any:
+        return self._compared(operator.eq, other)
+
+    def __ne__(self, other: object) -> Any:
+        return self._compared(operator.ne, other)
+
+    def __bool__(self) -> bool:
+        return bool(self.trace.guard(operator.ne, self, 0))
+
+    def __float__(self) -> float:
+        self.trace.guard(operator.eq, self, self.value)
+        self.trace.pinned = True
+        return float(self.value)
+
+    def __len__(self) -> int:
+        size = len(self.value)
+        self.trace.guard(operator.eq, call(len, self), size)
+        return size
+
+    def __int__(self) -> int:
+        return int(float(self))
+
+    def __round__(self, *digits: int) -> Any:
+        return call(round, self, *digits)
+
+    def __format__(self, spec: str) -> str:
+        return format(float(self), spec)
+
+    def __repr__(self) -> str:
+        return repr(float(self))
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        scalars = all(isinstance(each, (Traced, *PLAIN)) for each in inputs)
+        if scalars and method == "__call__" and ufunc.nout == 1 and not options:
+            return call(UFUNCS.get(ufunc, ufunc), *inputs)
+        plain = [float(each) if isinstance(each, Traced) else each for each in inputs]
+        return getattr(ufunc, method)(*plain, **options)
+
+
+def call(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Return what a pure function of numbers returns; traced where one of its arguments is.
+
+    The function returns a number, or a tuple of numbers.
+
+    >>> call(max, 1.0, 2.0)
+    2.0
+    """
+    traces = [each.trace for each in arguments if isinstance(each, Traced)]
+    plain = [each.value if isinstance(each, Traced) else each for each in arguments]
+    result = function(*plain)
+    if not traces:
+        return result
+    number = traces[0].number(function, arguments, result)
+    if not isinstance(result, tuple):
+        return number
+    return tuple(call(operator.getitem, number, place) for place in range(len(result)))
+
+
+def traceable(function: Callable[..., T]) -> Callable[..., T]:
+    """Make a pure function of numbers one that is traced as a whole, see :func:`call`.
+
+    >>> traceable(math.hypot)(3.0, 4.0)
+    5.0
+    """
+
+    @wraps(function)
+    def traced(*arguments: Any) -> T:
+        result: T = call(function, *arguments)
+        return result
+
+    return traced
+
+
+float32 = traceable(np.float32)
+int32 = traceable(np.int32)
+hypot = traceable(math.hypot)
+sqrt = traceable(math.sqrt)
+
+
+class Trace:
+    """A computation as it is traced.
+
+    Args:
+        values: the numbers that it starts from.
+
+    >>> trace = Trace([3.0])
+    >>> (x,) = trace.inputs
+    >>> repeat = trace.repeat({"square": x * x if x > 0 else x})
+    >>> repeat([4.0]), repeat([-4.0])
+    ({'square': 16.0}, None)
+    """
+
+    def __init__(self, values: Sequence[Any]) -> None:
+        self.inputs = [Traced(self, f"x{n}", value) for n, value in enumerate(values)]
+        self.pinned = False  # whether code took the value of a number
+        self._lines: list[str] = []
+        self._constants: dict[str, Any] = {"with_attributes": with_attributes}
+        self._names: dict[int, str] = {}  # of constants, by their identities
+
+    def number(self, function: Callable[..., Any], arguments: Sequence[Any], result: Any) -> Traced:
+        """Return the result of a function of numbers, traced."""
+        name = f"v{len(self._lines)}"
+        self._lines.append(f"{name} = {self._text(function, arguments)}")
+        return Traced(self, name, result)
+
+    def guard(self, function: Callable[..., Any], *arguments: Any) -> bool:
+        """Return the outcome of a comparison; the computation holds for the same outcome only."""
+        plain = [each.value if isinstance(each, Traced) else each for each in arguments]
+        outcome = bool(function(*plain))
+        holds = self._text(function, arguments)
+        line = f"if {'not ' if outcome else ''}({holds}): return None"
+        if line not in self._lines[-8:]:  # code asks the same a few times
+            self._lines.append(line)
+        return outcome
+
+    @contextmanager
+    def attempt(self) -> Iterator[None]:
+        """Trace a part that may be left out: nothing of it stays if it fails or takes a value."""
+        before, count, self.pinned = self.pinned, len(self._lines), False
+        try:
+            yield
+            if self.pinned:
+                raise NotTraceableError
+        except Exception:
+            del self._lines[count:]
+            raise NotTraceableError from None
+        finally:
+            self.pinned = before
+
+    def holds(self, value: Any) -> bool:
+        """Whether an object holds traced numbers."""
+        count = len(self._lines)
+        text = _Copies(self).text(value)
+        del self._lines[count:]
+        return text is not None
+
+    def repeat(self, result: Any) -> Repeat:
+        """Return a function that computes the result of other numbers.
+
+        Args:
+            result: any object. Where it holds traced numbers, in tuples, lists, dicts and
+                attributes, the function returns copies with the numbers' new values; all other
+                parts are shared.
+
+        Returns:
+            The function. It returns None for numbers with which a guard fails.
+
+        Raises:
+            NotTraceableError: the result holds traced numbers in other places.
+        """
+        text = _Copies(self).text(result) or self._constant(result)
+        inputs = "".join(f"{each.name}, " for each in self.inputs)
+        body = [f"{inputs}= values" if inputs else "pass", *self._lines, f"return {text}"]
+        source = "\n    ".join(["def repeat(values):", *body])
+        exec(compile(source, "<trace>", "exec"), self._constants)  # noqa: S102  # of lines above
+        repeat: Repeat = self._constants["repeat"]
+        return repeat
+
+    def _text(self, function: Callable[..., Any], arguments: Sequence[Any]) -> str:
+        texts = [a.name if isinstance(a, Traced) else self._constant(a) for a in arguments]
+        if function in INFIX:
+            return f" {INFIX[function]} ".join(texts)
+        return f"{self._constant(function)}({', '.join(texts)})"
+
+    def _constant(self, value: Any) -> str:
+        """The name of a constant."""
+        name = self._names.setdefault(id(value), f"k{len(self._names)}")
+        self._constants[name] = value
+        return name
+
+
+def altered(template: T, attributes: Mapping[str, Any]) -> T:
+    """Return a copy of an object with other attributes; nothing is checked."""
+    return with_attributes(template, {**vars(template), **attributes})
+
+
+def with_attributes(template: T, attributes: dict[str, Any]) -> T:
+    """Return an object of the same class with these attributes, which it keeps."""
+    other: T = object.__new__(type(template))
+    object.__setattr__(other, "__dict__", attributes)
+    if isinstance(template, BaseModel):
+        for name in BaseModel.__slots__[1:]:
+            object.__setattr__(other, name, getattr(template, name))
+    return other
+
+
+class _Copies:
+    """Writes the lines that copy a result with new numbers; see :meth:`Trace.repeat`."""
+
+    def __init__(self, trace: Trace) -> None:
+        self._trace = trace
+        self._texts: dict[int, tuple[Any, str | None]] = {}  # with the object, which stays so
+        self._open: set[int] = set()
+
+    def text(self, value: Any) -> str | None:
+        """The text of an expression for a value; None where no part of it is traced.
+
+        Raises:
+            NotTraceableError: as :meth:`Trace.repeat`.
+        """
+        if isinstance(value, Traced):
+            return value.name
+        if isinstance(value, (str, type, type(None), *PLAIN)):
+            return None
+        key = id(value)
+        if key in self._open:  # it refers to itself
+            self._texts[key] = value, None
+            return None
+        if key not in self._texts:
+            self._open.add(key)
+            text = self._text_of(value)
+            self._open.remove(key)
+            if text and key in self._texts:
+                raise NotTraceableError(f"{type(value).__name__} refers to itself")
+            if text:
+                name = f"o{len(self._texts)}"
+                self._trace._lines.append(f"{name} = {text}")
+                text = name
+            self._texts[key] = value, text
+        return self._texts[key][1]
+
+    def _text_of(self, value: Any) -> str | None:
+        trace = self._trace
+        if isinstance(value, tuple | list | dict):
+            parts = list(value.values() if isinstance(value, dict) else value)
+            texts = [self.text(part) for part in parts]
+            if not any(texts):
+                return None
+            full = [t or trace._constant(p) for t, p in zip(texts, parts, strict=True)]
+            if isinstance(value, dict):
+                keys = (trace._constant(key) for key in value)
+                return f"{{{', '.join(f'{k}: {t}' for k, t in zip(keys, full, strict=True))}}}"
+            if type(value) in (tuple, list):
+                listed = "".join(f"{each}, " for each in full)
+                return f"[{listed}]" if isinstance(value, list) else f"({listed})"
+            return f"{trace._constant(type(value))}({', '.join(full)})"
+        attributes = getattr(value, "__dict__", None) or {}
+        texts_of = {name: self.text(part) for name, part in attributes.items()}
+        if any(map(self.text, _hidden(value))):
+            raise NotTraceableError(f"{type(value).__name__} holds traced numbers")
+        if not any(texts_of.values()):
+            return None
+        changes = ", ".join(f"{name!r}: {text}" for name, text in texts_of.items() if text)
+        # With all names, so that their order stays.
+        known = trace._constant(
+            {n: None if text else attributes[n] for n, text in texts_of.items()}
+        )
+        return f"with_attributes({trace._constant(value)}, {{**{known}, {changes}}})"
+
+
+def _hidden(value: Any) -> list[Any]:
+    """What an object holds beside its attributes."""
+    match value:
+        case BaseModel():
+            return [value.__pydantic_private__, value.__pydantic_extra__]
+        case FunctionType():
+            return [[cell.cell_contents for cell in value.__closure__ or ()], value.__defaults__]
+        case MethodType():
+            return [value.__self__]
+        case partial():
+            return [value.func, value.args, value.keywords]
+        case np.ndarray():
+            return value.ravel().tolist() if value.dtype == object else []
+    slots = [n for t in type(value).__mro__ for n in getattr(t, "__slots__", ())]
+    return [getattr(value, name, None) for name in slots]

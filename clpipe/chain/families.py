@@ -1,0 +1,180 @@
+"""Families: chains that differ in numbers only, of which one is made and the others computed.
+
+To make a chain, each stage's code runs. With an ISO or a parameter drawn for each image, the same
+code would run for each of them, to compute a few numbers. So it is traced once (see
+:mod:`clpipe.base.tracing`), and other numbers go through what was traced: the values are the same
+to the last bit, in a hundredth of the time. Code that cannot be traced runs again each time.
+"""
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from clpipe.base.cache import BoundedCache, Identity
+from clpipe.base.digests import stamp_of
+from clpipe.base.tracing import Repeat, Trace, altered
+from clpipe.camera.profile import Camera
+from clpipe.chain.chain import Chain
+from clpipe.chain.registry import all_stages
+from clpipe.chain.settings import Settings
+from clpipe.stage import Method
+
+MOST_FAMILIES = 16  # of settings that differ in numbers, as ISOs on both sides of a gain stage
+MOST_SETTINGS = 256
+
+Numbers = Sequence[Any]  # floats, or what stands for them as they are traced
+Making = Callable[[Numbers], Chain]
+
+
+class Family:
+    """Chains that differ in numbers only.
+
+    Args:
+        make: makes a chain of numbers.
+        repeat: the same as it was traced; returns None where the code takes another path.
+        numbers: those that it was traced with.
+    """
+
+    def __init__(self, make: Making, repeat: Repeat, numbers: Numbers) -> None:
+        self._make = make
+        self._repeat = repeat
+        self._traced = numbers
+        self._is_checked = False
+        self._derived: dict[Callable[[Chain], Chain], Families] = {}
+
+    def chain(self, numbers: Numbers) -> Chain | None:
+        """Return the chain of numbers, None where it is none of the family.
+
+        The first one that was not traced is also made, and compared.
+        """
+        try:
+            chain: Chain | None = self._repeat(numbers)
+        except (ArithmeticError, ValueError):
+            return None  # the code says it in its own words
+        if chain is None:
+            return None
+        if not self._is_checked and numbers != self._traced:
+            if not chain.is_equal(self._make(numbers)):
+                self._repeat = lambda numbers: None
+                return None
+            self._is_checked = True
+        return chain.in_family(self, numbers)
+
+    def derived(self, make: Callable[[Chain], Chain], chain: Chain) -> Chain:
+        """Return ``make(chain)`` for a chain of the family."""
+        families = self._derived.setdefault(make, Families())
+        found = families.chain(
+            chain.numbers, lambda numbers: make(self._make(numbers)), lambda: make(chain)
+        )
+        return found.with_settings(chain.settings)
+
+
+class Families:
+    """The families of chains that are made in one way: one for each path that the code takes."""
+
+    def __init__(self) -> None:
+        self._known: list[Family] = []
+        self._is_new = True
+        self._may_trace = True
+
+    def chain(self, numbers: Numbers, make: Making, plain: Callable[[], Chain]) -> Chain:
+        """Return the chain of numbers.
+
+        Args:
+            numbers: the numbers.
+            make: makes a chain of numbers, which may be traced.
+            plain: makes the chain of these numbers.
+
+        Raises:
+            RequestError: it cannot be made.
+        """
+        for family in self._known:
+            if chain := family.chain(numbers):
+                return chain
+        chain = plain()
+        if self._may_trace and not self._is_new:  # what is asked for once is not traced
+            self._add(numbers, make, chain)
+        self._is_new = False
+        return chain
+
+    def _add(self, numbers: Numbers, make: Making, chain: Chain) -> None:
+        trace = Trace(numbers)
+        try:
+            repeat = trace.repeat(make(trace.inputs).settled(trace))
+            is_equal = chain.is_equal(repeat(numbers))
+        except Exception:  # whatever a stage's code does with numbers that are no floats
+            is_equal = False
+        if is_equal:
+            self._known.append(Family(make, repeat, numbers))
+        self._may_trace = is_equal and len(self._known) < MOST_FAMILIES
+
+
+FAMILIES: BoundedCache[Families] = BoundedCache(MOST_SETTINGS)
+
+
+def chain_of_family(
+    settings: Settings, camera: Camera, ends: Hashable, make: Callable[[Settings], Chain]
+) -> Chain:
+    """Return the chain of settings, computed where one that differs in numbers only was made.
+
+    Args:
+        settings: without draws.
+        camera: its camera.
+        ends: what else the chain depends on.
+        make: makes the chain.
+
+    Raises:
+        RequestError: it cannot be made.
+    """
+    others, numbers = numbers_of(settings)
+    key = (
+        ends,
+        Identity(camera),
+        Identity(all_stages()),
+        *(getattr(settings, name) for name in SHARED),
+        others,
+        *((file, stamp_of(Path(file))) for file in settings.files()),
+    )
+    try:
+        families = FAMILIES.get(key, Families)
+    except TypeError:  # a value without a hash
+        return make(settings)
+    chain = families.chain(
+        numbers, lambda numbers: make(with_numbers(settings, numbers)), lambda: make(settings)
+    )
+    return chain.with_settings(settings)
+
+
+SHARED = ("stages", "skip", "lens", "focal_length", "aperture", "focus_distance", "render")
+
+
+def numbers_of(settings: Settings) -> tuple[Hashable, tuple[float, ...]]:
+    """Return the floats among the values that are set, and all the other values."""
+    numbers, others = [settings.iso], []
+    for step, method in _set_methods(settings):
+        table = settings.parameters[step]
+        values = [getattr(method, name) for name in table]
+        kinds = [None if type(value) is float else value for value in values]
+        others.append((step, type(method), *table, *kinds))
+        numbers += [value for value in values if type(value) is float]
+    return (tuple(settings.parameters), *others), tuple(numbers)
+
+
+def with_numbers(settings: Settings, numbers: Numbers) -> Settings:
+    """Return settings with other floats, in the order of :func:`numbers_of`."""
+    left = iter(numbers)
+    iso = next(left)
+    parameters, validated = dict(settings.parameters), dict(settings.validated)
+    for step, method in _set_methods(settings):
+        table = settings.parameters[step]
+        floats = {name: next(left) for name in table if type(getattr(method, name)) is float}
+        parameters[step] = {**table, **floats}
+        validated[step] = parameters[step], altered(method, floats) if floats else method
+    return replace(settings, iso=iso, parameters=parameters, validated=validated)
+
+
+def _set_methods(settings: Settings) -> list[tuple[str, Method]]:
+    """The methods of the steps of which anything is set."""
+    set_ = (step for step in settings.step_names if step in settings.parameters)
+    return [(step, settings.method(step)) for step in set_]

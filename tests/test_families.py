@@ -1,0 +1,208 @@
+"""Chains that differ in numbers: those that are computed are those that are made."""
+
+import math
+import operator
+from functools import partial
+
+import numpy as np
+import pytest
+
+from clpipe.base.cache import BoundedCache
+from clpipe.base.errors import RequestError
+from clpipe.base.tracing import NotTraceableError, Trace, call, float32, traceable
+from clpipe.camera.profile import built_in_cameras, load_camera
+from clpipe.chain.chain import Chain
+from clpipe.chain.making import make_chain
+from clpipe.chain.settings import overlay, settings_from
+from clpipe.engine.ops import chain_ops
+from clpipe.stage import CompileTime
+
+
+@pytest.fixture
+def families(monkeypatch):
+    """No chains are known yet."""
+    known = BoundedCache(64)
+    monkeypatch.setattr("clpipe.chain.families.FAMILIES", known)
+    return known
+
+
+def made(settings, monkeypatch):
+    """The chain of settings, made without a look at any family."""
+    with monkeypatch.context() as alone:
+        alone.setattr("clpipe.chain.families.FAMILIES", BoundedCache(1))
+        return make_chain(settings)
+
+
+def assert_equal(chain, other):
+    assert len(chain.steps) == len(other.steps)
+    for step, own in zip(chain.steps, other.steps, strict=True):
+        assert step.is_equal(own), step.name
+        assert step.arguments.keys() == own.arguments.keys()
+        for name, value in step.arguments.items():
+            expected = own.arguments[name]
+            assert type(value) is type(expected), (step.name, name)
+            if not isinstance(value, CompileTime):
+                assert value.tobytes() == expected.tobytes(), (step.name, name)
+    assert [repr(step.method) for step in chain.steps] == [repr(s.method) for s in other.steps]
+
+
+DRAWN = {
+    "iso": ({}, "iso", (100, 25600)),
+    "ev": ({}, "exposure.ev", (-2, 2)),
+    "shot noise": ({}, "sensor_noise.a", (1e-5, 1e-2)),
+    "system gain": ({}, "sensor_noise.system_gain", (0.1, 10)),
+    "tukey": ({}, "sensor_noise.tukey_lambda", (-0.3, 0.3)),
+    "poisson": ({"sensor_noise": {"method": "poisson"}}, "sensor_noise.a", (1e-5, 1e-2)),
+    "light": ({}, "inverse_white_balance.red_gain", (1.1, 3)),
+    "blur": ({}, "optical_blur.sigma", (0.3, 0.8)),
+    "streak": ({}, "motion_blur.length", (0.0, 4)),
+    "strength": ({}, "denoise.luma_strength", (0, 2)),
+    "bilateral": ({"denoise": {"method": "bilateral"}}, "denoise.chroma_strength", (0.5, 2)),
+    "gamma": ({"gamma": {"method": "power"}}, "gamma.exponent", (1.8, 2.6)),
+    "temperature": ({"dark_current": {"exposure_time": 4.0}}, "dark_current.temperature", (0, 50)),
+    "distortion": (
+        {"distortion": {"method": "brown_conrady", "fx": 40.0}},
+        "distortion.k1",
+        (-0.1, 0.1),
+    ),
+    "flicker": ({"shutter": {"flicker_depth": 0.5}}, "shutter.flicker_frequency", (50, 200)),
+}
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_a_computed_chain_is_the_one_that_is_made(name, families, monkeypatch):
+    base, key, (low, high) = DRAWN[name]
+    general = settings_from({"camera": "sony-a7r2", **base})
+    step, _, parameter = key.rpartition(".")
+    for number in range(12):
+        value = low + (high - low) * ((number * 0.618) % 1)
+        values = {step: {parameter: float(value)}} if step else {parameter: float(value)}
+        settings = overlay(general, values)
+        chain, expected = make_chain(settings), made(settings, monkeypatch)
+        assert_equal(chain, expected)
+        assert_equal(chain.cleaned(), expected.cleaned())
+        assert_equal(chain.without_noise(), expected.without_noise())
+        assert chain.settings is settings
+        arguments = [{s.name: s.arguments for s in c.steps} for c in (chain, expected)]
+        assert chain_ops(chain, arguments[0]) == chain_ops(expected, arguments[1])
+
+
+@pytest.mark.parametrize("camera", built_in_cameras())
+def test_one_camera_has_few_families(camera, families, monkeypatch):
+    general = settings_from({"camera": camera})
+    low, high = load_camera(camera).iso_range
+    chains = []
+    for number in range(24):
+        iso = low * (high / low) ** ((number * 0.618) % 1)
+        chains.append(make_chain(overlay(general, {"iso": iso})))
+    assert_equal(chains[-1], made(chains[-1].settings, monkeypatch))
+    assert chains[-1].structure is not None
+    assert sum(chain.family is not None for chain in chains) >= 16
+
+
+def test_chains_of_one_structure_have_one_plan(families):
+    general = settings_from({"camera": "canon-5d2"})
+    chains = [make_chain(overlay(general, {"iso": iso})) for iso in (400.0, 500, 620, 710, 730)]
+    one, other = chains[-2:]
+    assert one.structure is other.structure
+    assert one.cleaned().structure is not one.structure
+    ops = [chain_ops(c, {s.name: s.arguments for s in c.steps}) for c in (one, other)]
+    assert ops[0] == ops[1]
+
+
+def test_a_value_that_is_not_allowed_is_refused_in_a_family_too(families):
+    general = settings_from({"camera": "canon-5d2"})
+    for iso in (400.0, 500.0, 600.0):
+        make_chain(overlay(general, {"iso": iso}))
+    with pytest.raises(RequestError, match="goes from 100 to 6400"):
+        make_chain(overlay(general, {"iso": 1e6}))
+
+
+def test_code_that_computes_beside_its_arguments_is_found_out(families, monkeypatch):
+    """The first chain that was not traced is compared with the one that is made."""
+    from clpipe.stages.exposure.gain import Gain
+
+    seen = []
+
+    def resolve(self, context):
+        seen.append(float(getattr(self.ev, "value", self.ev)))  # what no trace sees
+        return self.model_copy(update={"headroom": seen[-1] + 1})
+
+    monkeypatch.setattr(Gain, "resolve", resolve)
+    general = settings_from({})
+    for ev in (0.1, 0.2, 0.3, 0.4):
+        chain = make_chain(overlay(general, {"exposure": {"method": "gain", "ev": ev}}))
+        assert chain.step_named("exposure").method.headroom == ev + 1
+
+
+def test_a_changed_file_is_read_again(families, tmp_path):
+    curve = tmp_path / "curve.csv"
+    means = []
+    for ev, values in enumerate(("0,0\n1,1\n", "0,0\n1,1\n", "0,0\n1,1\n", "0,0\n0.5,0.9\n1,1\n")):
+        curve.write_text(values)
+        table = {"method": "file", "file": str(curve)}
+        settings = settings_from({"tone_curve": table, "exposure": {"ev": float(ev)}})
+        means.append(make_chain(settings).step_named("tone_curve").arguments["table"].mean())
+    assert means[0] == means[1] == means[2] < means[3]
+
+
+def test_operations_are_repeated_in_order():
+    def computed(x, y):
+        z = x / y - 2 * x + y**2 if x > y else -x + 1 / y
+        return {"a": (z, abs(z) % 3), "b": [max(x, y), 7], "c": float32(x) * np.float32(0.1)}
+
+    trace = Trace([3.0, 2.0])
+    repeat = trace.repeat(computed(*trace.inputs))
+    for values in ([3.0, 2.0], [5.5, 0.1], [1e-3, 1e-9]):
+        assert repeat(values) == computed(*values)
+        assert type(repeat(values)["c"]) is np.float32
+    assert repeat([1.0, 2.0]) is None
+
+
+def test_numpys_functions_of_numbers_are_traced():
+    trace = Trace([0.3])
+    repeat = trace.repeat([np.log(trace.inputs[0]), np.sqrt(2 * trace.inputs[0])])
+    assert repeat([0.7]) == [np.log(0.7), np.sqrt(1.4)]
+
+
+def test_a_value_that_is_taken_holds_for_that_value_only():
+    trace = Trace([0.3, 0.5])
+    x, y = trace.inputs
+    repeat = trace.repeat(math.sin(x) + y)
+    assert repeat([0.3, 0.9]) == math.sin(0.3) + 0.9
+    assert repeat([0.4, 0.9]) is None
+
+
+def test_functions_may_return_several_numbers():
+    halves = traceable(lambda x: divmod(x, 0.5))
+    trace = Trace([1.2])
+    whole, rest = halves(trace.inputs[0])
+    assert trace.repeat((rest, whole))([3.4]) == divmod(3.4, 0.5)[::-1]
+
+
+def test_a_part_that_fails_leaves_nothing():
+    trace = Trace([2.0])
+    (x,) = trace.inputs
+    with pytest.raises(NotTraceableError), trace.attempt():
+        assert float(x) == 2
+    assert trace.repeat(x * 2)([3.0]) == 6.0
+
+
+def test_what_cannot_be_replaced_is_refused():
+    trace = Trace([2.0])
+    (x,) = trace.inputs
+    for hidden in (lambda: x, partial(operator.add, x), np.array([x])):
+        with pytest.raises(NotTraceableError):
+            trace.repeat([hidden])
+    with pytest.raises(TypeError):
+        hash(x)
+    assert call(max, 1, 2) == 2
+
+
+def test_a_trace_does_not_change_the_objects_it_copies(families):
+    general = settings_from({"camera": "canon-5d2"})
+    first = make_chain(overlay(general, {"iso": 400.0}))
+    chains = [make_chain(overlay(general, {"iso": iso})) for iso in (500.0, 600.0, 640.0)]
+    assert isinstance(first, Chain)
+    assert [chain.steps[0].context.iso for chain in (first, *chains)] == [400, 500, 600, 640]
+    assert len({chain.noise.a for chain in (first, *chains)}) == 4
