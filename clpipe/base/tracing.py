@@ -8,6 +8,7 @@ taken another path, and has to be traced again. PyTorch's Dynamo and JAX work in
 
 import math
 import operator
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial, wraps
@@ -215,14 +216,19 @@ class Trace:
         self.inputs = [Traced(self, f"x{n}", value) for n, value in enumerate(values)]
         self.pinned = False  # whether code took the value of a number
         self._lines: list[str] = []
-        self._constants: dict[str, Any] = {"with_attributes": with_attributes}
+        self._places: dict[str, int] = {}  # where a line computes a text, if it is still there
+        self._constants: dict[str, Any] = {"altered": altered, "with_attributes": with_attributes}
         self._names: dict[int, str] = {}  # of constants, by their identities
 
     def number(self, function: Callable[..., Any], arguments: Sequence[Any], result: Any) -> Traced:
         """Return the result of a function of numbers, traced."""
-        name = f"v{len(self._lines)}"
-        self._lines.append(f"{name} = {self._text(function, arguments)}")
-        return Traced(self, name, result)
+        text = self._text(function, arguments)
+        place = self._places.get(text, len(self._lines))
+        line = f"v{place} = {text}"
+        if self._lines[place : place + 1] != [line]:  # or it has been computed before
+            place = self._places[text] = len(self._lines)
+            self._lines.append(f"v{place} = {text}")
+        return Traced(self, f"v{place}", result)
 
     def guard(self, function: Callable[..., Any], *arguments: Any) -> bool:
         """Return the outcome of a comparison; the computation holds for the same outcome only."""
@@ -230,7 +236,9 @@ class Trace:
         outcome = bool(function(*plain))
         holds = self._text(function, arguments)
         line = f"if {'not ' if outcome else ''}({holds}): return None"
-        if line not in self._lines[-8:]:  # code asks the same a few times
+        place = self._places.get(line, len(self._lines))
+        if self._lines[place : place + 1] != [line]:
+            self._places[line] = len(self._lines)
             self._lines.append(line)
         return outcome
 
@@ -271,7 +279,8 @@ class Trace:
         """
         text = _Copies(self).text(result) or self._constant(result)
         inputs = "".join(f"{each.name}, " for each in self.inputs)
-        body = [f"{inputs}= values" if inputs else "pass", *self._lines, f"return {text}"]
+        body = [f"{inputs}= values" if inputs else "pass"]
+        body += needed_lines([*self._lines, f"return {text}"])
         source = "\n    ".join(["def repeat(values):", *body])
         exec(compile(source, "<trace>", "exec"), self._constants)  # noqa: S102  # of lines above
         repeat: Repeat = self._constants["repeat"]
@@ -290,18 +299,35 @@ class Trace:
         return name
 
 
+def needed_lines(lines: Sequence[str]) -> list[str]:
+    """Return the lines of a function without those whose result no later one takes.
+
+    >>> needed_lines(["v0 = x0 + k0", "v1 = x0 * x0", "return v0"])
+    ['v0 = x0 + k0', 'return v0']
+    """
+    taken: set[str] = set()
+    kept = []
+    for line in reversed(lines):
+        result, *used = re.findall(r"\w+", line)
+        if result in taken or result in ("if", "return"):
+            kept.append(line)
+            taken.update(used)
+    return kept[::-1]
+
+
 def altered(template: T, attributes: Mapping[str, Any]) -> T:
     """Return a copy of an object with other attributes; nothing is checked."""
-    return with_attributes(template, {**vars(template), **attributes})
-
-
-def with_attributes(template: T, attributes: dict[str, Any]) -> T:
-    """Return an object of the same class with these attributes, which it keeps."""
-    other: T = object.__new__(type(template))
-    object.__setattr__(other, "__dict__", attributes)
+    other = with_attributes(type(template), {**vars(template), **attributes})
     if isinstance(template, BaseModel):
         for name in BaseModel.__slots__[1:]:
             object.__setattr__(other, name, getattr(template, name))
+    return other
+
+
+def with_attributes(kind: type[T], attributes: dict[str, Any]) -> T:
+    """Return an object of a class with these attributes, which it keeps."""
+    other = object.__new__(kind)
+    object.__setattr__(other, "__dict__", attributes)
     return other
 
 
@@ -366,7 +392,9 @@ class _Copies:
         known = trace._constant(
             {n: None if text else attributes[n] for n, text in texts_of.items()}
         )
-        return f"with_attributes({trace._constant(value)}, {{**{known}, {changes}}})"
+        if isinstance(value, BaseModel):
+            return f"altered({trace._constant(value)}, {{**{known}, {changes}}})"
+        return f"with_attributes({trace._constant(type(value))}, {{**{known}, {changes}}})"
 
 
 def _hidden(value: Any) -> list[Any]:

@@ -2,8 +2,10 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from functools import cached_property, wraps
+from typing import Any, TypeVar
+
+import numpy as np
 
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
@@ -33,8 +35,11 @@ from clpipe.stage import (
     StageRole,
 )
 
-if TYPE_CHECKING:
-    from clpipe.chain.families import Family
+# Properties of a chain, and those whose values are the same in chains of one structure.
+COMPUTED = "optics", "filters", "context_after", "context_of_raw", "geometry"
+STRUCTURAL = "is_noisy", "maker_of_raw", "result", "step_names", "_resamplings"
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -70,6 +75,14 @@ class Step:
         optics = self.context.optics, other.context.optics
         return self == other and optics[0] == optics[1] and self.passes == other.passes
 
+    def has_equal_arguments(self, other: "Step") -> bool:
+        """Whether another step has the same kernel arguments."""
+        own, others = self.arguments, other.arguments
+        return own.keys() == others.keys() and all(
+            type(value) is type(others[name]) and np.array_equal(value, others[name])
+            for name, value in own.items()
+        )
+
     def __repr__(self) -> str:
         return f"Step({self.name}, {self.method.method})"
 
@@ -88,11 +101,8 @@ class Chain:
     names: tuple[str, ...]  # of all steps, with those before start_at and after until
     draws: Mapping[str, Draw] = field(default_factory=dict)  # the settings are an example of these
     margins: Margins = NO_MARGINS  # of what enters, beyond the picture
-    # Of a chain that was computed as one of a family: see clpipe.chain.families.
-    family: "Family | None" = field(default=None, init=False)
-    numbers: Sequence[Any] = field(default=(), init=False)
-    # Steps of which a part is the same in chains that share this object; None is only this chain.
-    structure: object = field(default=None, init=False)
+    # What is known of all chains that differ in numbers only, see of_structure(); None is of none.
+    structure: dict[Any, Any] | None = field(default=None, init=False)
 
     def __repr__(self) -> str:
         return f"Chain({self.settings.label}, {self.label})"
@@ -113,35 +123,65 @@ class Chain:
         """The seed of the noise."""
         return self.settings.seed
 
-    def streams(self, step: Step, noise_key: str) -> dict[NoiseScope, Stream]:
-        """The random streams of a step for one image.
+    def streams(self, step: str, noise_key: str) -> dict[NoiseScope, Stream]:
+        """The random streams of a step, by its name, for one image.
 
         Image noise is keyed on the seed and the noise key, fixed pattern noise on the camera.
         """
         return {
-            NoiseScope.IMAGE: stream_of(f"image:{self.seed}:{noise_key}", step.name),
-            NoiseScope.CAMERA: stream_of(f"camera:{self.camera.name}", step.name),
+            NoiseScope.IMAGE: stream_of(f"image:{self.seed}:{noise_key}", step),
+            NoiseScope.CAMERA: stream_of(f"camera:{self.camera.name}", step),
         }
 
-    @property
+    @cached_property
+    def arguments(self) -> Mapping[str, Arguments]:
+        """The kernel arguments of its steps, by their names."""
+        return {step.name: step.arguments for step in self.steps}
+
+    @cached_property
     def optics(self) -> Optics:
         """The camera's optics, as far as they are known."""
         last = self.steps[-1]
         return last.context.optics.set_to(last.method.optics())
 
-    @property
+    @cached_property
+    def context_after(self) -> Context:
+        """What is known of the image that comes out."""
+        last = self.steps[-1]
+        return last.method.next_context(last.context)
+
+    @cached_property
+    def step_names(self) -> tuple[str, ...]:
+        """The names of its steps."""
+        return tuple(step.name for step in self.steps)
+
+    @cached_property
+    def maker_of_raw(self) -> str | None:
+        """The last step that makes a raw in DN; None where none does."""
+        raws = [step.name for step in self.steps if step.stage.writes is Kind.RAW]
+        return raws[-1] if raws else None
+
+    @cached_property
+    def context_of_raw(self) -> Context:
+        """What is known of its raw in DN; without one, of what enters."""
+        if self.maker_of_raw is None:
+            return self.steps[0].context
+        maker = self.step_named(self.maker_of_raw)
+        return maker.method.next_context(maker.context)
+
+    @cached_property
     def filters(self) -> FilterArray:
         """The filter array of its raw, or of its mosaic where it makes no raw."""
-        raws = [step for step in self.steps if step.stage.writes is Kind.RAW]
-        if raws or self.result is Kind.MOSAIC:
-            step = (raws or self.steps)[-1]
-        elif self.source in (Kind.RAW, Kind.MOSAIC):
+        if self.maker_of_raw:
+            return self.context_of_raw.filters
+        if self.result is Kind.MOSAIC:
+            return self.context_after.filters
+        if self.source in (Kind.RAW, Kind.MOSAIC):
             return self.steps[0].context.filters
-        else:
-            step = self.step_in(StageRole.PATTERN) or self.steps[-1]
+        step = self.step_in(StageRole.PATTERN) or self.steps[-1]
         return step.method.next_context(step.context).filters
 
-    @property
+    @cached_property
     def result(self) -> Kind:
         """The kind of image that comes out."""
         return self.steps[-1].stage.writes if self.steps else self.source
@@ -186,17 +226,12 @@ class Chain:
     @property
     def noise(self) -> NoiseModel | None:
         """The sensor noise in the image that comes out; None where none was added."""
-        last = self.steps[-1]
-        return last.method.next_context(last.context).noise
+        return self.context_after.noise
 
-    @property
+    @cached_property
     def is_noisy(self) -> bool:
         """Whether a step draws random numbers."""
         return any(p.random for s in self.steps for p in s.passes)
-
-    def in_family(self, family: "Family", numbers: Sequence[Any]) -> "Chain":
-        """The chain as one of a family, with its numbers."""
-        return altered(self, {"family": family, "numbers": numbers})
 
     def with_settings(self, settings: Settings) -> "Chain":
         """The chain with the settings that it was made of."""
@@ -204,28 +239,33 @@ class Chain:
 
     def settled(self, trace: Trace) -> "Chain":
         """The chain with all that is computed of its steps, as far as it can be traced."""
-        is_whole = True
+        whole = True
         for step in self.steps:
-            is_whole &= not trace.holds(step.passes)
+            whole &= not trace.holds(step.passes)
             _ = step.adds_noise
             try:
                 with trace.attempt():
                     _ = step.arguments
             except NotTraceableError:
                 vars(step).pop("arguments", None)
-                is_whole = False
-        _ = self.geometry, self._resamplings
-        return altered(self, {"structure": object() if is_whole else None})
+                whole = False
+        for name in (*COMPUTED, *STRUCTURAL):
+            getattr(self, name)
+        _ = whole and self.arguments
+        return altered(self, {"structure": {} if whole else None})
 
     def is_equal(self, other: "Chain") -> bool:
         """Whether another chain has the same steps, with the same numbers."""
-        return len(self.steps) == len(other.steps) and all(
-            map(Step.is_equal, self.steps, other.steps)
+        pairs = list(zip(self.steps, other.steps, strict=False))
+        return (
+            len(self.steps) == len(other.steps)
+            and all(own.is_equal(step) for own, step in pairs)
+            and (self.structure is None or all(own.has_equal_arguments(s) for own, s in pairs))
         )
 
-    def _derived(self, make: Callable[["Chain"], "Chain"]) -> "Chain":
-        """Return ``make(self)``, computed where the chain is one of a family."""
-        return self.family.derived(make, self) if self.family else make(self)
+    def derived(self, make: Callable[["Chain"], "Chain"]) -> "Chain":
+        """Return ``make(self)``."""
+        return make(self)
 
     def without_noise(self) -> "Chain":
         """The chain without the noise of its steps.
@@ -235,7 +275,7 @@ class Chain:
         Raises:
             RequestError: no step adds noise.
         """
-        return self._derived(Chain._without_noise)
+        return self.derived(Chain._without_noise)
 
     def _without_noise(self) -> "Chain":
         left = [(step, step.method.without_noise()) for step in self.steps]
@@ -252,7 +292,7 @@ class Chain:
         Raises:
             RequestError: a user's stage does not allow it.
         """
-        return self._derived(Chain._cleaned)
+        return self.derived(Chain._cleaned)
 
     def _cleaned(self) -> "Chain":
         left = []
@@ -316,3 +356,21 @@ class Chain:
             if step.name == name:
                 return step
         raise RequestError(one_of("stage in this chain", name, [s.name for s in self.steps]))
+
+
+def of_structure(function: Callable[[Chain], T]) -> Callable[[Chain], T]:
+    """Compute a function of a chain once for all chains that differ in numbers only.
+
+    What it returns must follow from names, stages and passes alone.
+    """
+
+    @wraps(function)
+    def known(chain: Chain) -> T:
+        if chain.structure is None:
+            return function(chain)
+        if function not in chain.structure:
+            chain.structure[function] = function(chain)
+        found: T = chain.structure[function]
+        return found
+
+    return known

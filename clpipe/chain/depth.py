@@ -7,7 +7,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
-from clpipe.chain.chain import Chain
+from clpipe.chain.chain import Chain, of_structure
 from clpipe.reference.defocus import Depth, checked_depth
 from clpipe.stage import OfDepth
 
@@ -15,6 +15,12 @@ from clpipe.stage import OfDepth
 def depth_steps(chain: Chain) -> dict[str, OfDepth]:
     """The methods of the steps of a chain that need depth, by the names of the steps."""
     return {s.name: s.method for s in chain.steps if isinstance(s.method, OfDepth)}
+
+
+@of_structure
+def needs_depth(chain: Chain) -> bool:
+    """Whether a step of a chain needs the depth of its image."""
+    return bool(depth_steps(chain))
 
 
 def with_depth(chain: Chain, depth: Depth) -> Chain:

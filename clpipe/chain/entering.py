@@ -8,7 +8,7 @@ import numpy as np
 
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
-from clpipe.chain.depth import depth_steps, warnings_of, with_depth
+from clpipe.chain.depth import needs_depth, warnings_of, with_depth
 from clpipe.chain.keys import RENDER
 from clpipe.chain.making import make_chain
 from clpipe.chain.overscan import steps_of_overscan, with_overscan
@@ -58,7 +58,7 @@ def enter(
         ImageError: what ``depth`` raises.
         RequestError: what is known of the camera contradicts itself, or the depth is of no use.
     """
-    if chain.steps[0].name == chain.names[0] and pixels.ndim == 3:
+    if chain.step_names[0] == chain.names[0] and pixels.ndim == 3:
         width, height = margins.inside(*pixels.shape[1::-1])
         optics = chain.optics
         of_lens = ("sensor_width",) if optics.is_sensor_of_lens else ()
@@ -75,7 +75,7 @@ def enter(
         chain = with_overscan(chain, margins)
     height, width = pixels.shape[:2]
     warnings = tuple(filter(None, [check_void(chain, width, height)]))
-    if depth is None or pixels.ndim != 3 or not depth_steps(chain):
+    if depth is None or pixels.ndim != 3 or not needs_depth(chain):
         return Entered(chain, pixels, margins, warnings=warnings)
     found = depth(chain, width, height, margins)
     warnings += tuple(warnings_of(chain, found))

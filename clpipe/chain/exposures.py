@@ -8,7 +8,7 @@ import numpy as np
 
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
-from clpipe.chain.chain import Chain, Step
+from clpipe.chain.chain import Chain, Step, of_structure
 from clpipe.stage import InTime, OfExposures, Reduction, Span
 
 
@@ -56,9 +56,20 @@ class Exposures:
 
 def exposures_of(chain: Chain) -> Exposures | None:
     """The exposures of a chain; None where it has one, or the light does not change."""
+    place = _place(chain)
+    if place is None:
+        return None
+    method = chain.steps[place].method
+    assert isinstance(method, OfExposures)
+    return Exposures(chain, place, method.spans)
+
+
+@of_structure
+def _place(chain: Chain) -> int | None:
+    """The place of the step that merges the exposures of a chain, see :func:`exposures_of`."""
     for place, step in enumerate(chain.steps):
         if isinstance(step.method, OfExposures) and len(step.method.spans) > 1:
-            return Exposures(chain, place, step.method.spans)
+            return place
     return None
 
 

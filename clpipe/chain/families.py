@@ -8,14 +8,15 @@ to the last bit, in a hundredth of the time. Code that cannot be traced runs aga
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.digests import stamp_of
-from clpipe.base.tracing import Repeat, Trace, altered
+from clpipe.base.tracing import Trace, altered, with_attributes
 from clpipe.camera.profile import Camera
-from clpipe.chain.chain import Chain
+from clpipe.chain.chain import Chain, Step
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.stage import Method
@@ -31,17 +32,27 @@ class Family:
     """Chains that differ in numbers only.
 
     Args:
-        make: makes a chain of numbers.
-        repeat: the same as it was traced; returns None where the code takes another path.
-        numbers: those that it was traced with.
+        make: makes a chain of numbers, which may be traced.
+        numbers: those that the family is traced with.
+
+    Raises:
+        NotTraceableError: what is computed is not all in numbers.
     """
 
-    def __init__(self, make: Making, repeat: Repeat, numbers: Numbers) -> None:
+    def __init__(self, make: Making, numbers: Numbers) -> None:
         self._make = make
-        self._repeat = repeat
         self._traced = numbers
         self._is_checked = False
         self._derived: dict[Callable[[Chain], Chain], Families] = {}
+        trace = Trace(numbers)
+        chain = make(trace.inputs).settled(trace)
+        self._steps = trace.repeat(chain.steps)
+        self._attributes = trace.repeat({**vars(chain), "steps": None, "settings": None})
+
+    def steps(self, numbers: Numbers) -> tuple[Step, ...]:
+        """Return the steps of the chain of numbers."""
+        steps: tuple[Step, ...] = self._steps(numbers)
+        return steps
 
     def chain(self, numbers: Numbers) -> Chain | None:
         """Return the chain of numbers, None where it is none of the family.
@@ -49,25 +60,45 @@ class Family:
         The first one that was not traced is also made, and compared.
         """
         try:
-            chain: Chain | None = self._repeat(numbers)
+            attributes = self._attributes(numbers)
         except (ArithmeticError, ValueError):
             return None  # the code says it in its own words
-        if chain is None:
+        if attributes is None:
             return None
+        del attributes["steps"]
+        chain = with_attributes(ComputedChain, {**attributes, "family": self, "numbers": numbers})
         if not self._is_checked and numbers != self._traced:
             if not chain.is_equal(self._make(numbers)):
-                self._repeat = lambda numbers: None
+                self._attributes = lambda numbers: None
                 return None
             self._is_checked = True
-        return chain.in_family(self, numbers)
+        return chain
 
-    def derived(self, make: Callable[[Chain], Chain], chain: Chain) -> Chain:
-        """Return ``make(chain)`` for a chain of the family."""
+    def derived(self, make: Callable[[Chain], Chain], chain: Chain, numbers: Numbers) -> Chain:
+        """Return ``make(chain)`` for the chain of numbers."""
         families = self._derived.setdefault(make, Families())
-        found = families.chain(
-            chain.numbers, lambda numbers: make(self._make(numbers)), lambda: make(chain)
+        return families.chain(
+            numbers, lambda numbers: make(self._make(numbers)), lambda: make(chain)
         )
-        return found.with_settings(chain.settings)
+
+
+class ComputedChain(Chain):
+    """A chain of a family. Its steps are computed when they are asked for."""
+
+    family: Family | None = None  # None is a copy with other steps
+    numbers: Numbers = ()
+
+    @cached_property
+    def steps(self) -> tuple[Step, ...]:  # type: ignore[override]
+        """The steps."""
+        assert self.family
+        return self.family.steps(self.numbers)
+
+    def derived(self, make: Callable[[Chain], Chain]) -> Chain:
+        if not self.family:
+            return make(self)
+        found = self.family.derived(make, self, self.numbers)
+        return found.with_settings(self.settings)
 
 
 class Families:
@@ -99,15 +130,16 @@ class Families:
         return chain
 
     def _add(self, numbers: Numbers, make: Making, chain: Chain) -> None:
-        trace = Trace(numbers)
         try:
-            repeat = trace.repeat(make(trace.inputs).settled(trace))
-            is_equal = chain.is_equal(repeat(numbers))
+            family = Family(make, numbers)
+            computed = family.chain(numbers)
         except Exception:  # whatever a stage's code does with numbers that are no floats
-            is_equal = False
-        if is_equal:
-            self._known.append(Family(make, repeat, numbers))
-        self._may_trace = is_equal and len(self._known) < MOST_FAMILIES
+            computed = None
+        if computed and computed.is_equal(chain):
+            self._known.append(family)
+        else:
+            self._may_trace = False
+        self._may_trace &= len(self._known) < MOST_FAMILIES
 
 
 FAMILIES: BoundedCache[Families] = BoundedCache(MOST_SETTINGS)

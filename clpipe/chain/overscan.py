@@ -9,10 +9,11 @@ from dataclasses import replace
 
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
-from clpipe.chain.chain import Chain
+from clpipe.chain.chain import Chain, of_structure
 from clpipe.reference.geometry import NO_MARGINS, Margins
 
 
+@of_structure
 def steps_of_overscan(chain: Chain) -> int:
     """How many steps of a chain get an image that goes on beyond the picture; 0 is none."""
     for count, step in enumerate(chain.steps, 1):

@@ -2,7 +2,7 @@
 
 import os
 import threading
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from operator import itemgetter
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.base.cache import BoundedCache
+from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, Step
@@ -25,7 +25,7 @@ from clpipe.outputs.patches import Patch, Patches, facts_of, pattern_of, varianc
 from clpipe.stage import Kind
 
 Sample = dict[str, Any]
-MAX_CHAINS = 1024  # of 50 KB each, since patches of one image may be asked for at any time
+MAX_STRUCTURES = 256
 
 
 @dataclass(frozen=True)
@@ -94,17 +94,6 @@ def raw_step(chain: Chain, arrays: ArrayFormat) -> str:
 
 
 @dataclass(frozen=True)
-class Prepared:
-    """A chain, ready to run: what makes "image" and "truth", and the names of their raws."""
-
-    chain: Chain
-    runners: dict[str, Runner]
-    raws: dict[str, str]
-    noise: tuple[Step, ...]  # of the variance
-    facts: Sample
-
-
-@dataclass(frozen=True)
 class Order:
     """An image of which samples are made.
 
@@ -113,15 +102,12 @@ class Order:
         source: the image.
         noise_key: what its noise is made of.
         patches: the parts of the picture that are samples; () is one sample, all of it.
-        chain_key: what the chain follows from, so that it is prepared once; None is more than can
-            be told.
     """
 
     chain: Chain
     source: SourceImage
     noise_key: str
     patches: Sequence[Patch]
-    chain_key: Hashable | None
 
     @property
     def options(self) -> RunOptions:
@@ -143,7 +129,7 @@ class Developer:
         self._device = device
         self._spec = spec
         self._lock = threading.Lock()
-        self._prepared: BoundedCache[Prepared] = BoundedCache(MAX_CHAINS)
+        self._raws: BoundedCache[dict[str, str]] = BoundedCache(MAX_STRUCTURES)
         self._latest: dict[str, Runner] = {}
 
     def begin(self, orders: Sequence[Order]) -> list[Callable[[], list[Sample]]]:
@@ -157,39 +143,82 @@ class Developer:
             ImageError, RequestError, MemoryError: an image cannot be developed.
         """
         with self._lock:
-            prepared = [self._prepared_for(order) for order in orders]
+            runs = [self._runs(order.chain) for order in orders]
             begun = submit_together(
                 [
                     runner.work(order.source.pixels, order.noise_key, order.options)
-                    for order, own in zip(orders, prepared, strict=True)
-                    for runner in own.runners.values()
+                    for order, own in zip(orders, runs, strict=True)
+                    for runner in own.values()
                 ]
             )
         waits = iter(begun)
         return [
-            partial(self._finish, order, own, dict(zip(own.runners, waits, strict=False)))
-            for order, own in zip(orders, prepared, strict=True)
+            partial(self._finish, order, dict(zip(own, waits, strict=False)))
+            for order, own in zip(orders, runs, strict=True)
         ]
 
-    def _prepared_for(self, order: Order) -> Prepared:
-        if order.chain_key is None:
-            return self._prepare(order.chain)
-        return self._prepared.get(order.chain_key, lambda: self._prepare(order.chain))
+    def _runs(self, chain: Chain) -> dict[str, Runner]:
+        """What makes "image", "truth", and the "signal" that a variance is computed from."""
+        spec, raws = self._spec, self._raws_of(chain)
+        encode = chain.result is Kind.DISPLAY and spec.arrays.dtype is None
+        chains = {"image": chain}
+        if spec.truth:
+            chains["truth"] = picture_without_noise(spec.truth, chain)
+        runs = {
+            name: self._runner(name, each, (*spec.keep, *filter(None, [raws.get(name)])), encode)
+            for name, each in chains.items()
+        }
+        if spec.variance:
+            signal, _ = variance_steps(chain)
+            runs["signal"] = self._runner("signal", signal, (), encode=False)
+        return runs
 
-    def _finish(
-        self, order: Order, prepared: Prepared, begun: Mapping[str, Callable[[], Result]]
-    ) -> list[Sample]:
+    def _raws_of(self, chain: Chain) -> dict[str, str]:
+        """The steps whose images are the raws of "image" and "truth"."""
+        spec = self._spec
+        if not spec.arrays.raw:
+            return {}
+
+        def found() -> dict[str, str]:
+            last = raw_step(chain, spec.arrays)
+            if not spec.truth:
+                return {"image": last}
+            truth = picture_without_noise(spec.truth, chain)
+            return {"image": last, "truth": last_until(truth, chain, last)}
+
+        if chain.structure is None:
+            return found()
+        return self._raws.get(Identity(chain.structure), found)
+
+    def _runner(self, name: str, chain: Chain, keep: Sequence[str], encode: bool) -> Runner:
+        kept = tuple(step for step in chain.step_names if step in keep)
+        latest = self._latest.get(name)
+        if latest and latest.keep == kept and latest.encode == encode:
+            runner = latest.for_chain(chain)  # shares its plans
+        else:
+            runner = Runner(chain, self._device, kept, encode, final=not encode)
+        self._latest[name] = runner
+        return runner
+
+    def _finish(self, order: Order, begun: Mapping[str, Callable[[], Result]]) -> list[Sample]:
         """The samples of what was begun."""
         results = {}
         for name, wait in begun.items():
             with self._lock:
                 results[name] = wait()
+        raws = self._raws_of(order.chain)
+        noise = variance_steps(order.chain)[1] if self._spec.variance else ()
         if not order.patches:
-            return [self._sample(prepared, results, None, lambda image: image)]
-        return [
-            self._sample(prepared, results, patch, itemgetter(i))
-            for i, patch in enumerate(order.patches)
-        ]
+            samples = [self._sample(order.chain, raws, results, None, noise, lambda image: image)]
+        else:
+            samples = [
+                self._sample(order.chain, raws, results, patch, noise, itemgetter(i))
+                for i, patch in enumerate(order.patches)
+            ]
+        facts = facts_of(order.chain).items()
+        for sample in samples:
+            sample |= {name: v.copy() if isinstance(v, np.ndarray) else v for name, v in facts}
+        return samples
 
     def drain(self) -> None:
         """Wait for what was begun."""
@@ -199,13 +228,24 @@ class Developer:
 
     def _sample(
         self,
-        prepared: Prepared,
-        results: dict[str, Result],
+        chain: Chain,
+        raws: Mapping[str, str],
+        results: Mapping[str, Result],
         patch: Patch | None,
+        noise: tuple[Step, ...],
         part: Callable[[Array], Array],
     ) -> Sample:
-        """The sample of an image, or of a patch: ``part`` gives that of an image of a result."""
-        arrays, chain = self._spec.arrays, prepared.chain
+        """The arrays of the sample of an image, or of a patch.
+
+        Args:
+            chain: of the image.
+            raws: the steps whose images are raws, by the names of results.
+            results: what came out.
+            patch: the patch; None is the image.
+            noise: the steps that the variance follows from.
+            part: returns the sample's part of an image of a result.
+        """
+        arrays = self._spec.arrays
         pattern = pattern_of(chain)
 
         def turned(image: Array) -> Array:
@@ -219,51 +259,18 @@ class Developer:
                     sample[prefix + step] = arrays.ordered(turned(image))
             sample[name] = arrays.picture(turned(result.image), chain.result)
             if arrays.raw:
-                raw = result.kept[prepared.raws[name]]
-                sample[f"{prefix}raw"] = arrays.mosaic(turned(raw), pattern)
-        if self._spec.variance:
-            variance = variance_at(prepared.noise, part(results["signal"].image), patch)
+                sample[f"{prefix}raw"] = arrays.mosaic(turned(result.kept[raws[name]]), pattern)
+        if noise:
+            variance = variance_at(noise, part(results["signal"].image), patch)
             variance = patch.turned(variance) if patch else variance
             sample["variance"] = arrays.variance(variance, pattern)
         if patch:
             sample |= {"place": np.array([patch.left, patch.top]), "turn": patch.orientation}
-        facts = prepared.facts.items()
-        return sample | {name: v.copy() if isinstance(v, np.ndarray) else v for name, v in facts}
-
-    def _prepare(self, chain: Chain) -> Prepared:
-        """What runs a chain."""
-        spec = self._spec
-        chains = {"image": chain}
-        if spec.truth:
-            chains["truth"] = picture_without_noise(spec.truth, chain)
-        raws = {}
-        if spec.arrays.raw:
-            last = raw_step(chain, spec.arrays)
-            raws = {name: last_until(each, chain, last) for name, each in chains.items()}
-        encode = chain.result is Kind.DISPLAY and spec.arrays.dtype is None
-        runners = {
-            name: self._runner(name, each, (*spec.keep, *filter(None, [raws.get(name)])), encode)
-            for name, each in chains.items()
-        }
-        noise: tuple[Step, ...] = ()
-        if spec.variance:
-            signal, noise = variance_steps(chain)
-            runners["signal"] = self._runner("signal", signal, (), encode=False)
-        return Prepared(chain, runners, raws, noise, facts_of(chain))
-
-    def _runner(self, name: str, chain: Chain, keep: Sequence[str], encode: bool) -> Runner:
-        kept = tuple(step.name for step in chain.steps if step.name in keep)
-        latest = self._latest.get(name)
-        if latest and latest.keep == kept and latest.encode == encode:
-            runner = latest.for_chain(chain)  # shares its plans
-        else:
-            runner = Runner(chain, self._device, kept, encode, final=not encode)
-        self._latest[name] = runner
-        return runner
+        return sample
 
 
 def last_until(truth: Chain, chain: Chain, name: str) -> str:
     """The last step of a truth up to a step of its chain, which the truth may do without."""
-    names = [step.name for step in chain.steps]
+    names = chain.step_names
     until = names[: names.index(name) + 1]
-    return [step.name for step in truth.steps if step.name in until][-1]
+    return [step for step in truth.step_names if step in until][-1]

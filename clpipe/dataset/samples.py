@@ -3,7 +3,7 @@
 import os
 import threading
 import warnings
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,7 +14,7 @@ from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.carry import VALID
 from clpipe.chain.identity import noise_key, of_frame
-from clpipe.dataset.developer import MAX_CHAINS, Developer, Order, Sample, SampleSpec
+from clpipe.dataset.developer import Developer, Order, Sample, SampleSpec
 from clpipe.engine.device import open_device
 from clpipe.images.read import SourceImage
 from clpipe.inputs.find import Job
@@ -75,7 +75,6 @@ class SampleLoader:
         self.patches = patches
         self.renders: BoundedCache[SourceImage] = BoundedCache(cache, pixel_bytes)
         self._loader = loader
-        self._loaders: BoundedCache[ImageLoader] = BoundedCache(MAX_CHAINS)
         self._spec = spec
         self._device = device
         self._opened: Developer | None = None
@@ -109,9 +108,7 @@ class SampleLoader:
         loader = self._loader
         carried: Sample = {}
         try:
-            loader = self._loaders.get(
-                batch.draw_key, lambda: self._loader.for_job(replace(job, key=batch.draw_key))
-            )
+            loader = self._loader.for_job(replace(job, key=batch.draw_key))
             loaded = loader.enter(job, self._source(job, loader))
             if loaded and loader.request.carry:
                 along = loader.aovs(job, loaded)
@@ -172,7 +169,7 @@ class SampleLoader:
             else:
                 self._spec.arrays.check_size(*chain.size(*pixels.shape[1::-1]))
         key = noise_key(chain.settings, loaded.key, batch.epoch)
-        return Order(chain, loaded.source, key, patches, self._chain_key(batch, loaded))
+        return Order(chain, loaded.source, key, patches)
 
     def _finish(
         self,
@@ -191,13 +188,6 @@ class SampleLoader:
                 sample[name] = arrays.ordered(patches[i].cut_out(layer) if patches else layer)
             sample.update(facts)
         return samples
-
-    def _chain_key(self, batch: SampleBatch, loaded: LoadedImage) -> Hashable | None:
-        """What the chain of an image follows from; None where that is its depth, too."""
-        if loaded.source.depth:  # of which runners would keep a copy
-            return None
-        own = loaded.chain is not self._loader.chain
-        return (loaded.key, batch.draw_key) if own else ()
 
     @contextmanager
     def _errors_of(self, *jobs: Job) -> Iterator[None]:

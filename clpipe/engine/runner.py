@@ -10,7 +10,7 @@ import numpy as np
 from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array, Floats
-from clpipe.chain.chain import Chain
+from clpipe.chain.chain import Chain, of_structure
 from clpipe.chain.exposures import exposures_of
 from clpipe.chain.registry import user_code_errors
 from clpipe.engine.bindings import (
@@ -32,7 +32,7 @@ from clpipe.engine.programs import announced
 from clpipe.engine.submission import Work, submit_together
 from clpipe.reference.curve import compose, to_8_bit
 from clpipe.reference.random import Stream
-from clpipe.stage import NoiseScope, ReferenceContext, Resample
+from clpipe.stage import Method, NoiseScope, ReferenceContext, Resample
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,12 @@ def cut_out(image: Array, boxes: Sequence[Box]) -> Array:
     return np.stack([image[box.top : box.bottom, box.left : box.right] for box in boxes])
 
 
+@of_structure
+def may_estimate(chain: Chain) -> bool:
+    """Whether numbers follow from the size of an image."""
+    return any(type(s.method).estimates_for is not Method.estimates_for for s in chain.steps)
+
+
 class Runner:
     """Runs one chain over images, on a device or in NumPy.
 
@@ -114,7 +120,7 @@ class Runner:
         self.encode = encode
         self.final = final
         self.incremental = incremental
-        self._arguments = {step.name: step.arguments for step in chain.steps}
+        self._arguments = chain.arguments
         self._exposures = exposures_of(chain)
         self._estimates: BoundedCache[dict[str, dict[str, float]]] = BoundedCache(32)  # by size
         # Shared with the runners of other chains, by a chain's structure.
@@ -150,7 +156,9 @@ class Runner:
             options = chain, half, *results, fold, planar, self.incremental
             return self._plans.get(structure, lambda: make_plan(*options))
 
-        return self._plans.get((*key, Identity(chain.structure or chain)), plan)
+        return self._plans.get(
+            (*key, Identity(chain if chain.structure is None else chain.structure)), plan
+        )
 
     def plan_for(self, image: Array) -> Plan:
         """The plan for an image."""
@@ -285,17 +293,18 @@ class Runner:
                 f"{self.chain.source.label} with {channels} channel(s)"
             )
         if options.boxes:
-            self._check_sizes(*image.shape[1::-1])
+            self._check_sizes(image)
 
-    def _check_sizes(self, width: int, height: int) -> None:
+    def _check_sizes(self, image: Array) -> None:
         """See that all images of an image's result are of one size, so that patches are, too.
 
         Raises:
             ImageError: they are not.
         """
-        last = self.chain.size(width, height)
-        for name in self.keep:
-            own = self.chain.through([name]).size(width, height)
+        plan = self.plan_for(image)
+        *_, last = sizes = plan.sizes(*image.shape[1::-1])
+        for name, kept in plan.kept:
+            own = sizes[kept.level]
             if own != last:
                 raise ImageError(
                     f"the image of {name} has {own[0]}x{own[1]} pixels, but the last one "
@@ -317,14 +326,16 @@ class Runner:
                     return self._composed(steps)
                 case StreamWord(step, scope, word):
                     if step not in keys:
-                        keys[step] = self.chain.streams(self.chain.step_named(step), noise_key)
+                        keys[step] = self.chain.streams(step, noise_key)
                     return np.uint32(getattr(keys[step][scope], word))
 
         return bind
 
     def _estimates_for(self, width: int, height: int) -> dict[str, dict[str, float]]:
         """Numbers that follow from the size of the steps' images, by step."""
-        found = {}
+        found: dict[str, dict[str, float]] = {}
+        if not may_estimate(self.chain):
+            return found
         for step in self.chain.steps:
             if values := step.method.estimates_for(width, height):
                 found[step.name] = dict(values)
@@ -375,7 +386,9 @@ class Runner:
         steps = (self.chain if whole else self.chain.through(self.keep)).steps
         for step in steps:
             from_size = dict(step.method.estimates_for(*image.shape[1::-1]))
-            given = ReferenceContext(step.context, self.chain.streams(step, noise_key), from_size)
+            given = ReferenceContext(
+                step.context, self.chain.streams(step.name, noise_key), from_size
+            )
             with user_code_errors(f"stage {step.name}", step.stage.folder):
                 image = step.method.reference(image, given)
             if step.name in self.keep:

@@ -1,15 +1,17 @@
 """The raw of a chain as a negative: what a DNG stores beside the samples."""
 
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clpipe.base.errors import RequestError
+from clpipe.base.types import Doubles
 from clpipe.camera.noise import NoiseModel
+from clpipe.camera.profile import Matrix
 from clpipe.chain.chain import Chain
 from clpipe.images.dng import Negative, check_array, check_channels, xyz_to_camera
+from clpipe.reference.filter_array import FilterArray
 from clpipe.stage import Context, Kind, StageRole, run_reference
 from clpipe.stages.tone_curve.neutral import Neutral
 
@@ -25,25 +27,23 @@ def negative_of(chain: Chain) -> Negative:
     Raises:
         RequestError: the chain has no raw, or one that DNG cannot hold.
     """
-    makers = [step for step in chain.steps if step.stage.writes is Kind.RAW]
-    first, last = chain.steps[0], chain.steps[-1]
-    is_input = not makers
+    is_input = chain.maker_of_raw is None
     if is_input and chain.source is not Kind.RAW:
         raise RequestError(
             "--format dng writes the raw in DN that quantize makes, but this chain starts on "
             f"{chain.source.label} and has no quantize; put it in, or use another format"
         )
-    context = first.context if is_input else makers[-1].method.next_context(makers[-1].context)
-    end = last.method.next_context(last.context)
-    is_balanced = chain.step_in(StageRole.BALANCE) is not None
-    gains = end.applied_gains if is_input and is_balanced else context.gains
-    levels = first.method if is_input else context  # normalize has the levels of a raw that enters
+    context, end = chain.context_of_raw, chain.context_after
+    is_balanced = is_input and chain.step_in(StageRole.BALANCE) is not None
+    gains = end.applied_gains if is_balanced else context.gains
+    # normalize has the levels of a raw that enters
+    levels = chain.steps[0].method if is_input else context
     black = _level(levels, "black_level", chain.camera.black_level)
     white = _level(levels, "white_level", chain.camera.white_level)
     if white != int(white):
         raise RequestError(
             f"--format dng: found a white level of {white:g}, but DNG wants whole DN; "
-            f"--set {(first if is_input else makers[-1]).name}.white_level={white:.0f}"
+            f"--set {chain.maker_of_raw or chain.step_names[0]}.white_level={white:.0f}"
         )
     if context.knots:
         raise RequestError(
@@ -55,14 +55,15 @@ def negative_of(chain: Chain) -> Negative:
             f"--format dng: found a white level of {white:.0f}, but it holds DN of 16 bits; use "
             "--format npy, or fewer bits"
         )
+    undone = end.colours if is_input and end.colours != context.colours else None
     array = replace(context.filters, gains=gains, is_balanced=True)
     check_array(array)
     return Negative(
-        step=None if is_input else makers[-1].name,
+        step=chain.maker_of_raw,
         array=array,
         black_level=black,
         white_level=int(white),
-        xyz_to_camera=xyz_to_camera(_colours(context, end, is_input), array),
+        xyz_to_camera=_xyz_to_camera(context.colours, undone, array),
         noise=_of_white(context),
         tone=partial(run_reference, Neutral()),
     )
@@ -92,17 +93,15 @@ def _level(owner: object, name: str, default: float) -> float:
     return default if value is None else float(value)
 
 
-def _colours(context: Context, end: Context, is_input: bool) -> NDArray[np.float64]:
-    """The matrix from linear sRGB to the mosaic's own colours, white-balanced.
-
-    It is what was done to a render before the mosaic. For a raw that enters it is the inverse of
-    what is done to it behind, if anything is.
+@lru_cache(maxsize=64)
+def _xyz_to_camera(colours: Matrix, undone: Matrix | None, array: FilterArray) -> Doubles:
+    """The ColorMatrix of a raw, see :func:`~clpipe.images.dng.xyz_to_camera`.
 
     Args:
-        context: at the raw.
-        end: at the end of the chain.
-        is_input: whether the raw is the image that enters.
+        colours: linear sRGB to the mosaic's own colours, white-balanced: what was done to a render
+            before the mosaic.
+        undone: for a raw that enters, what is done to it later, of which this is the inverse.
+        array: its filter array.
     """
-    if is_input and end.colours != context.colours:
-        return np.asarray(np.array(context.colours) @ np.linalg.inv(end.colours), np.float64)
-    return np.array(context.colours)
+    own = np.array(colours)
+    return xyz_to_camera(own if undone is None else own @ np.linalg.inv(undone), array)
