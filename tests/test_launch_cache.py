@@ -11,7 +11,6 @@ import pytest
 
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
-from clpipe.engine.calls import Call
 from clpipe.engine.check import example
 from clpipe.engine.codegen import write_kernel
 from clpipe.engine.device import Device
@@ -20,6 +19,7 @@ from clpipe.engine.launch_cache import LaunchCache
 from clpipe.engine.options import RunOptions
 from clpipe.engine.plan import make_plan
 from clpipe.engine.runner import Runner
+from clpipe.engine.stack import Call
 from clpipe.stage import Kind
 from tests.test_tiles import same
 
@@ -136,9 +136,9 @@ def test_a_launch_is_left_out_if_all_that_it_writes_is_there():
 
     def launches(cache, first=first, second=calls[1]):
         own = [first, second, calls[2]]
-        return cache.next(own, pool, source, True, extents, lambda value: value)[0]
+        return cache.next(own, pool, source, True, extents, list)[0]
 
-    numbers, cache = LaunchCache().next(calls, pool, source, True, extents, lambda value: value)
+    numbers, cache = LaunchCache().next(calls, pool, source, True, extents, list)
     assert numbers == (0, 1, 2)
     assert launches(cache) == (2,)
     assert launches(cache, second=a_call(*second, np.ones(3))) == (2,)

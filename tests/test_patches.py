@@ -217,19 +217,19 @@ def test_no_buffer_is_replaced_while_an_image_is_on_the_device(device, monkeypat
     runner.run(*images[0])  # compiles
     fresh.limit(fresh.memory)  # release all buffers
     before, replaced = [], []
-    make_room, reserve = Flow.make_room, Pool.reserve
+    make_way, reserve = Flow.reserve, Pool.reserve
 
-    def recording_make_room(flow, *arguments):
-        before.append(len(flow._tiles))
-        return make_room(flow, *arguments)
+    def recording_flow(flow, *arguments):
+        before.append(len(flow._sent))
+        return make_way(flow, *arguments)
 
     def recording_reserve(pool, *arguments):
-        generation, tiles = pool.generation, len(fresh.flow._tiles)
+        generation, tiles = pool.generation, len(fresh.flow._sent)
         reserve(pool, *arguments)
         if pool.generation != generation:
             replaced.append(tiles)
 
-    monkeypatch.setattr(Flow, "make_room", recording_make_room)
+    monkeypatch.setattr(Flow, "reserve", recording_flow)
     monkeypatch.setattr(Pool, "reserve", recording_reserve)
     waits = [runner.submit(*image) for image in images]
     assert before == [0, 1, 1]  # an image is on the device when the next one needs larger buffers

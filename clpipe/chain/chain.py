@@ -5,8 +5,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
 from typing import Any, TypeVar
 
-import numpy as np
-
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
 from clpipe.base.tracing import NotTraceableError, Trace, altered
@@ -33,6 +31,7 @@ from clpipe.stage import (
     Resample,
     Stage,
     StageRole,
+    bytes_of,
 )
 
 # Properties of a chain, and those whose values are the same in chains of one structure.
@@ -79,8 +78,7 @@ class Step:
         """Whether another step has the same kernel arguments."""
         own, others = self.arguments, other.arguments
         return own.keys() == others.keys() and all(
-            type(value) is type(others[name]) and np.array_equal(value, others[name])
-            for name, value in own.items()
+            bytes_of(value) == bytes_of(others[name]) for name, value in own.items()
         )
 
     def __repr__(self) -> str:

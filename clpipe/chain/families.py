@@ -89,7 +89,7 @@ class ComputedChain(Chain):
     numbers: Numbers = ()
 
     @cached_property
-    def steps(self) -> tuple[Step, ...]:  # type: ignore[override]
+    def steps(self) -> tuple[Step, ...]:
         """The steps."""
         assert self.family
         return self.family.steps(self.numbers)

@@ -18,8 +18,7 @@ from clpipe.chain.truth import noisy_mosaic, picture_without_noise
 from clpipe.dataset.arrays import HIGHEST, ArrayFormat
 from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions
-from clpipe.engine.runner import Result, Runner
-from clpipe.engine.submission import submit_together
+from clpipe.engine.runner import Result, Runner, submit_together
 from clpipe.images.read import SourceImage
 from clpipe.outputs.patches import Patch, Patches, facts_of, pattern_of, variance_at, variance_steps
 from clpipe.stage import Kind
@@ -146,7 +145,7 @@ class Developer:
             runs = [self._runs(order.chain) for order in orders]
             begun = submit_together(
                 [
-                    runner.work(order.source.pixels, order.noise_key, order.options)
+                    (runner, order.source.pixels, order.noise_key, order.options)
                     for order, own in zip(orders, runs, strict=True)
                     for runner in own.values()
                 ]

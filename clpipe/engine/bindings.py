@@ -3,7 +3,7 @@
 They are tuples because these classes are made seven times faster than dataclasses.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from clpipe.stage import NoiseScope
@@ -64,7 +64,7 @@ class ResamplingValue(NamedTuple):
 # What follows from the image's chain, its key and its size.
 Value = ArgumentValue | StreamWord | EncodedCurves | ResamplingValue
 
-Bind = Callable[[Value], Any]  # gives a NumPy scalar or array
+Bind = Callable[[Sequence[Value]], list[Any]]  # returns NumPy scalars and arrays
 
 
 Bound = Buffer | ExtentNumber | TileNumber | Value

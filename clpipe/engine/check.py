@@ -12,8 +12,8 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
-from clpipe.engine.runner import Runner
-from clpipe.engine.submission import submit_together
+from clpipe.engine.options import DEFAULTS
+from clpipe.engine.runner import Runner, submit_together
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.stage import PERIOD, Kind, Method, Stage, variant_label, variants
 
@@ -235,14 +235,14 @@ def check_stack(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Che
     """The default chain over images of several sizes and ISOs in common launches, which must give
     the bits that each has alone.
     """
-    total, works, alone = Difference(), [], []
+    total, images, alone = Difference(), [], []
     for seed, size in enumerate(sizes):
         chain = make_chain(Settings(iso=ISO + 100 * seed, parameters=NOISE))
         image = example(chain.source, size, half=True, seed=seed)
         runner = Runner(chain, device, final=True)
         alone.append(runner.run(image, "check").final)
-        works.append(runner.work(image, "check"))
-    for wait, expected in zip(submit_together(works), alone, strict=True):
+        images.append((runner, image, "check", DEFAULTS))
+    for wait, expected in zip(submit_together(images), alone, strict=True):
         total += difference(wait().final, expected)
     return Check("exposure..gamma", "common launches", len(sizes), total, 0.0)
 

@@ -25,7 +25,7 @@ from clpipe.engine.ir import (
     Read,
     Reduce,
 )
-from clpipe.engine.kernel_builder import KernelBuilder, opening
+from clpipe.engine.kernel_builder import KernelBuilder, in_order, opening
 from clpipe.engine.ops import Op
 from clpipe.engine.sources import LIBRARY, files_text
 from clpipe.engine.work_items import PARTIALS, RUN, columns_of, local_size, summed_together
@@ -43,14 +43,9 @@ def call(op: Op, arguments: Sequence[str]) -> str:
     return f"{op.pass_.function}({', '.join(arguments)})"
 
 
-def write_kernel(
-    plan: Plan, launch: AnyLaunch | Border, lanes: int, stacked: bool = False
-) -> Kernel:
-    """The OpenCL source of one launch of a plan, for a device with that many lanes.
-
-    One that is ``stacked`` is over several images, see :mod:`clpipe.engine.stack`.
-    """
-    builder = KernelBuilder(plan, lanes, stacked)
+def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
+    """The OpenCL source of one launch of a plan, for a device with that many lanes."""
+    builder = KernelBuilder(plan, lanes)
     for number in ("width", "height", "pitch", "left", "top", "columns", "rows", "border"):
         builder.number(number)
     seen: set[str] = set()
@@ -79,12 +74,13 @@ def write_kernel(
             at = "(uint)get_global_id(0), (uint)get_global_id(1)"
             down, across = (n if n > MIRRORED else 0 for n in launch.period or (0, 0))
             plane = builder.slot(launch.slot, True)
-            body = f"    fill_border({plane}, {at}, {down}, {across}, e);\n"
-            if stacked:  # of members that differ in size
-                body = f"    if (get_global_id(1) >= rows + 2 * border) return;\n{body}"
-    declared, first = [p.declaration for p in builder.parameters.values()], list[str]()
-    if stacked:
-        declared, first = opening(builder.parameters)
+            # Members differ in size.
+            body = (
+                "    if (get_global_id(1) >= rows + 2 * border) return;\n"
+                f"    fill_border({plane}, {at}, {down}, {across}, e);\n"
+            )
+    parameters = in_order(builder.parameters)
+    declared, first = opening(parameters)
     signature = ",\n    ".join(declared)
     size = 1 if isinstance(launch, Finalize) else local_size(lanes)
     setup = "".join(f"    {line}\n" for line in builder.setup)
@@ -98,7 +94,7 @@ def write_kernel(
     )
     name = f"launch_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
     source = text.replace(UNNAMED, name)
-    return Kernel(name, source, tuple(builder.parameters.values()), launch, tuple(sorted(seen)))
+    return Kernel(name, source, tuple(parameters.values()), launch, tuple(sorted(seen)))
 
 
 def kernels_of(ops: Sequence[Op | None]) -> list[str]:
@@ -236,9 +232,8 @@ def _pixels(builder: KernelBuilder, launch: Launch) -> str:
     )
     rows = "".join(f"    {line}\n" for line in [*once, *body])
     rows = f"    const site first = site_at(x, y);\n{rows}"
-    inside, outside = "x - e.left < columns", "x - e.left >= columns"
-    if builder.stacked:  # of which members may differ in size
-        inside, outside = f"{inside} && y - e.top < rows", f"{outside} || y - e.top >= rows"
+    inside = "x - e.left < columns && y - e.top < rows"  # of which members may differ in size
+    outside = "x - e.left >= columns || y - e.top >= rows"
     if not launch.sums:
         return f"{place}    if ({outside}) return;\n{rows}"
     own = "(int4)(fold_columns(even_rows, first), fold_columns(odd_rows, first))"

@@ -2,14 +2,12 @@
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import partial
+from typing import Any
 
 from clpipe.base.errors import DeviceError
-from clpipe.base.types import Array
-from clpipe.engine.bindings import Bind
-from clpipe.engine.buffers import HostImages, room_for
 from clpipe.engine.discovery import (
     DeviceInfo,
     choose,
@@ -18,17 +16,15 @@ from clpipe.engine.discovery import (
     shared_out,
     usable_memory,
 )
-from clpipe.engine.flow import DeviceImage, Flow
+from clpipe.engine.flow import Flight, Flow
 from clpipe.engine.ir import Plan
-from clpipe.engine.members import ImageTask, Member
-from clpipe.engine.options import RunOptions
 from clpipe.engine.patches import with_patches
-from clpipe.engine.plan_kernels import calls_with, stack_kernels_with
+from clpipe.engine.plan_kernels import PlanKernels
 from clpipe.engine.programs import announced, forget_programs, programs_of
 from clpipe.engine.recovery import Recovery
-from clpipe.engine.stack import Stack, cut, members_of
-from clpipe.engine.stack import start as start_stack
+from clpipe.engine.stack import Stack, cut
 from clpipe.engine.tiles import Tiling, tiling_of
+from clpipe.engine.work import Member, R, Work
 
 log = logging.getLogger(__name__)
 
@@ -63,8 +59,7 @@ class Device:
             DeviceError: the device cannot be opened.
         """
         self._programs = programs_of(self.info)
-        self._calls = calls_with(self._programs, self.info.lanes)
-        self._stack_kernels = stack_kernels_with(self._programs, self.info.lanes)
+        self._kernels = PlanKernels(self._programs, self.info.lanes)
         try:
             self.flow = Flow(
                 self._programs.context, self.info.alignment if self.info.in_place else None
@@ -89,93 +84,84 @@ class Device:
 
     def is_compiled(self, plan: Plan) -> bool:
         """Whether the kernels of a plan are compiled."""
-        return plan in self._calls
+        return plan in self._kernels
 
     def keep_programs(self) -> None:
         """Keep for later processes what was compiled, and launched once, since the last time."""
         self._programs.keep()
 
-    def submit(
-        self, plan: Plan, source: Array, bind: Bind, options: RunOptions
-    ) -> Callable[[], HostImages]:
-        """Enqueue one image for a plan, in tiles if it does not fit into the memory.
+    def submit(self, works: Sequence[Work[R]]) -> list[Callable[[], R]]:
+        """Enqueue images, in tiles where they do not fit, and small ones of a plan in stacks.
 
-        So many images are on the way at a time as :attr:`depth` says; before one more is enqueued,
+        So many stacks are on the way at a time as :attr:`depth` says; before one more is enqueued,
         the oldest is waited for.
 
-        Args:
-            plan: the plan.
-            source: the image, (height, width[, channel]), of a type that converts without loss to
-                what the plan reads, half or float. It must stay as it is until the results are
-                taken.
-            bind: gives the values of kernel parameters.
-            options: what comes back, and how.
-
         Returns:
-            What waits for the results and gives them, called once and in the order of images; see
-            :meth:`clpipe.engine.recovery.Recovery.result`.
+            For each image, a callable that waits for its result and returns it, called once and in
+            the order of images. One that fails together with others is done again by itself; see
+            :meth:`clpipe.engine.recovery.Recovery.output`.
 
         Raises:
-            ImageError: the image does not fit into the device's memory, not even in tiles.
+            ImageError: an image does not fit into the device's memory, not even in tiles; of
+                several it is not said which.
             DeviceError: a kernel does not compile.
         """
-        task = self._task(plan, source, bind, options)
-        enqueued = self.enqueue(task, self.memory)
-        return partial(self._recovery.result, task, enqueued, self._recovery.generation)
+        groups: dict[Any, list[Work[R]]] = {}
+        for work in works:
+            key = work if work.is_for_itself else work.plan.unscaled
+            groups.setdefault(key, []).append(work)
+        waits: dict[Work[R], Callable[[], R]] = {}
+        for group in groups.values():
+            flight = self.enqueue(group, self.memory)
+            for work in group:
+                waits[work] = self._recovery.wait(work, flight)
+        return [waits[work] for work in works]
 
-    def _task(self, plan: Plan, source: Array, bind: Bind, options: RunOptions) -> ImageTask:
-        height, width = source.shape[:2]
-        output = room_for(plan, width, height, options.into, options.boxes)
-        return ImageTask(plan, source, bind, output, options)
-
-    def submit_together(
-        self, images: Sequence[tuple[Plan, Array, Bind, RunOptions]]
-    ) -> list[Callable[[], HostImages]] | None:
-        """Enqueue images, or patches of them, in common launches; see :mod:`clpipe.engine.stack`.
-
-        Args:
-            images: what :meth:`submit` takes, of each; their plans have the same kernels.
+    def enqueue(self, works: Sequence[Work[Any]], memory: int) -> Flight | Exception:
+        """Enqueue images, whose plans have the same kernels, within so many bytes.
 
         Returns:
-            What waits for the results of each, as :meth:`submit` does; a stack that fails is done
-            again image by image. None where they are too large, or need launches of their own.
+            What is on the way, or what the device raises.
 
         Raises:
             ImageError, DeviceError: as :meth:`submit`.
         """
-        if sum(max(len(options.boxes), 1) for *_, options in images) < 2:
-            return None
-        tasks = [self._task(*image) for image in images]
-        members = [members_of(task, self.tiling(task, self.memory)) for task in tasks]
-        placed = [each for own in members for each in own or ()]
-        in_place, largest = self.info.in_place, self.info.max_buffer
-        stacks = cut(placed, in_place, self.memory, largest, self.depth) if all(members) else None
-        if not stacks:
-            return None
-        begun = self._begin(stacks)
-        wait, generation = self._recovery.result_of_stacks, self._recovery.generation
-        return [partial(wait, task, begun, generation) for task in tasks]
-
-    def _begin(
-        self, stacks: Sequence[tuple[Sequence[Member], dict[str, int]]]
-    ) -> list[Stack] | Exception:
-        """Enqueue stacks; what the device raises is returned."""
-        begun: list[Stack] = []
-        plan = stacks[0][0][0].task.plan
-        is_new = plan not in self._stack_kernels
+        plan = works[0].plan
+        is_new = plan not in self._kernels
         try:
             with announced(self.info) if is_new else nullcontext():
-                kernels = self._stack_kernels.of(plan)
-            borders = partial(self._stack_kernels.borders, plan)
-            for members, strides in stacks:
-                begun.append(Stack(members, kernels, borders, strides))
-                start_stack(self.flow, begun[-1], self.memory)
-            if is_new:
-                self.drain()  # PoCL is done with a kernel when it has been launched
-                self.keep_programs()
-            return begun
+                flight = self._enqueued(works, memory)
+                if is_new:
+                    self.drain()  # PoCL is done with a kernel when it has been launched
+                    self.keep_programs()
+            return flight
         except (self._cl.Error, MemoryError) as error:
             return error
+
+    def _enqueued(self, works: Sequence[Work[Any]], memory: int) -> Flight:
+        flight, plan = Flight(), works[0].plan
+        calls = self._kernels.of(plan)
+        borders = partial(self._kernels.borders, plan)
+        members: list[Member] = []
+        sizes: Mapping[str, int] = {}
+        for work in works:
+            tiling = self.tiling(work, memory)
+            own = [Member(e, work, number) for number, e in enumerate(tiling.patches)]
+            if len(tiling.phases) > 1 or plan.incremental or not (own or len(tiling.tiles) == 1):
+                self.flow.start_alone(flight, work, tiling, calls, borders, self.memory)
+            else:
+                members += own or [Member(tiling.tiles[0], work, is_whole=True)]
+                sizes = tiling.sizes
+        if len(members) == 1:
+            fetches = works[0].options.download
+            one = Stack(members, calls, borders, {}, fetches=fetches)
+            self.flow.start(flight, one, sizes, self.memory)
+        if len(members) < 2:
+            return flight
+        in_place, largest = self.info.in_place, self.info.max_buffer
+        for part, strides, sizes in cut(members, in_place, memory, largest, self.depth):
+            self.flow.start(flight, Stack(part, calls, borders, strides), sizes, self.memory)
+        return flight
 
     def reopen(self) -> None:
         """Leave a context that is of no more use, with all that is in it, for a new one.
@@ -191,26 +177,17 @@ class Device:
         """Wait for what was enqueued, so that it uses no memory of the host any more."""
         self.flow.drain()
 
-    def tiling(self, task: ImageTask, memory: int) -> Tiling:
-        """Return the tiles of an image within so many bytes."""
-        height, width = task.source.shape[:2]
-        largest = min(memory, self.info.max_buffer)
-        lanes = self.info.lanes
-        tiling = tiling_of(task.plan, width, height, lanes, memory, largest, self.depth)
-        if not task.options.boxes:
-            return tiling
-        return with_patches(task.plan, task.options.boxes, tiling, lanes, memory, self.depth)
+    def tiling(self, work: Work[Any], memory: int) -> Tiling:
+        """Return the tiles of an image within so many bytes.
 
-    def enqueue(self, task: ImageTask, memory: int) -> DeviceImage | Exception:
-        """Enqueue an image; what the device raises is returned."""
-        try:
-            borders = partial(self._calls.borders, task.plan)
-            tiling = self.tiling(task, memory)
-            image = DeviceImage(task, self._calls.of(task.plan), borders, tiling)
-            self.flow.start(image, self.memory)
-            return image
-        except (self._cl.Error, MemoryError) as error:
-            return error
+        Raises:
+            ImageError: it does not fit, not even in tiles.
+        """
+        largest, lanes = min(memory, self.info.max_buffer), self.info.lanes
+        tiling = tiling_of(work.plan, *work.size, lanes, memory, largest, self.depth)
+        if not work.options.boxes:
+            return tiling
+        return with_patches(work.plan, work.options.boxes, tiling, lanes, memory, self.depth)
 
     def copy_speed(self, size: int = 96 * 2**20) -> float:
         """Bytes a second, read plus written, of the device's own buffer copy; the best of five."""

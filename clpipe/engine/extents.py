@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-
 from clpipe.engine.ir import Plan
 from clpipe.engine.work_items import border_left, round_up, summed_together
 
@@ -27,6 +25,11 @@ class Box:
     def height(self) -> int:
         """The number of rows."""
         return self.bottom - self.top
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """The number of columns and of rows."""
+        return self.right - self.left, self.bottom - self.top
 
     @property
     def is_empty(self) -> bool:
@@ -90,10 +93,10 @@ class Extent:
         return ((self.padded_height + 2 * self.border) * self.pitch + 5 * self.lanes) * 4
 
     @cached_property
-    def numbers(self) -> dict[str, np.uint32]:
+    def numbers(self) -> dict[str, int]:
         """The values of the kernel parameters that describe it, by name."""
         core = self.core
-        numbers = {
+        return {
             "width": self.width,
             "height": self.height,
             "pitch": self.pitch,
@@ -108,7 +111,6 @@ class Extent:
             "core_right": core.right,
             "core_bottom": core.bottom,
         }
-        return {name: np.uint32(value) for name, value in numbers.items()}
 
 
 # An image or a tile on each level of a plan.

@@ -24,19 +24,19 @@ LARGER = (
     "from_rows, border}"
 )
 
-# The kernel over a stack of images reads a table of numbers with a row for each image, which holds
-# the plain kernel's parameters. The third dimension of the index space counts the images.
+# A kernel is over a stack of images, which the third dimension of the index space counts. It reads
+# its numbers from a table with a row for each image. The table begins at the global offset, so that
+# one buffer serves all launches; offsets are above 0, for which PoCL compiles kernels of their own.
 TABLE = "numbers"
-AS_TYPE = {"uint": "{}", "int": "as_int({})", "float": "as_float({})"}
+AS_TYPE = {"float": "as_float({})", "int": "as_int({})", "uint": "{}"}
 
 
 class KernelBuilder:
     """Collects the parameters of one kernel and what is set up of them, under canonical names."""
 
-    def __init__(self, plan: Plan, lanes: int, stacked: bool = False) -> None:
+    def __init__(self, plan: Plan, lanes: int) -> None:
         self.plan = plan
         self.lanes = lanes
-        self.stacked = stacked
         self.parameters: dict[str, Parameter] = {}
         self.setup: list[str] = []
         self._steps: list[str] = []
@@ -157,6 +157,22 @@ def estimates_of(plan: Plan, step: str) -> tuple[str, ...]:
     return ()
 
 
+def in_order(parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
+    """Parameters in the order in which a table has their numbers.
+
+    First those of extents, then pointers, and the values of an image's chain by their types.
+    """
+
+    def group(parameter: Parameter) -> int:
+        if isinstance(parameter.bound, ExtentNumber):
+            return int(parameter.bound.larger)
+        if element_of(parameter) or isinstance(parameter.bound, TileNumber):
+            return 2
+        return 3 + list(AS_TYPE).index(parameter.declaration.split()[0])
+
+    return dict(sorted(parameters.items(), key=lambda item: group(item[1])))
+
+
 def element_of(parameter: Parameter) -> str | None:
     """The OpenCL type of what a parameter points to; None where it is a number."""
     type_, star, _ = parameter.declaration.partition("*")
@@ -164,18 +180,21 @@ def element_of(parameter: Parameter) -> str | None:
 
 
 def opening(parameters: Mapping[str, Parameter]) -> tuple[list[str], list[str]]:
-    """The parameters that a stack's kernel has instead of the plain one's, and its first lines.
+    """The parameters that a kernel is declared with, and its first lines.
 
     Args:
-        parameters: the plain kernel's, by their names in the text.
+        parameters: all that it reads, by their names in the text.
     """
     declared = [f"__global const uint *restrict {TABLE}"]
-    lines = [f"{TABLE} += get_global_id(2) * {len(parameters)};"]
+    lines = [
+        "const size_t member = get_global_id(2) - get_global_offset(2);",
+        f"{TABLE} += get_global_offset(2) + member * {len(parameters)};",
+    ]
     for place, (name, parameter) in enumerate(parameters.items()):
         number = f"{TABLE}[{place}]"
         if element_of(parameter):
             declared.append(parameter.declaration)
-            lines.append(f"{name} += get_global_id(2) * {number};")
+            lines.append(f"{name} += member * {number};")
         else:
             type_ = parameter.declaration.split()[0]
             lines.append(f"const {type_} {name} = {AS_TYPE[type_].format(number)};")

@@ -17,8 +17,8 @@ from xxhash import xxh3_128_digest
 from clpipe.base.types import Array
 from clpipe.engine.bindings import Bind
 from clpipe.engine.buffers import Pool
-from clpipe.engine.calls import Call
 from clpipe.engine.extents import Extents
+from clpipe.engine.stack import Call
 
 
 def digest_of(*parts: bytes) -> bytes:
@@ -67,7 +67,7 @@ class LaunchCache:
         same = unchanged and self.source is not None and self.source() is source
         number = self.number + (not same)
         after = LaunchCache(weakref.ref(source), number, dict(self.buffers))
-        planes = [b"".join(n.tobytes() for n in extent.numbers.values()) for extent in extents]
+        planes = [repr(extent.numbers).encode() for extent in extents]
 
         def holds(name: str, made: bytes) -> bool:
             buffer, maker = after.buffers.get(name, (None, b""))
@@ -85,7 +85,7 @@ class LaunchCache:
                 planes[max(level - 1, 0)],
                 number.to_bytes(8) if call.reads_source else b"",
                 *(after.buffers[name][1] for name in call.reads),
-                *(digest(bind(value)) for value in call.values),
+                *map(digest, bind(call.values)),
             )
             if call is calls[-1] or not all(holds(name, made) for name in call.writes):
                 numbers.append(i)

@@ -6,7 +6,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from clpipe.chain.chain import Chain, Step
-from clpipe.stage import Argument, CompileTime, Kind, Pass, Pointwise, Reduction, Resample, Stencil
+from clpipe.stage import (
+    Argument,
+    CompileTime,
+    Kind,
+    Pass,
+    Pointwise,
+    Reduction,
+    Resample,
+    Stencil,
+    bytes_of,
+)
 
 
 @dataclass(frozen=True)
@@ -78,11 +88,6 @@ def undone(
         bytes_of(own[mine]) == bytes_of(others[theirs])
         for mine, theirs in zip(pass_.arguments, before.arguments, strict=True)
     )
-
-
-def bytes_of(argument: Argument) -> bytes:
-    """An argument's value, to compare it."""
-    return argument.text.encode() if isinstance(argument, CompileTime) else argument.tobytes()
 
 
 def ops_of(step: Step, arguments: Mapping[str, Argument]) -> tuple[Op, ...]:

@@ -39,7 +39,7 @@ def with_patches(
     patches = tuple(cut.patch(box, levels) for box in boxes)
     phases = phases_of(plan)
     sizes = dict(whole.sizes) if len(phases) > 1 else {}
-    by_size = {tuple((e.stored.width, e.stored.height) for e in tile): tile for tile in patches}
+    by_size = {tuple(e.stored.size for e in tile): tile for tile in patches}
     for extents in by_size.values():
         for name, size in buffer_sizes(plan, extents, ends).items():
             sizes[name] = max(size, sizes.get(name, 0))

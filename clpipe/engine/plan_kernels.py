@@ -1,38 +1,36 @@
 """The compiled kernels of plans, kept while they are in use."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
-from typing import Generic, TypeVar
 
 from clpipe.base.cache import BoundedCache
-from clpipe.engine.calls import Call
 from clpipe.engine.codegen import write_kernel
 from clpipe.engine.ir import AnyLaunch, Border, Launch, Plan
 from clpipe.engine.programs import Programs, tell_watchers
-from clpipe.engine.stack import StackKernel
+from clpipe.engine.stack import Call
 
 PLANS = 64  # whose kernels stay at hand
 
-K = TypeVar("K")
 
-
-class PlanKernels(Generic[K]):
-    """The kernels of plans, of one kind.
+class PlanKernels:
+    """The kernels of plans, for a device.
 
     Args:
-        make: compiles the kernel of a launch of a plan.
+        programs: compiled on the device.
+        lanes: of the device.
     """
 
-    def __init__(self, make: Callable[[Plan, AnyLaunch | Border], K]) -> None:
-        self._make = make
-        self._plans: BoundedCache[list[K]] = BoundedCache(PLANS)
-        self._borders: BoundedCache[K] = BoundedCache(PLANS)
+    def __init__(self, programs: Programs, lanes: int) -> None:
+        self._programs = programs
+        self._lanes = lanes
+        self._plans: BoundedCache[list[Call]] = BoundedCache(PLANS)
+        self._borders: BoundedCache[Call] = BoundedCache(PLANS)
 
     def __contains__(self, plan: Plan) -> bool:
         """Whether the kernels of a plan are compiled."""
         return plan.unscaled in self._plans
 
-    def of(self, plan: Plan) -> list[K]:
+    def of(self, plan: Plan) -> list[Call]:
         """The kernels of a plan, from the first call on without compiling.
 
         Raises:
@@ -40,37 +38,21 @@ class PlanKernels(Generic[K]):
         """
         return self._plans.get(plan.unscaled, lambda: list(self._compiled(plan)))
 
-    def _compiled(self, plan: Plan) -> Iterator[K]:
+    def _compiled(self, plan: Plan) -> Iterator[Call]:
         count = len(plan.launches)
         for number, launch in enumerate(plan.launches):
             tell_watchers(number, count)
-            yield self._make(plan, launch)
+            yield self._made(plan, launch)
         tell_watchers(count, count)
 
-    def borders(self, plan: Plan, written: Launch) -> Iterator[K]:
+    def _made(self, plan: Plan, launch: AnyLaunch | Border) -> Call:
+        kernel = write_kernel(plan, launch, self._lanes)
+        return Call(kernel, self._programs.kernel(kernel))
+
+    def borders(self, plan: Plan, written: Launch) -> Iterator[Call]:
         """Those that fill the borders of the planes that a launch has written."""
         if not (image := written.writes):
             return
         for slot in plan.slots[image.number]:
             border = Border(slot, written.level, image.period)
-            yield self._borders.get(border, partial(self._make, plan, border))
-
-
-def calls_with(programs: Programs, lanes: int) -> PlanKernels[Call]:
-    """The kernels over one image, for a device of so many lanes."""
-
-    def make(plan: Plan, launch: AnyLaunch | Border) -> Call:
-        kernel = write_kernel(plan, launch, lanes)
-        return Call(kernel, programs.kernel(kernel))
-
-    return PlanKernels(make)
-
-
-def stack_kernels_with(programs: Programs, lanes: int) -> PlanKernels[StackKernel]:
-    """The kernels over a stack."""
-
-    def make(plan: Plan, launch: AnyLaunch | Border) -> StackKernel:
-        kernel = write_kernel(plan, launch, lanes, stacked=True)
-        return StackKernel(kernel, programs.kernel(kernel))
-
-    return PlanKernels(make)
+            yield self._borders.get(border, partial(self._made, plan, border))

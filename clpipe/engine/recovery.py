@@ -1,7 +1,7 @@
 """What happens when a device fails: images are tried again, in a new context if need be."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -9,11 +9,10 @@ import numpy as np
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.engine.buffers import HostImages
 from clpipe.engine.discovery import DeviceInfo
-from clpipe.engine.flow import DeviceImage, Flow
-from clpipe.engine.members import ImageTask
+from clpipe.engine.flow import Flight, Flow
 from clpipe.engine.options import Timing
-from clpipe.engine.stack import Stack
 from clpipe.engine.tiles import Tiling
+from clpipe.engine.work import R, Work
 
 FAILURES = 3  # images in a row that a device fails at, before it is given up
 
@@ -25,11 +24,11 @@ class Recoverable(Protocol):
     memory: int
     flow: Flow
 
-    def enqueue(self, task: ImageTask, memory: int) -> DeviceImage | Exception:
-        """Enqueue an image within so many bytes; what the device raises is returned."""
+    def enqueue(self, works: Sequence[Work[Any]], memory: int) -> Flight | Exception:
+        """Enqueue images within so many bytes; what the device raises is returned."""
         ...
 
-    def tiling(self, task: ImageTask, memory: int) -> Tiling:
+    def tiling(self, work: Work[Any], memory: int) -> Tiling:
         """Return the tiles of an image within so many bytes."""
         ...
 
@@ -60,14 +59,18 @@ class Recovery:
         self._device = device
         self._failures = 0  # images in a row
 
-    def result(
-        self, task: ImageTask, enqueued: DeviceImage | Exception, generation: int
-    ) -> HostImages:
-        """Wait for the results of an image that was enqueued in a generation.
+    def wait(self, work: Work[R], flight: Flight | Exception) -> Callable[[], R]:
+        """Return a callable that waits for an image that was enqueued and returns its result."""
+        output, generation = self.output, self.generation
+        return lambda: work.finish(output(work, flight, generation))
+
+    def output(self, work: Work[Any], flight: Flight | Exception, generation: int) -> HostImages:
+        """Wait for the output of an image that was enqueued in a generation.
 
         If the device runs out of memory before the limit is reached, the buffers of earlier images
         are released, then tiles become smaller. If a kernel fails, the image is tried once more, in
-        a new context if the old one is of no more use.
+        a new context if the old one is of no more use. An image that failed together with others
+        is tried again by itself, and only that counts.
 
         Raises:
             ImageError: memory is not enough for tiles of any size.
@@ -81,22 +84,23 @@ class Recovery:
         while True:
             if generation != self.generation:  # what was enqueued is lost
                 try:
-                    enqueued, generation = device.enqueue(task, memory), self.generation
+                    flight, generation = device.enqueue([work], memory), self.generation
                 except ImageError:
                     if full is None:
                         raise
-                    height, width = task.source.shape[:2]
+                    width, height = work.size
                     raise ImageError(
                         f"{width}x{height} pixels: {device.info.label} is out of memory, in tiles "
                         f"of any size; others may be using it ({full})"
                     ) from None
             try:
-                if isinstance(enqueued, Exception):
-                    raise enqueued
-                device.flow.finish(enqueued)
+                if isinstance(flight, Exception):
+                    raise flight
+                device.flow.finish(flight)
             except (cl.Error, MemoryError) as error:
-                if self._context_survives() and isinstance(error, cl.MemoryError | MemoryError):
-                    memory = memory if full is None else device.tiling(task, memory).bytes // 2
+                is_full = isinstance(error, cl.MemoryError | MemoryError)
+                if self._context_survives() and is_full:
+                    memory = memory if full is None else device.tiling(work, memory).bytes // 2
                     full = error
                     continue
                 if not failed:
@@ -105,29 +109,9 @@ class Recovery:
                 self._count_failure(error)
                 raise DeviceFailedError(f"{device.info.label} failed: {error}") from None
             self._failures = 0
-            if task.options.timings is not None:
-                task.options.timings.extend(timed(enqueued.events))
-            return task.output if task.options.download else HostImages({}, None, {})
-
-    def result_of_stacks(
-        self, task: ImageTask, begun: Sequence[Stack] | Exception, generation: int
-    ) -> HostImages:
-        """Wait for the results of an image in stacks; if one fails, the image goes by itself.
-
-        Raises:
-            ImageError, DeviceFailedError, DeviceError: as :meth:`result`.
-        """
-        if generation == self.generation:
-            try:
-                if isinstance(begun, Exception):
-                    raise begun
-                for stack in begun:
-                    self._device.flow.finish(stack)
-                self._failures = 0
-                return task.output
-            except (self._cl.Error, MemoryError):
-                self._context_survives()
-        return self.result(task, ImageError("it was lost"), generation)
+            if work.options.timings is not None:
+                work.options.timings.extend(timed(flight.events))
+            return work.output if work.options.download else HostImages({}, None, {})
 
     def abandon(self) -> None:
         """Wait for everything on the device and release all memory; images must start again."""

@@ -1,7 +1,7 @@
 """One image through a chain, on a device or in NumPy."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
@@ -21,15 +21,14 @@ from clpipe.engine.bindings import (
     StreamWord,
     Value,
 )
-from clpipe.engine.buffers import HostImages
+from clpipe.engine.buffers import HostImages, room_for
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.ir import Finalize, Plan
 from clpipe.engine.ops import chain_ops
 from clpipe.engine.options import DEFAULTS, RunOptions
 from clpipe.engine.plan import make_plan
-from clpipe.engine.programs import announced
-from clpipe.engine.submission import Work, submit_together
+from clpipe.engine.work import Work
 from clpipe.reference.curve import compose, to_8_bit
 from clpipe.reference.random import Stream
 from clpipe.stage import Method, NoiseScope, ReferenceContext, Resample
@@ -193,9 +192,7 @@ class Runner:
                 plan.check_resamplings(width, height)
             except ImageError:
                 return  # which larger images need not be refused for
-            with announced(self.device.info):
-                self.device.submit(plan, tiny, self.bind(plan, tiny, ""), RunOptions())()
-            self.device.keep_programs()
+            self.device.submit([self._work(plan, tiny, "", DEFAULTS)])[0]()
 
     def run(self, image: Array, noise_key: str, options: RunOptions = DEFAULTS) -> Result:
         """Put one image through, and wait for it; see :meth:`submit`."""
@@ -221,12 +218,12 @@ class Runner:
             DeviceFailedError: the device fails.
             DeviceError: a kernel does not compile, or the device is given up.
         """
-        return submit_together([self.work(image, noise_key, options)])[0]
+        return submit_together([(self, image, noise_key, options)])[0]
 
     def work(
         self, image: Array, noise_key: str, options: RunOptions = DEFAULTS
     ) -> Work[Result] | Callable[[], Result]:
-        """One image for :func:`clpipe.engine.submission.submit_together`.
+        """One image for :meth:`clpipe.engine.device.Device.submit`.
 
         All its exposures but the first are done at once. Arguments and errors as :meth:`submit`.
 
@@ -235,29 +232,25 @@ class Runner:
         """
         self.check(image, options)
         runner = self._merging(image, noise_key, options.later)
-        return runner._work(
-            image, noise_key, replace(options, later=()) if options.later else options
-        )
-
-    def _work(
-        self, image: Array, noise_key: str, options: RunOptions
-    ) -> Work[Result] | Callable[[], Result]:
-        """See :meth:`work`; of an image whose other exposures are done."""
         if not (self.encode or self.final or self.keep):
             return lambda: Result(None, None, {}, {})
         if not self.device:
-            return partial(self._run_numpy, np.asarray(image, np.float32), noise_key, options.boxes)
+            pixels = np.asarray(image, np.float32)
+            return partial(runner._run_numpy, pixels, noise_key, options.boxes)
+        plan = runner.plan_for(image)
+        plan.check_resamplings(*image.shape[1::-1])
+        return runner._work(plan, image, noise_key, options)
+
+    def _work(self, plan: Plan, image: Array, noise_key: str, options: RunOptions) -> Work[Result]:
+        """See :meth:`work`; of an image whose other exposures are done."""
         width, height = image.shape[1::-1]
-        plan = self.plan_for(image)
-        plan.check_resamplings(width, height)
         estimates = self._estimates.get((width, height), lambda: self._estimates_for(width, height))
         return Work(
-            self.device,
             plan,
             image,
             self.bind(plan, image, noise_key),
+            room_for(plan, width, height, options.into, options.boxes),
             options,
-            partial(self._compile_plan, plan),
             partial(self._result, plan, estimates),
         )
 
@@ -315,11 +308,10 @@ class Runner:
         """What gives the values of the kernels' parameters for an image."""
         keys: dict[str, dict[NoiseScope, Stream]] = {}
         sizes = plan.sizes(*image.shape[1::-1])
+        arguments = self._arguments
 
-        def bind(value: Value) -> Any:
+        def other(value: Value) -> Any:
             match value:
-                case ArgumentValue(step, name):
-                    return self._arguments[step][name]
                 case ResamplingValue(level, name):
                     return plan.resamplings[level].values(*sizes[level])[name]
                 case EncodedCurves(steps):
@@ -328,6 +320,12 @@ class Runner:
                     if step not in keys:
                         keys[step] = self.chain.streams(step, noise_key)
                     return np.uint32(getattr(keys[step][scope], word))
+
+        def bind(values: Sequence[Value]) -> list[Any]:
+            return [
+                arguments[each.step][each.name] if type(each) is ArgumentValue else other(each)
+                for each in values
+            ]
 
         return bind
 
@@ -404,3 +402,23 @@ class Runner:
             kept=kept,
             estimates=estimates,
         )
+
+
+def submit_together(
+    images: Sequence[tuple[Runner, Array, str, RunOptions]],
+) -> list[Callable[[], Result]]:
+    """Enqueue images, and small ones of alike chains in common launches.
+
+    Args:
+        images: of each its runner, all on one device, and the arguments of :meth:`Runner.submit`.
+
+    Returns:
+        A callable for each, which waits for its result and returns it; called once and in order.
+
+    Raises:
+        ImageError, DeviceFailedError, DeviceError: as :meth:`Runner.submit`.
+    """
+    works = [runner.work(image, key, options) for runner, image, key, options in images]
+    device = images[0][0].device
+    begun = iter(device.submit([w for w in works if isinstance(w, Work)]) if device else ())
+    return [next(begun) if isinstance(work, Work) else work for work in works]

@@ -1,27 +1,38 @@
-"""Stacks: small images and patches of one plan, which go through a device in common launches.
+"""Stacks: members that go through a device in common launches, each with values of its own.
 
 A launch costs a few microseconds on the host and leaves a GPU empty where the image is small. The
-members of a stack are launched together, each with its own values, in buffers that hold all of
-them one behind the other; each has the bits that it has alone. Their kernels have the bodies of the
-plain ones, and read what differs between members from a table, see :func:`opening`.
+members of a stack are launched together, in buffers that hold all of them one behind the other, and
+each has the bits that it has alone. What differs between them, kernels read from a table of numbers
+with a row for each member, see :func:`~clpipe.engine.kernel_builder.opening`. A large image is a
+stack of one.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from clpipe.base.types import Array
-from clpipe.engine.bindings import Buffer, ExtentNumber, Parameter, TileNumber
+from clpipe.engine.bindings import (
+    ArgumentValue,
+    Buffer,
+    EncodedCurves,
+    ExtentNumber,
+    ResamplingValue,
+    StreamWord,
+    TileNumber,
+    Value,
+)
 from clpipe.engine.buffers import PAGE
-from clpipe.engine.calls import ENDS, index_space
-from clpipe.engine.flow import DeviceTile, Flow, OnTheWay
-from clpipe.engine.ir import Kernel, Launch
+from clpipe.engine.extents import Extent, Extents
+from clpipe.engine.ir import Border, Finalize, Histogram, Kernel, Launch, Lines, Reduce
 from clpipe.engine.kernel_builder import element_of
-from clpipe.engine.members import ImageTask, Member
-from clpipe.engine.tiles import Tiling, buffer_sizes
-from clpipe.engine.work_items import round_up
+from clpipe.engine.tiles import buffer_sizes
+from clpipe.engine.work import Member
+from clpipe.engine.work_items import PARTIALS, columns_of, local_size, round_up, summed_together
+
+ENDS = ("src", "dst")  # buffers that are an image's own
 
 # Bytes of the buffers of a stack, by whether the device works in the host's memory. A CPU does
 # images of 128x128 pixels twice as fast in stacks as alone and 256x256 a third faster, but loses a
@@ -29,62 +40,177 @@ from clpipe.engine.work_items import round_up
 STACK_BYTES = {True: 2**24, False: 2**29}
 BYTES = {"uchar": 1, "half": 2, "float": 4, "uint": 4, "int4": 16, "long4": 32}
 FEWEST = 4  # members, or images are so large that launches are few
+# Of numbers in a table, in the order in which their columns end it.
+TYPES = {"float": np.float32, "int": np.int32, "uint": np.uint32}
+
+
+class Call:
+    """A compiled kernel, and where the rows of its table have what.
+
+    Attributes:
+        reads_source: whether it reads the image that is sent.
+        reads: the names of buffers that stay on the device, of those that it only reads.
+        writes: of those that it writes.
+        values: what an image's chain gives.
+    """
+
+    def __init__(self, kernel: Kernel, compiled: Any) -> None:
+        self.kernel = kernel
+        self.compiled = compiled
+        self.reads: list[str] = []
+        self.writes: list[str] = []
+        self.values: list[Value] = []
+        self._pointers: list[tuple[int, str | int]] = []  # places; a buffer, or one of the values
+        self._elements: dict[int, int] = {}  # bytes, by the places of buffers
+        self._numbers: dict[bool, list[str]] = {False: [], True: []}  # of the extent, the larger
+        self._scalars: dict[str, list[int]] = {type_: [] for type_ in TYPES}  # numbers of values
+        self._tile: int | None = None
+        for place, parameter in enumerate(kernel.parameters):
+            element = element_of(parameter)
+            match parameter.bound:
+                case Buffer(name, written):
+                    self._pointers.append((place, name))
+                    self._elements[place] = BYTES[str(element)]
+                    if name not in ENDS:
+                        (self.writes if written else self.reads).append(name)
+                case ExtentNumber(name, larger):
+                    self._numbers[larger].append(name)
+                case TileNumber():
+                    self._tile = place
+                case ArgumentValue() | StreamWord() | EncodedCurves() | ResamplingValue() as value:
+                    if element:
+                        self._pointers.append((place, len(self.values)))
+                    else:
+                        self._scalars[parameter.declaration.split()[0]].append(len(self.values))
+                    self.values.append(value)
+        self.reads_source = any(name == "src" for _, name in self._pointers)
+        self._of_one: tuple[Extents, Array] = (), np.zeros(0, np.uint32)  # the last one's places
+
+    def table(
+        self,
+        stack: "Stack",
+        buffers: Mapping[str, Any],
+        constant: Callable[[Array], Any],
+        new: Callable[[Array], Any],
+    ) -> tuple[Array, list[Any]]:
+        """The rows of numbers of a stack's members, and the buffers that are the other arguments.
+
+        Args:
+            stack: the stack.
+            buffers: on the device, by name.
+            constant: returns a buffer that holds an array, the same one for the same object.
+            new: returns a new buffer that holds an array.
+        """
+        rows = self._places(stack)
+        if self._tile is not None:
+            rows[:, self._tile] = stack.tile
+        values = [member.work.bind(self.values) for member in stack.members] if self.values else []
+        end = rows.shape[1]
+        for type_, numbers in reversed(self._scalars.items()):  # they are the last columns
+            if numbers:
+                columns = np.array([[own[n] for n in numbers] for own in values], TYPES[type_])
+                rows[:, end - len(numbers) : end] = columns.view(np.uint32)
+                end -= len(numbers)
+        pointers = []
+        for place, name in self._pointers:
+            if isinstance(name, str):
+                pointers.append(buffers[name])
+            else:
+                arrays = [own[name] for own in values]
+                array, rows[:, place] = side_by_side(arrays)
+                pointers.append((constant if array is arrays[0] else new)(array))
+        return rows, pointers
+
+    def _places(self, stack: "Stack") -> Array:
+        """Rows with the numbers of the members' extents and of their places in buffers."""
+        members, is_one = stack.members, len(stack.members) == 1
+        if is_one and members[0].extents is self._of_one[0]:
+            return self._of_one[1].copy()
+        rows = np.zeros((len(members), len(self.kernel.parameters)), np.uint32)
+        level, first = self.kernel.launch.level, 0
+        for larger, names in self._numbers.items():
+            of, end = max(level - larger, 0), first + len(names)
+            extents = [member.extents[of].numbers for member in members]
+            rows[:, first:end] = [[numbers[name] for name in names] for numbers in extents]
+            first = end
+        for place, name in self._pointers:
+            if isinstance(name, str):
+                rows[:, place] = stack.strides.get(name, 0) // self._elements[place]
+        if is_one:
+            self._of_one = members[0].extents, rows.copy()
+        return rows
 
 
 @dataclass(frozen=True)
-class StackKernel:
-    """A kernel over a stack, compiled."""
-
-    kernel: Kernel
-    compiled: Any
-
-
-@dataclass
-class Stack(OnTheWay):
-    """Members on their way together.
+class Stack:
+    """Members that go through launches together.
 
     Args:
-        members: the members, of one plan but for the scales of its resamplings.
-        kernels: of the plan's launches.
-        borders: those that fill the borders of what a launch has written.
+        members: of one plan but for the scales of its resamplings.
+        calls: the launches, in order.
+        borders: returns those that fill the borders of what a launch has written.
         strides: bytes from a member to the next, in each buffer.
+        tile: the number of tiles before it.
+        fetches: whether results come back; else it is a phase that only measures the image.
+        is_last: whether numbers that are estimated from the image come back too.
     """
 
     members: Sequence[Member]
-    kernels: Sequence[StackKernel]
-    borders: Callable[[Launch], Iterable[StackKernel]]
-    strides: dict[str, int]
+    calls: Sequence[Call]
+    borders: Callable[[Launch], Iterator[Call]]
+    strides: Mapping[str, int]
+    tile: int = 0
+    fetches: bool = True
+    is_last: bool = True
 
-    @property
-    def sizes(self) -> dict[str, int]:
-        """The bytes of its buffers in the pool."""
-        count = len(self.members)
-        return {name: stride * count for name, stride in self.strides.items() if name not in ENDS}
+    def launches(self) -> Iterator[tuple[Call, tuple[int, ...], tuple[int, ...]]]:
+        """The kernels to launch, each with its global and its local size in work items."""
+        for call in self.calls:
+            launch = call.kernel.launch
+            extents = {member.extents[launch.level] for member in self.members}
+            if any(extent.is_empty for extent in extents):
+                continue
+            calls = [call]
+            if isinstance(launch, Launch):
+                if launch.has_period or any(extent.is_small for extent in extents):
+                    calls += self.borders(launch)
+            for each in calls:
+                spaces = [index_space(each.kernel, extent) for extent in extents]
+                across = tuple(map(max, zip(*(space for space, _ in spaces), strict=True)))
+                local, ones = spaces[0][1], (1,) * (2 - len(across))
+                yield each, (*across, *ones, len(self.members)), (*local, *ones, 1)
 
 
-def members_of(task: ImageTask, tiling: Tiling) -> list[Member] | None:
-    """An image, or its patches, as members of a stack.
-
-    None where it needs launches of its own: it goes through in tiles or more than one phase, or
-    somebody asks how long it took, or for results in a certain place or not at all.
-    """
-    options = task.options
-    if len(tiling.phases) > 1 or task.plan.incremental or not options.download:
-        return None
-    if options.timings is not None or options.into is not None:
-        return None
-    if tiling.patches:
-        return [Member(e, task, number) for number, e in enumerate(tiling.patches)]
-    whole = len(tiling.tiles) == 1
-    return [Member(tiling.tiles[0], task)] if whole else None
+def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The global and the local size of a kernel over one member, in work items."""
+    lanes, local = extent.lanes, local_size(extent.lanes)
+    match kernel.launch:
+        case Launch(rows=rows) as launch:
+            wide = lanes * columns_of(launch, lanes)
+            blocks = round_up(-(-extent.padded_width // wide), local)
+            return (blocks, -(-extent.stored.height // rows)), (local, 1)
+        case Border():
+            wide = extent.stored.width + 2 * extent.border
+            high = extent.stored.height + 2 * extent.border
+            return (round_up(wide, local), high), (local, 1)
+        case Finalize():
+            return (1,), (1,)
+        case Lines():
+            items = round_up(max(extent.width, extent.height), lanes) // lanes
+        case Histogram():
+            items = PARTIALS * summed_together(lanes)
+        case Reduce(op=op):
+            items = op.reduction.bins if lanes == 1 and op.reduction.bins else PARTIALS
+    return (round_up(items, local),), (local,)
 
 
 def cut(
     members: Sequence[Member], in_place: bool, memory: int, largest: int, ends: int
-) -> list[tuple[Sequence[Member], dict[str, int]]] | None:
-    """Members as stacks that fit into memory, with the strides of their buffers.
+) -> Iterator[tuple[Sequence[Member], dict[str, int], dict[str, int]]]:
+    """Members as stacks that fit into memory, with the strides and the sizes of their buffers.
 
-    None where they do not fit several at a time, or some have nothing to do where others have.
+    They go one by one, without strides, where few would fit, or some have nothing to do where
+    others have.
 
     Args:
         members: all of one plan.
@@ -94,119 +220,22 @@ def cut(
         ends: how many sources and results there are at a time.
     """
     strides: dict[str, int] = {}
-    for extents, plan in {m.extents: m.task.plan for m in members}.items():
+    different = {(id(m.work.plan), *(e.stored.size for e in m.extents)): m for m in members}
+    for plan, extents in ((m.work.plan, m.extents) for m in different.values()):
         for name, size in buffer_sizes(plan, extents, ends).items():
             strides[name] = max(round_up(size, PAGE), strides.get(name, 0))
-    together, longest = sum(strides.values()), max(strides.values())
-    if len({tuple(extent.is_empty for extent in m.extents) for m in members}) > 1:
-        return None
     allowed = min(STACK_BYTES[in_place], memory)
-    count = min(allowed // together, largest // longest)
-    strides |= {end: strides[f"{end}0"] for end in ENDS if f"{end}0" in strides}
-    if count < FEWEST:
-        return None
-    parts = [members[first : first + count] for first in range(0, len(members), count)]
-    return [(part, strides) for part in parts]
-
-
-def start(flow: Flow, stack: Stack, memory: int) -> None:
-    """Enqueue all of a stack, while buffers take no more than ``memory`` bytes."""
-    flow.forget()
-    flow.make_room(stack.sizes, memory)
-    flow.make_way()
-    members, strides = stack.members, stack.strides
-    source, events = flow.transfers.upload_all(
-        [member.pixels for member in members], members[0].dtype, strides["src"]
-    )
-    stack.events += [("upload", event) for event in events]
-    size = strides.get("dst", 0) * len(members)
-    ends = {"src": source, "dst": flow.transfers.target(size, None)}
-    wait = [*events, *flow.after_reads()]
-    last = launch(flow, stack, ends, list(wait))
-    sent = DeviceTile(stack, [*wait, *last], [])
-    flow.fetch_results(sent, members, strides, ends, last)
-    flow.push(sent)
-
-
-def launch(flow: Flow, stack: Stack, ends: dict[str, Any], wait: list[Any]) -> list[Any]:
-    """Launch the kernels of a stack, the first after events; the last one's event."""
-    import pyopencl as cl
-
-    members, last = stack.members, wait
-    buffers = {**flow.pool.buffers, **ends}
-    for each in stack.kernels:
-        step = each.kernel.launch
-        extents = {member.extents[step.level] for member in members}
-        if any(extent.is_empty for extent in extents):
-            continue
-        kernels = [each]
-        if isinstance(step, Launch) and (step.has_period or any(e.is_small for e in extents)):
-            kernels += stack.borders(step)
-        for number, (kernel, compiled) in enumerate((k.kernel, k.compiled) for k in kernels):
-            spaces = [index_space(kernel, extent) for extent in extents]
-            across = [max(sides) for sides in zip(*(space for space, _ in spaces), strict=True)]
-            local = spaces[0][1]
-            ones = [1] * (2 - len(across))
-            given = kernel.parameters, step.level, buffers, stack.strides, members
-            # Held until it is enqueued, since what a kernel is given holds no buffer.
-            arguments = arguments_of(*given, flow.table, flow.new_table)
-            compiled.set_args(*arguments)
-            event = cl.enqueue_nd_range_kernel(
-                flow.queue,
-                compiled,
-                (*across, *ones, len(members)),
-                (*local, *ones, 1),
-                wait_for=wait or None,
-            )
-            wait = []
-            if not number:  # nothing waits for borders
-                stack.events.append((step.name, event))
-                last = [event]
-    return last
-
-
-def arguments_of(
-    parameters: Sequence[Parameter],
-    level: int,
-    buffers: Mapping[str, Any],
-    strides: Mapping[str, int],
-    members: Sequence[Member],
-    table: Callable[[Array], Any],
-    new_table: Callable[[Array], Any],
-) -> list[Any]:
-    """The arguments of a stack's kernel, in order.
-
-    Args:
-        parameters: the plain kernel's, in order.
-        level: of its launch.
-        buffers: by name.
-        strides: bytes from a member to the next in each buffer.
-        members: of the stack.
-        table: gives a buffer that holds an array, which is used again for the same object.
-        new_table: gives a new one.
-    """
-    numbers = np.zeros((len(members), len(parameters)), np.uint32)
-    pointers = []
-    for place, parameter in enumerate(parameters):
-        match parameter.bound:
-            case Buffer(name):
-                pointers.append(buffers[name])
-                element = element_of(parameter)
-                assert element
-                numbers[:, place] = strides[name] // BYTES[element]
-            case ExtentNumber(name, larger):
-                of = max(level - 1, 0) if larger else level
-                numbers[:, place] = [member.extents[of].numbers[name] for member in members]
-            case TileNumber():
-                pass  # of each the first
-            case value:
-                found = [member.task.bind(value) for member in members]
-                if isinstance(found[0], np.ndarray):
-                    array, numbers[:, place] = side_by_side(found)
-                    pointers.append((table if array is found[0] else new_table)(array))
-                else:
-                    numbers[:, place] = np.array(found, found[0].dtype).view(np.uint32)
-    return [new_table(numbers), *pointers]
+    count = min(allowed // sum(strides.values()), largest // max(strides.values()))
+    is_mixed = len({tuple(extent.is_empty for extent in m.extents) for m in members}) > 1
+    if count < FEWEST or is_mixed:
+        for member in members:
+            yield [member], {}, buffer_sizes(member.work.plan, member.extents, ends)
+        return
+    of_ends = {end: strides[f"{end}0"] for end in ENDS if f"{end}0" in strides}
+    for first in range(0, len(members), count):
+        part = members[first : first + count]
+        sizes = {name: stride * len(part) for name, stride in strides.items()}
+        yield part, strides | of_ends, sizes
 
 
 def side_by_side(arrays: Sequence[Array]) -> tuple[Array, int]:

@@ -41,6 +41,7 @@ from clpipe.stage.passes import (
     Resample,
     Stencil,
     TableLookup,
+    bytes_of,
 )
 
 __all__ = [
@@ -76,6 +77,7 @@ __all__ = [
     "Stencil",
     "TableLookup",
     "Unchanged",
+    "bytes_of",
     "levels_table",
     "odd_size",
     "parameter",

@@ -164,3 +164,12 @@ class CompileTime:
 
 Argument = np.float32 | np.uint32 | np.int32 | Array | CompileTime
 Arguments = Mapping[str, Argument]  # by name
+
+
+def bytes_of(argument: Argument) -> bytes:
+    """An argument's value, to compare it.
+
+    >>> bytes_of(np.float32(1)) == bytes_of(np.float32(1.0)), bytes_of(CompileTime("1u"))
+    (True, b'1u')
+    """
+    return argument.text.encode() if isinstance(argument, CompileTime) else argument.tobytes()

@@ -7,6 +7,7 @@
 
 #define DECLARE(type) type __attribute__((overloadable, const))
 DECLARE(size_t) get_global_id(uint);
+DECLARE(size_t) get_global_offset(uint);
 DECLARE(size_t) get_global_size(uint);
 DECLARE(size_t) get_local_id(uint);
 DECLARE(size_t) get_local_size(uint);
