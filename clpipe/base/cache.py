@@ -3,7 +3,7 @@
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 V = TypeVar("V")
 
@@ -50,7 +50,7 @@ class BoundedCache(Generic[V]):
         self._bound = bound
         self._size = size
         self._lock = threading.Lock()
-        self._values: OrderedDict[Hashable, V] = OrderedDict()
+        self._values: OrderedDict[Hashable, Any] = OrderedDict()
         self.taken = 0  # of the bound
 
     def __contains__(self, key: Hashable) -> bool:
@@ -65,9 +65,10 @@ class BoundedCache(Generic[V]):
         A value that is larger than the bound is not kept. What ``make`` raises is passed on.
         """
         with self._lock:
-            if key in self._values:
+            known = self._values.get(key, self)
+            if known is not self:
                 self._values.move_to_end(key)
-                return self._values[key]
+                return cast(V, known)
         value = make()
         with self._lock:
             if key not in self._values and self._size_of(value) <= self._bound:

@@ -3,7 +3,7 @@
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -54,8 +54,7 @@ class GainStage(BaseModel):
         The table is converted to electrons and interpolated linearly in log ISO; outside the
         table, the value in electrons stays that of the nearest end.
         """
-        per_gain = zip(values, self.system_gain, strict=True)
-        electrons = self.between(iso, [value / gain for value, gain in per_gain])
+        electrons = self.between(iso, _ratios(values, self.system_gain))
         return electrons * self.gain_at(iso)
 
     def between(self, iso: float, values: Sequence[float]) -> float:
@@ -73,8 +72,7 @@ class GainStage(BaseModel):
 
     def gain_at(self, iso: float) -> float:
         """The system gain in DN/e-, interpolated in proportion to the ISO."""
-        per_iso = zip(self.system_gain, self.iso, strict=True)
-        return self.between(iso, [gain / of for gain, of in per_iso]) * iso
+        return self.between(iso, _ratios(self.system_gain, self.iso)) * iso
 
     @cached_property
     def adc_noise(self) -> float:
@@ -90,6 +88,11 @@ class GainStage(BaseModel):
         terms = np.stack([np.square(self.system_gain) / read2, 1 / read2], axis=1)
         _, after2 = np.linalg.lstsq(terms, np.ones(len(read2)))[0]
         return float(np.sqrt(np.clip(after2, 0, read2.min())))
+
+
+@lru_cache(maxsize=1024)  # one object for the same tables, so that it is traced once
+def _ratios(values: tuple[float, ...], over: tuple[float, ...]) -> tuple[float, ...]:
+    return tuple(value / divisor for value, divisor in zip(values, over, strict=True))
 
 
 def _interpolated(

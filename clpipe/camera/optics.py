@@ -7,6 +7,7 @@ holds for all, and what two of them state must be the same.
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any
 
 from clpipe.base.errors import KeyedError, RequestError
@@ -124,7 +125,7 @@ class Optics:
             )
         return known
 
-    @property
+    @cached_property
     def known(self) -> dict[str, float]:
         """The numbers that are known, by their names."""
         return {name: value for name in NUMBERS if (value := getattr(self, name)) is not None}

@@ -115,7 +115,8 @@ class Settings:
             else:
                 values[name] = value
         pushed = "iso" in self.draws and "camera" not in self.draws
-        return overlay(replace(self, draws={}, pushed=pushed), values)
+        drawn = overlay(self, values)
+        return replace(drawn, pushed=True) if pushed else drawn
 
     def constants(self) -> dict[str, Any]:
         """The values that are set and not drawn, by their dotted names."""

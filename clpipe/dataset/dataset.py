@@ -16,7 +16,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.processors import available_processors
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import several
-from clpipe.base.types import plain
+from clpipe.base.types import Array, plain
 from clpipe.base.validation import typed
 from clpipe.chain.rendition import DEVELOPMENT
 from clpipe.chain.request import Request
@@ -40,14 +40,24 @@ MOST_BYTES = 2**27
 MOST_PIXELS = 2**21
 
 
-def are_enough(read: Sequence[tuple[SampleBatch, LoadedImage, Sample]], side: int | None) -> bool:
-    """Whether so many batches are developed together, whose patches have such sides, in px."""
-    sources = {id(loaded.source.pixels): loaded.source.pixels for _, loaded, _ in read}.values()
-    if side:
-        pixels = sum(len(batch.numbers) for batch, *_ in read) * side**2
-    else:
-        pixels = sum(each.shape[0] * each.shape[1] for each in sources)
-    return pixels >= MOST_PIXELS or sum(each.nbytes for each in sources) >= MOST_BYTES
+class Size:
+    """The size of images that are to be developed together, of patches with such sides, in px."""
+
+    def __init__(self, side: int | None) -> None:
+        self._side = side
+        self._sources: set[int] = set()
+        self._pixels = self._bytes = 0
+
+    def add(self, batch: SampleBatch, source: Array) -> bool:
+        """Add samples of an image; whether they are enough now."""
+        is_new = id(source) not in self._sources
+        self._sources.add(id(source))
+        self._bytes += source.nbytes * is_new
+        if self._side:
+            self._pixels += len(batch.numbers) * self._side**2
+        else:
+            self._pixels += source.shape[0] * source.shape[1] * is_new
+        return self._pixels >= MOST_PIXELS or self._bytes >= MOST_BYTES
 
 
 class Dataset(ReadOnly):
@@ -294,12 +304,14 @@ class Dataset(ReadOnly):
         side = self._patches.size if self._patches else None
         pending: list[tuple[int, int, Sequence[int]]] = []
         read: list[tuple[SampleBatch, LoadedImage, Sample]] = []
+        size, are_enough = Size(side), False
         for last, each in enumerate(asked, 1 - len(asked)):
             pending.append(each)
             batch = self._batch(*each)
             with suppress(ImageError):
                 read.append((batch, *self._loader.read(batch)))
-            if last and len(read) == len(pending) and not are_enough(read, side):
+                are_enough = size.add(batch, read[-1][1].source.pixels)
+            if last and len(read) == len(pending) and not are_enough:
                 continue
             begun: list[Callable[[], list[Sample]]] = []
             if len(read) == len(pending):
@@ -310,7 +322,7 @@ class Dataset(ReadOnly):
                 with suppress(ImageError):
                     made = begun[number]() if begun else None
                 yield self._made(*alone) if made is None else made
-            pending, read = [], []
+            pending, read, size, are_enough = [], [], Size(side), False
 
     def _made(self, epoch: int, image: int, numbers: Sequence[int]) -> list[Sample]:
         """Samples of an image; of the next one that has any, where it is to be skipped.

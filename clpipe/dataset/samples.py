@@ -5,7 +5,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -108,7 +108,7 @@ class SampleLoader:
         loader = self._loader
         carried: Sample = {}
         try:
-            loader = self._loader.for_job(replace(job, key=batch.draw_key))
+            loader = self._loader.for_job(job, batch.draw_key)
             loaded = loader.enter(job, self._source(job, loader))
             if loaded and loader.request.carry:
                 along = loader.aovs(job, loaded)

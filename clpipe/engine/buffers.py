@@ -9,7 +9,7 @@ import numpy as np
 
 from clpipe.base.types import Array
 from clpipe.engine.extents import Box, Extent
-from clpipe.engine.ir import Finalize, Plan
+from clpipe.engine.ir import Plan
 from clpipe.engine.work_items import border_left
 from clpipe.stage import Kind
 
@@ -78,9 +78,7 @@ def room_for(
     return HostImages(
         images={i.number: np.empty(shape(i.kind, i.level), np.float32) for i in images},
         encoded=encoded,
-        estimates={
-            x.op.step: np.empty(4, np.float32) for x in plan.launches if isinstance(x, Finalize)
-        },
+        estimates={step: np.empty(4, np.float32) for step in plan.estimates},
     )
 
 

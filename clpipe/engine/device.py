@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import partial
 from typing import Any
@@ -143,7 +143,6 @@ class Device:
         calls = self._kernels.of(plan)
         borders = partial(self._kernels.borders, plan)
         members: list[Member] = []
-        sizes: Mapping[str, int] = {}
         for work in works:
             tiling = self.tiling(work, memory)
             own = [Member(e, work, number) for number, e in enumerate(tiling.patches)]
@@ -151,16 +150,13 @@ class Device:
                 self.flow.start_alone(flight, work, tiling, calls, borders, self.memory)
             else:
                 members += own or [Member(tiling.tiles[0], work, is_whole=True)]
-                sizes = tiling.sizes
-        if len(members) == 1:
-            fetches = works[0].options.download
-            one = Stack(members, calls, borders, {}, fetches=fetches)
-            self.flow.start(flight, one, sizes, self.memory)
-        if len(members) < 2:
+        if not members:
             return flight
         in_place, largest = self.info.in_place, self.info.max_buffer
         for part, strides, sizes in cut(members, in_place, memory, largest, self.depth):
-            self.flow.start(flight, Stack(part, calls, borders, strides), sizes, self.memory)
+            fetches = part[0].work.options.download
+            stack = Stack(part, calls, borders, strides, fetches=fetches)
+            self.flow.start(flight, stack, sizes, self.memory)
         return flight
 
     def reopen(self) -> None:

@@ -1,5 +1,6 @@
 """The place of an image or a tile of it, and the size of its planes on a device. Pure."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -27,14 +28,12 @@ class Box:
         return self.bottom - self.top
 
     @property
-    def size(self) -> tuple[int, int]:
-        """The number of columns and of rows."""
-        return self.right - self.left, self.bottom - self.top
-
-    @property
     def is_empty(self) -> bool:
         """Whether it has no pixels."""
         return self.width <= 0 or self.height <= 0
+
+
+NOTHING = Box(0, 0, 0, 0)
 
 
 @dataclass(frozen=True)
@@ -115,6 +114,26 @@ class Extent:
 
 # An image or a tile on each level of a plan.
 Extents = tuple[Extent, ...]
+
+
+def enclosing(places: Sequence[Extents]) -> Extents:
+    """On each level an image and a tile of it that are as large as the largest of some."""
+    return tuple(
+        Extent(
+            max(extent.width for extent in extents),
+            max(extent.height for extent in extents),
+            extents[0].lanes,
+            extents[0].border,
+            NOTHING,
+            Box(
+                0,
+                0,
+                max(extent.stored.width for extent in extents),
+                max(extent.stored.height for extent in extents),
+            ),
+        )
+        for extents in zip(*places, strict=True)
+    )
 
 
 def whole_image(plan: Plan, width: int, height: int, lanes: int) -> Extents:

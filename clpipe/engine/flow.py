@@ -217,9 +217,15 @@ class Flow:
         """Launch the kernels of a stack, the first one after events; the last one's event."""
         buffers = {**self.pool.buffers, **ends}
         launches = list(stack.launches())
-        given = [call.table(stack, buffers, self.table, self.new_table) for call, *_ in launches]
         if not launches:
             return wait
+        asked = [value for call, *_ in launches for value in call.values]
+        values = [member.work.bind(asked) for member in stack.members]
+        given, first = [], 0
+        for call, *_ in launches:
+            own = [each[first : first + len(call.values)] for each in values]
+            given.append(call.table(stack, own, buffers, self.table, self.new_table))
+            first += len(call.values)
         numbers = self.new_table(np.concatenate([ONE, *(rows.reshape(-1) for rows, _ in given)]))
         offset, done = ONE.size, wait
         for (call, across, local), (rows, pointers) in zip(launches, given, strict=True):

@@ -172,6 +172,12 @@ class Plan:
         launches = tuple(unscaled(launch) for launch in self.launches)
         return replace(self, launches=launches, resamplings=())
 
+    @cached_property
+    def estimates(self) -> dict[str, tuple[str, ...]]:
+        """The names of the numbers that steps estimate from the image, by step."""
+        found = [launch.op for launch in self.launches if isinstance(launch, Finalize)]
+        return {op.step: op.reduction.estimates for op in found}
+
     def sizes(self, width: int, height: int) -> tuple[tuple[int, int], ...]:
         """The width and height of images on each level, from those of the source."""
         return sizes(self.resamplings, width, height)

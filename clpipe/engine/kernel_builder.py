@@ -15,7 +15,7 @@ from clpipe.engine.bindings import (
     slot_buffer,
     step_buffer,
 )
-from clpipe.engine.ir import Finalize, Plan, Read
+from clpipe.engine.ir import Plan, Read
 from clpipe.engine.ops import Op
 from clpipe.stage import NoiseScope
 
@@ -151,10 +151,7 @@ class KernelBuilder:
 
 def estimates_of(plan: Plan, step: str) -> tuple[str, ...]:
     """The names of the numbers that a step estimates from the image, in their buffer's order."""
-    for launch in plan.launches:
-        if isinstance(launch, Finalize) and launch.op.step == step:
-            return launch.op.reduction.estimates
-    return ()
+    return plan.estimates.get(step, ())
 
 
 def in_order(parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:

@@ -4,12 +4,12 @@ A patch is stored from whole blocks on, as every tile is, wherever it begins. So
 that the whole result has there.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from clpipe.base.errors import ImageError
 from clpipe.base.memory import in_words
-from clpipe.engine.extents import Box
+from clpipe.engine.extents import Box, enclosing
 from clpipe.engine.ir import Plan
 from clpipe.engine.tiles import Tiling, buffer_sizes, cutter_of, phases_of
 
@@ -31,21 +31,31 @@ def with_patches(
         ends: as for :func:`~clpipe.engine.tiles.tiling_of`.
 
     Raises:
-        ImageError: a part does not fit into the memory.
+        ImageError: a part does not fit into the memory; of parts that go in stacks, that is seen
+            when these are made.
     """
     source = whole.tiles[0][0]
     cut = cutter_of(plan, source.width, source.height, lanes)
     levels = {image.level for _, image in plan.kept} | {len(cut.whole) - 1}
     patches = tuple(cut.patch(box, levels) for box in boxes)
     phases = phases_of(plan)
-    sizes = dict(whole.sizes) if len(phases) > 1 else {}
-    by_size = {tuple(e.stored.size for e in tile): tile for tile in patches}
-    for extents in by_size.values():
-        for name, size in buffer_sizes(plan, extents, ends).items():
-            sizes[name] = max(size, sizes.get(name, 0))
+    if len(phases) == 1:  # they go in stacks
+        return replace(whole, phases=phases, sizes={}, patches=patches)
+    sizes = dict(whole.sizes)
+    for name, size in buffer_sizes(plan, enclosing(patches), ends).items():
+        sizes[name] = max(size, sizes.get(name, 0))
+    check_memory(sizes, memory)
+    return replace(whole, phases=phases, sizes=sizes, patches=patches)
+
+
+def check_memory(sizes: Mapping[str, int], memory: int) -> None:
+    """See that the buffers of a patch, bytes by name, fit into memory.
+
+    Raises:
+        ImageError: they do not.
+    """
     if sum(sizes.values()) > memory:
         raise ImageError(
             f"a patch needs {in_words(sum(sizes.values()))} of device memory; "
             f"allowed are {in_words(memory)}"
         )
-    return replace(whole, phases=phases, sizes=sizes, patches=patches)

@@ -24,7 +24,7 @@ from clpipe.engine.bindings import (
 from clpipe.engine.buffers import HostImages, room_for
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
-from clpipe.engine.ir import Finalize, Plan
+from clpipe.engine.ir import Plan
 from clpipe.engine.ops import chain_ops
 from clpipe.engine.options import DEFAULTS, RunOptions
 from clpipe.engine.plan import make_plan
@@ -345,9 +345,7 @@ class Runner:
     @staticmethod
     def _result(plan: Plan, from_size: dict[str, dict[str, float]], output: HostImages) -> Result:
         """The results that the device made of an image, by steps."""
-        names = {
-            x.op.step: x.op.reduction.estimates for x in plan.launches if isinstance(x, Finalize)
-        }
+        names = plan.estimates
         return Result(
             final=output.images.get(plan.final.number) if plan.final else None,
             encoded=output.encoded,

@@ -25,9 +25,10 @@ from clpipe.engine.bindings import (
     Value,
 )
 from clpipe.engine.buffers import PAGE
-from clpipe.engine.extents import Extent, Extents
+from clpipe.engine.extents import Extent, Extents, enclosing
 from clpipe.engine.ir import Border, Finalize, Histogram, Kernel, Launch, Lines, Reduce
 from clpipe.engine.kernel_builder import element_of
+from clpipe.engine.patches import check_memory
 from clpipe.engine.tiles import buffer_sizes
 from clpipe.engine.work import Member
 from clpipe.engine.work_items import PARTIALS, columns_of, local_size, round_up, summed_together
@@ -89,6 +90,7 @@ class Call:
     def table(
         self,
         stack: "Stack",
+        values: Sequence[Sequence[Any]],
         buffers: Mapping[str, Any],
         constant: Callable[[Array], Any],
         new: Callable[[Array], Any],
@@ -97,6 +99,7 @@ class Call:
 
         Args:
             stack: the stack.
+            values: those that are asked for, of each member.
             buffers: on the device, by name.
             constant: returns a buffer that holds an array, the same one for the same object.
             new: returns a new buffer that holds an array.
@@ -104,7 +107,6 @@ class Call:
         rows = self._places(stack)
         if self._tile is not None:
             rows[:, self._tile] = stack.tile
-        values = [member.work.bind(self.values) for member in stack.members] if self.values else []
         end = rows.shape[1]
         for type_, numbers in reversed(self._scalars.items()):  # they are the last columns
             if numbers:
@@ -165,19 +167,20 @@ class Stack:
 
     def launches(self) -> Iterator[tuple[Call, tuple[int, ...], tuple[int, ...]]]:
         """The kernels to launch, each with its global and its local size in work items."""
+        places = [member.extents for member in self.members]
+        are_small = [any(e.is_small for e in level) for level in zip(*places, strict=True)]
+        largest = enclosing(places)
         for call in self.calls:
             launch = call.kernel.launch
-            extents = {member.extents[launch.level] for member in self.members}
-            if any(extent.is_empty for extent in extents):
+            extent = largest[launch.level]
+            if extent.is_empty:
                 continue
             calls = [call]
-            if isinstance(launch, Launch):
-                if launch.has_period or any(extent.is_small for extent in extents):
-                    calls += self.borders(launch)
+            if isinstance(launch, Launch) and (launch.has_period or are_small[launch.level]):
+                calls += self.borders(launch)
             for each in calls:
-                spaces = [index_space(each.kernel, extent) for extent in extents]
-                across = tuple(map(max, zip(*(space for space, _ in spaces), strict=True)))
-                local, ones = spaces[0][1], (1,) * (2 - len(across))
+                across, local = index_space(each.kernel, extent)
+                ones = (1,) * (2 - len(across))
                 yield each, (*across, *ones, len(self.members)), (*local, *ones, 1)
 
 
@@ -206,7 +209,7 @@ def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[
 
 def cut(
     members: Sequence[Member], in_place: bool, memory: int, largest: int, ends: int
-) -> Iterator[tuple[Sequence[Member], dict[str, int], dict[str, int]]]:
+) -> Iterator[tuple[Sequence[Member], Mapping[str, int], Mapping[str, int]]]:
     """Members as stacks that fit into memory, with the strides and the sizes of their buffers.
 
     They go one by one, without strides, where few would fit, or some have nothing to do where
@@ -218,18 +221,21 @@ def cut(
         memory: bytes that all buffers together may take.
         largest: bytes that one may take.
         ends: how many sources and results there are at a time.
+
+    Raises:
+        ImageError: one does not fit into the memory by itself.
     """
-    strides: dict[str, int] = {}
-    different = {(id(m.work.plan), *(e.stored.size for e in m.extents)): m for m in members}
-    for plan, extents in ((m.work.plan, m.extents) for m in different.values()):
-        for name, size in buffer_sizes(plan, extents, ends).items():
-            strides[name] = max(round_up(size, PAGE), strides.get(name, 0))
+    largest_member = enclosing([member.extents for member in members])
+    sizes_of_one = buffer_sizes(members[0].work.plan, largest_member, ends)
+    strides = {name: round_up(size, PAGE) for name, size in sizes_of_one.items()}
     allowed = min(STACK_BYTES[in_place], memory)
     count = min(allowed // sum(strides.values()), largest // max(strides.values()))
     is_mixed = len({tuple(extent.is_empty for extent in m.extents) for m in members}) > 1
     if count < FEWEST or is_mixed:
         for member in members:
-            yield [member], {}, buffer_sizes(member.work.plan, member.extents, ends)
+            sizes = buffer_sizes(member.work.plan, member.extents, ends)
+            check_memory(sizes, memory)
+            yield [member], {}, sizes
         return
     of_ends = {end: strides[f"{end}0"] for end in ENDS if f"{end}0" in strides}
     for first in range(0, len(members), count):

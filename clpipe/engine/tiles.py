@@ -97,6 +97,7 @@ class Tiling:
         return sum(self.sizes.values())
 
 
+@lru_cache(maxsize=256)
 def phases_of(plan: Plan) -> tuple[Phase, ...]:
     """The phases in which tiles go through a plan, one for each pass over all tiles.
 

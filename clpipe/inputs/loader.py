@@ -69,23 +69,27 @@ class ImageLoader:
     request: Request
     folder: Path | None = None
 
-    def for_job(self, job: Job) -> "ImageLoader":
+    def for_job(self, job: Job, draw_key: str = "") -> "ImageLoader":
         """The loader for one job; the same one where the job has no values of its own.
+
+        Args:
+            job: the job.
+            draw_key: what draws belong to; "" is the job's key.
 
         Raises:
             ImageError: the job cannot be made.
         """
         job.check()
-        return self._for_values(job)
+        return self._for_values(job, draw_key)
 
     def has_own_values(self, job: Job) -> bool:
         """Whether settings hold for one job alone."""
         return bool(job.values) or self.has_draws
 
-    def _for_values(self, job: Job) -> "ImageLoader":
+    def _for_values(self, job: Job, draw_key: str = "") -> "ImageLoader":
         if not self.has_own_values(job):
             return self
-        return ImageLoader(self.request.for_image(job.key, job.values), self.folder)
+        return ImageLoader(self.request.for_image(draw_key or job.key, job.values), self.folder)
 
     @cached_property
     def settings(self) -> Settings:
@@ -274,6 +278,8 @@ class ImageLoader:
 
         around = source.panorama
         own = enter(loaded.chain, source.pixels, source.margins, depth, source.shot, around)
+        if own.pixels is source.pixels and not (own.margins or own.depth or own.warnings):
+            return LoadedImage(own.chain, source, loaded.key)
         later = source.later
         if own.margins != source.margins:
             later = tuple(np.ascontiguousarray(source.margins.cropped(each)) for each in later)

@@ -56,7 +56,7 @@ def negative_of(chain: Chain) -> Negative:
             "--format npy, or fewer bits"
         )
     undone = end.colours if is_input and end.colours != context.colours else None
-    array = replace(context.filters, gains=gains, is_balanced=True)
+    array = _balanced(context.filters, gains)
     check_array(array)
     return Negative(
         step=chain.maker_of_raw,
@@ -91,6 +91,11 @@ def _of_white(context: Context) -> NoiseModel | None:
 def _level(owner: object, name: str, default: float) -> float:
     value = getattr(owner, name, None)
     return default if value is None else float(value)
+
+
+@lru_cache(maxsize=64)  # one object, whose channels are found once
+def _balanced(array: FilterArray, gains: tuple[float, float]) -> FilterArray:
+    return replace(array, gains=gains, is_balanced=True)
 
 
 @lru_cache(maxsize=64)

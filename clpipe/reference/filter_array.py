@@ -93,7 +93,7 @@ class FilterArray:
         """A Bayer pattern, such as "RGGB", or the rows with / between."""
         return self.bayer or "/".join(self.rows)
 
-    @property
+    @cached_property
     def bayer(self) -> Pattern | None:
         """Its Bayer pattern; None where it is another array."""
         joined = "".join(self.rows)
@@ -104,7 +104,7 @@ class FilterArray:
         """One period, (row, column), of single letters."""
         return np.array([list(row) for row in self.rows])
 
-    @property
+    @cached_property
     def channels(self) -> tuple[str, ...]:
         """Its channels, each once, in the order of :data:`PASSES`."""
         return tuple(letter for letter in PASSES if any(letter in row for row in self.rows))
