@@ -31,7 +31,7 @@ from clpipe.images.kinds import CHANNELS, vectors_of
 from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
 from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import NO_MARGINS, Margins
-from clpipe.stage import InTime, Kind
+from clpipe.stage import Kind
 
 if TYPE_CHECKING:
     from clpipe.chain.keywords import Keywords
@@ -126,12 +126,11 @@ class Pipeline(ReadOnly):
             RequestError: a name or value that is not allowed.
         """
         runner = self._runner_for(key, settings)
-        for step in runner.chain.steps:
-            if isinstance(step.method, InTime) and step.method.layer_of_light:
-                raise RequestError(
-                    f"{step.name}: found a layer of the light that flickers, which an array has "
-                    "not; clpipe run takes it from the render's file"
-                )
+        for name in runner.chain.lit_by_layers:
+            raise RequestError(
+                f"{name}: found a layer of the light that flickers, which an array has "
+                "not; clpipe run takes it from the render's file"
+            )
         try:
             checked = as_image(image, runner.chain.source)
         except ImageError as error:

@@ -224,9 +224,9 @@ def test_no_buffer_is_replaced_while_an_image_is_on_the_device(device, monkeypat
         return make_way(flow, *arguments)
 
     def recording_reserve(pool, *arguments):
-        generation, tiles = pool.generation, len(fresh.flow._sent)
+        held, tiles = dict(pool.buffers), len(fresh.flow._sent)
         reserve(pool, *arguments)
-        if pool.generation != generation:
+        if pool.buffers != held:
             replaced.append(tiles)
 
     monkeypatch.setattr(Flow, "reserve", recording_flow)

@@ -3,7 +3,7 @@
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar
 
 V = TypeVar("V")
 
@@ -20,7 +20,7 @@ class Identity:
         self.of = of
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Identity) and other.of is self.of
+        return type(other) is Identity and other.of is self.of
 
     def __hash__(self) -> int:
         return id(self.of)
@@ -68,7 +68,8 @@ class BoundedCache(Generic[V]):
             known = self._values.get(key, self)
             if known is not self:
                 self._values.move_to_end(key)
-                return cast(V, known)
+                found: V = known
+                return found
         value = make()
         with self._lock:
             if key not in self._values and self._size_of(value) <= self._bound:

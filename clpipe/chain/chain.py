@@ -23,6 +23,7 @@ from clpipe.reference.resample import Resampler, sizes
 from clpipe.stage import (
     Arguments,
     Context,
+    InTime,
     Kind,
     Method,
     Noiseless,
@@ -36,7 +37,7 @@ from clpipe.stage import (
 
 # Properties of a chain, and those whose values are the same in chains of one structure.
 COMPUTED = "optics", "filters", "context_after", "context_of_raw", "geometry"
-STRUCTURAL = "is_noisy", "maker_of_raw", "result", "step_names", "_resamplings"
+STRUCTURAL = "is_noisy", "lit_by_layers", "maker_of_raw", "result", "step_names", "_resamplings"
 
 T = TypeVar("T")
 
@@ -121,15 +122,14 @@ class Chain:
         """The seed of the noise."""
         return self.settings.seed
 
-    def streams(self, step: str, noise_key: str) -> dict[NoiseScope, Stream]:
-        """The random streams of a step, by its name, for one image.
+    def stream(self, step: str, scope: NoiseScope, noise_key: str) -> Stream:
+        """A random stream of a step, by its name, for one image.
 
         Image noise is keyed on the seed and the noise key, fixed pattern noise on the camera.
         """
-        return {
-            NoiseScope.IMAGE: stream_of(f"image:{self.seed}:{noise_key}", step),
-            NoiseScope.CAMERA: stream_of(f"camera:{self.camera.name}", step),
-        }
+        if scope is NoiseScope.IMAGE:
+            return stream_of(f"image:{self.seed}:{noise_key}", step)
+        return stream_of(f"camera:{self.camera.name}", step)
 
     @cached_property
     def arguments(self) -> Mapping[str, Arguments]:
@@ -152,6 +152,12 @@ class Chain:
     def step_names(self) -> tuple[str, ...]:
         """The names of its steps."""
         return tuple(step.name for step in self.steps)
+
+    @cached_property
+    def lit_by_layers(self) -> tuple[str, ...]:
+        """The steps that must have the light of a layer of the image's file."""
+        named = ((step.name, step.method) for step in self.steps)
+        return tuple(n for n, each in named if isinstance(each, InTime) and each.layer_of_light)
 
     @cached_property
     def maker_of_raw(self) -> str | None:

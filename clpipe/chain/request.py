@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 
@@ -12,6 +12,7 @@ from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of, several
+from clpipe.base.tracing import altered
 from clpipe.base.validation import first_fault
 from clpipe.chain.assignments import parse_assignment
 from clpipe.chain.carry import AovSpec, parse_carry
@@ -223,7 +224,7 @@ class Request:
 
     def for_image(self, name: str, values: Mapping[str, Any]) -> Self:
         """The request for one image: its name, and values that hold for it alone."""
-        return replace(self, image_name=name, image=values)
+        return altered(self, {"image_name": name, "image": values})
 
     def with_outputs(self, chain: Chain) -> "ResolvedRequest":
         """The request with every output named, as a chain has them.

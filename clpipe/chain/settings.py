@@ -5,7 +5,7 @@ Nothing here depends on the camera's data or on a stage's place in the chain; th
 """
 
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -15,6 +15,7 @@ from pydantic import BaseModel
 
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import either, one_of
+from clpipe.base.tracing import altered
 from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_name, load_camera
 from clpipe.chain.drawing import draw_of, extremes_of, values_of
 from clpipe.chain.draws import TINY, Choice, Draw, Limits, limits_of
@@ -116,7 +117,7 @@ class Settings:
                 values[name] = value
         pushed = "iso" in self.draws and "camera" not in self.draws
         drawn = overlay(self, values)
-        return replace(drawn, pushed=True) if pushed else drawn
+        return altered(drawn, {"pushed": True}) if pushed else drawn
 
     def constants(self) -> dict[str, Any]:
         """The values that are set and not drawn, by their dotted names."""
@@ -271,7 +272,8 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
         parameters[step] = constants
         if not step_draws:
             validated[step] = constants, make_method(stage, step, constants)
-    changed = replace(settings, parameters=parameters, validated=validated, draws=draws, **plain)
+    tables_now = {"parameters": parameters, "validated": validated, "draws": draws}
+    changed = altered(settings, {**plain, **tables_now})
     if draws:
         _check_draws(changed, values)
     return changed

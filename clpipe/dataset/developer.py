@@ -142,7 +142,8 @@ class Developer:
             ImageError, RequestError, MemoryError: an image cannot be developed.
         """
         with self._lock:
-            runs = [self._runs(order.chain) for order in orders]
+            raws = [self._raws_of(order.chain) for order in orders]
+            runs = [self._runs(o.chain, own) for o, own in zip(orders, raws, strict=True)]
             begun = submit_together(
                 [
                     (runner, order.source.pixels, order.noise_key, order.options)
@@ -152,13 +153,13 @@ class Developer:
             )
         waits = iter(begun)
         return [
-            partial(self._finish, order, dict(zip(own, waits, strict=False)))
-            for order, own in zip(orders, runs, strict=True)
+            partial(self._finish, order, names, dict(zip(own, waits, strict=False)))
+            for order, names, own in zip(orders, raws, runs, strict=True)
         ]
 
-    def _runs(self, chain: Chain) -> dict[str, Runner]:
+    def _runs(self, chain: Chain, raws: Mapping[str, str]) -> dict[str, Runner]:
         """What makes "image", "truth", and the "signal" that a variance is computed from."""
-        spec, raws = self._spec, self._raws_of(chain)
+        spec = self._spec
         encode = chain.result is Kind.DISPLAY and spec.arrays.dtype is None
         chains = {"image": chain}
         if spec.truth:
@@ -199,13 +200,14 @@ class Developer:
         self._latest[name] = runner
         return runner
 
-    def _finish(self, order: Order, begun: Mapping[str, Callable[[], Result]]) -> list[Sample]:
+    def _finish(
+        self, order: Order, raws: Mapping[str, str], begun: Mapping[str, Callable[[], Result]]
+    ) -> list[Sample]:
         """The samples of what was begun."""
         results = {}
         for name, wait in begun.items():
             with self._lock:
                 results[name] = wait()
-        raws = self._raws_of(order.chain)
         noise = variance_steps(order.chain)[1] if self._spec.variance else ()
         if not order.patches:
             samples = [self._sample(order.chain, raws, results, None, noise, lambda image: image)]

@@ -115,11 +115,12 @@ class Pool:
     def __init__(self, make: Callable[[int], Any]) -> None:
         self._make = make
         self.buffers: dict[str, Any] = {}
-        self.generation = 0  # counts up when a buffer is replaced
+        self._sizes: dict[str, int] = {}  # asking a buffer takes longer
 
     def has(self, sizes: Mapping[str, int], memory: int) -> bool:
         """Whether :meth:`reserve` would release none of its buffers and make none."""
-        is_there = all(n in self.buffers and self.buffers[n].size >= s for n, s in sizes.items())
+        held = self._sizes
+        is_there = all(name in held and held[name] >= size for name, size in sizes.items())
         return is_there and self.bytes <= memory
 
     def reserve(self, sizes: Mapping[str, int], memory: int) -> None:
@@ -128,30 +129,29 @@ class Pool:
         Buffers that only earlier images needed are kept while all together take no more than
         ``memory`` bytes.
         """
-        enough = {name: b for name, b in self.buffers.items() if b.size >= sizes.get(name, 0)}
-        missing = sum(size for name, size in sizes.items() if name not in enough)
-        for spare in (lambda name, _: name not in sizes, lambda name, b: b.size > sizes[name]):
-            if sum(b.size for b in enough.values()) + missing > memory:
-                dropped = [name for name, b in enough.items() if spare(name, b)]
-                missing += sum(sizes.get(name, 0) for name in dropped)
-                enough = {name: b for name, b in enough.items() if name not in dropped}
-        if enough.keys() == self.buffers.keys() >= sizes.keys():
+        if self.has(sizes, memory):
             return
-        self.generation += 1
+        enough = {name: size for name, size in self._sizes.items() if size >= sizes.get(name, 0)}
+        missing = sum(size for name, size in sizes.items() if name not in enough)
+        for spare in (lambda name, _: name not in sizes, lambda name, size: size > sizes[name]):
+            if sum(enough.values()) + missing > memory:
+                dropped = [name for name, size in enough.items() if spare(name, size)]
+                missing += sum(sizes.get(name, 0) for name in dropped)
+                enough = {name: size for name, size in enough.items() if name not in dropped}
         for name in self.buffers.keys() - enough.keys():
             self.buffers.pop(name).release()
+            del self._sizes[name]
         for name, size in sizes.items():
             if name not in enough:
-                self.buffers[name] = self._make(size)
+                self.buffers[name], self._sizes[name] = self._make(size), size
 
     @property
     def bytes(self) -> int:
         """The size of all buffers together."""
-        return sum(buffer.size for buffer in self.buffers.values())
+        return sum(self._sizes.values())
 
     def release(self) -> None:
         """Give all buffers back to the device."""
-        self.generation += 1
-        buffers, self.buffers = self.buffers, {}
+        buffers, self.buffers, self._sizes = self.buffers, {}, {}
         for buffer in buffers.values():
             buffer.release()

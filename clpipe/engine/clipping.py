@@ -29,12 +29,13 @@ def clipped_share(result: Result, chain: Chain) -> float | None:
     image = result.final if result.encoded is None else result.encoded
     # Of a chain that only has to give a raw, no more than that is run: it is final and kept.
     kept = [chain.step_named(name) for name, each in result.kept.items() if each is image]
-    last, kind = (kept[0], kept[0].stage.writes) if kept else (chain.steps[-1], chain.result)
+    kind = kept[0].stage.writes if kept else chain.result
     top: float | None = None
     if kind is Kind.DISPLAY:
         top = 255 if result.encoded is not None else 1
     elif kind is Kind.RAW:
-        top = last.method.next_context(last.context).white_level
+        after = kept[0].method.next_context(kept[0].context) if kept else chain.context_after
+        top = after.white_level
     if image is None or top is None:
         return None
     has_channels = len(kind.channels) > 1

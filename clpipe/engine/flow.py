@@ -223,9 +223,10 @@ class Flow:
         values = [member.work.bind(asked) for member in stack.members]
         given, first = [], 0
         for call, *_ in launches:
-            own = [each[first : first + len(call.values)] for each in values]
+            end = first + len(call.values)
+            own = [each[first:end] for each in values]
             given.append(call.table(stack, own, buffers, self.table, self.new_table))
-            first += len(call.values)
+            first = end
         numbers = self.new_table(np.concatenate([ONE, *(rows.reshape(-1) for rows, _ in given)]))
         offset, done = ONE.size, wait
         for (call, across, local), (rows, pointers) in zip(launches, given, strict=True):

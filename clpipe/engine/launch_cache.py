@@ -74,7 +74,11 @@ class LaunchCache:
             return buffer is pool.buffers[name] and maker == made
 
         def digest(value: Any) -> bytes:
-            return xxh3_128_digest(value.data) if isinstance(value, np.ndarray) else value.tobytes()
+            return (
+                xxh3_128_digest(value.data)
+                if isinstance(value, np.ndarray)
+                else repr(value).encode()
+            )
 
         numbers = []
         for i, call in enumerate(calls):

@@ -90,6 +90,22 @@ def may_estimate(chain: Chain) -> bool:
     return any(type(s.method).estimates_for is not Method.estimates_for for s in chain.steps)
 
 
+def check_sizes(plan: Plan, width: int, height: int) -> None:
+    """See that all images of a result are of one size, so that patches are, too.
+
+    Raises:
+        ImageError: they are not.
+    """
+    *_, last = sizes = plan.sizes(width, height)
+    for name, kept in plan.kept:
+        own = sizes[kept.level]
+        if own != last:
+            raise ImageError(
+                f"the image of {name} has {own[0]}x{own[1]} pixels, but the last one "
+                f"{last[0]}x{last[1]}; patches are cut of images of one size"
+            )
+
+
 class Runner:
     """Runs one chain over images, on a device or in NumPy.
 
@@ -121,7 +137,6 @@ class Runner:
         self.incremental = incremental
         self._arguments = chain.arguments
         self._exposures = exposures_of(chain)
-        self._estimates: BoundedCache[dict[str, dict[str, float]]] = BoundedCache(32)  # by size
         # Shared with the runners of other chains, by a chain's structure.
         self._plans: BoundedCache[Plan] = BoundedCache(256)
         self._tables: BoundedCache[Array] = BoundedCache(32)
@@ -230,21 +245,25 @@ class Runner:
         Returns:
             The work, or a callable that returns the result where no device is needed.
         """
-        self.check(image, options)
+        self.check(image)
         runner = self._merging(image, noise_key, options.later)
         if not (self.encode or self.final or self.keep):
             return lambda: Result(None, None, {}, {})
         if not self.device:
+            if options.boxes:
+                check_sizes(runner.plan_for(image), *image.shape[1::-1])
             pixels = np.asarray(image, np.float32)
             return partial(runner._run_numpy, pixels, noise_key, options.boxes)
         plan = runner.plan_for(image)
         plan.check_resamplings(*image.shape[1::-1])
+        if options.boxes:
+            check_sizes(plan, *image.shape[1::-1])
         return runner._work(plan, image, noise_key, options)
 
     def _work(self, plan: Plan, image: Array, noise_key: str, options: RunOptions) -> Work[Result]:
         """See :meth:`work`; of an image whose other exposures are done."""
         width, height = image.shape[1::-1]
-        estimates = self._estimates.get((width, height), lambda: self._estimates_for(width, height))
+        estimates = self._estimates_for(width, height) if may_estimate(self.chain) else {}
         return Work(
             plan,
             image,
@@ -272,11 +291,11 @@ class Runner:
         seen = [runner.run(own, noise_key).image for runner, own in pairs]
         return self.for_chain(self._exposures.merging(seen))
 
-    def check(self, image: Array, options: RunOptions) -> None:
+    def check(self, image: Array) -> None:
         """See that an image is one that the chain starts on.
 
         Raises:
-            ImageError: it is not, or patches are asked for of images that differ in size.
+            ImageError: it is not.
         """
         channels = len(self.chain.source.channels)
         shape = image.shape[2] if image.ndim == 3 else 1
@@ -285,28 +304,10 @@ class Runner:
                 f"found an image of shape {image.shape}, but the chain starts on "
                 f"{self.chain.source.label} with {channels} channel(s)"
             )
-        if options.boxes:
-            self._check_sizes(image)
-
-    def _check_sizes(self, image: Array) -> None:
-        """See that all images of an image's result are of one size, so that patches are, too.
-
-        Raises:
-            ImageError: they are not.
-        """
-        plan = self.plan_for(image)
-        *_, last = sizes = plan.sizes(*image.shape[1::-1])
-        for name, kept in plan.kept:
-            own = sizes[kept.level]
-            if own != last:
-                raise ImageError(
-                    f"the image of {name} has {own[0]}x{own[1]} pixels, but the last one "
-                    f"{last[0]}x{last[1]}; patches are cut of images of one size"
-                )
 
     def bind(self, plan: Plan, image: Array, noise_key: str) -> Bind:
         """What gives the values of the kernels' parameters for an image."""
-        keys: dict[str, dict[NoiseScope, Stream]] = {}
+        streams: dict[tuple[str, NoiseScope], Stream] = {}
         sizes = plan.sizes(*image.shape[1::-1])
         arguments = self._arguments
 
@@ -317,9 +318,9 @@ class Runner:
                 case EncodedCurves(steps):
                     return self._composed(steps)
                 case StreamWord(step, scope, word):
-                    if step not in keys:
-                        keys[step] = self.chain.streams(step, noise_key)
-                    return np.uint32(getattr(keys[step][scope], word))
+                    if (step, scope) not in streams:
+                        streams[step, scope] = self.chain.stream(step, scope, noise_key)
+                    return getattr(streams[step, scope], word)
 
         def bind(values: Sequence[Value]) -> list[Any]:
             return [
@@ -331,9 +332,7 @@ class Runner:
 
     def _estimates_for(self, width: int, height: int) -> dict[str, dict[str, float]]:
         """Numbers that follow from the size of the steps' images, by step."""
-        found: dict[str, dict[str, float]] = {}
-        if not may_estimate(self.chain):
-            return found
+        found = {}
         for step in self.chain.steps:
             if values := step.method.estimates_for(width, height):
                 found[step.name] = dict(values)
@@ -382,9 +381,8 @@ class Runner:
         steps = (self.chain if whole else self.chain.through(self.keep)).steps
         for step in steps:
             from_size = dict(step.method.estimates_for(*image.shape[1::-1]))
-            given = ReferenceContext(
-                step.context, self.chain.streams(step.name, noise_key), from_size
-            )
+            streams = {s: self.chain.stream(step.name, s, noise_key) for s in NoiseScope}
+            given = ReferenceContext(step.context, streams, from_size)
             with user_code_errors(f"stage {step.name}", step.stage.folder):
                 image = step.method.reference(image, given)
             if step.name in self.keep:

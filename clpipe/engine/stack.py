@@ -8,7 +8,8 @@ stack of one.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -131,10 +132,10 @@ class Call:
         rows = np.zeros((len(members), len(self.kernel.parameters)), np.uint32)
         level, first = self.kernel.launch.level, 0
         for larger, names in self._numbers.items():
-            of, end = max(level - larger, 0), first + len(names)
-            extents = [member.extents[of].numbers for member in members]
-            rows[:, first:end] = [[numbers[name] for name in names] for numbers in extents]
-            first = end
+            if names:
+                end = first + len(names)
+                rows[:, first:end] = stack.numbers(max(level - larger, 0), tuple(names))
+                first = end
         for place, name in self._pointers:
             if isinstance(name, str):
                 rows[:, place] = stack.strides.get(name, 0) // self._elements[place]
@@ -164,6 +165,15 @@ class Stack:
     tile: int = 0
     fetches: bool = True
     is_last: bool = True
+    _numbers: dict[Any, list[Any]] = field(default_factory=dict, init=False)
+
+    def numbers(self, level: int, names: tuple[str, ...]) -> list[Any]:
+        """Numbers of the members' extents on a level, a row for each member."""
+        if (level, names) not in self._numbers:
+            chosen = itemgetter(*names)
+            rows = [chosen(member.extents[level].numbers) for member in self.members]
+            self._numbers[level, names] = rows
+        return self._numbers[level, names]
 
     def launches(self) -> Iterator[tuple[Call, tuple[int, ...], tuple[int, ...]]]:
         """The kernels to launch, each with its global and its local size in work items."""
@@ -225,11 +235,14 @@ def cut(
     Raises:
         ImageError: one does not fit into the memory by itself.
     """
-    largest_member = enclosing([member.extents for member in members])
-    sizes_of_one = buffer_sizes(members[0].work.plan, largest_member, ends)
-    strides = {name: round_up(size, PAGE) for name, size in sizes_of_one.items()}
-    allowed = min(STACK_BYTES[in_place], memory)
-    count = min(allowed // sum(strides.values()), largest // max(strides.values()))
+    strides: dict[str, int] = {}
+    count = 1
+    if len(members) > 1:
+        largest_member = enclosing([member.extents for member in members])
+        sizes_of_one = buffer_sizes(members[0].work.plan, largest_member, ends)
+        strides = {name: round_up(size, PAGE) for name, size in sizes_of_one.items()}
+        allowed = min(STACK_BYTES[in_place], memory)
+        count = min(allowed // sum(strides.values()), largest // max(strides.values()))
     is_mixed = len({tuple(extent.is_empty for extent in m.extents) for m in members}) > 1
     if count < FEWEST or is_mixed:
         for member in members:

@@ -147,7 +147,7 @@ class RawNoise(ReadOnly):
             [next(i for i, c in enumerate(distinct) if c is own) for own in chains_of]
         )
         streams = [
-            chain.streams(chain.steps[0].name, key)[NoiseScope.IMAGE]
+            chain.stream(chain.steps[0].name, NoiseScope.IMAGE, key)
             for chain, key in zip(chains_of, keys, strict=True)
         ]
         words = torch.tensor([[s.key0 for s in streams], [s.key1 for s in streams]])

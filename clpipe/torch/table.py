@@ -150,7 +150,7 @@ def _variants(chains: Sequence[Chain], position: int) -> list[Variant]:
             )
             for name in arguments[number]
         }
-        sensors = [chain.streams(example.name, "")[NoiseScope.CAMERA] for chain in chains]
+        sensors = [chain.stream(example.name, NoiseScope.CAMERA, "") for chain in chains]
         stage = sensors[0].stage
         own = [steps.get(k) for k in range(len(chains))]
         variants.append(Variant(twin, own, sensors, numbers, stage))
