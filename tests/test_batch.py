@@ -195,9 +195,9 @@ def test_devices_develop_at_the_same_time(renders, tmp_path, monkeypatch):
     (tmp_path / "out").mkdir()
     start, both = ImageWorker.start, threading.Barrier(2)
 
-    def together(self, state, recipe, runner):
+    def together(self, asked):
         both.wait(GUARD)  # for the other device's image
-        return start(self, state, recipe, runner)
+        return start(self, asked)
 
     monkeypatch.setattr(ImageWorker, "start", together)
     worker, jobs = worker_of(tmp_path)
@@ -749,7 +749,7 @@ class Panic(BaseException):
 # Where an image is decoded, developed and encoded.
 INSIDE = {
     "decode": (ImageLoader, "read"),
-    "device": (Runner, "submit"),
+    "device": (Runner, "work"),
     "encode": (OutputWriter, "write"),
 }
 
@@ -822,13 +822,13 @@ def test_what_a_device_leaves_another_does(renders, tmp_path, monkeypatch, caplo
     worker, jobs = worker_of(tmp_path)
     broken, is_broken = [], threading.Event()
 
-    def start(self, state, recipe, runner):
+    def start(self, asked):
         if threading.current_thread().name == "device 0":
-            broken.append(state.job)
+            broken.append(asked[0][0].job)
             is_broken.set()
             raise DeviceError("it is given up")
         assert is_broken.wait(GUARD)
-        return right(self, state, recipe, runner)
+        return right(self, asked)
 
     right = ImageWorker.start
     monkeypatch.setattr(ImageWorker, "start", start)

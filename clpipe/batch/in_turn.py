@@ -1,5 +1,5 @@
-"""Many images in one thread: all of one is done, then the next is begun; a second one only waits
-for the disk.
+"""Many images in one thread: all of one, or of a few small ones, is done, then the next is begun;
+a second thread only waits for the disk.
 
 A process that has one processor needs no more. In :class:`clpipe.batch.threads.Batch` threads take
 turns at the interpreter's lock some fifty times an image, which of a small image's time is a third.
@@ -7,8 +7,9 @@ turns at the interpreter's lock some fifty times an image, which of a small imag
 
 import queue
 import threading
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 
 from clpipe.base.errors import ClpipeError, DeviceError, OutputError
@@ -18,8 +19,10 @@ from clpipe.batch.room import Room
 from clpipe.batch.runners import Runners
 from clpipe.batch.work import ImageWorker, Written
 from clpipe.engine.device import Device
+from clpipe.engine.runner import Result, Runner
 from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.find import Job
+from clpipe.outputs.recipes import Recipe
 
 TOGETHER = 16  # images that are brought to the disk at a time, at most
 
@@ -51,6 +54,8 @@ class InTurn:
         worker.reserve(1)
         self._room = Room(room, [device], partial(worker.reserve, 1))
         self._runners: Runners | None = None
+        self._decoded: list[JobState] = []
+        self._made: list[Made] = []
         self._failure: ClpipeError | None = None
         self._stopping = threading.Event()
 
@@ -68,7 +73,6 @@ class InTurn:
             DeviceError: the device cannot be used any more.
         """
         set_codec_threads(1)
-        made: list[Made] = []
         committing: Future[list[Outcome]] | None = None
         with ThreadPoolExecutor(1, "write") as beside:
             try:
@@ -76,25 +80,24 @@ class InTurn:
                     try:
                         job = jobs.get_nowait()
                     except queue.Empty:
+                        self._develop()
                         yield from committing.result() if committing else ()
                         committing = None
-                        yield from self._commit(made)
-                        made = []
+                        yield from self._commit(self._taken())
                         if self._stopping.is_set():
                             break
                         job = jobs.get()
                     if job is None or self._stopping.is_set():
                         break
-                    made.append(self._make(job))
-                    if len(made) >= TOGETHER:
+                    self._begin(job)
+                    if len(self._made) >= TOGETHER:
                         yield from committing.result() if committing else ()
-                        committing = beside.submit(self._commit, made)
-                        made = []
+                        committing = beside.submit(self._commit, self._taken())
+                self._develop()
                 yield from committing.result() if committing else ()
-                yield from self._commit(made)
-                made = []
+                yield from self._commit(self._taken())
             finally:
-                for _, files in made:
+                for _, files in self._taken():
                     for each in files:
                         each.group.discard()
                 if self._device:
@@ -102,27 +105,61 @@ class InTurn:
         if self._failure:
             raise self._failure
 
-    def _make(self, job: Job) -> Made:
-        """Do all of a job, but bring nothing to the disk."""
-        worker = self._worker
-        state, files = JobState(job, worker.loader), list[Written]()
+    def _taken(self) -> list[Made]:
+        """What was made since the last time."""
+        made, self._made = self._made, []
+        return made
+
+    def _begin(self, job: Job) -> None:
+        """Decode a job's image, and develop it with those before it unless more may follow."""
+        state = JobState(job, self._worker.loader)
+        with self._errors_of(state):
+            state = self._worker.decode(job, self._admit)
+        self._decoded.append(state)
+        size = state.source.pixels.shape[1::-1] if state.source else (0, 0)
+        if len(self._decoded) >= TOGETHER or not (self._device and self._device.stacks(*size)):
+            self._develop()
+
+    def _develop(self) -> None:
+        """Do what is left of the jobs that are decoded, but bring nothing to the disk."""
+        states, self._decoded = self._decoded, []
+        files: list[list[Written]] = [[] for _ in states]
+        for number in range(max((len(state.recipes) for state in states), default=0)):
+            asked: list[tuple[int, Recipe, Runner]] = []
+            for place, state in enumerate(states):
+                if not state.error and number < len(state.recipes):
+                    with self._errors_of(state):
+                        recipe = self._worker.measured(state, state.recipes[number])
+                        asked.append((place, recipe, self._compiled().of(recipe)))
+            begun: list[Callable[[], Result | None]] = []
+            try:
+                begun = self._worker.start(
+                    [(states[place], recipe, runner) for place, recipe, runner in asked]
+                )
+            except BaseException as error:
+                for place, *_ in asked:
+                    with self._errors_of(states[place]):
+                        raise error
+            for (place, recipe, _), wait in zip(asked, begun, strict=False):
+                with self._errors_of(state := states[place]):
+                    result = wait()
+                    written = result and self._worker.encode(state, recipe, result, self._device)
+                    files[place] += [written] if written else []
+        for state in states:
+            state.drop_pixels()
+            self._room.leave(state.job.stem)
+        self._made += zip(states, files, strict=True)
+
+    @contextmanager
+    def _errors_of(self, state: JobState) -> Iterator[None]:
+        """What fails within fails one job, unless it is of what all that follows needs."""
         try:
-            state = worker.decode(job, self._admit)
-            for asked in tuple(state.recipes):
-                if state.error:
-                    break
-                recipe = worker.measured(state, asked)
-                result = worker.develop(state, recipe, self._compiled().of(recipe))
-                written = result and worker.encode(state, recipe, result, self._device)
-                files += [written] if written else []
-        except (OutputError, DeviceError) as error:  # of which all that follows would fail
-            state.error = failure_text(job, error)
+            yield
+        except (OutputError, DeviceError) as error:
+            state.error = failure_text(state.job, error)
             self._fail(error)
-        except BaseException as error:  # nothing that one image does may end the run
-            state.error = failure_text(job, error)
-        state.drop_pixels()
-        self._room.leave(job.stem)
-        return state, files
+        except BaseException as error:
+            state.error = failure_text(state.job, error)
 
     def _compiled(self) -> Runners:
         """The device's runners; kernels are compiled at the first call.
@@ -150,7 +187,10 @@ class InTurn:
                 self._fail(error)
                 raise
             self._room.started()
-        self._room.enter(job.stem, self._worker.bytes_of(job, 1, self._device is None))
+        size = self._worker.bytes_of(job, 1, self._device is None)
+        if self._decoded and not self._room.fits(size):
+            self._develop()  # and give their memory back
+        self._room.enter(job.stem, size)
 
     def _commit(self, made: Sequence[Made]) -> list[Outcome]:
         """Bring to the disk what was made; the outcomes."""

@@ -122,6 +122,11 @@ class Room:
                 self._squeeze(size)
             self._taken[name] = size
 
+    def fits(self, size: int) -> bool:
+        """Whether there is room for an image now."""
+        with self._changed:
+            return self._fits(size)
+
     def leave(self, name: str) -> None:
         """Give back the room of an image, where it has any."""
         with self._changed:

@@ -340,7 +340,7 @@ class Batch:
             try:
                 if not state.error:
                     recipe = self._worker.measured(state, asked)
-                    finish = self._worker.start(state, recipe, runners.of(recipe))
+                    (finish,) = self._worker.start([(state, recipe, runners.of(recipe))])
             except DeviceError:
                 self._results.release()
                 raise

@@ -9,8 +9,9 @@ from typing import Any, TypeVar
 
 from clpipe.base.buckets import fetched
 from clpipe.base.digests import stamp_of
-from clpipe.base.errors import ImageError, NoPictureError, OutputError, RequestError
+from clpipe.base.errors import DeviceError, ImageError, NoPictureError, OutputError, RequestError
 from clpipe.base.files import FileGroup, deferred_files
+from clpipe.base.types import Array
 from clpipe.batch.job_state import JobState
 from clpipe.batch.outcome import LEFT_OUT, SKIPPED, Span
 from clpipe.batch.room import host_bytes
@@ -23,10 +24,8 @@ from clpipe.chain.formats import DNG
 from clpipe.chain.rendition import Rendition
 from clpipe.engine.clipping import clipped_share
 from clpipe.engine.device import Device
-from clpipe.engine.extents import Box
 from clpipe.engine.options import RunOptions, Timing
-from clpipe.engine.runner import Result, Runner
-from clpipe.images.read import SourceImage
+from clpipe.engine.runner import Result, Runner, submit_together
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.existing import Found, Redo
@@ -233,59 +232,73 @@ class ImageWorker:
         state.recipes[state.recipes.index(recipe)] = known
         return known
 
-    def develop(self, state: JobState, recipe: Recipe, runner: Runner) -> Result | None:
-        """Develop one rendition; None where it fails."""
-        return self.start(state, recipe, runner)()
-
-    def start(self, state: JobState, recipe: Recipe, runner: Runner) -> Callable[[], Result | None]:
-        """Begin to develop one rendition.
+    def start(
+        self, asked: Sequence[tuple[JobState, Recipe, Runner]]
+    ) -> list[Callable[[], Result | None]]:
+        """Begin to develop renditions on one device, small ones in common launches.
 
         Returns:
-            What waits for the result and gives it; None where it fails. It raises DeviceError, too.
+            A callable for each, which waits for its result and returns it, called in order. It
+            returns None where the rendition fails, and raises DeviceError, too.
 
         Raises:
             DeviceError: the device cannot be used any more.
         """
-        assert state.source
-        start, source = time.perf_counter(), state.source
-        timings: list[Timing] | None = [] if self._trace and runner.device else None
-        boxes = [patch.box for patch in state.patches]
-        work = partial(self._submit, source, recipe, runner, timings, boxes)
-        wait = self._tried(state, work)
+        start = time.perf_counter()
+        orders = [self._tried(each[0], partial(self._order, *each)) for each in asked]
+        ready = [order for order in orders if order]
+        waits: list[Callable[[], Result] | None]
+        if len(asked) == 1:
+            waits = [self._tried(asked[0][0], lambda: submit_together(ready)[0]) if ready else None]
+        else:
+            try:
+                begun = iter(submit_together(ready) if ready else ())
+                waits = [next(begun) if order else None for order in orders]
+            except DeviceError:
+                raise
+            except Exception:  # of which it is not said, so each is tried alone when it is due
+                waits = [partial(o[0].run, *o[1:]) if o else None for o in orders]
+        return [
+            partial(self._finish, state, recipe, start, order[3].timings if order else None, wait)
+            for (state, recipe, _), order, wait in zip(asked, orders, waits, strict=True)
+        ]
 
-        def finish() -> Result | None:
-            result = self._tried(state, wait) if wait else None
-            state.note("device", start)
-            if result and result.final is not None:
-                for spread in {each.spread for each in state.recipes if each.spread}:
-                    spread.take(recipe.rendition, result.final)
-            if result and recipe.estimates:
-                result.estimates[recipe.chain.steps[-1].name] = dict(recipe.estimates)
-            name = threading.current_thread().name
-            state.spans += [Span(t.name, name, t.start, t.seconds) for t in timings or []]
-            if result and recipe is state.recipes[-1] and DNG not in self.writer.formats:
-                state.drop_pixels()
-            return result
-
-        return finish
-
-    def _submit(
-        self,
-        source: SourceImage,
-        recipe: Recipe,
-        runner: Runner,
-        timings: list[Timing] | None,
-        boxes: Sequence[Box],
-    ) -> Callable[[], Result]:
-        """Have a runner begin with an image, whose pixels nobody changes."""
-        pixels = source.pixels
+    def _order(
+        self, state: JobState, recipe: Recipe, runner: Runner
+    ) -> tuple[Runner, Array, str, RunOptions]:
+        """What a rendition asks a runner for; nobody changes its image's pixels."""
+        source = state.source
+        assert source
+        pixels, device = source.pixels, runner.device
         width, height = runner.chain.size(*pixels.shape[1::-1])
-        shape = (height, width, *pixels.shape[2:])
-        reused = runner.encode and runner.device and not boxes
-        into = self._spare.take(shape) if reused else None
-        key = recipe.noise_key
+        boxes = [patch.box for patch in state.patches]
+        is_used_again = runner.encode and not boxes and device and not device.stacks(width, height)
+        into = self._spare.take((height, width, *pixels.shape[2:])) if is_used_again else None
+        timings: list[Timing] | None = [] if self._trace and device else None
         options = RunOptions(timings, into=into, unchanged=True, boxes=boxes, later=source.later)
-        return runner.submit(pixels, key, options)
+        return runner, pixels, recipe.noise_key, options
+
+    def _finish(
+        self,
+        state: JobState,
+        recipe: Recipe,
+        start: float,
+        timings: list[Timing] | None,
+        wait: Callable[[], Result] | None,
+    ) -> Result | None:
+        """Wait for the result of a rendition that was begun."""
+        result = self._tried(state, wait) if wait else None
+        state.note("device", start)
+        if result and result.final is not None:
+            for spread in {each.spread for each in state.recipes if each.spread}:
+                spread.take(recipe.rendition, result.final)
+        if result and recipe.estimates:
+            result.estimates[recipe.chain.steps[-1].name] = dict(recipe.estimates)
+        name = threading.current_thread().name
+        state.spans += [Span(t.name, name, t.start, t.seconds) for t in timings or []]
+        if result and recipe is state.recipes[-1] and DNG not in self.writer.formats:
+            state.drop_pixels()
+        return result
 
     @staticmethod
     def _tried(state: JobState, work: Callable[[], T]) -> T | None:

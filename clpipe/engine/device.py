@@ -22,7 +22,7 @@ from clpipe.engine.patches import with_patches
 from clpipe.engine.plan_kernels import PlanKernels
 from clpipe.engine.programs import announced, forget_programs, programs_of
 from clpipe.engine.recovery import Recovery
-from clpipe.engine.stack import Stack, cut
+from clpipe.engine.stack import BYTES_OF_PIXEL, FEWEST, STACK_BYTES, Stack, cut
 from clpipe.engine.tiles import Tiling, tiling_of
 from clpipe.engine.work import Member, R, Work
 
@@ -116,6 +116,10 @@ class Device:
             for work in group:
                 waits[work] = self._recovery.wait(work, flight)
         return [waits[work] for work in works]
+
+    def stacks(self, width: int, height: int) -> bool:
+        """Whether images of that size share launches: whether a stack holds a few."""
+        return width * height * BYTES_OF_PIXEL * FEWEST <= STACK_BYTES[self.info.in_place]
 
     def enqueue(self, works: Sequence[Work[Any]], memory: int) -> Flight | Exception:
         """Enqueue images, whose plans have the same kernels, within so many bytes.

@@ -41,6 +41,7 @@ ENDS = ("src", "dst")  # buffers that are an image's own
 # tenth with 512x512, which leave its cache between two launches.
 STACK_BYTES = {True: 2**24, False: 2**29}
 BYTES = {"uchar": 1, "half": 2, "float": 4, "uint": 4, "int4": 16, "long4": 32}
+BYTES_OF_PIXEL = 36  # of the buffers of the default chain
 FEWEST = 4  # members, or images are so large that launches are few
 # Of numbers in a table, in the order in which their columns end it.
 TYPES = {"float": np.float32, "int": np.int32, "uint": np.uint32}
