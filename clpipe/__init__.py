@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from clpipe.camera.noise import NoiseModel
     from clpipe.camera.profile import Camera, built_in_cameras, load_camera
     from clpipe.dataset import Dataset, Patches, RawNoise
+    from clpipe.dataset.streaming import StreamingDataset
     from clpipe.engine.runner import Result
     from clpipe.pipeline import Pipeline
 
@@ -34,6 +35,7 @@ _MODULES = {
     "RequestError": "clpipe.base.errors",
     "Result": "clpipe.engine.runner",
     "Run": "clpipe.batch.session",
+    "StreamingDataset": "clpipe.dataset.streaming",
     "built_in_cameras": "clpipe.camera.profile",
     "load_camera": "clpipe.camera.profile",
     "run": "clpipe.batch.api",
@@ -53,6 +55,7 @@ __all__ = [
     "RequestError",
     "Result",
     "Run",
+    "StreamingDataset",
     "__version__",
     "built_in_cameras",
     "load_camera",

@@ -1,9 +1,11 @@
 """Samples for training, developed on the way: the same as a run's, whoever asks for them when."""
 
+import gc
 import itertools
 import multiprocessing
 import os
 import pickle
+import tarfile
 import threading
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -16,7 +18,11 @@ from PIL import Image
 import clpipe as api
 from clpipe.base.errors import DeviceError, ImageError, RequestError
 from clpipe.dataset import dataset as module
+from clpipe.dataset.renders import SharedRenders
 from clpipe.dataset.samples import SampleLoader
+from clpipe.engine.runner import is_planar
+from clpipe.images.read import SourceImage
+from clpipe.inputs.loader import ImageLoader
 from tests.conftest import same_samples as same
 
 ISO = 3200  # a chain that other tests compile too
@@ -287,6 +293,94 @@ def test_it_pickles_before_and_after_it_was_used(dataset):
     assert dataset._loader._opened.process == os.getpid()
     for data in (before, pickle.dumps(dataset)):
         same(pickle.loads(data)[1], one)
+
+
+def test_copies_in_other_processes_read_what_one_has_decoded(renders, monkeypatch):
+    samples = api.Dataset(renders, iso=ISO, truth=True)
+    other = pickle.loads(pickle.dumps(samples))
+    decoded, read = [], ImageLoader.read
+
+    def counted(loader, job):
+        decoded.append(job.key)
+        return read(loader, job)
+
+    monkeypatch.setattr(ImageLoader, "read", counted)
+    whole = [samples[number] for number in range(5)]
+    assert len(decoded) == 5
+    for number, one in enumerate(whole):
+        same(other[number], one)
+        same(samples[number], one)
+    assert len(decoded) == 5
+    os.utime("in/r2.exr", (1, 1))  # another file, for all that is known
+    same(other[2], whole[2])
+    assert decoded[5:] == ["r2.exr"]
+    folder = samples._loader.renders._folder
+    assert folder.is_dir()
+    del samples, other
+    gc.collect()
+    assert not folder.exists()
+
+
+def test_renders_beyond_the_cache_are_decoded_each_time(renders, monkeypatch):
+    some, none = (api.Dataset(renders, iso=ISO, cache=size) for size in (2 * 17 * 40 * 3 * 2, 0))
+    decoded, read = [], ImageLoader.read
+
+    def counted(loader, job):
+        decoded.append(job.key)
+        return read(loader, job)
+
+    monkeypatch.setattr(ImageLoader, "read", counted)
+    for samples, expected in ((some, 3), (none, 5)):
+        for number in range(5):
+            assert samples[number]["key"] == f"r{number}.exr"
+        decoded.clear()
+        for number in range(5):
+            assert samples[number]["key"] == f"r{number}.exr"
+        assert len(decoded) == expected
+    assert some._loader.renders.taken <= 2 * 17 * 40 * 3 * 2
+
+
+def test_a_render_in_planes_stays_in_planes(tmp_path):
+    planes = np.arange(24, dtype=np.float16).reshape(3, 2, 4)
+    image = SourceImage(planes.transpose(1, 2, 0), "", "", (), {})
+    kept = SharedRenders(1000)
+    found = [kept.get("a", lambda: image).pixels, pickle.loads(pickle.dumps(kept)).get("a", None)]
+    for pixels in (found[0], found[1].pixels):
+        assert is_planar(pixels) and np.array_equal(pixels, image.pixels)
+        assert not pixels.flags.writeable
+
+
+def test_tars_are_streamed(renders, monkeypatch):
+    for name, numbers in (("a", (0, 1)), ("b", (2,)), ("c", (3, 4))):
+        with tarfile.open(f"{name}.tar", "w") as tar:
+            for number in numbers:
+                tar.add(f"in/r{number}.exr", f"sub/r{number}.exr")
+            tar.addfile(tarfile.TarInfo("../outside.exr"))
+    streamed = api.StreamingDataset("?.tar", iso=ISO, truth=True)
+    first, second = list(streamed), list(streamed)
+    keys = ["a/sub/r0.exr", "a/sub/r1.exr", "b/sub/r2.exr", "c/sub/r3.exr", "c/sub/r4.exr"]
+    assert [sample["key"] for sample in first] == keys
+    assert [sample["epoch"] for sample in second] == [1] * 5
+    for sample, number in zip(first, range(5), strict=True):
+        single = api.Dataset(f"in/r{number}.exr", iso=ISO, truth=True)[0]
+        assert np.array_equal(sample["truth"], single["truth"])
+        assert not np.array_equal(sample["image"], single["image"])  # another key, other noise
+    assert not np.array_equal(first[0]["image"], second[0]["image"])
+    for part, expected in ((0, keys[:2] + keys[3:]), (1, keys[2:3])):
+        with monkeypatch.context() as patch:
+            patch.setattr("clpipe.dataset.streaming.worker", lambda part=part: (part, 2))
+            assert [sample["key"] for sample in streamed] == expected
+    assert not Path("outside.exr").exists()
+
+
+def test_tars_that_cannot_be_streamed(renders):
+    with pytest.raises(RequestError, match=r"no\*.tar: there is no such tar"):
+        api.StreamingDataset("no*.tar")
+    with pytest.raises(RequestError, match="each pass over a StreamingDataset is an epoch"):
+        api.StreamingDataset("no*.tar", epochs=2)
+    Path("bad.tar").write_bytes(b"no tar at all")
+    with pytest.raises(ImageError, match="bad.tar: cannot be read as a tar"):
+        list(api.StreamingDataset("bad.tar"))
 
 
 def test_an_iso_that_is_drawn(renders):

@@ -367,34 +367,36 @@ class _Copies:
         return self._texts[key][1]
 
     def _text_of(self, value: Any) -> str | None:
-        trace = self._trace
         if isinstance(value, tuple | list | dict):
-            parts = list(value.values() if isinstance(value, dict) else value)
-            texts = [self.text(part) for part in parts]
-            if not any(texts):
-                return None
-            full = [t or trace._constant(p) for t, p in zip(texts, parts, strict=True)]
-            if isinstance(value, dict):
-                keys = (trace._constant(key) for key in value)
-                return f"{{{', '.join(f'{k}: {t}' for k, t in zip(keys, full, strict=True))}}}"
-            if type(value) in (tuple, list):
-                listed = "".join(f"{each}, " for each in full)
-                return f"[{listed}]" if isinstance(value, list) else f"({listed})"
-            return f"{trace._constant(type(value))}({', '.join(full)})"
+            return self._text_of_container(value)
         attributes = getattr(value, "__dict__", None) or {}
-        texts_of = {name: self.text(part) for name, part in attributes.items()}
+        texts = {name: self.text(part) for name, part in attributes.items()}
         if any(map(self.text, _hidden(value))):
             raise NotTraceableError(f"{type(value).__name__} holds traced numbers")
-        if not any(texts_of.values()):
+        if not any(texts.values()):
             return None
-        changes = ", ".join(f"{name!r}: {text}" for name, text in texts_of.items() if text)
+        constant = self._trace._constant
         # With all names, so that their order stays.
-        known = trace._constant(
-            {n: None if text else attributes[n] for n, text in texts_of.items()}
-        )
+        known = constant({n: None if text else attributes[n] for n, text in texts.items()})
+        changes = ", ".join(f"{name!r}: {text}" for name, text in texts.items() if text)
         if isinstance(value, BaseModel):
-            return f"altered({trace._constant(value)}, {{**{known}, {changes}}})"
-        return f"with_attributes({trace._constant(type(value))}, {{**{known}, {changes}}})"
+            return f"altered({constant(value)}, {{**{known}, {changes}}})"
+        return f"with_attributes({constant(type(value))}, {{**{known}, {changes}}})"
+
+    def _text_of_container(self, value: Any) -> str | None:
+        constant = self._trace._constant
+        parts = list(value.values() if isinstance(value, dict) else value)
+        texts = [self.text(part) for part in parts]
+        if not any(texts):
+            return None
+        full = [text or constant(part) for text, part in zip(texts, parts, strict=True)]
+        if isinstance(value, dict):
+            pairs = zip(map(constant, value), full, strict=True)
+            return f"{{{', '.join(f'{key}: {text}' for key, text in pairs)}}}"
+        listed = "".join(f"{each}, " for each in full)
+        if type(value) in (tuple, list):
+            return f"[{listed}]" if isinstance(value, list) else f"({listed})"
+        return f"{constant(type(value))}({listed})"  # a named tuple
 
 
 def _hidden(value: Any) -> list[Any]:

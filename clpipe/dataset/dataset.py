@@ -129,8 +129,9 @@ class Dataset(ReadOnly):
         on_error: what becomes of an image that cannot be read or developed: "raise" its error, or
             "skip" it with a warning. Asked for by their numbers, its samples are then those of the
             next image. Headers are read at once; files without one are refused, or left out.
-        cache: bytes of decoded renders that are kept in memory for further patches and epochs, in
-            each process; also as a text, such as "4G".
+        cache: bytes of decoded renders that are kept for further patches and epochs, also as a
+            text, such as "4G". Workers share them: they are files among the system's temporary
+            ones (``TMPDIR``), mapped into memory. 0 keeps none.
         epoch: the number of the first epoch.
         epochs: how many epochs there are; None is no end.
         threads: how many images are decoded at once; None is one for each processor.

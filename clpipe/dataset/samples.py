@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from clpipe.base.cache import BoundedCache
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.carry import VALID
 from clpipe.chain.identity import noise_key, of_frame
 from clpipe.dataset.developer import Developer, Order, Sample, SampleSpec
+from clpipe.dataset.renders import SharedRenders
 from clpipe.engine.device import open_device
 from clpipe.images.read import SourceImage
 from clpipe.inputs.find import Job
@@ -48,11 +48,6 @@ class SampleBatch:
         return key if self.drawn is None else f"{key}, patch {self.drawn}"
 
 
-def pixel_bytes(source: SourceImage) -> int:
-    """The memory that an image takes."""
-    return source.pixels.nbytes
-
-
 class SampleLoader:
     """Makes the samples of images, in the order in which they are begun.
 
@@ -73,7 +68,7 @@ class SampleLoader:
         device: str | None,
     ) -> None:
         self.patches = patches
-        self.renders: BoundedCache[SourceImage] = BoundedCache(cache, pixel_bytes)
+        self.renders = SharedRenders(cache)
         self._loader = loader
         self._spec = spec
         self._device = device

@@ -199,9 +199,9 @@ class Flow:
         """Send what the members of a stack store of their sources, unless it is there already."""
         first, members = stack.members[0], stack.members
         options, source = first.work.options, first.work.source
-        if is_whole and (options.unchanged or not options.download):
-            if sent := self.transfers.again(source):
-                return sent
+        is_same = is_whole and (options.unchanged or not options.download)
+        if is_same and (sent := self.transfers.again(source)):
+            return sent
         if len(members) > 1:
             pixels = [member.pixels for member in members]
             sent = self.transfers.upload_all(pixels, first.dtype, stack.strides["src"])

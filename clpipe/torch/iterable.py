@@ -1,0 +1,21 @@
+"""What PyTorch's ``DataLoader`` takes as an iterable, where PyTorch is there."""
+
+from typing import Any
+
+__all__ = ["IterableDataset", "worker"]
+
+try:
+    from torch.utils.data import IterableDataset, get_worker_info
+except ModuleNotFoundError:
+
+    class IterableDataset:  # type: ignore[no-redef]
+        """Stands for PyTorch's class where PyTorch is not installed."""
+
+    def get_worker_info() -> Any:
+        """Stands for PyTorch's function."""
+
+
+def worker() -> tuple[int, int]:
+    """Return the number of this worker of a ``DataLoader``, and how many there are."""
+    info = get_worker_info()
+    return (info.id, info.num_workers) if info else (0, 1)
