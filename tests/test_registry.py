@@ -92,7 +92,10 @@ def test_a_stage_file_with_a_mistake(clpipe, stage_file, change, message):
     ("change", "message"),
     [
         (("self.focal_length**-2", "1 / 0"), r"vignette.py, line \d\d: ZeroDivisionError"),
-        (('"scale": scale', '"scale": "x"'), "arguments.. gives 'x' as 'scale'; allowed: float32"),
+        (
+            ('"scale": scale', '"scale": "x"'),
+            "arguments.. gives 'x' as 'scale'; allowed: float, float32",
+        ),
         (('"scale": scale', '"skale": scale'), "vignette needs the argument 'scale'; .*skale"),
         (('Pass("vignette"', 'Pass("vinette"'), "vignette.cl has no function vinette"),
     ],

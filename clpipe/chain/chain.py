@@ -21,7 +21,7 @@ from clpipe.reference.intrinsics import Intrinsics
 from clpipe.reference.random import Stream, stream_of
 from clpipe.reference.resample import Resampler, sizes
 from clpipe.stage import (
-    Arguments,
+    Argument,
     Context,
     InTime,
     Kind,
@@ -33,6 +33,7 @@ from clpipe.stage import (
     Stage,
     StageRole,
     bytes_of,
+    typed_arguments,
 )
 
 # Properties of a chain, and those whose values are the same in chains of one structure.
@@ -61,9 +62,9 @@ class Step:
         return self.method.passes()
 
     @cached_property
-    def arguments(self) -> Arguments:
+    def arguments(self) -> Mapping[str, Argument]:
         """The kernel arguments of its method, by name."""
-        return self.method.arguments(self.context)
+        return typed_arguments(self.method.arguments(self.context))
 
     @cached_property
     def adds_noise(self) -> bool:
@@ -132,7 +133,7 @@ class Chain:
         return stream_of(f"camera:{self.camera.name}", step)
 
     @cached_property
-    def arguments(self) -> Mapping[str, Arguments]:
+    def arguments(self) -> Mapping[str, Mapping[str, Argument]]:
         """The kernel arguments of its steps, by their names."""
         return {step.name: step.arguments for step in self.steps}
 

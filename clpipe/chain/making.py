@@ -5,7 +5,7 @@ from functools import partial
 
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
-from clpipe.base.tracing import altered
+from clpipe.base.tracing import Traced, altered
 from clpipe.camera.lens import calibration_of
 from clpipe.camera.optics import IN_PIXELS, Optics
 from clpipe.camera.profile import Camera, load_camera
@@ -163,7 +163,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
             after = method.next_context(context)
             if (states := method.optics()) and method.passes():
                 after = after.but(optics=after.optics.set_to(states))
-        if stage.folder:
+        if stage.folder and not isinstance(context.iso, Traced):  # else it has been checked
             check_passes(name, stage, method, context)
         # What a user's stage looks at, nobody knows.
         steps.append(Step(name, stage, method, context, follows_noise or bool(stage.folder)))

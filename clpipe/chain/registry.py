@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.base.reading import check_exists, check_regular
 from clpipe.chain.keys import NOISE
-from clpipe.stage import CompileTime, Context, Method, Stage, StageRole
+from clpipe.stage import CompileTime, Context, Method, Stage, StageRole, typed_arguments
 from clpipe.stages import own_stages
 
 ARGUMENT_TYPES = (np.float32, np.int32, np.uint32, np.ndarray, CompileTime)
@@ -177,7 +177,7 @@ def check_passes(name: str, stage: Stage, method: Method, context: Context) -> N
     assert stage.folder
     kernel = stage.folder / f"{method.kernel}.cl"
     with user_code_errors(f"stage {name}", stage.folder):
-        passes, arguments = method.passes(), method.arguments(context)
+        passes, arguments = method.passes(), typed_arguments(method.arguments(context))
         for pass_ in passes:
             names = [*arguments, *(name for p in passes for name in p.gives)]
             for argument in pass_.all_arguments:
@@ -193,7 +193,7 @@ def check_passes(name: str, stage: Stage, method: Method, context: Context) -> N
                     )
         for argument, value in arguments.items():
             if not isinstance(value, ARGUMENT_TYPES):
-                allowed = ", ".join(t.__name__ for t in ARGUMENT_TYPES)
+                allowed = ", ".join(["float", *(t.__name__ for t in ARGUMENT_TYPES)])
                 raise RequestError(
                     f"stage {name}: arguments() gives {value!r} as '{argument}'; allowed: {allowed}"
                 )

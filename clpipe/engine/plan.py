@@ -208,7 +208,7 @@ def make_plan(
     planner = _Planner(chain.source, fold)
     arrays = {step.name: step.context.array for step in chain.steps}
     kept: dict[str, Image] = {}
-    arguments = {step.name: step.method.arguments(step.context) for step in chain.steps}
+    arguments = chain.arguments
     for name, ops in chain_ops(chain, arguments):
         array = arrays[name]
         planner.period = array.period if array and array.needs_border else None

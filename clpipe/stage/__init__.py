@@ -42,6 +42,7 @@ from clpipe.stage.passes import (
     Stencil,
     TableLookup,
     bytes_of,
+    typed_arguments,
 )
 
 __all__ = [
@@ -78,6 +79,7 @@ __all__ = [
     "TableLookup",
     "Unchanged",
     "bytes_of",
+    "typed_arguments",
     "levels_table",
     "odd_size",
     "parameter",

@@ -6,6 +6,7 @@ from enum import Enum
 
 import numpy as np
 
+from clpipe.base.tracing import Traced, float32
 from clpipe.base.types import Array
 from clpipe.reference.resample import Axis, Resampler
 
@@ -163,7 +164,19 @@ class CompileTime:
 
 
 Argument = np.float32 | np.uint32 | np.int32 | Array | CompileTime
-Arguments = Mapping[str, Argument]  # by name
+Arguments = Mapping[str, Argument | float]  # by name; a float becomes a np.float32
+
+
+def typed_arguments(arguments: Arguments) -> dict[str, Argument]:
+    """Kernel arguments as kernels take them.
+
+    >>> typed_arguments({"gain": 0.5, "count": np.uint32(3)})
+    {'gain': np.float32(0.5), 'count': np.uint32(3)}
+    """
+    return {
+        name: float32(value) if isinstance(value, float | Traced) else value
+        for name, value in arguments.items()
+    }
 
 
 def bytes_of(argument: Argument) -> bytes:

@@ -161,6 +161,6 @@ def _numbers(step: Step) -> dict[str, Argument]:
     """The numbers among the arguments of a step's kernels."""
     return {
         name: value
-        for name, value in step.method.arguments(step.context).items()
+        for name, value in step.arguments.items()
         if not isinstance(value, CompileTime | np.ndarray)
     }
