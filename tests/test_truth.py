@@ -11,10 +11,8 @@ import pytest
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import DEFAULT_CAMERA, load_camera
 from clpipe.chain.making import make_chain
-from clpipe.chain.overscan import with_overscan
 from clpipe.chain.registry import all_stages
 from clpipe.chain.rendition import CLEAN, DEVELOPMENT, MOSAIC, VARIANCE
-from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
 from clpipe.chain.truth import noisy_mosaic, variance_of
 from clpipe.engine.runner import Runner
@@ -22,7 +20,6 @@ from clpipe.images.read import read_image
 from clpipe.outputs.recipes import chain_and_noise
 from clpipe.reference.cfa import PATTERNS
 from clpipe.reference.filter_array import parse_array
-from clpipe.reference.geometry import Margins
 from clpipe.stage import Context, Kind, Method
 from clpipe.stages import DEFAULT_CHAIN
 from clpipe.stages.exposure import Gain
@@ -370,24 +367,3 @@ def test_a_chain_that_only_adds_noise_has_a_truth_too(clpipe, write_exr):
         assert exr(f"o/m.{name}.exr").attributes["stage"] == "sensor_noise"
     assert len(np.unique(exr("o/m.truth_variance.exr").pixels)) == 1
     assert len(np.unique(exr("o/m.exr").pixels)) > 9
-
-
-@pytest.mark.parametrize("config", ["", "paper", "syb3r", "brooks2019", "nikon-d800-jpeg"])
-@pytest.mark.parametrize("iso", [100.0, 6400.0])
-def test_what_does_not_follow_the_noise_is_not_resolved_again(config, iso):
-    values = {} if config else {"prnu": {"sigma": 0.01}, "dsnu": {"sigma": 0.001}}
-    request = Request.from_options(config=config or None, iso=iso, values=values)
-    chain = with_overscan(request.chain(), Margins(2, 0, 4, 6))
-    slow = replace(chain, steps=tuple(replace(s, follows_noise=True) for s in chain.steps))
-    assert any(not step.follows_noise for step in chain.steps)
-    for one, other in zip(chain.cleaned().steps, slow.cleaned().steps, strict=True):
-        assert (one.name, type(one.method), one.method) == (
-            other.name,
-            type(other.method),
-            other.method,
-        )
-        assert one.method.margins == other.method.margins
-        assert (one.context.clean, one.context.noise) == (other.context.clean, other.context.noise)
-    followers = {step.name for step in chain.steps if step.follows_noise}
-    assert "mosaic" not in followers
-    assert config or "denoise" in followers

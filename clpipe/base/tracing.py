@@ -59,73 +59,6 @@ class Traced:
         self.name = name
         self.value = value
 
-    def _calculated(self, function: Callable[..., Any], other: Any, swapped: bool = False) -> Any:
-        if not isinstance(other, (Traced, *PLAIN)):
-            return NotImplemented
-        return call(function, other, self) if swapped else call(function, self, other)
-
-    def _compared(self, function: Callable[..., Any], other: Any) -> Any:
-        if not isinstance(other, (Traced, *PLAIN)):
-            return NotImplemented
-        return self.trace.guard(function, self, other)
-
-    def __add__(self, other: Any) -> Any:
-        return self._calculated(operator.add, other)
-
-    def __radd__(self, other: Any) -> Any:
-        return self._calculated(operator.add, other, swapped=True)
-
-    def __sub__(self, other: Any) -> Any:
-        return self._calculated(operator.sub, other)
-
-    def __rsub__(self, other: Any) -> Any:
-        return self._calculated(operator.sub, other, swapped=True)
-
-    def __mul__(self, other: Any) -> Any:
-        return self._calculated(operator.mul, other)
-
-    def __rmul__(self, other: Any) -> Any:
-        return self._calculated(operator.mul, other, swapped=True)
-
-    def __truediv__(self, other: Any) -> Any:
-        return self._calculated(operator.truediv, other)
-
-    def __rtruediv__(self, other: Any) -> Any:
-        return self._calculated(operator.truediv, other, swapped=True)
-
-    def __pow__(self, other: Any) -> Any:
-        return self._calculated(operator.pow, other)
-
-    def __rpow__(self, other: Any) -> Any:
-        return self._calculated(operator.pow, other, swapped=True)
-
-    def __mod__(self, other: Any) -> Any:
-        return self._calculated(operator.mod, other)
-
-    def __neg__(self) -> Any:
-        return call(operator.neg, self)
-
-    def __abs__(self) -> Any:
-        return call(operator.abs, self)
-
-    def __lt__(self, other: Any) -> Any:
-        return self._compared(operator.lt, other)
-
-    def __le__(self, other: Any) -> Any:
-        return self._compared(operator.le, other)
-
-    def __gt__(self, other: Any) -> Any:
-        return self._compared(operator.gt, other)
-
-    def __ge__(self, other: Any) -> Any:
-        return self._compared(operator.ge, other)
-
-    def __eq__(self, other: object) -> Any:
-        return self._compared(operator.eq, other)
-
-    def __ne__(self, other: object) -> Any:
-        return self._compared(operator.ne, other)
-
     def __bool__(self) -> bool:
         return bool(self.trace.guard(operator.ne, self, 0))
 
@@ -157,6 +90,35 @@ class Traced:
             return call(UFUNCS.get(ufunc, ufunc), *inputs)
         plain = [float(each) if isinstance(each, Traced) else each for each in inputs]
         return getattr(ufunc, method)(*plain, **options)
+
+
+def _calculation(function: Callable[..., Any], swapped: bool = False) -> Callable[..., Any]:
+    """A method of :class:`Traced` for an operator; swapped, for numbers on its right."""
+
+    def calculated(self: Traced, *others: Any) -> Any:
+        if not all(isinstance(other, (Traced, *PLAIN)) for other in others):
+            return NotImplemented
+        return call(function, *others, self) if swapped else call(function, self, *others)
+
+    return calculated
+
+
+def _comparison(function: Callable[..., Any]) -> Callable[..., Any]:
+    def compared(self: Traced, other: Any) -> Any:
+        if not isinstance(other, (Traced, *PLAIN)):
+            return NotImplemented
+        return self.trace.guard(function, self, other)
+
+    return compared
+
+
+for _name in ("add", "sub", "mul", "truediv", "pow", "mod"):
+    setattr(Traced, f"__{_name}__", _calculation(getattr(operator, _name)))
+    setattr(Traced, f"__r{_name}__", _calculation(getattr(operator, _name), swapped=True))
+for _name in ("neg", "abs"):
+    setattr(Traced, f"__{_name}__", _calculation(getattr(operator, _name)))
+for _name in ("lt", "le", "gt", "ge", "eq", "ne"):
+    setattr(Traced, f"__{_name}__", _comparison(getattr(operator, _name)))
 
 
 def call(function: Callable[..., Any], *arguments: Any) -> Any:

@@ -45,16 +45,12 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Step:
-    """A stage in its place in a chain: its method, resolved, and the context that it reads.
-
-    ``follows_noise`` is False where the method was resolved without a look at the noise.
-    """
+    """A stage in its place in a chain: its method, resolved, and the context that it reads."""
 
     name: str
     stage: Stage
     method: Method
     context: Context
-    follows_noise: bool = True
 
     @cached_property
     def passes(self) -> tuple[Pass, ...]:
@@ -63,8 +59,8 @@ class Step:
 
     @cached_property
     def arguments(self) -> Mapping[str, Argument]:
-        """The kernel arguments of its method, by name."""
-        return typed_arguments(self.method.arguments(self.context))
+        """The kernel arguments of its method, by name; none where it launches nothing."""
+        return typed_arguments(self.method.arguments(self.context)) if self.passes else {}
 
     @cached_property
     def adds_noise(self) -> bool:
@@ -305,9 +301,6 @@ class Chain:
             name, folder = step.name, step.stage.folder
             is_set = bool(self.settings.parameters.get(name))
             method = step.stage.chosen(self.settings.method(name), is_set, step.context)
-            if not step.follows_noise and type(method).noise_free is Method.noise_free:
-                left.append((step, step.method.without_noise()))  # as it would be resolved again
-                continue
             context = step.context.but(clean=True)
             with validation_errors(name, type(method)), user_code_errors(f"stage {name}", folder):
                 own = method.noise_free(context)

@@ -1,7 +1,6 @@
 """Chains made of settings: each parameter resolved, and what does not fit refused."""
 
 from collections.abc import Mapping
-from functools import partial
 
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
@@ -28,7 +27,6 @@ from clpipe.stage import (
     StageRole,
     Unchanged,
 )
-from clpipe.stage.context import asks_for_noise
 
 
 def make_chain(
@@ -141,11 +139,11 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
         own = stage.chosen(as_set, bool(settings.parameters.get(name)), context)
         with validation_errors(name, type(own)), user_code_errors(f"stage {name}", stage.folder):
             fits = stage.reads is (kind or stage.reads)
-            method, follows_noise = own, True
+            method = own
             is_resolved = fits or isinstance(own, FromLens)
             if is_resolved:
                 try:
-                    method, follows_noise = asks_for_noise(partial(own.resolve, context))
+                    method = own.resolve(context)
                 except RequestError:
                     if wide:
                         _check_behind(wide, name, own)
@@ -165,8 +163,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
                 after = after.but(optics=after.optics.set_to(states))
         if stage.folder and not isinstance(context.iso, Traced):  # else it has been checked
             check_passes(name, stage, method, context)
-        # What a user's stage looks at, nobody knows.
-        steps.append(Step(name, stage, method, context, follows_noise or bool(stage.folder)))
+        steps.append(Step(name, stage, method, context))
         context = after
         kind, before = stage.writes, name
     if not takes_lens:

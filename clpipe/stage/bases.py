@@ -5,7 +5,6 @@ from typing import ClassVar, NamedTuple, Self
 import numpy as np
 
 from clpipe.base.errors import RequestError
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.camera.lens import LensCalibration
 from clpipe.reference.curve import curve_index
@@ -228,7 +227,7 @@ class GaussianNoise(Method):
         return before + np.float32(self.sigma) ** 2
 
     def arguments(self, context: Context) -> Arguments:
-        return {"sigma": float32(self.sigma)}
+        return {"sigma": self.sigma}
 
 
 def odd_size(size: int, largest: int) -> int:

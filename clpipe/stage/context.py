@@ -1,11 +1,10 @@
 """Contexts: what a stage knows besides its image and its parameters."""
 
-import threading
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.optics import Optics
@@ -16,23 +15,6 @@ from clpipe.reference.defocus import Depth
 from clpipe.reference.filter_array import FilterArray, parse_array
 from clpipe.reference.random import Stream
 from clpipe.stage.passes import CompileTime, NoiseScope
-
-T = TypeVar("T")
-
-_asked = threading.local()  # has "noise" where this thread asked for it, see asks_for_noise
-
-
-def asks_for_noise(work: Callable[[], T]) -> tuple[T, bool]:
-    """What some work gives, and whether it asked any context for :meth:`Context.noise_parameters`.
-
-    >>> asks_for_noise(lambda: 3)
-    (3, False)
-    """
-    before, _asked.noise = getattr(_asked, "noise", False), False
-    try:
-        return work(), _asked.noise
-    finally:
-        _asked.noise |= before
 
 
 @dataclass(frozen=True)
@@ -77,7 +59,6 @@ class Context:
 
     def noise_parameters(self) -> tuple[float, float]:
         """The a and b of the noise that was added, else the camera's; of a clean image, zeros."""
-        _asked.noise = True
         if self.clean:
             return 0.0, 0.0
         model = self.noise or self.camera.noise(self.iso)

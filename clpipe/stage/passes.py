@@ -164,7 +164,8 @@ class CompileTime:
 
 
 Argument = np.float32 | np.uint32 | np.int32 | Array | CompileTime
-Arguments = Mapping[str, Argument | float]  # by name; a float becomes a np.float32
+# By name. A float becomes a np.float32; None is a parameter that is not resolved yet.
+Arguments = Mapping[str, Argument | float | None]
 
 
 def typed_arguments(arguments: Arguments) -> dict[str, Argument]:
@@ -176,6 +177,7 @@ def typed_arguments(arguments: Arguments) -> dict[str, Argument]:
     return {
         name: float32(value) if isinstance(value, float | Traced) else value
         for name, value in arguments.items()
+        if value is not None
     }
 
 

@@ -86,7 +86,7 @@ class Sine(Method):
         return float32(1 / self.period)
 
     def arguments(self, context: Context) -> Arguments:
-        return {"frequency": self.frequency, "amplitude": float32(self.amplitude)}
+        return {"frequency": self.frequency, "amplitude": self.amplitude}
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
         return before + np.float32(self.amplitude) ** 2 / np.float32(2)

@@ -94,7 +94,7 @@ class Offsets(Method):
             "column_0": CompileTime("0u"),
             "column_1": CompileTime("1u"),
             **{f"bias_{column}{row}": bias for (column, row), bias in places.items()},
-            "sigma": float32(self.sigma),
+            "sigma": self.sigma,
         }
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:

@@ -66,7 +66,7 @@ class Column(Method):
 
     def arguments(self, context: Context) -> Arguments:
         first, spill = float32((1 - self.spill) / 2), float32(self.spill)
-        return {"full": float32(self.full_signal), "first": first, "spill": spill}
+        return {"full": self.full_signal, "first": first, "spill": spill}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         full, spill = np.float32(self.full_signal), np.float32(self.spill)

@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.image import tap
 from clpipe.stage import (
@@ -55,7 +54,7 @@ class Neighbours(Method):
         return (Pass("crosstalk", Stencil(1), ("share",)),) if self.share else ()
 
     def arguments(self, context: Context) -> Arguments:
-        return {"share": float32(self.share)}
+        return {"share": self.share}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         across = tap(image, -1, 0) + tap(image, 1, 0)

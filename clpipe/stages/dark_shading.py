@@ -238,7 +238,7 @@ class File(Method):
         own = self._map(context.iso)
         height, width = own.shape
         sizes = {"width": np.int32(width), "height": np.int32(height)}
-        return {"map": own, **sizes, "per_px": float32(1 / self.block)}
+        return {"map": own, **sizes, "per_px": 1 / self.block}
 
     def without_noise(self) -> Method | None:
         return None if self.passes() else self

@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.math import negative_log
 from clpipe.reference.random import word_at
@@ -81,8 +80,8 @@ class Random(Method):
         return {
             "hot_limit": np.int32(hot_limit),
             "dead_limit": np.int32(dead_limit),
-            "hot_scale": float32(1 / max(hot_limit, 1)),
-            "hot_level": float32(self.hot_level),
+            "hot_scale": 1 / max(hot_limit, 1),
+            "hot_level": self.hot_level,
         }
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:

@@ -98,7 +98,7 @@ class Linear(Method):
     def arguments(self, context: Context) -> Arguments:
         assert self.black_level is not None and self.white_level is not None
         scale = float32(1 / (self.white_level - self.black_level))
-        return {"black_level": float32(self.black_level), "scale": scale}
+        return {"black_level": self.black_level, "scale": scale}
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
         assert self.black_level is not None and self.white_level is not None

@@ -6,7 +6,6 @@ from typing import ClassVar
 import numpy as np
 from pydantic import model_validator
 
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.companding import (
     Knots,
@@ -102,9 +101,9 @@ class Linear(Method):
 
     def arguments(self, context: Context) -> Arguments:
         return {
-            "range": float32(self._range / context.full_scale),
-            "black_level": float32(self.black_level),
-            "white_level": float32(self.white_level),
+            "range": self._range / context.full_scale,
+            "black_level": self.black_level,
+            "white_level": self.white_level,
         }
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:

@@ -85,7 +85,7 @@ class TwoLevels(Method):
 
     def arguments(self, context: Context) -> Arguments:
         limit, scale = self._chosen
-        return {"limit": limit, "scale": scale, "amplitude": float32(self.amplitude)}
+        return {"limit": limit, "scale": scale, "amplitude": self.amplitude}
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
         """The mean variance over the sensor: share * E[A^2] / 4, E[A^2] = 2 amplitude^2."""

@@ -5,7 +5,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from clpipe.base.tracing import float32, traceable
+from clpipe.base.tracing import traceable
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.reference.image import tap
@@ -134,10 +134,10 @@ class Unsharp(Method):
             "reach": CompileTime(str(self.reach)),
             "step": CompileTime(str(blur_step(self.radius))),
             "weights": blur_weights(self.radius),
-            "amount": float32(self.amount),
-            "threshold": float32(self.threshold),
-            "limit": float32(self.limit),
-            "offset": float32(self.offset),
+            "amount": self.amount,
+            "threshold": self.threshold,
+            "limit": self.limit,
+            "offset": self.offset,
         }
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

@@ -164,7 +164,7 @@ class Bounded(Method):
             "pattern": context.cfa,
             "even": EVEN,
             "noise": self.doubt,
-            "offset": float32(self.offset),
+            "offset": self.offset,
         }
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

@@ -5,7 +5,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from clpipe.base.tracing import float32, hypot
+from clpipe.base.tracing import hypot
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.reference.image import tap
@@ -185,11 +185,11 @@ class Biweight(Denoiser):
     def arguments(self, context: Context) -> Arguments:
         luma, chroma = self.ranges
         return {
-            "luma_range": float32(luma),
-            "chroma_range": float32(chroma),
-            "grain": float32(self.grain),
+            "luma_range": luma,
+            "chroma_range": chroma,
+            "grain": self.grain,
             "chroma_scale": CompileTime(str(self.chroma_scale)),
-            "offset": float32(self.offset),
+            "offset": self.offset,
         }
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

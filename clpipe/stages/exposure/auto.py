@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import model_validator
 
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats, Mask
 from clpipe.reference.math import negative_log, power_of_two
 from clpipe.stage import (
@@ -163,7 +162,7 @@ class Auto(Gain):
             "share": np.uint32(CIRCLES[self.metering]),
             "inside": np.uint32(inside),
             "outside": np.uint32(outside),
-            "delta": float32(self.delta),
+            "delta": self.delta,
             "millionths": np.uint32(self._millionths),
             "target": np.int32(round(np.log2(self.target) * STEPS)),
             "lowest": np.int32(round(self.min_ev * STEPS)),

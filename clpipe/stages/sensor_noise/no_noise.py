@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, parameter
 from clpipe.stages.sensor_noise.common import NEVER_FULL, or_default
@@ -40,7 +39,7 @@ class NoNoise(Method):
         return (Pass("full_well", arguments=("full_signal",)),) if self.full_signal else ()
 
     def arguments(self, context: Context) -> Arguments:
-        return {"full_signal": float32(or_default(self.full_signal, NEVER_FULL))}
+        return {"full_signal": or_default(self.full_signal, NEVER_FULL)}
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
         return before
