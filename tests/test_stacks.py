@@ -1,12 +1,17 @@
 """Stacks: what goes through a device in common launches has the bits that it has alone."""
 
+import queue
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl as cl
 import pytest
 
+from clpipe.batch.in_turn import InTurn
+from clpipe.batch.threads import Batch
+from clpipe.batch.work import ImageWorker
 from clpipe.chain.making import make_chain
+from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
 from clpipe.engine import stack
 from clpipe.engine.check import check_stack, example
@@ -14,6 +19,9 @@ from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.options import DEFAULTS, RunOptions
 from clpipe.engine.runner import Result, Runner, cut_out, submit_together
+from clpipe.inputs.find import find_jobs
+from clpipe.inputs.loader import ImageLoader
+from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
 # Of each kind of launch: lines and stencils; a resampling, sums, a mosaic with a period.
@@ -182,3 +190,77 @@ def test_a_stack_that_fails_is_done_image_by_image(on, monkeypatch, error):
     monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
     for wait, expected in zip([*before, *submit(asked)], alone * 2, strict=True):
         equal(wait(), expected)
+
+
+class InOne:
+    """A run in one thread, as its processes do it."""
+
+    def __init__(self, worker, device):
+        self.run_ = InTurn(worker, device, None, lambda: None)
+
+    def run(self, jobs):
+        waiting = queue.SimpleQueue()
+        for job in [*jobs, None]:
+            waiting.put(job)
+        return self.run_.run(waiting)
+
+
+WAYS = {"in turn": InOne, "threads": lambda worker, device: Batch(worker, [device], 2)}
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("what", ["pictures", "a burst and its truth", "patches"])
+def test_small_images_of_a_run_share_launches(
+    device, write_exr, tmp_path, monkeypatch, launches, way, what
+):
+    rng = np.random.default_rng(0)
+    for number in range(7):
+        size = (24, 32) if number % 3 else (17, 40)
+        pixels = rng.random((*size, 3)).astype(np.float32) / 2
+        write_exr(tmp_path / f"in/r{number}.exr", pixels)
+    asked = {"a burst and its truth": {"frames": 3, "truth": ("clean",)}}
+    asked["patches"] = {"patch": 16, "patches_per_image": 2}
+    request = Request.from_options(formats=("png",), iso=3200, **asked.get(what, {}))
+
+    def made(name):
+        (tmp_path / name).mkdir()
+        loader = ImageLoader(request)
+        jobs = find_jobs([str(tmp_path / "in")], tmp_path / name)
+        chain = loader.first_chain(jobs)
+        writer = OutputWriter(tmp_path / name, request.with_outputs(chain))
+        outcomes = list(WAYS[way](ImageWorker(loader, writer, chain), device).run(jobs))
+        assert [outcome.status for outcome in outcomes] == ["done"] * 7
+        files = (tmp_path / name).rglob("*.png")
+        return {file.name: file.read_bytes() for file in files}
+
+    launches.clear()
+    together = made("together")
+    most = max(size[2] for size in launches)
+    monkeypatch.setattr(stack, "FEWEST", 1000)
+    launches.clear()
+    alone = made("alone")
+    assert max(size[2] for size in launches) == 1
+    assert together == alone and len(alone) == {"pictures": 7, "patches": 14}.get(what, 35)
+    assert most > 1
+
+
+def test_a_small_image_that_fails_fails_alone(device, write_exr, tmp_path, monkeypatch):
+    for number in range(6):
+        grey = 0.5 if number == 2 else 0.2
+        write_exr(tmp_path / f"in/r{number}.exr", np.full((16, 16, 3), grey, np.float32))
+    loader = ImageLoader(Request.from_options(formats=("png",)))
+    jobs = find_jobs([str(tmp_path / "in")], tmp_path / "out")
+    (tmp_path / "out").mkdir()
+    chain = loader.first_chain(jobs)
+    writer = OutputWriter(tmp_path / "out", loader.request.with_outputs(chain))
+    work = Runner.work
+
+    def planted(runner, image, *given):
+        if image.mean() > 0.4:
+            raise ValueError("a mistake")
+        return work(runner, image, *given)
+
+    monkeypatch.setattr(Runner, "work", planted)
+    outcomes = list(InOne(ImageWorker(loader, writer, chain), device).run(jobs))
+    assert [outcome.status for outcome in outcomes] == ["done"] * 2 + ["failed"] + ["done"] * 3
+    assert outcomes[2].error.endswith("r2.exr: unexpected ValueError: a mistake")

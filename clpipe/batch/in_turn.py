@@ -7,6 +7,7 @@ turns at the interpreter's lock some fifty times an image, which of a small imag
 
 import queue
 import threading
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -17,14 +18,13 @@ from clpipe.batch.job_state import JobState, failure_text
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.room import Room
 from clpipe.batch.runners import Runners
+from clpipe.batch.threads import TOGETHER, is_small
 from clpipe.batch.work import ImageWorker, Written
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.find import Job
 from clpipe.outputs.recipes import Recipe
-
-TOGETHER = 16  # images that are brought to the disk at a time, at most
 
 Jobs = queue.SimpleQueue[Job | None]  # None: there are no more
 
@@ -116,21 +116,26 @@ class InTurn:
         with self._errors_of(state):
             state = self._worker.decode(job, self._admit)
         self._decoded.append(state)
-        size = state.source.pixels.shape[1::-1] if state.source else (0, 0)
-        if len(self._decoded) >= TOGETHER or not (self._device and self._device.stacks(*size)):
+        if len(self._decoded) >= TOGETHER or not is_small(state, self._device):
             self._develop()
 
     def _develop(self) -> None:
         """Do what is left of the jobs that are decoded, but bring nothing to the disk."""
         states, self._decoded = self._decoded, []
         files: list[list[Written]] = [[] for _ in states]
-        for number in range(max((len(state.recipes) for state in states), default=0)):
+        left = deque((i, recipe) for i, state in enumerate(states) for recipe in state.recipes)
+        while left:
             asked: list[tuple[int, Recipe, Runner]] = []
-            for place, state in enumerate(states):
-                if not state.error and number < len(state.recipes):
+            # The noise of some is measured on those before them.
+            while left and len(asked) < TOGETHER and not (asked and left[0][1].spread):
+                place, recipe = left.popleft()
+                state = states[place]
+                if not state.error:
                     with self._errors_of(state):
-                        recipe = self._worker.measured(state, state.recipes[number])
+                        recipe = self._worker.measured(state, recipe)
                         asked.append((place, recipe, self._compiled().of(recipe)))
+                if not is_small(state, self._device):
+                    break
             begun: list[Callable[[], Result | None]] = []
             try:
                 begun = self._worker.start(

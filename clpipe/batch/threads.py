@@ -39,6 +39,7 @@ Developed = tuple[JobState, Recipe, Result, Device | None]
 # job's last one.
 Encoded = tuple[JobState, Written | None, bool]
 
+TOGETHER = 16  # small images that are developed at a time, at most
 COMMITTED = 64  # renditions at a time at most; more would make those that wait for them late
 
 
@@ -57,6 +58,11 @@ log = logging.getLogger(__name__)
 def depth_of(device: Device | None) -> int:
     """How many images a device works on at a time; None is NumPy."""
     return device.depth if device else 1
+
+
+def is_small(state: JobState, device: Device | None) -> bool:
+    """Whether a job's renditions share launches with others."""
+    return bool(device and state.source and device.stacks(*state.source.pixels.shape[1::-1]))
 
 
 def no_result() -> None:
@@ -280,8 +286,8 @@ class Batch:
         self._is_needed.wait()  # a run that makes nothing compiles nothing
         if self._closing:
             return
-        decoded: Decoded | None = None
-        started: deque[Started] = deque()
+        decoded: list[Decoded] = []
+        started: deque[deque[Started]] = deque()
         try:
             try:
                 runners = self._worker.runners(device)
@@ -289,7 +295,7 @@ class Batch:
                 self._room.started()
             while decoded := self._next_decoded(started, device):
                 self._develop(decoded, started, runners, device)
-                decoded = None  # or its memory would be held until there is another one
+                decoded = []  # or its memory would be held until there is another one
         except DeviceError as error:
             with self._lock:
                 self._developing -= 1
@@ -297,79 +303,127 @@ class Batch:
             if is_last:
                 raise
             log.warning("%s; the other devices go on", error)
-            left = [each.decoded for each in started] + ([decoded] if decoded else [])
-            for each in {id(each): each for each in left}.values():
+            left = [each for stack in started for each in stack]
+            jobs = [*(each.decoded for each in left), *decoded]
+            for each in {id(each): each for each in jobs}.values():
                 self._decoded.put(each)
-            for _ in started:
+            for _ in left:
                 self._results.release()
         finally:
             if device:
                 device.drain()
 
-    def _next_decoded(self, started: deque[Started], device: Device | None) -> Decoded | None:
-        """The next job, None at the end; what is started does not wait for it."""
-        while started:
+    def _next_decoded(self, started: deque[deque[Started]], device: Device | None) -> list[Decoded]:
+        """The next job, or a few small ones that wait, and none at the end.
+
+        What is started does not wait for it.
+        """
+        first: Decoded | None = None
+        while started and not first:
             try:
-                decoded = self._decoded.get_nowait()
+                first = self._decoded.get_nowait()
             except queue.Empty:
                 self._finish(started, device)
                 continue
-            while started and not decoded:
+            while started and not first:
                 self._finish(started, device)
-            return decoded
-        return self._decoded.get()
+            if not first:
+                return []
+        first = first or self._decoded.get()
+        decoded = [first] if first else []
+        while decoded and len(decoded) < TOGETHER and is_small(decoded[-1][0], device):
+            try:
+                following = self._decoded.get_nowait()
+            except queue.Empty:
+                break
+            if not following:
+                self._decoded.put(None)  # for the next time
+                break
+            decoded.append(following)
+        return decoded
 
     def _develop(
-        self, decoded: Decoded, started: deque[Started], runners: Runners, device: Device | None
+        self,
+        decoded: Sequence[Decoded],
+        started: deque[deque[Started]],
+        runners: Runners,
+        device: Device | None,
     ) -> None:
-        """Start what is left of a job, and finish what a device cannot have beside that.
+        """Start what is left of jobs, and finish what a device cannot have beside that.
 
         Raises:
             DeviceError: the device cannot be used any more; what it did not finish is left.
         """
-        state, left = decoded
-        for asked in tuple(left):
+        waiting = deque((each, recipe) for each in decoded for recipe in each[1])
+        while waiting:
             while not self._results.acquire(blocking=not started):
                 self._finish(started, device)
             if self._broken:
                 return
-            finish: Callable[[], Result | None] = no_result
-            while asked.spread and started:  # its noise is measured on those before it
+            stack = [waiting.popleft()]
+            while stack[-1][1].spread and started:  # its noise is measured on those before it
                 self._finish(started, device)
-            recipe = asked
-            try:
-                if not state.error:
-                    recipe = self._worker.measured(state, asked)
-                    (finish,) = self._worker.start([(state, recipe, runners.of(recipe))])
-            except DeviceError:
-                self._results.release()
-                raise
-            except BaseException as error:
-                state.error = failure_text(state.job, error)
-            started.append(Started(decoded, recipe, finish))
+            while (
+                waiting
+                and is_small(stack[-1][0][0], device)
+                and not waiting[0][1].spread
+                and self._results.acquire(blocking=False)
+            ):
+                stack.append(waiting.popleft())
+            started.append(self._started(stack, runners))
             if len(started) >= depth_of(device):
                 self._finish(started, device)
 
-    def _finish(self, started: deque[Started], device: Device | None) -> None:
-        """Wait for the oldest rendition that was started, and hand it on.
+    def _started(self, stack: Sequence[tuple[Decoded, Recipe]], runners: Runners) -> deque[Started]:
+        """Start renditions together.
 
         Raises:
-            DeviceError: the device cannot be used any more; the rendition stays started.
+            DeviceError: the device cannot be used any more.
         """
-        state, left = started[0].decoded
-        result = None
+        begun, asked = [Started(*each, no_result) for each in stack], []
+        for place, ((state, _), recipe) in enumerate(stack):
+            try:
+                if not state.error:
+                    own = self._worker.measured(state, recipe)
+                    asked.append((place, (state, own, runners.of(own))))
+            except BaseException as error:
+                state.error = failure_text(state.job, error)
         try:
-            result = started[0].finish()
+            waits = self._worker.start([own for _, own in asked])
+            for (place, (_, recipe, _)), wait in zip(asked, waits, strict=True):
+                begun[place] = Started(stack[place][0], recipe, wait)
         except DeviceError:
+            for _ in stack:
+                self._results.release()
             raise
         except BaseException as error:
-            state.error = failure_text(state.job, error)
-        recipe = started.popleft().recipe
-        left.popleft()
-        if result:
-            self._developed.put((state, recipe, result, device))
-        else:
-            self._hand_on(state, None)
+            for _, (state, *_) in asked:
+                state.error = failure_text(state.job, error)
+        return deque(begun)
+
+    def _finish(self, started: deque[deque[Started]], device: Device | None) -> None:
+        """Wait for the renditions that were started first, together, and hand them on.
+
+        Raises:
+            DeviceError: the device cannot be used any more; what is not finished stays started.
+        """
+        stack = started[0]
+        while stack:
+            state, left = stack[0].decoded
+            result = None
+            try:
+                result = stack[0].finish()
+            except DeviceError:
+                raise
+            except BaseException as error:
+                state.error = failure_text(state.job, error)
+            recipe = stack.popleft().recipe
+            left.popleft()
+            if result:
+                self._developed.put((state, recipe, result, device))
+            else:
+                self._hand_on(state, None)
+        started.popleft()
 
     def _encode_all(self) -> None:
         while developed := self._developed.get():

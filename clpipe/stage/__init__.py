@@ -79,12 +79,12 @@ __all__ = [
     "TableLookup",
     "Unchanged",
     "bytes_of",
-    "typed_arguments",
     "levels_table",
     "odd_size",
     "parameter",
     "period_of",
     "run_reference",
+    "typed_arguments",
     "variant_label",
     "variants",
 ]
