@@ -9,6 +9,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -189,6 +190,23 @@ def outputs_in(values: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     }
 
 
+class Constant(dict[str, Any]):
+    """A part of many records, which never changes: its JSON is made once.
+
+    >>> Constant(a=1).text
+    '{"a": 1}'
+    """
+
+    @cached_property
+    def text(self) -> str:
+        """Its JSON."""
+        return json.dumps(self)
+
+
+def _text_of(value: Any) -> str:
+    return value.text if isinstance(value, Constant) else json.dumps(value)
+
+
 def json_text(record: Mapping[str, Any]) -> str:
     """JSON with a line for each key, and for each object of a list.
 
@@ -203,10 +221,11 @@ def json_text(record: Mapping[str, Any]) -> str:
     """
     lines = []
     for key, value in record.items():
-        text = json.dumps(value)
         if isinstance(value, list) and value and isinstance(value[0], dict):
-            each = ",\n".join(f"    {json.dumps(one)}" for one in value)
+            each = ",\n".join(f"    {_text_of(one)}" for one in value)
             text = f"[\n{each}\n  ]"
+        else:
+            text = _text_of(value)
         lines.append(f"  {json.dumps(key)}: {text}")
     return "{\n" + ",\n".join(lines) + "\n}\n"
 

@@ -25,7 +25,7 @@ from clpipe.outputs.motion import motion_records
 from clpipe.outputs.patches import Patch, facts_of
 from clpipe.outputs.program import program_digest
 from clpipe.outputs.recipes import Recipe
-from clpipe.outputs.sealed import OWN, sealed
+from clpipe.outputs.sealed import OWN, Constant, sealed
 from clpipe.reference.intrinsics import Intrinsics
 
 FACTS, PATCHES = "facts", "patches"  # keys of a sidecar of patches
@@ -169,12 +169,12 @@ def patch_text(values: Mapping[str, Any], number: int) -> bytes:
 def stage_records(chain: Chain) -> list[dict[str, Any]]:
     """What a sidecar says of the steps of a chain, as JSON values; cached, as images share it."""
     return [
-        {
-            "name": step.name,
-            "stage": step.stage.name,
-            "method": step.method.method,
-            "parameters": step.method.model_dump(),
-        }
+        Constant(
+            name=step.name,
+            stage=step.stage.name,
+            method=step.method.method,
+            parameters=step.method.model_dump(),
+        )
         for step in chain.steps
     ]
 
@@ -194,10 +194,10 @@ def device_record(device: Device | None) -> dict[str, Any]:
 @cache
 def all_versions() -> dict[str, str]:
     """The versions of all that a picture's bytes may depend on, by name."""
-    return {
-        "clpipe": full_version(),
-        "python": platform.python_version(),
-        "numpy": version("numpy"),
-        "pyopencl": version("pyopencl"),
+    return Constant(
+        clpipe=full_version(),
+        python=platform.python_version(),
+        numpy=version("numpy"),
+        pyopencl=version("pyopencl"),
         **versions(),
-    }
+    )
