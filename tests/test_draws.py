@@ -267,7 +267,7 @@ def test_syb3r():
         ("iso = { log_uniform = [0, 100] }", "both ends must be above 0"),
         ("iso = { normal = [800, -1] }", "the standard deviation is 0 or above"),
         ("iso = { uniform = [100, 200], sigma = 2 }", "unknown key of uniform 'sigma'"),
-        ("seed = { choice = [1, 2] }", "line 1: seed: found .*cannot be drawn; iso, camera, lens"),
+        ("seed = { choice = [1, 2] }", "line 1: seed: found .*cannot be drawn; camera, iso, lens"),
         ("dump = { choice = ['8x8'] }", "dump: found .*cannot be drawn"),
         ("camera = { uniform = [1, 2] }", "camera: found .*but it is drawn by choice"),
         ("camera = { choice = [3] }", "camera: found 3, but it is text"),

@@ -10,7 +10,7 @@ from typing import Any
 from clpipe.base.errors import KeyedError
 from clpipe.base.text import one_of
 from clpipe.chain.draws import Choice, Draw, Limits, parse_draw
-from clpipe.chain.keys import DRAWABLE, KEYS
+from clpipe.chain.keys import KEYS
 from clpipe.reference.random import philox_rounds, stream_of
 
 LimitsOf = Callable[[str], Limits | None]  # by the dotted name of a value
@@ -22,8 +22,9 @@ def draw_of(key: str, table: Mapping[str, Any]) -> Draw:
     Raises:
         KeyedError: the table is no draw, or this value cannot be drawn, or not by such a law.
     """
-    if key in KEYS and key not in DRAWABLE:
-        allowed = f"{', '.join(DRAWABLE)} and the parameters of stages can"
+    if key in KEYS and not KEYS[key].is_drawn:
+        drawn = ", ".join(known.name for known in KEYS.values() if known.is_drawn)
+        allowed = f"{drawn} and the parameters of stages can"
         raise KeyedError(key, f"{key}: found {dict(table)!r}, but it cannot be drawn; {allowed}")
     draw = parse_draw(key, table)
     if (key == "camera" or key.endswith(".method")) and not isinstance(draw, Choice):

@@ -1,74 +1,90 @@
 """The keys of a configuration that stand in no table, and the types of their values."""
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from clpipe.base.errors import KeyedError
 
 CODE = "stage_files"  # the key that only a configuration file may have
 
-LENS = ("lens", "focal_length", "aperture", "focus_distance")  # how a lens is named and set
-
-KEYS = (
-    *("camera", "iso", *LENS, "seed", "noise_key", "dump", "stages", "skip"),
-    CODE,
-)
-
 OUTPUT, RENDER = "output", "render"  # the tables that belong to no stage
 TABLES = (OUTPUT, RENDER)
-
-DRAWABLE = (
-    "iso",
-    "camera",
-    *LENS,
-)  # of the keys; parameters of stages and of other tables can be, too
-
-MAX_ISO = 10**9
-
-MAX_LENGTH = 10**6  # of what a lens is set to, in mm or m
 
 NOISE = "noise"  # under "skip": the noise of every stage
 
 MAX_STAGES = 256  # of a chain; an image can carry one
 
-TYPES: dict[str, tuple[str, Any]] = {
-    "iso": ("a number", int | float),
-    "seed": ("a whole number", int),
-    **dict.fromkeys(LENS[1:], ("a number", int | float)),
-    **dict.fromkeys(("camera", "lens", "noise_key", "dump"), ("text", str)),
-}
 
-# What a value is, for people, and its unit.
-ABOUT: dict[str, tuple[str, str]] = {
-    "lens": (
-        "A lens of lensfun's database: its distortion, lateral colour and vignetting.",
-        "",
-    ),
-    "focal_length": ("The lens's focal length.", "mm"),
-    "aperture": ("The lens's f-number; without it, a lens by name does not vignette.", ""),
-    "focus_distance": ("Where the lens is focused; without it, far away.", "m"),
-    "seed": ("The seed of the noise.", ""),
-    "noise_key": (
-        "Share the noise with all images that have this key, whatever their ISO; without it, each "
-        "image and ISO has noise of its own.",
-        "",
-    ),
-}
+class Key(NamedTuple):
+    """A key of a configuration.
+
+    Args:
+        name: the key.
+        type_: of its value, :class:`list` for a list of texts.
+        is_drawn: whether a draw may stand in place of its value.
+        text: one sentence about it, for help.
+        unit: of its value.
+        most: the largest number that it may be.
+        above: what a number must be larger than; None is any.
+    """
+
+    name: str
+    type_: type
+    is_drawn: bool = False
+    text: str = ""
+    unit: str = ""
+    most: float = math.inf
+    above: float | None = None
+
+
+def _of_lens(name: str, text: str, unit: str = "") -> Key:
+    """What a lens is set to."""
+    return Key(name, float, is_drawn=True, text=text, unit=unit, most=1e6, above=0.0)
+
+
+LENS_TEXT = "A lens of lensfun's database: its distortion, lateral colour and vignetting."
+NOISE_KEY_TEXT = (
+    "Share the noise with all images that have this key, whatever their ISO; without it, each "
+    "image and ISO has noise of its own."
+)
+_ALL = (
+    Key("camera", str, is_drawn=True),
+    Key("iso", float, is_drawn=True, most=1e9),
+    Key("lens", str, is_drawn=True, text=LENS_TEXT),
+    _of_lens("focal_length", "The lens's focal length.", "mm"),
+    _of_lens("aperture", "The lens's f-number; without it, a lens by name does not vignette."),
+    _of_lens("focus_distance", "Where the lens is focused; without it, far away.", "m"),
+    Key("seed", int, text="The seed of the noise."),
+    Key("noise_key", str, text=NOISE_KEY_TEXT),
+    Key("dump", str),
+    Key("stages", list),
+    Key("skip", list),
+    Key(CODE, list),
+)
+KEYS = {key.name: key for key in _ALL}
+
+LENS = ("lens", "focal_length", "aperture", "focus_distance")  # how a lens is named and set
 
 
 def check_type(key: str, value: Any) -> None:
-    """See that the value of a key is of the key's type.
+    """See that the value of a key is of the key's type, and in its range.
 
     Raises:
-        KeyedError: it is not, or is an ISO above :data:`MAX_ISO`.
+        KeyedError: it is not.
     """
-    kind, expected = TYPES.get(key, ("", object))
-    if not isinstance(value, expected) or isinstance(value, bool):
+    known = KEYS.get(key)
+    if not known or known.type_ is list:
+        return
+    kind = {float: "a number", int: "a whole number", str: "text"}[known.type_]
+    types: Any = (int, float) if known.type_ is float else known.type_
+    if not isinstance(value, types) or isinstance(value, bool):
         raise KeyedError(key, f"{key}: found {value!r}, but it is {kind}")
-    if key in LENS[1:] and not 0 < value < MAX_LENGTH:
-        raise KeyedError(key, f"{key}: found {value!r}, but it is above 0 and below {MAX_LENGTH:g}")
-    if key == "iso" and value > MAX_ISO:
-        raise KeyedError(key, f"{key}: found {value!r}, but it is at most {MAX_ISO:g}")
+    if known.above is not None and not known.above < value < known.most:
+        allowed = f"above {known.above:g} and below {known.most:g}"
+        raise KeyedError(key, f"{key}: found {value!r}, but it is {allowed}")
+    if known.type_ is float and value > known.most:
+        raise KeyedError(key, f"{key}: found {value!r}, but it is at most {known.most:g}")
 
 
 def names_in(values: Mapping[str, Any], key: str, what: str) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.text import whole_number
 from clpipe.chain.files import built_in_configs
 from clpipe.chain.formats import EVERY_FORMAT, format_named
-from clpipe.chain.keys import ABOUT
+from clpipe.chain.keys import KEYS
 from clpipe.chain.request import DEFAULTS, MOMENTS, MOST_PATCHES
 from clpipe.commands.completion import (
     cameras,
@@ -26,7 +26,7 @@ from clpipe.reference.carried import RESAMPLING
 
 def about(key: str) -> str:
     """What the value of a key is, with its unit."""
-    text, unit = ABOUT[key]
+    text, unit = KEYS[key].text, KEYS[key].unit
     return f"{text} In {unit}." if unit else text
 
 

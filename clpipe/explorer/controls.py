@@ -9,7 +9,7 @@ from pydantic import BaseModel
 from clpipe.base.errors import KeyedError
 from clpipe.camera.lens import INSTALL, lens_names
 from clpipe.camera.profile import built_in_cameras, load_camera
-from clpipe.chain.keys import ABOUT, LENS, TYPES
+from clpipe.chain.keys import KEYS, LENS
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
@@ -60,10 +60,12 @@ def key_controls() -> dict[str, Any]:
 
     That of "lens" has all names as "suggested", or says what to install for them.
     """
-    names = {int: "integer", str: "string", int | float: "number"}
+    names = {int: "integer", str: "string", float: "number"}
     controls: dict[str, dict[str, Any]] = {}
-    for key, (text, unit) in ABOUT.items():
-        controls[key] = {"type": names[TYPES[key][1]], "text": text, "unit": unit, "plain": True}
+    for key, known in KEYS.items():
+        if known.text:
+            about = {"type": names[known.type_], "text": known.text, "unit": known.unit}
+            controls[key] = {**about, "plain": True}
         if key in LENS and key != "lens":
             controls[key]["exclusiveMinimum"] = 0
     try:

@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from clpipe.chain.keys import CODE, KEYS, TYPES
+from clpipe.chain.keys import CODE, KEYS
 from clpipe.chain.methods import TABLE_MODELS
 from clpipe.chain.registry import all_stages
 from tools import ROOT
@@ -78,9 +78,8 @@ def text_of() -> str:
     for name, model in TABLE_MODELS.items():
         tables[name] = model.__name__
         parts.append(class_of(tables[name], fields_of(model)))
-    kinds = {int: "Whole", str: "Text", int | float: "Number"}
-    plain = {key: {kinds[TYPES[key][1]]} for key in KEYS if key in TYPES}
-    plain |= {key: {"Sequence[str]"} for key in KEYS if key not in (*TYPES, CODE)}
+    kinds = {int: "Whole", str: "Text", float: "Number", list: "Sequence[str]"}
+    plain = {name: {kinds[key.type_]} for name, key in KEYS.items() if name != CODE}
     fields = plain | {name: {title} for name, title in tables.items()}
     parts.append(class_of("Keywords", fields))
     command = [sys.executable, "-m", "ruff", "format", "--stdin-filename", str(PATH), "-"]
