@@ -62,7 +62,7 @@ class Pipeline(ReadOnly):
         config: str | Path | Sequence[str | Path] = "default",
         *,
         device: str | int | None = None,
-        keep: str | Sequence[str] = (),
+        keep: str | Sequence[str] | None = None,
         start_at: str | None = None,
         until: str | None = None,
         **settings: "Unpack[Keywords]",
@@ -72,7 +72,7 @@ class Pipeline(ReadOnly):
         self._numbers = itertools.count()
         self._lock = threading.Lock()  # a device is for one thread
         chain = self._chain(self._settings)
-        kept = chain.select([keep] if isinstance(keep, str) else keep)
+        kept = chain.select(several(keep))
         encode = chain.result is Kind.DISPLAY
         on = open_device(None if device is None else str(device))
         self._runner = Runner(chain, on, kept, encode=encode, final=not encode)

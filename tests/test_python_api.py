@@ -1,5 +1,7 @@
 """What a Python user sees of the package: exported names, short reprs, attributes that refuse."""
 
+import inspect
+import re
 import subprocess
 import sys
 
@@ -21,6 +23,29 @@ def test_every_exported_name_is_there_and_documented():
             assert f"::: clpipe.{name}\n" in page
     with pytest.raises(AttributeError, match="no attribute 'Pipelin'"):
         _ = clpipe.Pipelin
+
+
+@pytest.mark.parametrize(
+    ("function", "owner"),
+    [
+        (clpipe.run, clpipe.run),
+        (clpipe.Pipeline.__init__, clpipe.Pipeline),
+        (clpipe.Pipeline.process, clpipe.Pipeline.process),
+        (clpipe.Pipeline.carry, clpipe.Pipeline.carry),
+        (clpipe.Dataset.__init__, clpipe.Dataset),
+        (clpipe.RawNoise.__init__, clpipe.RawNoise),
+        (clpipe.RawNoise.__call__, clpipe.RawNoise.__call__),
+        (clpipe.StreamingDataset.__init__, clpipe.StreamingDataset),
+        (clpipe.Patches.__init__, clpipe.Patches),
+    ],
+)
+def test_every_parameter_is_documented_and_none_has_an_empty_default(function, owner):
+    for parameter in inspect.signature(function).parameters.values():
+        if parameter.name != "self":
+            stars = {parameter.VAR_KEYWORD: r"\*\*", parameter.VAR_POSITIONAL: r"\*"}
+            name = stars.get(parameter.kind, "") + parameter.name
+            assert re.search(rf"^ +(\w+, )*{name}(, \w+)*: \S", owner.__doc__, re.M), name
+            assert parameter.default != ()
 
 
 def test_the_type_checkers_names_are_the_lazy_ones():

@@ -128,10 +128,10 @@ def duration(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60:02} min"
 
 
-def several(values: str | int | Path | Sequence[str | int | Path]) -> tuple[str, ...]:
-    """One value or several as texts.
+def several(values: str | int | Path | Sequence[str | int | Path] | None) -> tuple[str, ...]:
+    """Return one value or several as texts; none for None.
 
-    >>> several("a"), several((0, Path("b")))
-    (('a',), ('0', 'b'))
+    >>> several("a"), several((0, Path("b"))), several(None)
+    (('a',), ('0', 'b'), ())
     """
-    return tuple(map(str, [values] if isinstance(values, str | int | Path) else values))
+    return tuple(map(str, [values] if isinstance(values, str | int | Path) else values or ()))

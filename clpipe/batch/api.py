@@ -14,7 +14,7 @@ from clpipe.batch.where import Where
 from clpipe.chain.formats import EVERY_FORMAT, format_named
 from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.rendition import parse_bracket
-from clpipe.chain.request import Request
+from clpipe.chain.request import Moments, Request
 from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS
 from clpipe.inputs.find import parse_shard
 from clpipe.inputs.series import Series, check_isos
@@ -40,19 +40,20 @@ def run(
     output: str | Path,
     config: Texts | None = None,
     *,
-    camera: Texts = (),
-    iso: float | Sequence[float] | Mapping[str, Any] = (),
+    camera: Texts | None = None,
+    iso: float | Sequence[float] | Mapping[str, Any] | None = None,
     start_at: str | None = None,
     until: str | None = None,
-    stage_files: Texts = (),
-    format: Texts = (),
-    keep: Texts = (),
-    carry: Texts = (),
-    truth: Texts = (),
+    stage_files: Texts | None = None,
+    format: Texts | None = None,
+    keep: Texts | None = None,
+    carry: Texts | None = None,
+    truth: Texts | None = None,
+    truth_at: Moments = "middle",
     frames: int | None = None,
-    bracket: Sequence[float] = (),
+    bracket: Sequence[float] | None = None,
     patch: int | Patches | None = None,
-    exclude: Texts = (),
+    exclude: Texts | None = None,
     poses: str | Path | None = None,
     layer: str | None = None,
     transfer: Literal["srgb", "linear"] | None = None,
@@ -60,7 +61,7 @@ def run(
     redo: Literal["missing", "old", "damaged", "all"] = "old",
     webdataset: int | None = None,
     shard: str = "1/1",
-    device: str | int | Sequence[str | int] = (),
+    device: str | int | Sequence[str | int] | None = None,
     memory: int | str | None = None,
     jobs: int | None = None,
     processes: int | None = None,
@@ -68,7 +69,7 @@ def run(
     trace: str | Path | None = None,
     **settings: Any,
 ) -> Run:
-    """Images through a chain, to files: what ``clpipe run`` does, by the same names.
+    """Put images through a chain and write the results, like ``clpipe run``.
 
     >>> import clpipe
     >>> made = clpipe.run("renders/", "out", iso=1600, truth="clean")  # doctest: +SKIP
@@ -78,23 +79,54 @@ def run(
     {'done': 24, 'skipped': 0, 'left out': 0, 'failed': 0}
 
     Args:
-        inputs: files, folders, globs and manifests.
-        output: the folder that the pictures go to; it is made where it is missing.
-        config: a built-in configuration or a TOML file, or several, each over those before it.
-        camera, iso: one, or several, whose pictures go to folders of their own.
-        stage_files, format, keep, carry, truth, exclude, device: one, or several.
-        memory: of a device, in bytes or as "2G".
-        **settings: what a configuration file may hold, over ``config``.
-        patch: the sides of patches in px, or with how many and how: ``Patches(128, per_image=4)``.
-        start_at, until, frames, bracket, poses, layer, transfer, max_pixels, redo, webdataset,
-            shard, jobs, processes, dask, trace: as the options of ``clpipe run``.
+        inputs: files, folders, globs, URLs and manifests; one, or several.
+        output: the output directory or its URL. It is created if it does not exist.
+        config: a built-in configuration or a TOML file. If you name several, each overrides those
+            before it. None is the default configuration.
+        camera: the name of a profile or its TOML file. With several, each camera's pictures go to
+            a directory of their own.
+        iso: the ISO, or a draw such as ``{"log_uniform": [100, 6400]}``. With several numbers,
+            each ISO's pictures go to a directory of their own.
+        start_at: the first step to run. Inputs are then images of the kind that this step reads.
+        until: the last step to run.
+        stage_files: Python files that define further stages.
+        format: formats of the pictures, such as "png" or "exr". None is JPEG.
+        keep: steps whose image is also written, or "all".
+        carry: layers that are warped with the picture, such as "Depth".
+        truth: ground truths and baselines to write next to each picture: "development", "clean",
+            "mosaic", "variance", "iid", "intensity".
+        truth_at: the moment of an exposure of several files whose pose and layers go with the
+            picture: "start", "middle", "end", or "all".
+        frames: the number of frames of a burst. Each frame has its own noise. None is one picture.
+        bracket: one exposure per value, in EV relative to ``exposure.ev``.
+        patch: the side of square patches in px, which are written instead of pictures, or
+            ``Patches(128, per_image=4, augment=True)``.
+        exclude: patterns of files that are skipped in directories and globs.
+        poses: a file with the camera and pose of each render, such as ``transforms.json``.
+        layer: the layer or part of an EXR that is the picture. None lets clpipe choose.
+        transfer: the transfer curve of renders in integers: "srgb" or "linear".
+        max_pixels: larger images are rejected before memory is allocated.
+        redo: which existing pictures to make again: "missing", "old" (also those of another
+            version or request), "damaged" (also damaged files, which reads every file), or "all".
+        webdataset: the number of images per tar. None writes files, no tars.
+        shard: the part of the images to make, such as "2/8", for job arrays.
+        device: an index or part of a name from ``clpipe devices``, or "numpy"; one, or several.
+            None is the first GPU and all GPUs like it, else the CPU.
+        memory: the memory of a device that clpipe may use, in bytes or such as "2G".
+        jobs: the number of threads that decode, and of those that encode.
+        processes: the number of processes that share the work.
+        dask: the address of a Dask scheduler, whose workers do the work.
+        trace: a JSON file for a timeline of the run, for Perfetto or chrome://tracing.
+        **settings: any value of a configuration file, which overrides ``config``:
+            ``seed=1``, ``denoise={"method": "mean"}``.
 
     Returns:
-        A run that begins when it is iterated.
+        A :class:`Run`. The run starts when you iterate over it, and yields an :class:`Outcome`
+        for each image, in any order.
 
     Raises:
-        RequestError: a name or value that is not allowed, an input that is not there, or a result
-            that would overwrite something. One image's failure is its outcome, and no error.
+        RequestError: a name or value is not allowed, an input does not exist, or a result would
+            overwrite an input. If one image fails, its outcome says so, and the run continues.
     """
     numbers = {
         "frames": frames,
@@ -114,7 +146,9 @@ def run(
             raise RequestError(one_of("format", each, EVERY_FORMAT))
     if isinstance(memory, int) and memory < 1:
         raise RequestError(f"found memory {memory}; expected bytes, or a size such as 8G")
-    isos = (iso,) if isinstance(iso, int | float) else () if isinstance(iso, Mapping) else iso
+    isos: Sequence[float] = ()
+    if iso is not None and not isinstance(iso, Mapping):
+        isos = (iso,) if isinstance(iso, int | float) else iso
     series = Series(several(camera), check_isos(isos))
     patches = Patches(patch) if isinstance(patch, int) else patch
     values = plain(settings)
@@ -132,6 +166,7 @@ def run(
         keep=several(keep),
         carry=several(carry),
         truth=several(truth),
+        truth_at=truth_at,
         frames=frames,
         bracket=parse_bracket(",".join(map(str, bracket))) if bracket else (),
         patch=patches.size if patches else None,
