@@ -1,4 +1,4 @@
-"""The example stage in CONTRIBUTING.md, as it stands there."""
+"""CONTRIBUTING.md, the glossary, and the example on the page about own stages."""
 
 import pkgutil
 import re
@@ -17,10 +17,12 @@ from tests.markdown import blocks
 
 PAGE = ROOT / "CONTRIBUTING.md"
 TEXT = PAGE.read_text()
+STAGES = ROOT / "docs" / "own_stages.md"
+GLOSSARY = ROOT / "docs" / "glossary.md"
 
 
 def block(language: str) -> str:
-    return next(block.text for block in blocks(PAGE) if block.language == language)
+    return next(block.text for block in blocks(STAGES) if block.language == language)
 
 
 @pytest.mark.slow
@@ -51,13 +53,14 @@ def test_the_commands_it_shows_work(tmp_path, monkeypatch):
 
 
 def test_every_file_it_names_is_there():
-    for name in re.findall(r"`((?:clpipe|kernels|tests|tools|docs)/[\w./]+)`", PAGE.read_text()):
+    text = TEXT + STAGES.read_text()
+    for name in re.findall(r"`((?:clpipe|kernels|tests|tools|docs)/[\w./]+)`", text):
         if "vignette" not in name and "<" not in name:
             assert (ROOT / name).exists(), name
 
 
 def test_the_walks_are_true_to_the_code():
-    walks = TEXT[TEXT.index("## Two walks") : TEXT.index("## A stage of your own")]
+    walks = TEXT[TEXT.index("## Two walks") : TEXT.index("## Stages and words")]
     names = re.findall(r"`([a-z_]+(?:\.[A-Za-z_]+)+)`", walks)
     assert len(names) > 20
     for name in names:
@@ -66,7 +69,7 @@ def test_the_walks_are_true_to_the_code():
 
 
 def test_the_words_are_those_of_the_code():
-    words = TEXT[TEXT.index("| word |") : TEXT.index("## A stage of your own")]
+    words = GLOSSARY.read_text()
     code = "\n".join(path.read_text() for path in (ROOT / "clpipe").rglob("*.py"))
     named = re.findall(r"^\| ([a-zA-Z, ]+) \|", words, re.MULTILINE)[1:]
     assert len(named) > 25

@@ -30,7 +30,7 @@ def pages() -> dict[str, str | bytes]:
         "cli.md": cli_page(),
         "changelog.md": (ROOT / "CHANGELOG.md").read_text("utf-8"),
         "security.md": (ROOT / "SECURITY.md").read_text("utf-8"),
-        "contributing.md": (ROOT / "CONTRIBUTING.md").read_text("utf-8"),
+        "contributing.md": (ROOT / "CONTRIBUTING.md").read_text("utf-8").replace("](docs/", "]("),
         **notebook_files(ROOT / "docs" / f"{NOTEBOOK}.ipynb"),
     }
 
