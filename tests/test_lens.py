@@ -2,13 +2,15 @@
 
 import json
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.errors import ImageError, KeyedError, RequestError
 from clpipe.camera import lens as by_name
 from clpipe.camera.profile import load_camera
 from clpipe.chain.making import make_chain
@@ -286,6 +288,39 @@ def test_a_lens_by_a_part_of_its_name_is_named(clpipe, write_exr):
     assert "is a part of a name" not in whole.stderr
     Path("m.csv").write_text("path,lens\na.exr,Canon 50mm\n")
     assert taken in clpipe("run", "m.csv", "-o", "q", "--device", "numpy").stderr
+
+
+def test_every_lens_of_the_database_takes_an_aperture_or_says_its_range():
+    """lensfun knows no range, or half of one, for most."""
+    lensfunpy = pytest.importorskip("lensfunpy", reason="needs lensfunpy, in the extra lens")
+    database = lensfunpy.Database()
+    checked = 0
+    for camera in database.cameras[::20]:
+        for lens in database.find_lenses(camera):
+            checked += 1
+            with suppress(KeyedError):
+                by_name._check_aperture(lens, 8.0)
+    assert checked > 100
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "aperture", "said"),
+    [
+        (None, None, 1.0, None),
+        (2.8, None, 8.0, None),
+        (2.8, None, 1.4, "has f/2.8 and above"),
+        (None, 22.0, 32.0, "has f/0 to f/22"),
+    ],
+)
+def test_an_aperture_of_a_lens_whose_range_is_not_all_known(low, high, aperture, said):
+    lens = SimpleNamespace(
+        maker="Canon", model="EF 1", min_aperture=low, max_aperture=high, min_focal=1, max_focal=1
+    )
+    if said is None:
+        by_name._check_aperture(lens, aperture)
+    else:
+        with pytest.raises(KeyedError, match=said):
+            by_name._check_aperture(lens, aperture)
 
 
 def test_what_is_said_without_lensfunpy(clpipe, monkeypatch):

@@ -259,7 +259,7 @@ def _check_aperture(lens: Any, aperture: float) -> None:
     Raises:
         KeyedError: it cannot.
     """
-    low, high = lens.min_aperture, lens.max_aperture
+    low, high = lens.min_aperture or 0.0, lens.max_aperture or 0.0  # None where it does not
     if (low and aperture < low - 0.06) or (high > low and aperture > high + 0.06):
         most = f" to f/{high:g}" if high > low else " and above"
         raise KeyedError(
