@@ -2,7 +2,10 @@
 
 import math
 import operator
+import re
+from contextlib import suppress
 from functools import partial
+from random import Random
 
 import numpy as np
 import pytest
@@ -11,12 +14,18 @@ from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import RequestError
 from clpipe.base.tracing import NotTraceableError, Trace, call, float32, traceable
 from clpipe.camera.profile import built_in_cameras, load_camera
-from clpipe.chain.chain import Chain
+from clpipe.chain.chain import COMPUTED, STRUCTURAL, Chain
+from clpipe.chain.draws import limits_of
 from clpipe.chain.families import ComputedChain
 from clpipe.chain.making import make_chain
+from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import overlay, settings_from
 from clpipe.engine.ops import chain_ops
 from clpipe.stage import CompileTime
+
+
+def slow(seed):
+    return pytest.param(seed, marks=pytest.mark.slow)
 
 
 @pytest.fixture
@@ -86,6 +95,65 @@ def test_a_computed_chain_is_the_one_that_is_made(name, families, monkeypatch):
         assert chain.settings is settings
         arguments = [{s.name: s.arguments for s in c.steps} for c in (chain, expected)]
         assert chain_ops(chain, arguments[0]) == chain_ops(expected, arguments[1])
+
+
+def numbers_of_stages():
+    """Each number that a method takes, with its limits and the method's example."""
+    for stage in all_stages().values():
+        for method in stage.methods:
+            for name in method.model_fields:
+                if limits := limits_of(method, name):
+                    yield stage.name, method, name, limits
+
+
+def drawn_at_random(random):
+    """Settings of six images, which differ in a few numbers."""
+    base, drawn = {"camera": random.choice(list(built_in_cameras()))}, {}
+    if random.random() < 0.3:
+        base["mosaic"] = {"method": "array", "array": random.choice(["RCCB", "mono", "x-trans"])}
+    for stage, method, name, limits in random.sample(list(numbers_of_stages()), 3):
+        if stage not in base:
+            base[stage] = {**method.example, "method": method.method}
+            base[stage].pop(name, None)
+            drawn[stage, name] = max(limits.low, -2, 1e-3), min(limits.high, 5), limits.whole
+    low, high = load_camera(base["camera"]).iso_range
+    for _ in range(6):
+        values = {"iso": random.uniform(low, high)}
+        for (stage, name), (least, most, whole) in drawn.items():
+            value = random.choice([least, most, *[random.uniform(least, most)] * 3])
+            values[stage] = {name: round(value) if whole else float(value)}
+        with suppress(RequestError):
+            yield overlay(settings_from(base), values)
+
+
+@pytest.mark.parametrize("seed", [*range(24), *(slow(n) for n in range(24, 120))])
+def test_chains_of_numbers_at_random_are_those_that_are_made(seed, families, monkeypatch):
+    for settings in drawn_at_random(Random(seed)):
+        try:
+            expected = made(settings, monkeypatch)
+        except RequestError as error:
+            with pytest.raises(RequestError, match=re.escape(str(error))):
+                make_chain(settings)
+            continue
+        assert_alike(make_chain(settings), expected)
+
+
+def assert_alike(chain, expected):
+    """Fail unless a chain and its truths are those that are expected."""
+    assert_equal(chain, expected)
+    for name in COMPUTED:
+        assert repr(getattr(chain, name)) == repr(getattr(expected, name))
+    for name in STRUCTURAL[:-1]:
+        assert getattr(chain, name) == getattr(expected, name)
+    assert chain_ops(chain, chain.arguments) == chain_ops(expected, expected.arguments)
+    for derived in (Chain.cleaned, Chain.without_noise):
+        try:
+            truth = derived(expected)
+        except RequestError:
+            with pytest.raises(RequestError):
+                derived(chain)
+            continue
+        assert_equal(derived(chain), truth)
 
 
 @pytest.mark.parametrize("camera", built_in_cameras())

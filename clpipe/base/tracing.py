@@ -121,6 +121,11 @@ for _name in ("lt", "le", "gt", "ge", "eq", "ne"):
     setattr(Traced, f"__{_name}__", _comparison(getattr(operator, _name)))
 
 
+def value_of(number: Any) -> Any:
+    """Return the value of a traced number; anything else as it is."""
+    return number.value if isinstance(number, Traced) else number
+
+
 def call(function: Callable[..., Any], *arguments: Any) -> Any:
     """Return what a pure function of numbers returns; traced where one of its arguments is.
 
@@ -130,8 +135,7 @@ def call(function: Callable[..., Any], *arguments: Any) -> Any:
     2.0
     """
     traces = [each.trace for each in arguments if isinstance(each, Traced)]
-    plain = [each.value if isinstance(each, Traced) else each for each in arguments]
-    result = function(*plain)
+    result = function(*map(value_of, arguments))
     if not traces:
         return result
     number = traces[0].number(function, arguments, result)
@@ -194,8 +198,7 @@ class Trace:
 
     def guard(self, function: Callable[..., Any], *arguments: Any) -> bool:
         """Return the outcome of a comparison; the computation holds for the same outcome only."""
-        plain = [each.value if isinstance(each, Traced) else each for each in arguments]
-        outcome = bool(function(*plain))
+        outcome = bool(function(*map(value_of, arguments)))
         holds = self._text(function, arguments)
         line = f"if {'not ' if outcome else ''}({holds}): return None"
         place = self._places.get(line, len(self._lines))

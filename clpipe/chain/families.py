@@ -68,11 +68,17 @@ class Family:
         del attributes["steps"]
         chain = with_attributes(ComputedChain, {**attributes, "family": self, "numbers": numbers})
         if not self._is_checked and numbers != self._traced:
-            if not chain.is_equal(self._make(numbers)):
+            self._is_checked = self._is_equal(chain, numbers)
+            if not self._is_checked:
                 self._attributes = lambda numbers: None
                 return None
-            self._is_checked = True
         return chain
+
+    def _is_equal(self, chain: Chain, numbers: Numbers) -> bool:
+        try:
+            return chain.is_equal(self._make(numbers))
+        except Exception:  # arguments that cannot be computed: it is said when they are needed
+            return False
 
     def derived(self, make: Callable[[Chain], Chain], chain: Chain, numbers: Numbers) -> Chain:
         """Return ``make(chain)`` for the chain of numbers."""

@@ -3,10 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
-from clpipe.base.tracing import Traced, float32
+from clpipe.base.tracing import float32, value_of
 from clpipe.base.types import Array
 from clpipe.reference.resample import Axis, Resampler
 
@@ -174,11 +175,9 @@ def typed_arguments(arguments: Arguments) -> dict[str, Argument]:
     >>> typed_arguments({"gain": 0.5, "count": np.uint32(3)})
     {'gain': np.float32(0.5), 'count': np.uint32(3)}
     """
-    return {
-        name: float32(value) if isinstance(value, float | Traced) else value
-        for name, value in arguments.items()
-        if value is not None
-    }
+    typed: dict[str, Any] = {name: v for name, v in arguments.items() if v is not None}
+    floats = {name: float32(v) for name, v in typed.items() if isinstance(value_of(v), float)}
+    return typed | floats
 
 
 def bytes_of(argument: Argument) -> bytes:

@@ -65,7 +65,7 @@ class DistortionOfLens(FromLens, HasPicture):
     def of_lens(self, lens: LensCalibration | None) -> Method:
         if lens is None or not lens.distortion:
             return NoDistortion()
-        own, table = self.model_dump(), dict(lens.distortion)
+        own, table = dict(self), dict(lens.distortion)
         return STAGE.by_name[table.pop("method")](**own, **table)
 
 

@@ -83,7 +83,7 @@ class Linear(Method):
         white = camera.white_level if context.white_level is None else context.white_level
         first = black + (white - black) / context.full_scale
         filled = self.with_defaults(black_level=black, white_level=first)
-        return type(self).model_validate(filled.model_dump())
+        return type(self).model_validate(dict(filled))
 
     def next_context(self, context: Context) -> Context:
         if context.full_scale == 1 or context.white_level is None or context.black_level is None:

@@ -91,7 +91,7 @@ class Linear(Method):
         filled = self.with_defaults(black_level=black, white_level=white)
         assert filled.white_level is not None
         filled = filled.with_defaults(bits=max(int(filled.white_level).bit_length(), 8))
-        return type(self).model_validate(filled.model_dump())
+        return type(self).model_validate(dict(filled))
 
     def next_context(self, context: Context) -> Context:
         return context.but(black_level=self.black_level, white_level=self.white_level)
@@ -162,7 +162,7 @@ class Pwl(Linear):
         assert filled.white_level is not None
         usual = usual_knots(filled.white_level, 2**self.result_bits - 1)
         filled = filled.with_defaults(knots=[list(pair) for pair in usual])
-        return type(self).model_validate(filled.model_dump())
+        return type(self).model_validate(dict(filled))
 
     @property
     def _knots(self) -> Knots:

@@ -96,7 +96,7 @@ class OfArray(CameraGains):
     @classmethod
     def on(cls, array: FilterArray, own: CameraGains) -> Self:
         """The (resolved) gains on a filter array."""
-        made = cls(**own.model_dump())
+        made = cls(**dict(own))
         made._array = replace(array, gains=own.gains)
         return made
 
