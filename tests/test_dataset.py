@@ -217,7 +217,7 @@ def test_what_is_refused(renders):
         ({"truth": True, "skip": ["sensor_noise", "row_noise", "column_noise"]}, "adds noise"),
         ({"epoch": -1}, "found epoch -1"),
         ({"truth": "mosaic"}, "expected true or false, 'development', 'clean' or None"),
-        ({"keep": 5}, "found keep 5; expected a text or a list of texts"),
+        ({"keep": 5}, "found keep 5; expected a text, a list of texts or None"),
         ({"start_at": 5}, "found start_at 5; expected a text or None"),
         ({"threads": 0}, "found threads 0; expected 1 or more"),
         ({"threads": "all"}, "found threads 'all'; expected a whole number or None"),
