@@ -7,7 +7,6 @@ what was measured when they were last lowered. Lower them with the cost.
 import itertools
 import json
 import os
-import queue
 import subprocess
 import sys
 import threading
@@ -21,7 +20,7 @@ import pyopencl as cl
 import pytest
 
 import clpipe
-from clpipe.batch.in_turn import InTurn
+from clpipe.batch.threads import Batch
 from clpipe.engine.device import open_devices
 from clpipe.images.write import write_exr
 from tests.conftest import ROOT
@@ -101,10 +100,7 @@ def measured(folder: Path) -> dict[str, tuple[float, float]]:
     (device,) = open_devices()
 
     def run(part):
-        waiting = queue.SimpleQueue()
-        for job in [*part, None]:
-            waiting.put(job)
-        outcomes = InTurn(worker, device, None, lambda: None).run(waiting)
+        outcomes = Batch(worker, [device], 1, in_flight=1).run(part)
         assert [outcome.status for outcome in outcomes] == ["done"] * len(part)
 
     run(jobs[:2])

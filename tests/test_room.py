@@ -200,7 +200,7 @@ def test_threads_that_cannot_be_started_are_one_line(monkeypatch):
 
     worker = SimpleNamespace(reserve=lambda count: None)
     monkeypatch.setattr(threading.Thread, "start", start)
-    with pytest.raises(RequestError, match=r"--jobs: 3: no thread can be started for 'decode 0'"):
+    with pytest.raises(RequestError, match=r"--jobs: 3: no thread can be started for 'write'"):
         list(Batch(worker, [None], threads=3).run([]))
 
 

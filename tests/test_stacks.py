@@ -1,13 +1,11 @@
 """Stacks: what goes through a device in common launches has the bits that it has alone."""
 
-import queue
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl as cl
 import pytest
 
-from clpipe.batch.in_turn import InTurn
 from clpipe.batch.threads import Batch
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.making import make_chain
@@ -192,20 +190,10 @@ def test_a_stack_that_fails_is_done_image_by_image(on, monkeypatch, error):
         equal(wait(), expected)
 
 
-class InOne:
-    """A run in one thread, as its processes do it."""
-
-    def __init__(self, worker, device):
-        self.run_ = InTurn(worker, device, None, lambda: None)
-
-    def run(self, jobs):
-        waiting = queue.SimpleQueue()
-        for job in [*jobs, None]:
-            waiting.put(job)
-        return self.run_.run(waiting)
-
-
-WAYS = {"in turn": InOne, "threads": lambda worker, device: Batch(worker, [device], 2)}
+WAYS = {
+    "in turn": lambda worker, device: Batch(worker, [device], 1, in_flight=1),
+    "threads": lambda worker, device: Batch(worker, [device], 2),
+}
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -261,6 +249,6 @@ def test_a_small_image_that_fails_fails_alone(device, write_exr, tmp_path, monke
         return work(runner, image, *given)
 
     monkeypatch.setattr(Runner, "work", planted)
-    outcomes = list(InOne(ImageWorker(loader, writer, chain), device).run(jobs))
+    outcomes = list(Batch(ImageWorker(loader, writer, chain), [device], in_flight=1).run(jobs))
     assert [outcome.status for outcome in outcomes] == ["done"] * 2 + ["failed"] + ["done"] * 3
     assert outcomes[2].error.endswith("r2.exr: unexpected ValueError: a mistake")

@@ -19,12 +19,10 @@ from typing import Any, NoReturn
 from clpipe.base.errors import ClpipeError
 from clpipe.base.files import discard, remove_temporary_files
 from clpipe.base.system import stay_on
-from clpipe.batch.in_turn import InTurn, Jobs
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.pipes import Pipe
-from clpipe.batch.room import usual_room
 from clpipe.batch.spec import RunSpec
-from clpipe.batch.threads import Batch
+from clpipe.batch.threads import Batch, Jobs
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.process_folder import process_folder
 
@@ -113,28 +111,23 @@ def _work(pipe: Pipe, spec: RunSpec, seat: Seat) -> None:
     devices: list[Device | None] = [*open_devices(where.devices, where.memory, share)] or [None]
     pipe.send("ready")
     jobs: Jobs = queue.SimpleQueue()
-    batch: Batch | InTurn
-    if seat.in_turn and len(devices) == 1:
-        batch = InTurn(
-            spec.worker(), devices[0], usual_room(seat.of), lambda: pipe.send("compiled")
-        )
-        running = batch.run(jobs)
-    else:
-        batch = spec.batch(devices, seat.threads, seat.of)
-        running = batch.run(iter(jobs.get, None), wake=lambda: jobs.put(None))
+    in_flight = 1 if seat.in_turn and len(devices) == 1 else None
+    batch = spec.batch(
+        devices, seat.threads, seat.of, in_flight, compiled=lambda: pipe.send("compiled")
+    )
     threading.Thread(target=_listen, args=(pipe, jobs, batch), daemon=True).start()
     finished: queue.SimpleQueue[Outcome | None] = queue.SimpleQueue()
     teller = threading.Thread(target=_tell, args=(pipe, finished))
     teller.start()
     try:
-        for outcome in running:
+        for outcome in batch.run(jobs):
             finished.put(outcome)
     finally:
         finished.put(None)
         teller.join()
 
 
-def _listen(pipe: Pipe, jobs: Jobs, batch: Batch | InTurn) -> None:
+def _listen(pipe: Pipe, jobs: Jobs, batch: Batch) -> None:
     """Take jobs in, until it is said that there are no more."""
     while True:
         what, *values = pipe.receive()

@@ -1,6 +1,6 @@
 """A run, as it is sent to other processes, on this machine or on others."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -40,16 +40,25 @@ class RunSpec:
         chain = loader.first_chain([self.first])
         return ImageWorker(loader, writer, chain, where.redo, where.trace is not None)
 
-    def batch(self, devices: Sequence[Device | None], threads: int, sharing: int) -> Batch:
+    def batch(
+        self,
+        devices: Sequence[Device | None],
+        threads: int,
+        sharing: int,
+        in_flight: int | None = None,
+        compiled: Callable[[], None] = lambda: None,
+    ) -> Batch:
         """What does a part of the run.
 
         Args:
             devices: the process's.
             threads: where the run does not say how many.
             sharing: how many processes share the machine's memory.
+            in_flight, compiled: as for :class:`~clpipe.batch.threads.Batch`.
         """
         number = self.where.threads or threads
-        return Batch(self.worker(), devices, number, usual_room(sharing))
+        room = usual_room(sharing)
+        return Batch(self.worker(), devices, number, room, in_flight, compiled)
 
 
 def shifted(outcome: Outcome, seconds: float, prefix: str = "") -> Outcome:

@@ -8,7 +8,7 @@ import os
 import shutil
 import tarfile
 import threading
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -21,7 +21,7 @@ from clpipe.base.files import Stored, keep_names, passing_files, whole_file
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, Outcome
 from clpipe.batch.remote_tars import RemoteTars
 from clpipe.batch.tars import OF_PATCHES, STAGING, Members, Tar, prepare
-from clpipe.batch.threads import Batch
+from clpipe.batch.threads import Batch, Jobs
 from clpipe.batch.where import Where
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.chain import Chain
@@ -284,9 +284,7 @@ class TarBatch(Batch):
         )
         super().__init__(worker, devices, where.threads)
 
-    def run(
-        self, jobs: Iterable[Job], wake: Callable[[], None] = lambda: None
-    ) -> Generator[Outcome, None, None]:
+    def run(self, jobs: Iterable[Job] | Jobs) -> Generator[Outcome, None, None]:
         """Do every job, as the base does; a tar is packed while the next one is made.
 
         What a killed run left is removed first.
@@ -310,7 +308,7 @@ class TarBatch(Batch):
         prepare(self._tars, self._redo is Redo.ALL)
         packing: Future[None] | None = None
         with ThreadPoolExecutor(1, "pack") as pool:
-            for outcome in super().run(jobs, wake):
+            for outcome in super().run(jobs):
                 packer = self._packers.of(outcome.job)
                 is_last = packer.add(outcome)
                 yield packer.packed(outcome)

@@ -1,0 +1,251 @@
+"""The devices of a run: threads that develop what is ordered, and a pool that encodes it."""
+
+import logging
+import queue
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import chain
+
+from clpipe.base.cpu_time import CpuTimer
+from clpipe.base.errors import DeviceError, OutputError
+from clpipe.batch.job_state import JobState, failure_text
+from clpipe.batch.room import Room
+from clpipe.batch.runners import Runners
+from clpipe.batch.work import ImageWorker, Written
+from clpipe.engine.device import Device
+from clpipe.engine.runner import Result
+from clpipe.outputs.recipes import Recipe
+
+TOGETHER = 16  # small images that are developed at a time, at most
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Order:
+    """A rendition that is to be made, and what is written of it, which is None where it fails."""
+
+    state: JobState
+    recipe: Recipe
+    written: Future[Written | None] = field(default_factory=Future)
+
+
+Started = deque[deque[tuple[Order, Callable[[], Result | None]]]]  # with what waits for a result
+
+
+def no_result() -> None:
+    """The result of what is not developed."""
+
+
+def depth_of(device: Device | None) -> int:
+    """How many images a device works on at a time; None is NumPy."""
+    return device.depth if device else 1
+
+
+class Developers:
+    """Develops and encodes renditions that are ordered, on each device by a thread of its own.
+
+    Args:
+        worker: what is done to each image.
+        devices: where; None is NumPy.
+        threads: how many encode at a time.
+        room: is told when a device has its kernels.
+        compiled: so is this.
+        fail: is called with an error because of which the run cannot go on.
+    """
+
+    def __init__(
+        self,
+        worker: ImageWorker,
+        devices: Sequence[Device | None],
+        threads: int,
+        room: Room,
+        compiled: Callable[[], None],
+        fail: Callable[[BaseException], None],
+    ) -> None:
+        self.devices = devices
+        self.most = threads + len(devices)  # renditions of an image that are ordered at a time
+        self._worker = worker
+        self._room = room
+        self._tell = compiled
+        self._fail = fail
+        self._orders: queue.SimpleQueue[Order | None] = queue.SimpleQueue()
+        self._encoders = ThreadPoolExecutor(threads, "encode")
+        self._is_needed = threading.Event()  # an image is to be made, or none ever
+        self._is_closing = False
+        self._usable = len(devices)
+        self._counting = threading.Lock()  # of usable devices
+
+    @property
+    def is_needed(self) -> bool:
+        """Whether kernels are compiled."""
+        return self._is_needed.is_set()
+
+    def begin(self) -> None:
+        """Have kernels compiled, as an image is to be made."""
+        self._is_needed.set()
+
+    def close(self) -> None:
+        """Let the threads end, when all that was ordered is made."""
+        self._is_closing = True
+        self._is_needed.set()
+        for _ in self.devices:
+            self._orders.put(None)
+        self._encoders.shutdown()
+
+    def is_small(self, state: JobState) -> bool:
+        """Whether a job's renditions share launches with others."""
+        size = state.source.pixels.shape[1::-1] if state.source else (0, 0)
+        return all(each is not None and each.stacks(*size) for each in self.devices)
+
+    def order(self, states: Sequence[JobState]) -> list[list[Order]]:
+        """Have all renditions of jobs made, some at a time, and wait until they are; by job."""
+        made: list[list[Order]] = [[] for _ in states]
+        asked: deque[Order] = deque()
+        for state, orders in zip(states, made, strict=True):
+            most = TOGETHER if self.is_small(state) else self.most
+            for recipe in state.recipes:
+                # The noise of some is measured on those before them.
+                while asked and (len(asked) >= most or recipe.spread):
+                    asked.popleft().written.result()
+                orders.append(Order(state, recipe))
+                asked.append(orders[-1])
+                self._orders.put(orders[-1])
+        for order in reversed(asked):  # the last one first, so as to wait once
+            order.written.result()
+        return made
+
+    def develop_all(self, device: Device | None) -> None:
+        """Develop what is ordered, until there is no more, or no device that can do it."""
+        self._is_needed.wait()  # a run that makes nothing compiles nothing
+        if self._is_closing:
+            return
+        asked: list[Order] = []
+        started: Started = deque()
+        try:
+            try:
+                runners = self._worker.runners(device)
+                self._tell()
+            finally:
+                self._room.started()
+            while asked := self._taken(started, device):
+                if len(started) >= depth_of(device):
+                    self._finish(started, device)
+                started.append(self._started(asked, runners))
+                asked = []
+        except BaseException as error:
+            left = [order for stack in started for order, _ in stack]
+            with self._counting:
+                self._usable -= 1
+                is_last = not self._usable
+            if isinstance(error, DeviceError) and not is_last:
+                log.warning("%s; the other devices go on", error)
+                for order in (*left, *asked):
+                    self._orders.put(order)
+                return
+            self._fail(error)
+            for order in chain(left, asked, iter(self._orders.get, None)):
+                order.state.error = failure_text(order.state.job, error)
+                order.written.set_result(None)
+        finally:
+            if device:
+                device.drain()
+
+    def _taken(self, started: Started, device: Device | None) -> list[Order]:
+        """What is ordered next, several where they are small; none at the end.
+
+        What is started does not wait for it.
+
+        Raises:
+            DeviceError: the device cannot be used any more.
+        """
+        taken: list[Order] = []
+        is_waiting = not started
+        while len(taken) < TOGETHER:
+            try:
+                order = self._orders.get(is_waiting)
+            except queue.Empty:
+                if taken:
+                    break
+                self._finish(started, device)
+                is_waiting = not started
+                continue
+            if order is None:
+                if taken:
+                    self._orders.put(None)  # for the next time
+                    break
+                while started:
+                    self._finish(started, device)
+                return []
+            taken.append(order)
+            is_waiting = False
+            if not self.is_small(order.state):
+                break
+        return taken
+
+    def _started(
+        self, orders: Sequence[Order], runners: Runners
+    ) -> deque[tuple[Order, Callable[[], Result | None]]]:
+        """Start renditions together.
+
+        Raises:
+            DeviceError: the device cannot be used any more.
+        """
+        waits: list[Callable[[], Result | None]] = [no_result for _ in orders]
+        asked = []
+        for place, order in enumerate(orders):
+            state = order.state
+            try:
+                if not state.error:
+                    order.recipe = self._worker.measured(state, order.recipe)
+                    asked.append((place, (state, order.recipe, runners.of(order.recipe))))
+            except BaseException as error:
+                state.error = failure_text(state.job, error)
+        try:
+            begun = self._worker.start([each for _, each in asked])
+            for (place, _), wait in zip(asked, begun, strict=True):
+                waits[place] = wait
+        except DeviceError:
+            raise
+        except BaseException as error:
+            for _, (state, *_) in asked:
+                state.error = failure_text(state.job, error)
+        return deque(zip(orders, waits, strict=True))
+
+    def _finish(self, started: Started, device: Device | None) -> None:
+        """Wait for the renditions that were started first, together, and have them encoded.
+
+        Raises:
+            DeviceError: the device cannot be used any more; what is not finished stays started.
+        """
+        stack = started[0]
+        while stack:
+            order, wait = stack[0]
+            result = None
+            try:
+                result = wait()
+            except DeviceError:
+                raise
+            except BaseException as error:
+                order.state.error = failure_text(order.state.job, error)
+            if result:
+                self._encoders.submit(self._encode, order, result, device)
+            else:
+                order.written.set_result(None)
+            stack.popleft()
+        started.popleft()
+
+    def _encode(self, order: Order, result: Result, device: Device | None) -> None:
+        written = None
+        try:
+            with CpuTimer("Python"):
+                written = self._worker.encode(order.state, order.recipe, result, device)
+        except OutputError as error:
+            order.state.error = failure_text(order.state.job, error)
+            self._fail(error)
+        except BaseException as error:  # nothing that one image does may end a thread
+            order.state.error = failure_text(order.state.job, error)
+        order.written.set_result(written)
