@@ -7,11 +7,11 @@ process that has one processor needs: threads that run at the same time take tur
 interpreter's lock some fifty times an image, which of a small image's time is a third.
 """
 
-import logging
 import queue
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Sequence, Sized
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -31,9 +31,7 @@ Jobs = queue.SimpleQueue[Job | Exception | None]  # None: there are no more; an 
 
 Made = tuple[JobState, list[Written]]  # a job, and its renditions, which have no names yet
 
-COMMITTED = 64  # renditions at a time at most; more would make those that wait for them late
-
-log = logging.getLogger(__name__)
+COMMITTED = 64  # images at a time at most; more would make those that wait for them late
 
 
 class Batch:
@@ -251,17 +249,13 @@ class Batch:
     def _commit_all(self) -> None:
         """Bring to the disk, together, what was made while the disk had what was made before."""
         ended = 0
-        made: list[Made] = []
         try:
             while ended < self.in_flight:
                 taken = [self._made.get()]
-                made = [each for each in taken if each]
-                while sum(len(files) for _, files in made) < COMMITTED:
-                    try:
+                with suppress(queue.Empty):
+                    while len(taken) < COMMITTED:
                         taken.append(self._made.get_nowait())
-                    except queue.Empty:
-                        break
-                    made = [each for each in taken if each]
+                made = [each for each in taken if each]
                 ended += taken.count(None)
                 self._commit(made)
                 for state, _ in made:
