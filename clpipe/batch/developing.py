@@ -26,11 +26,19 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Order:
-    """A rendition that is to be made, and what is written of it, which is None where it fails."""
+    """A rendition that is to be made, and what is written of it.
+
+    That is None where it fails, and an error where no device is left to make it.
+    """
 
     state: JobState
     recipe: Recipe
     written: Future[Written | None] = field(default_factory=Future)
+
+    def discard(self) -> None:
+        """Remove what is written."""
+        if not self.written.exception() and (written := self.written.result()):
+            written.group.discard()
 
 
 Started = deque[deque[tuple[Order, Callable[[], Result | None]]]]  # with what waits for a result
@@ -110,12 +118,12 @@ class Developers:
             for recipe in state.recipes:
                 # The noise of some is measured on those before them.
                 while asked and (len(asked) >= most or recipe.spread):
-                    asked.popleft().written.result()
+                    asked.popleft().written.exception()
                 orders.append(Order(state, recipe))
                 asked.append(orders[-1])
                 self._orders.put(orders[-1])
         for order in reversed(asked):  # the last one first, so as to wait once
-            order.written.result()
+            order.written.exception()
         return made
 
     def develop_all(self, device: Device | None) -> None:
@@ -148,8 +156,7 @@ class Developers:
                 return
             self._fail(error)
             for order in chain(left, asked, iter(self._orders.get, None)):
-                order.state.error = failure_text(order.state.job, error)
-                order.written.set_result(None)
+                order.written.set_exception(error)
         finally:
             if device:
                 device.drain()
@@ -206,8 +213,8 @@ class Developers:
                 state.error = failure_text(state.job, error)
         try:
             begun = self._worker.start([each for _, each in asked])
-            for (place, _), wait in zip(asked, begun, strict=True):
-                waits[place] = wait
+            for (place, _), finish in zip(asked, begun, strict=True):
+                waits[place] = finish
         except DeviceError:
             raise
         except BaseException as error:
@@ -223,10 +230,10 @@ class Developers:
         """
         stack = started[0]
         while stack:
-            order, wait = stack[0]
+            order, finish = stack[0]
             result = None
             try:
-                result = wait()
+                result = finish()
             except DeviceError:
                 raise
             except BaseException as error:

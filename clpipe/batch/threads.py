@@ -238,13 +238,26 @@ class Batch:
         waits.append(time.perf_counter() - start)
 
     def _make(self, decoded: list[JobState]) -> None:
-        """Have the renditions of jobs made, and let go of the jobs."""
+        """Have the renditions of jobs made, and let go of the jobs.
+
+        Raises:
+            DeviceError, RequestError: no device is left to make them.
+        """
+        failure: Exception | None = None
         for state, orders in zip(decoded, self._developers.order(decoded), strict=True):
             state.drop_pixels()
             self._room.leave(state.job.stem)
-            results = [order.written.result() for order in orders]
-            self._made.put((state, [written for written in results if written]))
+            try:
+                results = [order.written.result() for order in orders]
+            except Exception as error:
+                failure = error
+                for order in orders:
+                    order.discard()
+            else:
+                self._made.put((state, [written for written in results if written]))
         decoded.clear()
+        if failure:
+            raise failure
 
     def _commit_all(self) -> None:
         """Bring to the disk, together, what was made while the disk had what was made before."""
