@@ -26,6 +26,7 @@ from clpipe.batch.job_state import JobState
 from clpipe.batch.outcome import DONE, Outcome, Span
 from clpipe.batch.room import Room, host_bytes
 from clpipe.batch.run_log import read_log
+from clpipe.batch.sinks import Folder
 from clpipe.batch.threads import Batch
 from clpipe.batch.trace import Trace
 from clpipe.batch.work import ImageWorker
@@ -63,7 +64,7 @@ def worker_of(folder):
     jobs = find_jobs([str(folder / "in")], folder / "out")
     chain = loader.first_chain(jobs)
     writer = OutputWriter(folder / "out", loader.request.with_outputs(chain))
-    return ImageWorker(loader, writer, chain), jobs
+    return ImageWorker(loader, Folder(writer), chain), jobs
 
 
 def stamps(folder):

@@ -8,6 +8,7 @@ import pyopencl as cl
 import pytest
 
 from clpipe.base.errors import DeviceError, DeviceFailedError
+from clpipe.batch.sinks import Folder
 from clpipe.batch.threads import Batch
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.making import make_chain
@@ -156,7 +157,7 @@ def test_kernels_that_fail_in_a_batch_change_no_byte(device, write_exr, tmp_path
         (tmp_path / name).mkdir()
         chain = loader.first_chain(jobs)
         writer = OutputWriter(tmp_path / name, loader.request.with_outputs(chain))
-        worker = ImageWorker(loader, writer, chain)
+        worker = ImageWorker(loader, Folder(writer), chain)
         # Both have one context, as two on one device have: what breaks it for one does for both.
         batch = Batch(worker, [Device(device.info), Device(device.info)])
         statuses = [outcome.status for outcome in batch.run(jobs)]

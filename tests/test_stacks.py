@@ -6,6 +6,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
+from clpipe.batch.sinks import Folder
 from clpipe.batch.threads import Batch
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.making import make_chain
@@ -216,7 +217,7 @@ def test_small_images_of_a_run_share_launches(
         jobs = find_jobs([str(tmp_path / "in")], tmp_path / name)
         chain = loader.first_chain(jobs)
         writer = OutputWriter(tmp_path / name, request.with_outputs(chain))
-        outcomes = list(WAYS[way](ImageWorker(loader, writer, chain), device).run(jobs))
+        outcomes = list(WAYS[way](ImageWorker(loader, Folder(writer), chain), device).run(jobs))
         assert [outcome.status for outcome in outcomes] == ["done"] * 7
         files = (tmp_path / name).rglob("*.png")
         return {file.name: file.read_bytes() for file in files}
@@ -249,6 +250,8 @@ def test_a_small_image_that_fails_fails_alone(device, write_exr, tmp_path, monke
         return work(runner, image, *given)
 
     monkeypatch.setattr(Runner, "work", planted)
-    outcomes = list(Batch(ImageWorker(loader, writer, chain), [device], in_flight=1).run(jobs))
+    outcomes = list(
+        Batch(ImageWorker(loader, Folder(writer), chain), [device], in_flight=1).run(jobs)
+    )
     assert [outcome.status for outcome in outcomes] == ["done"] * 2 + ["failed"] + ["done"] * 3
     assert outcomes[2].error.endswith("r2.exr: unexpected ValueError: a mistake")

@@ -13,7 +13,7 @@ from PIL import Image
 
 import clpipe as api
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.batch import tar_batch
+from clpipe.batch import tar_sink
 from clpipe.batch.run_log import read_log
 from clpipe.batch.tars import cut
 from clpipe.inputs.find import Job
@@ -284,7 +284,7 @@ def test_the_disk_is_full(clpipe, renders, when):
             return real(path, pixels, tags)
 
         if when == "tar":
-            patch.setattr(tar_batch, "whole_file", full)
+            patch.setattr(tar_sink, "whole_file", full)
         else:
             patch.setattr(writer, "write_display", write)
         result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)

@@ -18,6 +18,7 @@ from clpipe.base.memory import peak_memory
 from clpipe.base.processors import available_processors
 from clpipe.base.types import Array
 from clpipe.batch.outcome import DONE, STEPS, Span
+from clpipe.batch.sinks import Folder
 from clpipe.batch.threads import Batch
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.request import Request
@@ -112,7 +113,7 @@ def bench_batch(device: Device, request: Request, load: Load) -> BatchSpeed:
         def batch() -> Batch:
             shutil.rmtree(folder / "out", ignore_errors=True)
             (folder / "out").mkdir()
-            return Batch(ImageWorker(loader, writer, chain, trace=True), [device])
+            return Batch(ImageWorker(loader, Folder(writer), chain, trace=True), [device])
 
         # A few first, so that nothing is compiled and no file is cold in what is timed.
         list(batch().run(jobs[: 2 * DISTINCT]))

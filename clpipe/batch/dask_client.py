@@ -107,14 +107,14 @@ class Cluster:
         self._client = client
         self._address = address
         self._spec = spec.anchored()
-        self._stopping = False
+        self.is_stopping = False
         self._finished: queue.SimpleQueue[Any] = queue.SimpleQueue()  # futures; None means stop
         self._running: dict[Any, tuple[list[Job], bool]] = {}  # chunks, and whether each runs alone
         self._seen = time.monotonic()  # when there was a worker
 
     def stop(self) -> None:
         """Let no more images in; those in flight are finished. May be called by a signal."""
-        self._stopping = True
+        self.is_stopping = True
         self._finished.put(None)
 
     def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
@@ -160,7 +160,7 @@ class Cluster:
         chunks = _Chunks(deque(jobs))
         failure: ClpipeError | None = None
         try:
-            while self._running or (chunks and not self._stopping):
+            while self._running or (chunks and not self.is_stopping):
                 self._hand_out(chunks)
                 try:
                     future = self._finished.get(timeout=1)
@@ -205,9 +205,9 @@ class Cluster:
                 f"--dask: the scheduler at {self._address} has had no workers for {PATIENCE:g} s; "
                 "what is finished is there, and the same command goes on"
             )
-        while chunks.jobs and len(self._running) < workers and not self._stopping:
+        while chunks.jobs and len(self._running) < workers and not self.is_stopping:
             self._submit(chunks.cut(workers))
-        if chunks.suspects and not self._running and not self._stopping:
+        if chunks.suspects and not self._running and not self.is_stopping:
             self._submit([chunks.suspects.popleft()], alone=True)
 
     def _submit(self, chunk: list[Job], alone: bool = False) -> None:
@@ -241,7 +241,7 @@ class Cluster:
 
     def _halt(self) -> None:
         """Let the workers finish what is in flight."""
-        self._stopping = True
+        self.is_stopping = True
         self._client.run(halt, self._spec.run, on_error="ignore")
 
     def _finish(self) -> None:

@@ -121,11 +121,11 @@ class Processes:
         self._futile = 0  # processes that ended since the last outcome
         self._said: set[str] = set()
         self._failure: ClpipeError | None = None
-        self._is_stopping = False
+        self.is_stopping = False
 
     def stop(self) -> None:
         """Let no more images in; those in flight are finished. May be called by a signal."""
-        self._is_stopping = True
+        self.is_stopping = True
         self._messages.put((None, ("stop",)))
 
     def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
@@ -168,7 +168,7 @@ class Processes:
     def _is_finished(self) -> bool:
         if any(process.jobs for process in self._processes):
             return False
-        if self._is_stopping:
+        if self.is_stopping:
             return not self._processes
         return not self._left and not self._suspects
 
@@ -255,7 +255,7 @@ class Processes:
         Raises:
             RequestError: no process can be started.
         """
-        if self._is_stopping:
+        if self.is_stopping:
             return
         while len(self._processes) < self._count and self._left and self._has_worked:
             taken = {process.seat.number for process in self._processes}
@@ -290,7 +290,7 @@ class Processes:
         status = process.close()
         was_alone, jobs = process.is_alone, list(process.jobs.values())
         process.jobs.clear()
-        if self._is_stopping:
+        if self.is_stopping:
             return []
         self._still_born += not process.is_ready
         self._futile += 1

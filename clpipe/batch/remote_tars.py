@@ -8,7 +8,8 @@ is there. So a tar without one is somebody else's; where it is not complete the 
 import glob
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,32 +18,33 @@ from clpipe.base.buckets import fetched, listed, read_url, upload, url_of
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import discard, sha256_of, write_whole
-from clpipe.batch.outcome import FAILED
+from clpipe.batch.outcome import FAILED, SKIPPED, Outcome
+from clpipe.batch.sinks import Executor
+from clpipe.batch.tar_sink import Packer, Tars
 from clpipe.batch.tars import NUMBERED, Tar
-from clpipe.chain.request import ResolvedRequest
 from clpipe.inputs.find import Job
 from clpipe.outputs.existing import Redo
 from clpipe.outputs.program import program_digest
+from clpipe.outputs.writer import OutputWriter
 
 INDEX = ".index.json"
 
 
-class RemoteTars:
-    """The tars of a run, behind a URL.
+class RemoteTars(Tars):
+    """Tars at a URL as a sink. Each is packed here, sent, and removed here.
 
     Args:
-        tars: of the run's part.
-        request: what is asked for.
-        redo: which of them are made again.
+        writer: writes the files of a rendition.
+        redo: which of the tars are made again.
+        tars: the tars of the run's part.
 
     Raises:
-        RequestError: what lies there is of another run, or somebody else's.
+        RequestError: a tar there belongs to another run, or is not ours.
     """
 
-    def __init__(self, tars: Sequence[Tar], request: ResolvedRequest, redo: Redo) -> None:
-        self._asked = request
-        self._request = json.dumps(request.record(), sort_keys=True, default=str)
-        self._redo = redo
+    def __init__(self, writer: OutputWriter, redo: Redo, tars: Sequence[Tar]) -> None:
+        super().__init__(writer, redo, tars)
+        self._request = json.dumps(writer.request.record(), sort_keys=True, default=str)
         url = url_of(tars[0].folder)
         assert url
         below = [each.removeprefix(f"{url}/") for each in listed(url, may_be_missing=True)]
@@ -62,25 +64,50 @@ class RemoteTars:
                     "overwritten; move it, choose another URL, or say --redo all"
                 )
 
+    def receive(self, executor: Executor, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
+        """Let an executor do the jobs of tars that are missing; the others are skipped.
+
+        Raises:
+            RequestError, DeviceError, OutputError: as :meth:`Tars.receive`.
+        """
+        there = [tar for tar in self.tars if not executor.is_stopping and self.has(tar)]
+        if executor.is_stopping:
+            return
+        self.tars = [tar for tar in self.tars if tar not in there]
+        for tar in there:
+            for job in tar.jobs:
+                yield Outcome(replace(job, name=f"{tar.name}/{job.stem}"), SKIPPED)
+        if self.tars:
+            yield from super().receive(executor, [job for tar in self.tars for job in tar.jobs])
+
+    def pack(self, packer: Packer) -> None:
+        """Write a tar and send it.
+
+        Raises:
+            OutputError: it cannot be written, or sent.
+        """
+        super().pack(packer)
+        self._send(packer.tar, packer.statuses)
+
     def has(self, tar: Tar) -> bool:
         """Whether a tar is there, whole, made by the same request of the same inputs.
 
         Raises:
             OutputError: its index cannot be read.
         """
-        if self._redo is Redo.ALL or tar.name not in self._there:
+        if self.redo is Redo.ALL or tar.name not in self._there:
             return False
         index = self._index_of(tar)
         if index.get("key") != self._keys[tar.name] or index.get("failed") != []:
             return False
-        if self._redo is not Redo.MISSING and index.get("program") != program_digest():
+        if self.redo is not Redo.MISSING and index.get("program") != program_digest():
             return False
         if stamp_of(tar.path)[0] != index.get("size"):
             return False
-        return self._redo is not Redo.DAMAGED or _is_whole(tar, index)
+        return self.redo is not Redo.DAMAGED or _is_whole(tar, index)
 
-    def send(self, tar: Tar, statuses: Mapping[str, str]) -> None:
-        """Send a tar that is packed, and let go of it here.
+    def _send(self, tar: Tar, statuses: Mapping[str, str]) -> None:
+        """Send a packed tar, and remove it here.
 
         Args:
             tar: the tar.
@@ -117,7 +144,7 @@ class RemoteTars:
 
     def _record_of(self, job: Job) -> Mapping[str, Any]:
         """What a job's own values ask for, with the digests of files that they name."""
-        return self._asked.for_image(job.key, job.values).record() if job.values else {}
+        return self.writer.request.for_image(job.key, job.values).record() if job.values else {}
 
     def _index_of(self, tar: Tar) -> dict[str, Any]:
         """What a tar's index says; nothing where it is damaged."""

@@ -11,7 +11,6 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from clpipe.base.about import full_version
 from clpipe.base.buckets import upload, url_of
@@ -22,8 +21,9 @@ from clpipe.batch.outcome import Outcome
 from clpipe.batch.processes import Processes, usual_processes
 from clpipe.batch.remote_tars import RemoteTars
 from clpipe.batch.run_log import RunLog, Summary, log_name
+from clpipe.batch.sinks import Executor, Folder
 from clpipe.batch.spec import RunSpec
-from clpipe.batch.tar_batch import TarBatch
+from clpipe.batch.tar_sink import Tars
 from clpipe.batch.tars import Tar, cut
 from clpipe.batch.threads import Batch
 from clpipe.batch.trace import Trace, check_trace
@@ -43,10 +43,6 @@ from clpipe.outputs.folder import output_folder, remove_unfinished
 from clpipe.outputs.gone import pictures_without_input
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
-
-if TYPE_CHECKING:
-    from clpipe.batch.dask_client import Cluster
-
 
 log = logging.getLogger(__name__)
 
@@ -138,7 +134,7 @@ class Run:
         self._dask = dask
         self._arguments = arguments
         self._echo = echo
-        self._running: Batch | Cluster | Processes | None = None
+        self._running: Executor | None = None
         self._is_stopped = False
         self._loader = ImageLoader(request)
         self.jobs, self._tars = images.jobs(self._loader, where.output)
@@ -185,9 +181,10 @@ class Run:
         images, where = self._images, self.where
         start = {"arguments": list(self._arguments), "images": len(self.jobs)}
         with ExitStack() as stack:
-            batch = self._running = stack.enter_context(self._batch(jobs))
+            sink = self._sink()
+            executor = self._running = stack.enter_context(self._executor(sink, jobs))
             if self._is_stopped:
-                batch.stop()
+                executor.stop()
             stack.enter_context(output_folder(where.output, images.shard))
             folders = images.series.under(where.output) if images.poses and images.is_whole else []
             if folders:
@@ -202,7 +199,7 @@ class Run:
                 stack.callback(self._send_log, url)
             run_log = RunLog(where.output / log_name(images.shard), start, self._echo)
             stack.enter_context(closing(run_log))
-            running = stack.enter_context(closing(batch.run(jobs)))
+            running = stack.enter_context(closing(sink.receive(executor, jobs)))
             self.summary.began = time.perf_counter()
             yield from self._counted(running, run_log, trace)
             self._look_behind(folders)
@@ -272,32 +269,38 @@ class Run:
                 "more"
             )
 
-    def _batch(self, jobs: Iterable[Job]) -> "AbstractContextManager[Batch | Cluster | Processes]":
-        """What does the jobs: this machine, with or without tars, its processes, or a cluster.
+    def _sink(self) -> Folder:
+        """Where the pictures go: the output directory, tars in it, or tars at a URL.
+
+        Raises:
+            RequestError: the tars at the URL are not ours.
+        """
+        where = self.where
+        if not self._tars:
+            return Folder(self.writer, where.redo)
+        kind = RemoteTars if url_of(where.output) else Tars
+        return kind(self.writer, where.redo, self._tars)
+
+    def _executor(self, sink: Folder, jobs: Iterable[Job]) -> AbstractContextManager[Executor]:
+        """What does the jobs: threads or processes of this machine, or a cluster.
 
         Raises:
             RequestError: the cluster cannot be used.
             DeviceError: there is no usable device.
         """
+        where = self.where
         if self._dask is not None:
             from clpipe.batch.dask_client import connected
             from clpipe.batch.dask_worker import DaskSpec
 
-            return connected(self._dask, DaskSpec(self._request, self.where, self.jobs[0]))
-        where = self.where
+            return connected(self._dask, DaskSpec(self._request, where, self.jobs[0]))
         # The first one's size stands for all, whose headers nobody has read.
         claim = self._loader.claim(self.jobs[0])
         if (count := self._processes(jobs, claim)) > 1:
             spec = RunSpec(self._request, where, self.jobs[0])
             return nullcontext(Processes(spec, count, claim))
         devices: list[Device | None] = [*open_devices(where.devices, where.memory)] or [None]
-        if self._tars:
-            own = self._loader, self.writer, self._chain
-            is_remote = url_of(where.output) is not None
-            remote = RemoteTars(self._tars, self._request, where.redo) if is_remote else None
-            return nullcontext(TarBatch(self._tars, *own, where, devices, remote))
-        is_traced = where.trace is not None
-        worker = ImageWorker(self._loader, self.writer, self._chain, where.redo, is_traced)
+        worker = ImageWorker(self._loader, sink, self._chain, where.trace is not None)
         return nullcontext(Batch(worker, devices, where.threads))
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.room import usual_room
+from clpipe.batch.sinks import Folder
 from clpipe.batch.threads import Batch
 from clpipe.batch.where import Where
 from clpipe.batch.work import ImageWorker
@@ -36,9 +37,9 @@ class RunSpec:
         """What is done to each image."""
         where = self.where
         loader = ImageLoader(self.request, self.folder)
-        writer = OutputWriter(where.output, self.request)
+        sink = Folder(OutputWriter(where.output, self.request), where.redo)
         chain = loader.first_chain([self.first])
-        return ImageWorker(loader, writer, chain, where.redo, where.trace is not None)
+        return ImageWorker(loader, sink, chain, where.trace is not None)
 
     def batch(
         self,

@@ -16,6 +16,7 @@ from clpipe.batch.job_state import JobState
 from clpipe.batch.outcome import LEFT_OUT, SKIPPED, Span
 from clpipe.batch.room import host_bytes
 from clpipe.batch.runners import Runners, SpareArrays
+from clpipe.batch.sinks import Folder
 from clpipe.chain.baseline import with_noise
 from clpipe.chain.chain import Chain
 from clpipe.chain.depth import depth_steps
@@ -33,7 +34,6 @@ from clpipe.outputs.patches import every_patch
 from clpipe.outputs.recipes import Recipe
 from clpipe.outputs.sealed import SIDECAR, write_sidecar
 from clpipe.outputs.sidecar import intrinsics_of, sidecar
-from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
 T = TypeVar("T")
@@ -57,24 +57,22 @@ class ImageWorker:
 
     Args:
         loader: how images are loaded.
-        writer: how pictures are written.
+        sink: where pictures go, and which are there already.
         chain: that of the first image, for which kernels are compiled early.
-        redo: which pictures that are there already are made again.
         trace: note each launch and transfer.
     """
 
     def __init__(
         self,
         loader: ImageLoader,
-        writer: OutputWriter,
+        sink: Folder,
         chain: Chain,
-        redo: Redo = Redo.OLD,
         trace: bool = False,
     ) -> None:
-        self.writer = writer
+        self._sink = sink
+        self.writer = sink.writer
         self.loader = loader
         self.chain = chain
-        self._redo = redo
         self._trace = trace
         self._spare = SpareArrays(0)
 
@@ -165,29 +163,16 @@ class ImageWorker:
 
     def _missing(self, state: JobState) -> Set[Rendition]:
         """A job's renditions that are to be made."""
-        renditions = self.writer.renditions_of(state.job)
-        if self._redo is Redo.ALL:
+        renditions, redo = self.writer.renditions_of(state.job), self._sink.redo
+        if redo is Redo.ALL:
             return set(renditions)
         found = {
-            each: self.found(state.job, each, self.writer.record_of(state.request, each))
+            each: self._sink.found(state.job, each, self.writer.record_of(state.request, each))
             for each in renditions
         }
         state.old = sum(there is Found.OLD for there in found.values())
-        missing = [each for each, there in found.items() if not self._redo.keeps(there)]
+        missing = [each for each, there in found.items() if not redo.keeps(there)]
         return self.writer.plan_of(state.job).needed(missing)
-
-    def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> Found:
-        """Whether a rendition is there already, made by the same request.
-
-        Args:
-            job: the image.
-            rendition: which it is.
-            request: its record, see :meth:`OutputWriter.record_of`.
-
-        Raises:
-            ImageError: a file of its name is somebody else's.
-        """
-        return self.writer.existing(job, rendition).found(job, request, self._redo.verifies)
 
     def _load(self, state: JobState, job: Job, renditions: Set[Rendition]) -> None:
         """Load a state's image, and decide which renditions are made of it.

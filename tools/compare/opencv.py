@@ -43,6 +43,7 @@ from clpipe.base.processors import available_processors
 from clpipe.base.types import Array
 from clpipe.batch.bench import Load, write_renders
 from clpipe.batch.outcome import DONE
+from clpipe.batch.sinks import Folder
 from clpipe.batch.threads import Batch
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.request import Request
@@ -162,7 +163,7 @@ class Files:
         Raises:
             ClpipeError: one fails.
         """
-        worker = ImageWorker(self.loader, self.writer, self.chain)
+        worker = ImageWorker(self.loader, Folder(self.writer), self.chain)
         for outcome in Batch(worker, [self.device]).run(self.jobs[:count]):
             if outcome.status != DONE:
                 raise ClpipeError(outcome.error)

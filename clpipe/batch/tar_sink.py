@@ -1,6 +1,6 @@
-"""A batch whose pictures are packed into WebDataset tars.
+"""The sink that packs pictures into WebDataset tars.
 
-The pictures of a tar are first written to a hidden folder, and packed when all are there.
+The pictures of a tar are first written to a hidden directory, and packed when all are there.
 """
 
 import hashlib
@@ -19,16 +19,10 @@ from typing import Any
 from clpipe.base.errors import ImageError, OutputError
 from clpipe.base.files import Stored, keep_names, passing_files, whole_file
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, Outcome
-from clpipe.batch.remote_tars import RemoteTars
+from clpipe.batch.sinks import Executor, Folder
 from clpipe.batch.tars import OF_PATCHES, STAGING, Members, Tar, prepare
-from clpipe.batch.threads import Batch, Jobs
-from clpipe.batch.where import Where
-from clpipe.batch.work import ImageWorker
-from clpipe.chain.chain import Chain
 from clpipe.chain.rendition import Rendition
-from clpipe.engine.device import Device
 from clpipe.inputs.find import Job
-from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.existing import Existing, Found, Redo, found_in
 from clpipe.outputs.folder import RESUMABLE
 from clpipe.outputs.sealed import SIDECAR, outputs_in, read_sidecar
@@ -66,15 +60,15 @@ class Packer:
     """Packs one tar: what an earlier run left in it, and what became of its jobs."""
 
     def __init__(self, tar: Tar, writer: OutputWriter) -> None:
-        self._tar = tar
+        self.tar = tar
         self._writer = writer
         self._lock = threading.Lock()
         self._reused: dict[str, list[str]] = {}  # sidecars of the tar, and the files that they name
-        self._statuses: dict[str, str] = {}
+        self.statuses: dict[str, str] = {}  # of jobs, by stem
 
     @cached_property
     def _old(self) -> Members:
-        return Members(self._tar.path)
+        return Members(self.tar.path)
 
     def _member(self, job: Job, rendition: Rendition) -> str:
         """The name of a rendition's sidecar in the tar."""
@@ -82,7 +76,7 @@ class Packer:
         return folder + self._packed_as(self._writer.path(job, SIDECAR, rendition))
 
     def _packed_as(self, path: Path) -> str:
-        return path.relative_to(self._tar.staging).as_posix()
+        return path.relative_to(self.tar.staging).as_posix()
 
     def found(
         self, job: Job, rendition: Rendition, request: Mapping[str, Any], redo: Redo
@@ -113,39 +107,34 @@ class Packer:
 
     def packed(self, outcome: Outcome) -> Outcome:
         """An outcome that names the tar in place of the hidden folder."""
-        job = replace(outcome.job, name=f"{self._tar.name}/{outcome.job.stem}")
+        job = replace(outcome.job, name=f"{self.tar.name}/{outcome.job.stem}")
         outputs = tuple(file.removeprefix(STAGING) for file in outcome.outputs)
         return replace(outcome, job=job, outputs=outputs)
 
     def add(self, outcome: Outcome) -> bool:
         """Note what became of a job, and say whether it was the last one."""
-        self._statuses[outcome.job.stem] = outcome.status
-        return len(self._statuses) == len(self._tar.jobs)
+        self.statuses[outcome.job.stem] = outcome.status
+        return len(self.statuses) == len(self.tar.jobs)
 
-    def pack(self, remote: RemoteTars | None = None) -> None:
+    def pack(self) -> None:
         """Write the tar, unless it would stay the same, and remove the folder of its pictures.
 
         Images that failed are left out. Where some failed and none is new, the tar stays as it is.
 
-        Args:
-            remote: what sends it on; None leaves it here.
-
         Raises:
-            OutputError: it cannot be written, or sent.
+            OutputError: it cannot be written.
         """
         try:
             members = list(self._members())
             new = any(self._is_new(*member) for member in members)
             same = [name for name, _ in members] == self._old.names
-            if members and (new or not (same or FAILED in self._statuses.values())):
+            if members and (new or not (same or FAILED in self.statuses.values())):
                 self._write(members)
         except ImageError as error:
             raise OutputError(f"{error}; {RESUMABLE}") from None
         except FileNotFoundError as error:
             raise OutputError(f"{error.filename}: has gone; {RESUMABLE}") from None
-        shutil.rmtree(self._tar.staging, ignore_errors=True)
-        if remote:
-            remote.send(self._tar, self._statuses)
+        shutil.rmtree(self.tar.staging, ignore_errors=True)
 
     def _is_new(self, name: str, source: Source) -> bool:
         """Whether a member is not in the old tar as it is to be."""
@@ -155,8 +144,8 @@ class Packer:
 
     def _members(self) -> Iterator[tuple[str, Source]]:
         """The members of the tar, in order."""
-        for job in self._tar.jobs:
-            if self._statuses[job.stem] in (DONE, SKIPPED):
+        for job in self.tar.jobs:
+            if self.statuses[job.stem] in (DONE, SKIPPED):
                 members = self._members_of(job)
                 yield from self._by_patch(job, members) if self._writer.patches else members
 
@@ -195,7 +184,7 @@ class Packer:
 
     def _write(self, members: Sequence[tuple[str, Source]]) -> None:
         with (
-            whole_file(self._tar.path) as file,
+            whole_file(self.tar.path) as file,
             tarfile.TarFile(
                 fileobj=file,
                 mode="w",
@@ -210,112 +199,69 @@ class Packer:
                     info.size = len(source)
                     tar.addfile(info, BytesIO(source))
                     continue
-                with open(source if isinstance(source, Path) else self._tar.path, "rb") as data:
+                with open(source if isinstance(source, Path) else self.tar.path, "rb") as data:
                     if isinstance(source, Path):
                         info.size = os.fstat(data.fileno()).st_size
                     else:
                         start, info.size = source
                         data.seek(start)
                     tar.addfile(info, data)
-        keep_names(self._tar.folder)  # its pictures are removed next
+        keep_names(self.tar.folder)  # its pictures are removed next
 
 
-class TarWorker(ImageWorker):
-    """A worker whose pictures may be done in a tar."""
+class Tars(Folder):
+    """Tars as a sink. Each is packed while the pictures of the next one are made.
 
-    def __init__(self, packers: "Packers", *arguments: Any) -> None:
-        super().__init__(*arguments)
-        self._packers = packers
+    Args:
+        writer: writes the files of a rendition.
+        redo: which existing pictures are made again.
+        tars: the tars of the run's part.
+    """
+
+    def __init__(self, writer: OutputWriter, redo: Redo, tars: Sequence[Tar]) -> None:
+        folders = {job.stem: tar.staging.name for tar in tars for job in tar.jobs}
+        staged = StagedWriter(writer.folder, writer.request, folders)
+        super().__init__(staged, redo)
+        self.tars = tars
+        self._folders = folders
+        self._packers = {tar.staging.name: Packer(tar, staged) for tar in tars}
 
     def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> Found:
-        """Whether a rendition is done, in its tar or in the folder that will be packed."""
-        packed = self._packers.of(job).found(job, rendition, request, self._redo)
+        """Return what exists of a rendition, in its tar or in the directory that will be packed."""
+        packed = self._packers[self._folders[job.stem]].found(job, rendition, request, self.redo)
         if packed is not Found.NOTHING:
             return packed
         # After a loss of power a passing file may have its size and time, but not its bytes.
         return self.writer.existing(job, rendition).found(job, request, verify=True)
 
-
-class Packers:
-    """The packers of all tars of a run that are not packed yet."""
-
-    def __init__(self, tars: Sequence[Tar], writer: StagedWriter) -> None:
-        self._folders = writer.folders
-        self._packers = {tar.staging.name: Packer(tar, writer) for tar in tars}
-
-    def of(self, job: Job) -> Packer:
-        """The packer of a job's tar."""
-        return self._packers[self._folders[job.stem]]
-
-    def drop(self, job: Job) -> None:
-        """Forget the packer of a job's tar."""
-        del self._packers[self._folders[job.stem]]
-
-
-class TarBatch(Batch):
-    """One run over many images whose pictures are packed into tars.
-
-    Args:
-        tars: what is made.
-        loader, writer, chain: as for :class:`clpipe.batch.work.ImageWorker`.
-        where: how the run goes about it.
-        devices: as for the base.
-        remote: the URL that they go to; None leaves them in their folder.
-    """
-
-    def __init__(
-        self,
-        tars: Sequence[Tar],
-        loader: ImageLoader,
-        writer: OutputWriter,
-        chain: Chain,
-        where: Where,
-        devices: Sequence[Device | None],
-        remote: RemoteTars | None = None,
-    ) -> None:
-        folders = {job.stem: tar.staging.name for tar in tars for job in tar.jobs}
-        staged = StagedWriter(writer.folder, writer.request, folders)
-        self._tars = tars
-        self._remote = remote
-        self._redo = where.redo
-        self._packers = Packers(tars, staged)
-        worker = TarWorker(
-            self._packers, loader, staged, chain, where.redo, where.trace is not None
-        )
-        super().__init__(worker, devices, where.threads)
-
-    def run(self, jobs: Iterable[Job] | Jobs) -> Generator[Outcome, None, None]:
-        """Do every job, as the base does; a tar is packed while the next one is made.
-
-        What a killed run left is removed first.
+    def receive(self, executor: Executor, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
+        """Let an executor do the jobs, and yield their outcomes. Remnants are removed first.
 
         Raises:
-            RequestError: as :func:`prepare`.
-            OutputError: nothing can be written any more.
-            DeviceError: a kernel does not compile.
+            RequestError: a tar that would be overwritten is not ours, see :func:`prepare`.
+            DeviceError: no device is usable.
+            OutputError: nothing more can be written.
         """
-        if self._remote:
-            there = [tar for tar in self._tars if not self.is_stopping and self._remote.has(tar)]
-            if self.is_stopping:
-                return
-            self._tars = [tar for tar in self._tars if tar not in there]
-            jobs = [job for tar in self._tars for job in tar.jobs]
-            for tar in there:
-                for job in tar.jobs:
-                    yield Outcome(replace(job, name=f"{tar.name}/{job.stem}"), SKIPPED)
-            if not jobs:
-                return
-        prepare(self._tars, self._redo is Redo.ALL)
+        prepare(self.tars, self.redo is Redo.ALL)
         packing: Future[None] | None = None
         with ThreadPoolExecutor(1, "pack") as pool:
-            for outcome in super().run(jobs):
-                packer = self._packers.of(outcome.job)
+            for outcome in executor.run(jobs):
+                place = self._folders[outcome.job.stem]
+                packer = self._packers[place]
                 is_last = packer.add(outcome)
                 yield packer.packed(outcome)
                 if is_last:
                     if packing:
                         packing.result()
-                    packing = pool.submit(packer.pack, self._remote)
-                    self._packers.drop(outcome.job)
+                    packing = pool.submit(self.pack, packer)
+                    del self._packers[place]
             if packing:
                 packing.result()
+
+    def pack(self, packer: Packer) -> None:
+        """Write a tar.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        packer.pack()

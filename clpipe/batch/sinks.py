@@ -1,0 +1,77 @@
+"""Where results go, and who makes them: what a sink and an executor are.
+
+There are three executors: :class:`clpipe.batch.threads.Batch` (threads of this process),
+:class:`clpipe.batch.processes.Processes` (processes of this machine) and
+:class:`clpipe.batch.dask_client.Cluster` (workers of a Dask scheduler). There are three sinks: the
+output directory (:class:`Folder`), tars in it (:class:`clpipe.batch.tar_sink.Tars`), and tars at a
+URL (:class:`clpipe.batch.remote_tars.RemoteTars`).
+"""
+
+from collections.abc import Generator, Iterable, Mapping
+from typing import Any, Protocol
+
+from clpipe.batch.outcome import Outcome
+from clpipe.chain.rendition import Rendition
+from clpipe.inputs.find import Job
+from clpipe.outputs.existing import Found, Redo
+from clpipe.outputs.writer import OutputWriter
+
+
+class Executor(Protocol):
+    """Makes images. A job goes in, an outcome comes out; each executor runs once."""
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether :meth:`stop` was called, or the run cannot continue."""
+
+    def stop(self) -> None:
+        """Begin no more images, and finish those in flight. A signal handler may call it."""
+
+    def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
+        """Yield the outcome of each job, in any order. A job that fails has an outcome too.
+
+        Raises:
+            RequestError: the request cannot be run here.
+            DeviceError: no device is usable.
+            OutputError: nothing more can be written. Images in flight are reported first.
+        """
+
+
+class Folder:
+    """The output directory as a sink, and the base class of other sinks.
+
+    A sink of your own overrides what differs. :meth:`receive` sees every outcome; override it to
+    move finished files elsewhere. Override :meth:`found` if finished pictures are not in the
+    directory any more, and pass another ``writer`` to change the names of files.
+
+    Args:
+        writer: writes the files of a rendition.
+        redo: which existing pictures are made again.
+    """
+
+    def __init__(self, writer: OutputWriter, redo: Redo = Redo.OLD) -> None:
+        self.writer = writer
+        self.redo = redo
+
+    def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> Found:
+        """Return what exists of a rendition. The threads of an executor call it at the same time.
+
+        Args:
+            job: the image.
+            rendition: one of its pictures.
+            request: the record of what is asked for, see :meth:`OutputWriter.record_of`.
+
+        Raises:
+            ImageError: a file with the name of an output was not written by clpipe.
+        """
+        return self.writer.existing(job, rendition).found(job, request, self.redo.verifies)
+
+    def receive(self, executor: Executor, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
+        """Let an executor do the jobs, and yield their outcomes.
+
+        An outcome names files that exist: it comes after they have been written to the disk.
+
+        Raises:
+            RequestError, DeviceError, OutputError: as :meth:`Executor.run`.
+        """
+        return executor.run(jobs)
