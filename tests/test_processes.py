@@ -1,7 +1,7 @@
 """A run by several processes on this machine: the same bytes, whoever dies."""
 
-import io
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -15,7 +15,6 @@ import clpipe as package
 from clpipe.base.errors import DeviceError, RequestError
 from clpipe.batch import processes
 from clpipe.batch.local_worker import Seat
-from clpipe.batch.pipes import Pipe
 from clpipe.batch.run_log import read_log
 from clpipe.batch.spec import RunSpec
 from tests.conftest import ROOT, contents, statuses, written
@@ -211,21 +210,17 @@ def test_ctrl_c_does_not_reach_a_process_before_its_first_line(renders, monkeypa
 @pytest.mark.parametrize("gone", ["before it says what to do", "after it says what to do"])
 def test_a_process_whose_run_has_gone_ends_silently(renders, monkeypatch, gone):
     renders(1)
-    sent = io.BytesIO()
+    ours, theirs = multiprocessing.Pipe()
     if gone.startswith("after"):
-        pipe = Pipe(io.BytesIO(), sent)
         run = package.run("in", "out", device="numpy")
-        pipe.send(RunSpec(run._request, run.where, run.jobs[0]), Seat(0, 1, 1))
-    reading, writing = os.pipe()
-    os.close(reading)
-    with open(writing, "wb") as nobody_reads:
-        ended = subprocess.run(
-            [sys.executable, "-c", processes.START],
-            input=sent.getvalue(),
-            stdout=nobody_reads,
-            stderr=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-        )
+        ours.send((RunSpec(run._request, run.where, run.jobs[0]), Seat(0, 1, 1)))
+    ours.close()
+    ended = subprocess.run(
+        [sys.executable, "-c", f"import sys; {processes.START}", str(theirs.fileno())],
+        pass_fds=[theirs.fileno()],
+        stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
     assert (ended.returncode, ended.stderr) == (1, b"")
 
 

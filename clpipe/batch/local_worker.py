@@ -1,26 +1,25 @@
 """What a process of a run on this machine does: its share of the images, as they come to it.
 
-Its standard input brings what :class:`clpipe.batch.processes.Processes` sends, its standard output
-takes what became of it. It ends when there is no more to do, and at once when the run's process is
-gone. Signals are for that process, which says when to stop.
+A connection brings what :class:`clpipe.batch.processes.Processes` sends, and takes what became of
+it. The process ends when there is no more to do, and at once when the run's process has ended.
+It ignores signals; the run's process says when to stop.
 """
 
 import gc
 import logging
 import os
 import queue
-import sys
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from typing import Any, NoReturn
 
 from clpipe.base.errors import ClpipeError
 from clpipe.base.files import discard, remove_temporary_files
 from clpipe.base.system import stay_on
 from clpipe.batch.outcome import Outcome
-from clpipe.batch.pipes import Pipe
 from clpipe.batch.spec import RunSpec
 from clpipe.batch.threads import Batch, Jobs
 from clpipe.engine.device import Device, open_devices
@@ -50,10 +49,9 @@ class Seat:
     level: int = logging.INFO
 
 
-def main() -> None:
-    """Do what standard input says."""
-    pipe = _PipeToRun(sys.stdin.buffer, os.fdopen(os.dup(1), "wb"))
-    os.dup2(2, 1)  # what libraries print is no message
+def main(file: int) -> None:
+    """Do what the connection with this file descriptor says."""
+    pipe = _PipeToRun(Connection(file))
     gc.freeze()  # what is imported stays: looking through it again and again takes time
     spec, seat = pipe.receive()
     if seat.processors:
@@ -76,21 +74,26 @@ def _leave(status: int) -> NoReturn:
     os._exit(status)
 
 
-class _PipeToRun(Pipe):
-    """The pipe to the run's process. Ends this process silently if the run's process is gone."""
+class _PipeToRun:
+    """The connection to the run's process. Ends this process silently when that one has ended."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._sending = threading.Lock()  # one message is sent at a time
 
     def send(self, *message: Any) -> None:
-        """Send values."""
+        """Send values. Any thread may call it."""
         try:
-            super().send(*message)
+            with self._sending:
+                self._connection.send(message)
         except OSError:
             _abandon()
 
     def receive(self) -> Any:
-        """Return the next message."""
+        """Return the next message. Only one thread may call it at a time."""
         try:
-            return super().receive()
-        except EOFError:
+            return self._connection.recv()
+        except (EOFError, OSError):
             _abandon()
 
 
@@ -100,7 +103,7 @@ def _abandon() -> NoReturn:
     _leave(1)
 
 
-def _work(pipe: Pipe, spec: RunSpec, seat: Seat) -> None:
+def _work(pipe: _PipeToRun, spec: RunSpec, seat: Seat) -> None:
     """Do the jobs that come, and send what became of them.
 
     Raises:
@@ -127,7 +130,7 @@ def _work(pipe: Pipe, spec: RunSpec, seat: Seat) -> None:
         teller.join()
 
 
-def _listen(pipe: Pipe, jobs: Jobs, batch: Batch) -> None:
+def _listen(pipe: _PipeToRun, jobs: Jobs, batch: Batch) -> None:
     """Take jobs in, until it is said that there are no more."""
     while True:
         what, *values = pipe.receive()
@@ -139,7 +142,7 @@ def _listen(pipe: Pipe, jobs: Jobs, batch: Batch) -> None:
             jobs.put(None)
 
 
-def _tell(pipe: Pipe, finished: "queue.SimpleQueue[Outcome | None]") -> None:
+def _tell(pipe: _PipeToRun, finished: "queue.SimpleQueue[Outcome | None]") -> None:
     """Send outcomes, several at a time."""
     for first in iter(finished.get, None):
         time.sleep(SOON)
@@ -160,7 +163,7 @@ def _waiting(finished: "queue.SimpleQueue[Outcome | None]") -> Iterator[Outcome 
 class _Forwarder(logging.Handler):
     """Sends what is logged to the run's process, which prints it."""
 
-    def __init__(self, pipe: Pipe) -> None:
+    def __init__(self, pipe: _PipeToRun) -> None:
         super().__init__()
         self._pipe = pipe
 

@@ -10,6 +10,7 @@ by the sidecars what is done already.
 import contextlib
 import json
 import logging
+import multiprocessing
 import os
 import queue
 import subprocess
@@ -18,6 +19,7 @@ import threading
 from collections import Counter, deque
 from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
 
 from clpipe.base.errors import ClpipeError, DeviceError, RequestError
 from clpipe.base.memory import available_memory
@@ -26,7 +28,6 @@ from clpipe.base.system import blocked_signals, processor_numbers
 from clpipe.batch.interrupt import SIGNALS
 from clpipe.batch.local_worker import Seat
 from clpipe.batch.outcome import FAILED, Outcome
-from clpipe.batch.pipes import Pipe
 from clpipe.batch.spec import RunSpec, shifted
 from clpipe.images.claims import Claim
 from clpipe.inputs.find import Job
@@ -51,7 +52,7 @@ PROGRAM = (
     "signal.signal(signal.SIGTERM, signal.SIG_IGN); "
     "import json, sys; sys.path[:] = json.loads({path!r}); {start}"
 )
-START = "from clpipe.batch.local_worker import main; main()"
+START = "from clpipe.batch.local_worker import main; main(int(sys.argv[1]))"
 THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")  # up to PoCL 3.1, and from 4 on
 
 
@@ -83,7 +84,7 @@ class _Process:
 
     seat: Seat
     popen: "subprocess.Popen[bytes]"
-    pipe: Pipe
+    connection: Connection
     listener: threading.Thread = field(default_factory=threading.Thread)
     jobs: dict[str, Job] = field(default_factory=dict)  # before it, by their stems
     is_alone: bool = False  # whether what it has is all it gets
@@ -93,7 +94,7 @@ class _Process:
         """Wait for its end; its status."""
         status = self.popen.wait()
         self.listener.join()
-        self.pipe.close()
+        self.connection.close()
         return status
 
 
@@ -191,11 +192,15 @@ class Processes:
         limits = {name: os.environ.get(name, str(share)) for name in THREADS}
         program = PROGRAM.format(path=json.dumps(sys.path), start=START)
         try:
-            with blocked_signals(SIGNALS):
+            ours, theirs = multiprocessing.Pipe()
+            with blocked_signals(SIGNALS), theirs:
+                file = theirs.fileno()
                 popen = subprocess.Popen(  # noqa: S603 - this program
-                    [sys.executable, "-P", "-c", program],  # nothing from the working directory
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
+                    # nothing from the working directory
+                    [sys.executable, "-P", "-c", program, str(file)],
+                    stdin=subprocess.DEVNULL,
+                    stdout=2,  # what libraries print is no output of the run
+                    pass_fds=[file],
                     env={**os.environ, **limits},
                 )
         except OSError as error:
@@ -203,9 +208,7 @@ class Processes:
                 f"--processes: {self._count}: no process can be started ({error.strerror}); ask "
                 "for fewer"
             ) from None
-        assert popen.stdin
-        assert popen.stdout
-        process = _Process(seat, popen, Pipe(popen.stdout, popen.stdin))
+        process = _Process(seat, popen, ours)
         self._send(process, self._spec, seat)
         process.listener = threading.Thread(target=self._listen, args=(process,), daemon=True)
         process.listener.start()
@@ -214,7 +217,7 @@ class Processes:
     def _listen(self, process: _Process) -> None:
         try:
             while True:
-                self._messages.put((process, process.pipe.receive()))
+                self._messages.put((process, process.connection.recv()))
         except Exception:  # mostly EOFError; what cannot be understood is as if it had gone
             self._messages.put((process, ("gone",)))
 
@@ -222,7 +225,7 @@ class Processes:
     def _send(process: _Process, *message: object) -> None:
         """Send a message; that a process has gone, the thread that listens to it says."""
         with contextlib.suppress(OSError):
-            process.pipe.send(*message)
+            process.connection.send(message)
 
     def _heard(self, process: _Process, message: tuple[object, ...]) -> Iterable[Outcome]:
         """What a message from a process leads to: the outcomes of jobs."""
