@@ -70,7 +70,7 @@ class Pipeline(ReadOnly):
         self._settings = overlay(load_settings(*several(config)), plain(settings))
         self._ends = start_at, until
         self._numbers = itertools.count()
-        self._lock = threading.Lock()  # a device is for one thread
+        self._lock = threading.Lock()  # lets one thread use the device at a time
         chain = self._chain(self._settings)
         kept = chain.select(several(keep))
         encode = chain.result is Kind.DISPLAY

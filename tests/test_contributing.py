@@ -1,13 +1,18 @@
 """CONTRIBUTING.md, the glossary, and the example on the page about own stages."""
 
+import itertools
 import pkgutil
 import re
 import subprocess
 from dataclasses import replace
+from typing import Any
+from zipfile import ZipFile
 
 import pytest
 from click.testing import CliRunner
 
+import clpipe
+from clpipe.batch.session import Run
 from clpipe.chain.registry import load_stage_file
 from clpipe.commands.main import main
 from clpipe.engine.check import check_method
@@ -50,6 +55,33 @@ def test_the_commands_it_shows_work(tmp_path, monkeypatch):
         result = CliRunner().invoke(main, command, catch_exceptions=False)
         assert result.exit_code == 0, result.output
     assert (tmp_path / "out" / "render.jpg").is_file()
+
+
+@pytest.mark.slow
+def test_the_example_sink_works(tmp_path, monkeypatch):
+    """Pictures are in the archive after a run, and a second run skips them."""
+    example: dict[str, Any] = {}
+    exec(next(block.text for block in blocks(PAGE) if block.language == "python"), example)
+    monkeypatch.setattr(Run, "sink", lambda run: example["Zip"](run.writer, run.where.redo))
+    for status in ("done", "skipped"):
+        run = clpipe.run(STILL_LIFE, tmp_path / "out", processes=2)
+        assert [outcome.status for outcome in run] == [status]
+    name = STILL_LIFE.stem
+    with ZipFile(tmp_path / "out" / "pictures.zip") as archive:
+        assert sorted(archive.namelist()) == [f"{name}.jpg", f"{name}.json"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "pictures.zip",
+        "run.jsonl",
+    ]
+
+
+def test_every_lock_says_what_it_guards():
+    lock = re.compile(r"= threading\.\w*(Lock|Semaphore|Condition)\(")
+    for path in (ROOT / "clpipe").rglob("*.py"):
+        lines = path.read_text().splitlines()
+        for before, line in itertools.pairwise(["", *lines]):
+            if lock.search(line):
+                assert "  # " in line or before.lstrip().startswith("# "), f"{path}: {line}"
 
 
 def test_every_file_it_names_is_there():

@@ -49,7 +49,7 @@ class BoundedCache(Generic[V]):
     def __init__(self, bound: int, size: Callable[[V], int] | None = None) -> None:
         self._bound = bound
         self._size = size
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # guards the values and the sum of their sizes
         self._values: OrderedDict[Hashable, Any] = OrderedDict()
         self.taken = 0  # of the bound
 

@@ -38,7 +38,8 @@ class Stored:
 
 
 _unfinished: set[Path] = set()  # temporary files of this process, for `remove_temporary_files`
-# Held while one of them is begun. A signal's handler may take it where its thread has it already.
+# Guards the moment in which a temporary file is made and noted in _unfinished. A signal handler may
+# take it although its own thread holds it.
 _beginning = threading.RLock()
 
 LONGEST = 200  # bytes of a name that its temporary name repeats; file systems hold 255

@@ -93,7 +93,7 @@ class ChunkReport:
     error: ClpipeError | None = None
 
 
-_one_chunk = threading.Lock()  # devices are for one thread
+_one_chunk = threading.Lock()  # lets one chunk at a time use this worker's devices
 
 _halted: set[str] = set()
 

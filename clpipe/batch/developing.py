@@ -85,7 +85,7 @@ class Developers:
         self._is_needed = threading.Event()  # an image is to be made, or none ever
         self._is_closing = False
         self._usable = len(devices)
-        self._counting = threading.Lock()  # of usable devices
+        self._counting = threading.Lock()  # guards the number of usable devices
 
     @property
     def is_needed(self) -> bool:

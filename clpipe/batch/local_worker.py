@@ -79,7 +79,7 @@ class _PipeToRun:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        self._sending = threading.Lock()  # one message is sent at a time
+        self._sending = threading.Lock()  # lets one thread send at a time
 
     def send(self, *message: Any) -> None:
         """Send values. Any thread may call it."""

@@ -104,8 +104,8 @@ class Room:
         self._most = 0  # bytes that there ever were for one image and the devices
         self._measured: tuple[float, Left | None] = 0.0, Left(0, "")
         self._taken: dict[str, int] = {}  # bytes, by the name of an image
-        self._queue = threading.Lock()
-        self._changed = threading.Condition()
+        self._queue = threading.Lock()  # lets one image wait at a time, so none overtakes it
+        self._changed = threading.Condition()  # guards all of the above; notified when they change
         self._is_open = False
 
     def enter(self, name: str, size: int) -> None:
@@ -114,7 +114,7 @@ class Room:
         Raises:
             ImageError: it does not fit, not even alone; or nothing is to follow.
         """
-        with self._queue, self._changed:  # a large one is not passed by small ones for ever
+        with self._queue, self._changed:
             self._changed.wait_for(lambda: self._is_open or self._fits(size) or self._is_alone)
             if self._is_open:
                 raise ImageError("the run ended before it was begun")

@@ -66,7 +66,7 @@ class SpareArrays:
 
     def __init__(self, count: int) -> None:
         self._arrays: deque[Array] = deque(maxlen=count)
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # guards the arrays
 
     def take(self, shape: tuple[int, ...]) -> Array | None:
         """An array of that shape; None where there is none."""

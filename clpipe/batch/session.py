@@ -32,7 +32,6 @@ from clpipe.batch.work import ImageWorker
 from clpipe.chain.isos import draw_note
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_devices
-from clpipe.images.claims import Claim
 from clpipe.images.read import PICTURE_SUFFIXES
 from clpipe.inputs.find import Job, Shard, find_jobs
 from clpipe.inputs.lenses import lens_notes
@@ -181,7 +180,7 @@ class Run:
         images, where = self._images, self.where
         start = {"arguments": list(self._arguments), "images": len(self.jobs)}
         with ExitStack() as stack:
-            sink = self._sink()
+            sink = self.sink()
             executor = self._running = stack.enter_context(self._executor(sink, jobs))
             if self._is_stopped:
                 executor.stop()
@@ -242,15 +241,6 @@ class Run:
             if not unlogged:
                 log.end(self.summary)
 
-    def _processes(self, jobs: Iterable[Job], claim: Claim) -> int:
-        """How many processes do the jobs; the claim is of the first one."""
-        where = self.where
-        if where.processes:
-            return where.processes
-        if self._tars or jobs is not self.jobs:  # they may come one after the other
-            return 1
-        return usual_processes(len(self.jobs), claim, available_processors())
-
     def _look_behind(self, folders: Sequence[Path]) -> None:
         """Write the views of a run's folders, and note what else there is to say of it."""
         if self.summary.interrupted:
@@ -269,8 +259,8 @@ class Run:
                 "more"
             )
 
-    def _sink(self) -> Folder:
-        """Where the pictures go: the output directory, tars in it, or tars at a URL.
+    def sink(self) -> Folder:
+        """Return where the pictures go: the output directory, tars in it, or tars at a URL.
 
         Raises:
             RequestError: the tars at the URL are not ours.
@@ -296,7 +286,15 @@ class Run:
             return connected(self._dask, DaskSpec(self._request, where, self.jobs[0]))
         # The first one's size stands for all, whose headers nobody has read.
         claim = self._loader.claim(self.jobs[0])
-        if (count := self._processes(jobs, claim)) > 1:
+        if not sink.allows_processes:
+            count = 1
+        elif where.processes:
+            count = where.processes
+        elif jobs is not self.jobs:  # they may come one after the other
+            count = 1
+        else:
+            count = usual_processes(len(self.jobs), claim, available_processors())
+        if count > 1:
             spec = RunSpec(self._request, where, self.jobs[0])
             return nullcontext(Processes(spec, count, claim))
         devices: list[Device | None] = [*open_devices(where.devices, where.memory)] or [None]

@@ -40,14 +40,21 @@ class Executor(Protocol):
 class Folder:
     """The output directory as a sink, and the base class of other sinks.
 
-    A sink of your own overrides what differs. :meth:`receive` sees every outcome; override it to
-    move finished files elsewhere. Override :meth:`found` if finished pictures are not in the
-    directory any more, and pass another ``writer`` to change the names of files.
+    A sink of your own overrides what differs. Override :meth:`receive` to move finished files
+    elsewhere, and :meth:`found` if they are not in the directory any more. To change the names of
+    files, pass another ``writer`` to this constructor.
 
     Args:
         writer: writes the files of a rendition.
         redo: which existing pictures are made again.
+
+    Attributes:
+        allows_processes: whether several processes may make its pictures. Processes look for
+            existing pictures in the output directory only, so a sink with another ``found`` says
+            False.
     """
+
+    allows_processes = True
 
     def __init__(self, writer: OutputWriter, redo: Redo = Redo.OLD) -> None:
         self.writer = writer

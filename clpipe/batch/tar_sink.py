@@ -62,7 +62,7 @@ class Packer:
     def __init__(self, tar: Tar, writer: OutputWriter) -> None:
         self.tar = tar
         self._writer = writer
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # lets one thread read the old tar's index, once
         self._reused: dict[str, list[str]] = {}  # sidecars of the tar, and the files that they name
         self.statuses: dict[str, str] = {}  # of jobs, by stem
 
@@ -217,6 +217,8 @@ class Tars(Folder):
         redo: which existing pictures are made again.
         tars: the tars of the run's part.
     """
+
+    allows_processes = False
 
     def __init__(self, writer: OutputWriter, redo: Redo, tars: Sequence[Tar]) -> None:
         folders = {job.stem: tar.staging.name for tar in tars for job in tar.jobs}

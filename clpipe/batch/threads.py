@@ -66,7 +66,7 @@ class Batch:
         self._room = Room(size, self.devices, partial(worker.reserve, results))
         self._failure: Exception | None = None
         self._stopping = threading.Event()
-        self._decoding = threading.Semaphore(self.threads)  # of the threads that make images
+        self._decoding = threading.Semaphore(self.threads)  # limits the threads that decode
         self._developers = Developers(
             worker, self.devices, self.threads, self._room, compiled, self._fail
         )

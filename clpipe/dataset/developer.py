@@ -127,7 +127,7 @@ class Developer:
         self.process = os.getpid()
         self._device = device
         self._spec = spec
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # guards the runners, and lets one thread use the device
         self._raws: BoundedCache[dict[str, str]] = BoundedCache(MAX_STRUCTURES)
         self._latest: dict[str, Runner] = {}
 

@@ -22,7 +22,7 @@ from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.inputs.raw import RawImage
 from clpipe.outputs.patches import Patch, Patches
 
-_opening = threading.Lock()
+_opening = threading.Lock()  # lets one thread open the device of a process
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,8 @@ class PoclBuilder:
         folder: PoCL's, of this process alone.
     """
 
-    _one_at_a_time = threading.Lock()  # what a build has added to the folder is seen by looking
+    # One build at a time, because what a build added to the folder is found by comparing listings.
+    _one_at_a_time = threading.Lock()
     _has_compiled = False  # in this process, which has the compiler's memory then
 
     def __init__(self, context: Any, store: Store, folder: Path) -> None:

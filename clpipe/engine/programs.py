@@ -30,7 +30,7 @@ PROGRAMS = 1024  # that a process keeps for each device
 LONG = 2.0  # s of compiling after which a user is told what is going on
 log = logging.getLogger(__name__)
 _by_device: dict[int, "Programs"] = {}
-_lock = threading.Lock()
+_lock = threading.Lock()  # guards _by_device
 _announced = threading.Event()
 _watchers: list[Callable[[int, int], None]] = []
 
@@ -55,7 +55,7 @@ class Programs:
         except cl.Error as error:
             raise DeviceError(f"{info.label} cannot be opened: {error}") from None
         self._programs: BoundedCache[Any] = BoundedCache(PROGRAMS)
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # lets one thread compile at a time
         self._options = ["-cl-std=CL1.2", "-w"]
         if info.handle.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
             self._options.append("-cl-fp32-correctly-rounded-divide-sqrt")

@@ -71,7 +71,7 @@ class Explorer:
         self.jobs = tuple(jobs)
         self.device = device
         self._request = request
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # guards the samples, and lets one thread use the device
         self._sources: BoundedCache[SourceImage] = BoundedCache(SOURCES)
         self._runners: dict[bool, Runner] = {}
         self._samples: OrderedDict[int, Sample] = OrderedDict()

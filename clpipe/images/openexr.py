@@ -129,7 +129,7 @@ class _Stdout:
 
 
 _thread = threading.local()
-_lock = threading.Lock()
+_lock = threading.Lock()  # guards _silent, and the replacement of sys.stdout
 _silent: list[threading.Thread] = []
 
 

@@ -36,7 +36,7 @@ class Simulator:
 
     def __init__(self, device: Device | None) -> None:
         self._device = device
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # lets one thread use the device and its runners
         self._noisy: Runner | None = None  # shares plans with all runners of noisy chains
         self._quiet: Runner | None = None
         self._linear = BoundedCache[Floats](LINEAR)
@@ -56,7 +56,7 @@ class Simulator:
         seen = [name for name in settings.step_names if base_name(name) in SEEN]
         chain = make_chain(replace(settings, skip=(*settings.skip, *seen)))
         keys = [f"{key}:{scene.name}:{number}" for number in range(count or len(scene.frames))]
-        with self._lock:  # a device is for one thread
+        with self._lock:
             linear = self._linear_light(chain, scene)
             self._noisy = (self._noisy or Runner(chain, self._device)).for_chain(chain)
             pictures = [self._noisy.run(linear, name).encoded for name in keys]
