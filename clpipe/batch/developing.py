@@ -1,4 +1,4 @@
-"""The devices of a run: threads that develop what is ordered, and a pool that encodes it."""
+"""The devices of a run: a thread for each develops ordered renditions, and a pool encodes them."""
 
 import logging
 import queue
@@ -19,16 +19,19 @@ from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.outputs.recipes import Recipe
 
-TOGETHER = 16  # small images that are developed at a time, at most
+TOGETHER = 16  # most small images that share launches
 
 log = logging.getLogger(__name__)
 
 
 @dataclass
 class Order:
-    """A rendition that is to be made, and what is written of it.
+    """A rendition that a device shall make.
 
-    That is None where it fails, and an error where no device is left to make it.
+    Args:
+        state: its job.
+        recipe: how it is made.
+        written: resolves to its files; to None if it fails, and to an error if no device is left.
     """
 
     state: JobState
@@ -36,33 +39,34 @@ class Order:
     written: Future[Written | None] = field(default_factory=Future)
 
     def discard(self) -> None:
-        """Remove what is written."""
+        """Remove its files."""
         if not self.written.exception() and (written := self.written.result()):
             written.group.discard()
 
 
-Started = deque[deque[tuple[Order, Callable[[], Result | None]]]]  # with what waits for a result
+# Groups of orders that were started together, each with a function that waits for its result.
+Started = deque[deque[tuple[Order, Callable[[], Result | None]]]]
 
 
 def no_result() -> None:
-    """The result of what is not developed."""
+    """Stand in for the result of an order that was not started."""
 
 
 def depth_of(device: Device | None) -> int:
-    """How many images a device works on at a time; None is NumPy."""
+    """Return how many images a device works on at a time; None is NumPy."""
     return device.depth if device else 1
 
 
 class Developers:
-    """Develops and encodes renditions that are ordered, on each device by a thread of its own.
+    """Develops and encodes renditions. Each device has a thread, and all share a pool to encode.
 
     Args:
-        worker: what is done to each image.
-        devices: where; None is NumPy.
-        threads: how many encode at a time.
-        room: is told when a device has its kernels.
-        compiled: so is this.
-        fail: is called with an error because of which the run cannot go on.
+        worker: does the work of each image.
+        devices: the devices; None is NumPy.
+        threads: the number of renditions that are encoded at a time.
+        room: notified when a device has compiled its kernels.
+        compiled: called at the same time.
+        fail: called with an error after which the run cannot continue.
     """
 
     def __init__(
@@ -75,29 +79,29 @@ class Developers:
         fail: Callable[[BaseException], None],
     ) -> None:
         self.devices = devices
-        self.most = threads + len(devices)  # renditions of an image that are ordered at a time
+        self.most = threads + len(devices)  # renditions of one image that are in flight at a time
         self._worker = worker
         self._room = room
         self._tell = compiled
         self._fail = fail
         self._orders: queue.SimpleQueue[Order | None] = queue.SimpleQueue()
         self._encoders = ThreadPoolExecutor(threads, "encode")
-        self._is_needed = threading.Event()  # an image is to be made, or none ever
+        self._is_needed = threading.Event()  # set by the first image to be made, and at the end
         self._is_closing = False
         self._usable = len(devices)
         self._counting = threading.Lock()  # guards the number of usable devices
 
     @property
     def is_needed(self) -> bool:
-        """Whether kernels are compiled."""
+        """Whether an image has asked for kernels."""
         return self._is_needed.is_set()
 
     def begin(self) -> None:
-        """Have kernels compiled, as an image is to be made."""
+        """Let the devices compile their kernels. A run that skips all images never calls it."""
         self._is_needed.set()
 
     def close(self) -> None:
-        """Let the threads end, when all that was ordered is made."""
+        """Let the threads end once all orders are made."""
         self._is_closing = True
         self._is_needed.set()
         for _ in self.devices:
@@ -105,18 +109,18 @@ class Developers:
         self._encoders.shutdown()
 
     def is_small(self, state: JobState) -> bool:
-        """Whether a job's renditions share launches with others."""
+        """Return whether a job's image is small enough to share launches with others."""
         size = state.source.pixels.shape[1::-1] if state.source else (0, 0)
         return all(each is not None and each.stacks(*size) for each in self.devices)
 
     def order(self, states: Sequence[JobState]) -> list[list[Order]]:
-        """Have all renditions of jobs made, some at a time, and wait until they are; by job."""
+        """Make all renditions of jobs, some at a time, and wait. Returns them by job."""
         made: list[list[Order]] = [[] for _ in states]
         asked: deque[Order] = deque()
         for state, orders in zip(states, made, strict=True):
             most = TOGETHER if self.is_small(state) else self.most
             for recipe in state.recipes:
-                # The noise of some is measured on those before them.
+                # Baselines take their noise from the renditions before them.
                 while asked and (len(asked) >= most or recipe.spread):
                     asked.popleft().written.exception()
                 orders.append(Order(state, recipe))
@@ -127,8 +131,8 @@ class Developers:
         return made
 
     def develop_all(self, device: Device | None) -> None:
-        """Develop what is ordered, until there is no more, or no device that can do it."""
-        self._is_needed.wait()  # a run that makes nothing compiles nothing
+        """Develop orders until there are no more, or the device fails."""
+        self._is_needed.wait()  # a run that skips all images compiles nothing
         if self._is_closing:
             return
         asked: list[Order] = []
@@ -162,9 +166,9 @@ class Developers:
                 device.drain()
 
     def _taken(self, started: Started, device: Device | None) -> list[Order]:
-        """What is ordered next, several where they are small; none at the end.
+        """Return the next orders: one, several small ones, or none at the end.
 
-        What is started does not wait for it.
+        While no order is queued, those that were started are finished.
 
         Raises:
             DeviceError: the device cannot be used any more.
@@ -182,7 +186,7 @@ class Developers:
                 continue
             if order is None:
                 if taken:
-                    self._orders.put(None)  # for the next time
+                    self._orders.put(None)  # for the next call
                     break
                 while started:
                     self._finish(started, device)
@@ -196,7 +200,7 @@ class Developers:
     def _started(
         self, orders: Sequence[Order], runners: Runners
     ) -> deque[tuple[Order, Callable[[], Result | None]]]:
-        """Start renditions together.
+        """Start orders together.
 
         Raises:
             DeviceError: the device cannot be used any more.
@@ -223,10 +227,10 @@ class Developers:
         return deque(zip(orders, waits, strict=True))
 
     def _finish(self, started: Started, device: Device | None) -> None:
-        """Wait for the renditions that were started first, together, and have them encoded.
+        """Wait for the oldest group of orders, and hand the results to the encoders.
 
         Raises:
-            DeviceError: the device cannot be used any more; what is not finished stays started.
+            DeviceError: the device cannot be used any more. Unfinished orders stay in ``started``.
         """
         stack = started[0]
         while stack:
@@ -253,6 +257,6 @@ class Developers:
         except OutputError as error:
             order.state.error = failure_text(order.state.job, error)
             self._fail(error)
-        except BaseException as error:  # nothing that one image does may end a thread
+        except BaseException as error:  # no image may end a thread
             order.state.error = failure_text(order.state.job, error)
         order.written.set_result(written)

@@ -1,4 +1,4 @@
-"""A run, as it is sent to other processes, on this machine or on others."""
+"""The description of a run that is sent to other processes, on this machine or on others."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,13 +19,13 @@ from clpipe.outputs.writer import OutputWriter
 
 @dataclass(frozen=True)
 class RunSpec:
-    """A run, as it is sent to a process.
+    """The description of a run that a process receives.
 
     Args:
-        request: what is asked for.
-        where: to which folder, and with which devices.
-        first: the job whose chain is compiled early.
-        folder: where relative paths start; None is the working directory.
+        request: the pictures to make.
+        where: the output directory and the devices.
+        first: the job whose chain is compiled first.
+        folder: the directory that relative paths start from. None is the working directory.
     """
 
     request: ResolvedRequest
@@ -34,7 +34,7 @@ class RunSpec:
     folder: Path | None = None
 
     def worker(self) -> ImageWorker:
-        """What is done to each image."""
+        """Return what does the work of each image."""
         where = self.where
         loader = ImageLoader(self.request, self.folder)
         sink = Folder(OutputWriter(where.output, self.request), where.redo)
@@ -49,12 +49,12 @@ class RunSpec:
         in_flight: int | None = None,
         compiled: Callable[[], None] = lambda: None,
     ) -> Batch:
-        """What does a part of the run.
+        """Return the batch that does this process's part of the run.
 
         Args:
-            devices: the process's.
-            threads: where the run does not say how many.
-            sharing: how many processes share the machine's memory.
+            devices: the devices of the process.
+            threads: the number of threads if the run does not set it.
+            sharing: the number of processes that share the machine's memory.
             in_flight, compiled: as for :class:`~clpipe.batch.threads.Batch`.
         """
         number = self.where.threads or threads
@@ -63,7 +63,7 @@ class RunSpec:
 
 
 def shifted(outcome: Outcome, seconds: float, prefix: str = "") -> Outcome:
-    """An outcome with the times of another clock, and a prefix before the names of threads."""
+    """Return an outcome with its times shifted, and a prefix before the names of its threads."""
     spans = tuple(
         replace(s, worker=prefix + s.worker, start=s.start + seconds) for s in outcome.spans
     )

@@ -1,10 +1,12 @@
-"""Many images at once: threads that each make one image, or a few small ones, from file to file.
+"""The threads of one process: each makes one image at a time, or a few small ones.
 
-Such a thread decodes, asks a device's thread for each rendition, and has a pool encode it. There is
-a fixed number of them, and an image is let in only when it fits into the memory beside the others,
-so memory does not grow with the number of jobs. With one of them, all is done in turn, which a
-process that has one processor needs: threads that run at the same time take turns at the
-interpreter's lock some fifty times an image, which of a small image's time is a third.
+Such a thread decodes an image, orders its renditions from :mod:`clpipe.batch.developing`, and waits
+for them. Their number is fixed, and an image starts only if it fits into memory together with those
+in flight. So memory does not grow with the number of jobs.
+
+With a single thread, all steps run one after the other. A process that has one processor needs
+this: threads that run at the same time exchange the interpreter's lock about fifty times for each
+image, which takes a third of a small image's time.
 """
 
 import queue
@@ -27,24 +29,26 @@ from clpipe.engine.device import Device
 from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.find import Job
 
-Jobs = queue.SimpleQueue[Job | Exception | None]  # None: there are no more; an error ends the run
+Jobs = queue.SimpleQueue[Job | Exception | None]  # None is the end; an error ends the run
 
-Made = tuple[JobState, list[Written]]  # a job, and its renditions, which have no names yet
+Made = tuple[JobState, list[Written]]  # a job, and its renditions under temporary names
 
-COMMITTED = 64  # images at a time at most; more would make those that wait for them late
+COMMITTED = 64  # most images that are synchronised to the disk at a time
 
 
 class Batch:
     """One run over many images.
 
     Args:
-        worker: what is done to each image.
-        devices: where to develop, a thread for each; [None] is NumPy.
-        threads: how many decode, and how many encode, at a time; None is one for each processor.
-        room: bytes that images in flight may take; None is :func:`~clpipe.batch.room.usual_room`.
-        in_flight: how many threads make images; None is enough to keep all others busy. One does
-            small images a few at a time.
-        compiled: is called when a device has its kernels.
+        worker: does the work of each image.
+        devices: the devices that develop, each with its own thread; [None] is NumPy.
+        threads: the number of images that are decoded at a time, and of those that are encoded.
+            None is one for each processor.
+        room: bytes that images in flight may take. None is
+            :func:`~clpipe.batch.room.usual_room`.
+        in_flight: the number of threads that make images. None is enough to keep all others busy.
+            A single thread takes several small images at a time.
+        compiled: called when a device has compiled its kernels.
     """
 
     def __init__(
@@ -58,7 +62,7 @@ class Batch:
     ) -> None:
         self.devices = list(devices)
         self.threads = threads or available_processors()
-        results = self.threads + sum(map(depth_of, self.devices))  # at a time
+        results = self.threads + sum(map(depth_of, self.devices))  # that exist at a time
         self.in_flight = in_flight or results + 1
         self._worker = worker
         worker.reserve(results)
@@ -71,33 +75,30 @@ class Batch:
             worker, self.devices, self.threads, self._room, compiled, self._fail
         )
         self._jobs: Jobs = queue.SimpleQueue()
-        # None: a thread has ended.
+        # None: one of the threads has ended.
         self._made: queue.Queue[Made | None] = queue.Queue(COMMITTED)
         self._outcomes: queue.Queue[Outcome | None] = queue.Queue(COMMITTED)
 
     def stop(self) -> None:
-        """Let no more images in; those in flight are finished. May be called by a signal."""
+        """Begin no more images, and finish those in flight. A signal handler may call it."""
         self._stopping.set()
-        self._jobs.put(None)  # for one that waits
+        self._jobs.put(None)  # for a thread that waits
 
     @property
     def is_stopping(self) -> bool:
-        """Whether no more images are let in."""
+        """Whether no more images are begun."""
         return self._stopping.is_set()
 
     def run(self, jobs: Iterable[Job] | Jobs) -> Generator[Outcome, None, None]:
-        """Do every job; one that fails is reported and the others go on. A batch runs once.
-
-        Outcomes come as jobs are finished, in any order.
+        """Do every job, and yield outcomes as jobs finish, in any order. A batch runs once.
 
         Args:
-            jobs: the images; what is no sequence may take its time, and what it raises ends the
-                run.
+            jobs: the images. A lazy iterable is advanced by a thread of its own, so it may block;
+                an error that it raises ends the run.
 
         Raises:
-            OutputError: nothing can be written any more. What was in flight is reported before.
-            DeviceError: on no device is work possible any more. Where some can still be used, the
-                others' work is theirs.
+            OutputError: nothing more can be written. Images in flight are reported first.
+            DeviceError: no device is usable any more. If one fails, the others take over its work.
         """
         developers = self._developers
         count = max(len(jobs), 1) if isinstance(jobs, Sized) else self.in_flight
@@ -126,7 +127,7 @@ class Batch:
         finally:
             self.stop()
             self._room.open()
-            for _ in range(self.in_flight - makers):  # that could not be started
+            for _ in range(self.in_flight - makers):  # threads that could not be started
                 self._made.put(None)
             while not is_over and self._outcomes.get() is not None:
                 pass
@@ -146,7 +147,7 @@ class Batch:
         thread = threading.Thread(target=timed, name=name, daemon=True)
         try:
             thread.start()
-        except RuntimeError:  # the system gives no more, or their stacks do not fit
+        except RuntimeError:  # no more threads are allowed, or their stacks do not fit
             raise RequestError(
                 f"--jobs: {self.threads}: no thread can be started for '{name}'; ask for fewer, or "
                 "allow more threads (ulimit -u) or memory (ulimit -v)"
@@ -154,7 +155,7 @@ class Batch:
         return thread
 
     def _queue(self, jobs: Iterable[Job]) -> None:
-        """Queue all jobs, while more are let in."""
+        """Queue all jobs, until the run stops."""
         try:
             for job in jobs:
                 if self.is_stopping:
@@ -165,13 +166,13 @@ class Batch:
         self._jobs.put(None)
 
     def _fail(self, error: BaseException) -> None:
-        """Let nothing more in, and remember the first error."""
+        """Stop the run, and remember the first error."""
         known = error if isinstance(error, Exception) else RuntimeError(repr(error))
         self._failure = self._failure or known
         self.stop()
 
     def _next(self, is_waiting: bool) -> Job | None:
-        """The next job; None where none is to come, or none is there and nothing is to wait."""
+        """Return the next job. None is the end, or an empty queue if ``is_waiting`` is False."""
         try:
             job = self._jobs.get(is_waiting)
         except queue.Empty:
@@ -180,30 +181,30 @@ class Batch:
             self._fail(job)
         if isinstance(job, Job) and not self.is_stopping:
             return job
-        self._jobs.put(None)  # for the others
+        self._jobs.put(None)  # for the other threads
         return None
 
     def _make_all(self) -> None:
-        """Make images until none is to come."""
+        """Make images until there are no more."""
         decoded: list[JobState] = []
         most = TOGETHER if self.in_flight == 1 else 1
         try:
             while True:
-                with self._decoding:  # also while it waits for a job, so they are begun in order
+                with self._decoding:  # before a job is taken, so that jobs begin in order
                     if job := self._next(not decoded):
                         decoded.append(self._decoded(job, decoded))
                 if not decoded:
                     break
                 if not job or len(decoded) >= most or not self._developers.is_small(decoded[-1]):
                     self._make(decoded)
-        except BaseException as error:  # behind an image's back
+        except BaseException as error:  # of the run, not of one image
             self._fail(error)
             self._room.open()
         finally:
             self._made.put(None)
 
     def _decoded(self, job: Job, beside: list[JobState]) -> JobState:
-        """A job whose image is decoded; ``beside`` is what this thread has decoded before."""
+        """Decode a job's image. ``beside`` are jobs that this thread has decoded and not made."""
         state = JobState(job, self._worker.loader)
         waits: list[float] = []
         try:
@@ -211,20 +212,20 @@ class Batch:
         except OutputError as error:
             state.error = failure_text(job, error)
             self._fail(error)
-        except BaseException as error:  # nothing that one image does may end a thread
+        except BaseException as error:  # no image may end a thread
             state.error = failure_text(job, error)
-        state.spans = [  # without the wait for room, which is no decoding
+        state.spans = [  # without the wait for memory
             replace(span, start=span.start + sum(waits), seconds=span.seconds - sum(waits))
             for span in state.spans
         ]
         return state
 
     def _admit(self, beside: list[JobState], waits: list[float], job: Job) -> None:
-        """Wait until there is room for a job's image, and note how long: it is decoded next.
+        """Wait until a job's image fits into memory, and append the seconds to ``waits``.
 
         Raises:
-            OutputError: the first image of the run is to be made, but cannot be written.
-            ImageError: there is none.
+            OutputError: the output directory cannot be written to.
+            ImageError: the image does not even fit alone.
         """
         worker, developers = self._worker, self._developers
         if not developers.is_needed:
@@ -233,12 +234,12 @@ class Batch:
         size = worker.bytes_of(job, developers.most, None in self.devices)
         start = time.perf_counter()
         if beside and not self._room.fits(size):
-            self._make(beside)  # and give their memory back
+            self._make(beside)  # which frees their memory
         self._room.enter(job.stem, size)
         waits.append(time.perf_counter() - start)
 
     def _make(self, decoded: list[JobState]) -> None:
-        """Have the renditions of jobs made, and let go of the jobs.
+        """Have the renditions of decoded jobs made, and hand the jobs to the committing thread.
 
         Raises:
             DeviceError, RequestError: no device is left to make them.
@@ -260,7 +261,7 @@ class Batch:
             raise failure
 
     def _commit_all(self) -> None:
-        """Bring to the disk, together, what was made while the disk had what was made before."""
+        """Synchronise finished images to the disk, all those that are waiting at once."""
         ended = 0
         try:
             while ended < self.in_flight:
@@ -273,7 +274,7 @@ class Batch:
                 self._commit(made)
                 for state, _ in made:
                     self._outcomes.put(state.outcome())
-        except BaseException as error:  # behind an image's back
+        except BaseException as error:  # of the run, not of one image
             self._fail(error)
             while ended < self.in_flight:
                 if left := self._made.get():
@@ -285,7 +286,7 @@ class Batch:
             self._outcomes.put(None)
 
     def _commit(self, made: Sequence[Made]) -> None:
-        """Bring the renditions of jobs to the disk, and give them their names."""
+        """Synchronise the renditions of jobs to the disk, and rename them into place."""
         try:
             self._worker.commit([(state, each) for state, files in made for each in files])
         except OutputError as error:
