@@ -24,35 +24,35 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class JobState:
-    """What is known of a job so far."""
+    """What is known about a job so far."""
 
     job: Job
     loader: ImageLoader
     began: float = field(default_factory=time.time)
     spans: list[Span] = field(default_factory=list)
     source: SourceImage | None = None
-    stamps: Sequence[tuple[int, int]] = ()  # of the files of its exposure
-    request: Mapping[str, Any] = field(default_factory=dict)  # its record
+    stamps: Sequence[tuple[int, int]] = ()  # size and time of change of each of its files
+    request: Mapping[str, Any] = field(default_factory=dict)  # the record of its request
     recipes: list[Recipe] = field(default_factory=list)
     unwritten: int = 0  # renditions
     status: str = DONE
     error: str = ""
     reason: str = ""
     outputs: list[str] = field(default_factory=list)
-    aovs: Aovs | None = None  # until it is written
-    clipped: float = 0.0  # the share of clipped pixels, of the rendition that has most
-    patches: list[Patch] = field(default_factory=list)  # that are made in place of pictures
-    old: int = 0  # renditions that another program has made
+    aovs: Aovs | None = None  # carried layers, until they are written
+    clipped: float = 0.0  # the largest share of clipped pixels of its renditions
+    patches: list[Patch] = field(default_factory=list)  # that are written instead of pictures
+    old: int = 0  # existing renditions that another version of the program made
 
     def drop_pixels(self) -> None:
-        """Give the memory of the image back; its size is still known."""
+        """Free the memory of the image, but keep its size."""
         if self.source:
             empty = np.broadcast_to(np.float16(0), self.source.pixels.shape)
             self.source = replace(self.source, pixels=empty, later=())
 
     @contextmanager
     def timed(self, step: str) -> Iterator[None]:
-        """Note when a step was done, and by which thread."""
+        """Record the time of a step, and the thread that does it."""
         start = time.perf_counter()
         try:
             yield
@@ -60,12 +60,12 @@ class JobState:
             self.note(step, start)
 
     def note(self, step: str, start: float) -> None:
-        """Note that this thread has done a step that was begun at ``start``."""
+        """Record that this thread has done a step, which began at ``start``."""
         name = threading.current_thread().name
         self.spans.append(Span(step, name, start, time.perf_counter() - start))
 
     def outcome(self) -> Outcome:
-        """What became of the job."""
+        """Return the outcome of the job."""
         width, height = self.source.pixels.shape[1::-1] if self.source else (0, 0)
         return Outcome(
             self.job,
@@ -85,10 +85,7 @@ class JobState:
 
 
 def failure_text(job: Job, error: BaseException) -> str:
-    """The message of an image that failed of an error that nobody expected.
-
-    Its traceback goes to the log, at the level DEBUG.
-    """
+    """Return the message for an image that failed. The traceback is logged at level DEBUG."""
     if isinstance(error, MemoryError):
         reason = "there is not enough memory for it"
     elif isinstance(error, ClpipeError):

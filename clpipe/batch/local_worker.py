@@ -1,8 +1,8 @@
-"""What a process of a run on this machine does: its share of the images, as they come to it.
+"""The main function of a process that does a part of a run on this machine.
 
-A connection brings what :class:`clpipe.batch.processes.Processes` sends, and takes what became of
-it. The process ends when there is no more to do, and at once when the run's process has ended.
-It ignores signals; the run's process says when to stop.
+It receives jobs from :class:`clpipe.batch.processes.Processes` over a connection, and sends
+outcomes back. It ends when there are no more jobs, and immediately if the run's process has ended.
+It ignores signals, because the run's process tells it when to stop.
 """
 
 import gc
@@ -25,20 +25,20 @@ from clpipe.batch.threads import Batch, Jobs
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.process_folder import process_folder
 
-SOON = 0.005  # s for which outcomes are collected, as each message has its price
+SOON = 0.005  # s for which outcomes are collected into one message
 
 
 @dataclass(frozen=True)
 class Seat:
-    """Which of a run's processes one is.
+    """One process's part of a run.
 
     Args:
-        number: from 0 on.
-        of: how many there are.
-        threads: that decode, and that encode, where the run does not say how many.
-        processors: on which it stays; () is wherever the system puts it.
-        in_turn: whether one thread does all of one image after the other.
-        level: of what is logged.
+        number: its number, from 0.
+        of: the number of processes.
+        threads: the number of threads if the run does not set it.
+        processors: the processors that it is bound to. () binds it to none.
+        in_turn: whether a single thread makes the images, see :mod:`clpipe.batch.threads`.
+        level: the lowest level that is logged.
     """
 
     number: int
@@ -50,9 +50,9 @@ class Seat:
 
 
 def main(file: int) -> None:
-    """Do what the connection with this file descriptor says."""
+    """Work for the run at the other end of a connection, given by its file descriptor."""
     pipe = _PipeToRun(Connection(file))
-    gc.freeze()  # what is imported stays: looking through it again and again takes time
+    gc.freeze()  # imported modules stay, so the collector need not visit them
     spec, seat = pipe.receive()
     if seat.processors:
         stay_on(seat.processors)
@@ -68,7 +68,7 @@ def main(file: int) -> None:
 
 
 def _leave(status: int) -> NoReturn:
-    """End, whatever other threads wait for, and leave no folder behind."""
+    """End without waiting for other threads, and remove this process's directory."""
     if process_folder.cache_info().currsize and (folder := process_folder()):
         discard(folder)
     os._exit(status)
@@ -104,10 +104,10 @@ def _abandon() -> NoReturn:
 
 
 def _work(pipe: _PipeToRun, spec: RunSpec, seat: Seat) -> None:
-    """Do the jobs that come, and send what became of them.
+    """Do the jobs that arrive, and send their outcomes.
 
     Raises:
-        ClpipeError: the process cannot go on.
+        ClpipeError: the process cannot continue.
     """
     where = spec.where
     share = seat.number, seat.of
@@ -131,7 +131,7 @@ def _work(pipe: _PipeToRun, spec: RunSpec, seat: Seat) -> None:
 
 
 def _listen(pipe: _PipeToRun, jobs: Jobs, batch: Batch) -> None:
-    """Take jobs in, until it is said that there are no more."""
+    """Receive jobs until the end or a stop."""
     while True:
         what, *values = pipe.receive()
         for job in values[0] if what == "jobs" else ():
@@ -143,7 +143,7 @@ def _listen(pipe: _PipeToRun, jobs: Jobs, batch: Batch) -> None:
 
 
 def _tell(pipe: _PipeToRun, finished: "queue.SimpleQueue[Outcome | None]") -> None:
-    """Send outcomes, several at a time."""
+    """Send outcomes, several in each message."""
     for first in iter(finished.get, None):
         time.sleep(SOON)
         outcomes = [first, *_waiting(finished)]
@@ -161,7 +161,7 @@ def _waiting(finished: "queue.SimpleQueue[Outcome | None]") -> Iterator[Outcome 
 
 
 class _Forwarder(logging.Handler):
-    """Sends what is logged to the run's process, which prints it."""
+    """Sends log records to the run's process, which prints them."""
 
     def __init__(self, pipe: _PipeToRun) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""What became of one image, and how long each step took."""
+"""The outcome of one image, and the time that each step took."""
 
 from dataclasses import dataclass
 
@@ -12,13 +12,13 @@ STEPS = ("decode", "device", "encode")
 
 @dataclass(frozen=True)
 class Span:
-    """When something was done to an image, by which thread, and for how long.
+    """A period of work on an image.
 
     Args:
-        step: one of :data:`STEPS`, or the name of a launch or a transfer within "device".
+        step: one of :data:`STEPS`, or the name of a launch or transfer within "device".
         worker: the name of the thread.
-        start: in s, by time.perf_counter.
-        seconds: how long it took.
+        start: its begin, in s of time.perf_counter.
+        seconds: its length.
     """
 
     step: str
@@ -29,23 +29,23 @@ class Span:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one job.
+    """The outcome of one job.
 
     Args:
         job: the job.
-        status: "done", "skipped" (its pictures were there already), "left out" (found in a folder,
-            but without a picture, or kept after another step than the one to go on from) or
-            "failed".
-        megapixels: of the image that was read.
-        warnings: about the image.
-        error: why it failed; "" otherwise.
-        reason: what an image that was left out holds in place of a picture; "" otherwise.
-        outputs: the files that were written, relative to the output folder.
-        began: in s since 1970.
-        spans: what was done when.
-        clipped: the share of clipped pixels, 0 to 1; of several renditions, the largest.
-        old: how many of its renditions are there, but were made by another program.
-        layer: the name of the layer that was read as the picture; "" for one without a name.
+        status: "done", "skipped" (its pictures exist already), "left out" (a file in an input
+            directory that holds no picture, or an image kept after a step other than
+            ``start_at``), or "failed".
+        megapixels: the size of the image that was read.
+        warnings: warnings about the image.
+        error: why it failed, or "".
+        reason: what an image that was left out holds instead of a picture, or "".
+        outputs: the files that were written, relative to the output directory.
+        began: its begin, in s since 1970.
+        spans: the periods of work.
+        clipped: the share of clipped pixels, 0 to 1; the largest of its renditions.
+        old: the number of existing renditions that another version of the program made.
+        layer: the name of the layer that was read as the picture; "" if it has no name.
         part: the number of its part in the file, from 0.
     """
 
@@ -64,5 +64,5 @@ class Outcome:
     part: int = 0
 
     def seconds(self, step: str) -> float:
-        """How many seconds a step took, over all renditions of the image."""
+        """Return the seconds that a step took, summed over all renditions."""
         return sum(span.seconds for span in self.spans if span.step == step)

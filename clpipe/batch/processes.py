@@ -1,10 +1,10 @@
-"""Many images through processes on this machine, each with its share of processors and devices.
+"""Processes on this machine that share a run, each with its part of the processors and devices.
 
-One process of Python ends at some 500 small images a second, however many processors there are:
-its threads take turns at the interpreter's lock. So a run has several, where that pays. This one
-holds the output folder and the log, hands jobs out, and takes in what became of them; each of the
-others runs a :class:`clpipe.batch.threads.Batch`. Where one dies, its jobs go to others, which see
-by the sidecars what is done already.
+One Python process does not exceed about 500 small images a second, however many processors there
+are, because its threads share the interpreter's lock. So a run has several processes if that pays.
+This process holds the output directory and the log, distributes jobs, and collects outcomes. Each
+of the others runs a :class:`clpipe.batch.threads.Batch`. If one dies, its jobs go to the others,
+which see from the sidecars what is finished.
 """
 
 import contextlib
@@ -35,17 +35,17 @@ from clpipe.outputs.folder import remove_unfinished
 
 log = logging.getLogger(__name__)
 
-# The model of an image's CPU time by which processes are counted (docs/performance.md): ms under
-# the interpreter's lock, ms of all, and ms more of each megapixel.
+# The model of an image's CPU time from which the number of processes follows
+# (docs/performance.md): ms under the interpreter's lock, ms in all, and ms for each megapixel.
 LOCKED, OF_IMAGE, OF_MEGAPIXEL = 2.0, 3.0, 25.0
-SHARE = 0.5  # of a process's time that the lock may be held; beyond, threads wait for it
-WORTH = 1200  # ms of work of each process; to start one takes 600
-SMALL = 2.5  # megapixels, up to which reading need not go on beside developing
+SHARE = 0.5  # of a process's time that the lock may be held before threads wait for it
+WORTH = 1200  # ms of work for which a process pays; to start one takes 600
+SMALL = 2.5  # megapixels up to which reading and developing need not overlap
 ROOM = 400 << 20  # bytes for each process
 
-AHEAD, LEAST = 64, 12  # jobs that a process may have before it, and small ones towards the end
-DEATHS = 3  # of processes that took a job, after which it is given up; or of those that only start
-FUTILE = 20  # of processes in a row, of which none has done anything
+AHEAD, LEAST = 64, 12  # most jobs that a process holds, and small ones towards the end
+DEATHS = 3  # of processes that held a job before it fails, or of processes that only started
+FUTILE = 20  # deaths in a row without an outcome before the run fails
 
 PROGRAM = (
     "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "
@@ -57,12 +57,12 @@ THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")  # up to PoCL 3.1,
 
 
 def usual_processes(images: int, claim: Claim, processors: int) -> int:
-    """How many processes a run has where nobody says how many.
+    """Return how many processes a run has by default.
 
     Args:
-        images: of the run.
-        claim: of the first of them.
-        processors: that there are.
+        images: the number of images.
+        claim: the size of the first image.
+        processors: the number of available processors.
 
     >>> small, large = Claim(512, 512, 0, 0), Claim(6000, 4000, 0, 0)
     >>> [usual_processes(100_000, small, n) for n in (1, 2, 4)]
@@ -71,7 +71,7 @@ def usual_processes(images: int, claim: Claim, processors: int) -> int:
     (1, 1)
     """
     each = OF_IMAGE + OF_MEGAPIXEL * claim.megapixels
-    # Processors that the threads of one process keep busy.
+    # The number of processors that the threads of one process keep busy.
     fed = 1.0 if claim.megapixels <= SMALL else max(each / LOCKED * SHARE, 1.0)
     free = available_memory()
     fit = processors if free is None else free // ROOM
@@ -80,18 +80,18 @@ def usual_processes(images: int, claim: Claim, processors: int) -> int:
 
 @dataclass
 class _Process:
-    """One of the processes, as this one sees it."""
+    """The parent's view of one process."""
 
     seat: Seat
     popen: "subprocess.Popen[bytes]"
     connection: Connection
     listener: threading.Thread = field(default_factory=threading.Thread)
-    jobs: dict[str, Job] = field(default_factory=dict)  # before it, by their stems
-    is_alone: bool = False  # whether what it has is all it gets
-    is_ready: bool = False  # it has its devices
+    jobs: dict[str, Job] = field(default_factory=dict)  # that it holds, by stem
+    is_alone: bool = False  # whether it is testing one suspect job
+    is_ready: bool = False  # whether it has opened its devices
 
     def close(self) -> int:
-        """Wait for its end; its status."""
+        """Wait for its end, and return its exit status."""
         status = self.popen.wait()
         self.listener.join()
         self.connection.close()
@@ -99,12 +99,12 @@ class _Process:
 
 
 class Processes:
-    """The processes of a run, with the interface of a :class:`clpipe.batch.threads.Batch`.
+    """The processes of a run; an :class:`~clpipe.batch.sinks.Executor`.
 
     Args:
         spec: the run.
-        count: how many.
-        claim: of the first image, which stands for all.
+        count: the number of processes.
+        claim: the size of the first image, which stands for all.
     """
 
     def __init__(self, spec: RunSpec, count: int, claim: Claim) -> None:
@@ -115,28 +115,26 @@ class Processes:
         self._messages = queue.SimpleQueue()
         self._processes: list[_Process] = []
         self._left: deque[Job] = deque()
-        self._suspects: deque[Job] = deque()  # whose processes died; each is tried alone in the end
-        self._deaths: Counter[str] = Counter()  # by stems of jobs
-        self._has_worked = False  # one of them, which so has kept the kernels
-        self._still_born = 0  # processes in a row that ended before they were ready
-        self._futile = 0  # processes that ended since the last outcome
+        self._suspects: deque[Job] = deque()  # held by a process that died; tried alone at the end
+        self._deaths: Counter[str] = Counter()  # of processes that held a job, by its stem
+        self._has_worked = False  # whether one has compiled the kernels, which are cached
+        self._still_born = 0  # processes in a row that died before they were ready
+        self._futile = 0  # processes that died since the last outcome
         self._said: set[str] = set()
         self._failure: ClpipeError | None = None
         self.is_stopping = False
 
     def stop(self) -> None:
-        """Let no more images in; those in flight are finished. May be called by a signal."""
+        """Begin no more images, and finish those in flight. A signal handler may call it."""
         self.is_stopping = True
         self._messages.put((None, ("stop",)))
 
     def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
-        """Do every job; one that fails is reported and the others go on.
-
-        Outcomes come as jobs are finished, in any order.
+        """Do every job, and yield outcomes as jobs finish, in any order.
 
         Raises:
             DeviceError: there is no usable device, or a kernel does not compile.
-            OutputError: nothing can be written any more.
+            OutputError: nothing more can be written.
         """
         every = list(jobs)
         self._left = deque(every)
@@ -148,7 +146,7 @@ class Processes:
                 except RequestError:
                     if not self._processes:
                         raise
-                    self._count = number  # the system lets there be no more
+                    self._count = number  # the system allows no more
                     break
             self._hand_out()
             while not self._is_finished:
@@ -177,7 +175,7 @@ class Processes:
         """Start one of the processes.
 
         Raises:
-            RequestError: the system does not let it.
+            RequestError: the system refuses.
         """
         every, count = processor_numbers(), self._count
         share = max(available_processors() // count, 1)
@@ -196,10 +194,10 @@ class Processes:
             with blocked_signals(SIGNALS), theirs:
                 file = theirs.fileno()
                 popen = subprocess.Popen(  # noqa: S603 - this program
-                    # nothing from the working directory
+                    # -P: no module comes from the working directory.
                     [sys.executable, "-P", "-c", program, str(file)],
                     stdin=subprocess.DEVNULL,
-                    stdout=2,  # what libraries print is no output of the run
+                    stdout=2,  # libraries may print; stdout is for the run's own output
                     pass_fds=[file],
                     env={**os.environ, **limits},
                 )
@@ -218,17 +216,17 @@ class Processes:
         try:
             while True:
                 self._messages.put((process, process.connection.recv()))
-        except Exception:  # mostly EOFError; what cannot be understood is as if it had gone
+        except Exception:  # EOFError at its end; a damaged message counts as its end
             self._messages.put((process, ("gone",)))
 
     @staticmethod
     def _send(process: _Process, *message: object) -> None:
-        """Send a message; that a process has gone, the thread that listens to it says."""
+        """Send a message. If the process has died, its listener reports that."""
         with contextlib.suppress(OSError):
             process.connection.send(message)
 
     def _heard(self, process: _Process, message: tuple[object, ...]) -> Iterable[Outcome]:
-        """What a message from a process leads to: the outcomes of jobs."""
+        """Handle a message from a process, and return the outcomes that follow from it."""
         match message:
             case ("ready",):
                 process.is_ready, self._still_born = True, 0
@@ -241,7 +239,7 @@ class Processes:
                 process.is_alone &= bool(process.jobs)
                 return [shifted(each, 0.0, f"{process.seat.number} ") for each in outcomes]
             case ("log", int(level), str(text)):
-                if text not in self._said:  # each of them says it
+                if text not in self._said:  # every process logs it
                     self._said.add(text)
                     log.log(level, "%s", text)
             case ("failed", ClpipeError() as error):
@@ -253,7 +251,7 @@ class Processes:
         return ()
 
     def _hand_out(self) -> None:
-        """Give each process its next jobs, and start others where some have died.
+        """Give each process its next jobs, and replace processes that died.
 
         Raises:
             RequestError: no process can be started.
@@ -263,14 +261,14 @@ class Processes:
         while len(self._processes) < self._count and self._left and self._has_worked:
             taken = {process.seat.number for process in self._processes}
             self._processes.append(self._start(min({*range(self._count)} - taken)))
-        # The kernels are compiled, and kept for the others, by the first one.
+        # The first process compiles the kernels and caches them for the others.
         for process in self._processes if self._has_worked else self._processes[:1]:
             if process.is_alone:
                 continue
             threads = self._spec.where.threads or process.seat.threads
             least = LEAST if process.seat.in_turn else threads + 3
             most = max(min(AHEAD, len(self._left) // (2 * self._count)), least)
-            if len(process.jobs) > most // 2:  # one or two more are not worth a message
+            if len(process.jobs) > most // 2:  # a message for one or two jobs does not pay
                 continue
             count = min(most - len(process.jobs), len(self._left))
             if not count and self._suspects and not process.jobs:
@@ -284,10 +282,10 @@ class Processes:
         self._send(process, "jobs", jobs)
 
     def _lost(self, process: _Process) -> Iterable[Outcome]:
-        """A process has ended; what it had before it goes to others.
+        """Handle the end of a process: others get its jobs. Returns the outcomes of failed jobs.
 
         Raises:
-            DeviceError: they end as they start.
+            DeviceError: processes keep dying without doing anything.
         """
         self._processes.remove(process)
         status = process.close()
@@ -320,19 +318,19 @@ class Processes:
             self._send(process, "stop")
 
     def _end(self) -> None:
-        """Let all processes end, and wait for them."""
+        """End all processes, and wait for them."""
         for process in self._processes:
             self._send(process, "stop" if process.jobs else "end")
         for process in self._processes:
             process.close()
-        while not self._messages.empty():  # what came with the last images
+        while not self._messages.empty():  # errors and log lines that came last
             process_, message = self._messages.get()
             if process_ and message[0] in ("failed", "log"):
                 self._heard(process_, message)
 
 
 def _ended(status: int) -> str:
-    """How a process has ended, by its status.
+    """Describe how a process ended, from its exit status.
 
     >>> _ended(-9), _ended(1)
     ('by signal 9', 'with status 1')

@@ -1,4 +1,4 @@
-"""How many images fit into this machine's memory at a time, and which one never does."""
+"""Admission of images by memory: how many are in flight at a time, and which never fit."""
 
 import threading
 import time
@@ -14,19 +14,20 @@ from clpipe.chain.formats import DNG, FORMATS
 from clpipe.engine.device import Device
 from clpipe.images.claims import Claim
 
-FLOATS = 12  # bytes of a pixel in three floats
-IN_NUMPY = 16 * FLOATS  # of a pixel, while the chain runs in NumPy; measured: 152
-ASIDE = 8 << 20  # bytes for what is not counted; and an eighth of what an image takes
+FLOATS = 12  # bytes of a pixel of three floats
+IN_NUMPY = 16 * FLOATS  # bytes of a pixel while the chain runs in NumPy; measured: 152
+ASIDE = 8 << 20  # bytes that are not counted, in addition to an eighth of an image
 STARTING = 160 << 20  # bytes that compiling all kernels takes; measured: 100 to 140 MiB
-LEAST = 32 << 20  # bytes of a device's buffers with which a large image still goes through in tiles
-PATIENCE = 1.0  # s; what an image took before is freed a little after it is reported
-LASTS = 0.1  # s for which a measurement of memory holds; it takes 0.4 ms, a small image 10
+LEAST = 32 << 20  # bytes of device memory that suffice for a large image in tiles
+PATIENCE = 1.0  # s to wait for memory that earlier images free a little after their end
+LASTS = 0.1  # s for which a measurement is used: it takes 0.4 ms, a small image 10 ms
 
 
 def usual_room(sharing: int = 1) -> int | None:
-    """Bytes that several images may take at a time: half of what is free; the rest is for devices.
+    """Return the bytes that images in flight may take: half of the free memory.
 
-    ``sharing`` is how many processes do the same. None where the system does not say what is free.
+    The other half is for devices. ``sharing`` is the number of processes that share the memory.
+    None if the system does not report free memory.
     """
     free = available_memory()
     return None if free is None else free // 2 // sharing
@@ -41,23 +42,23 @@ def host_bytes(
     beside: int = 0,
     in_numpy: bool = False,
 ) -> int:
-    """About how many bytes an image takes at most while it is in flight.
+    """Estimate the most host memory, in bytes, that an image takes while it is in flight.
 
-    What devices take is not in it. At 6 and 24 MP it was 1.05 to 2.7 times what was measured.
+    Memory of devices is not included. At 6 and 24 MP the estimate was 1.05 to 2.7 times the
+    measured memory.
 
     Args:
-        claim: what its file claims.
-        chain: what it goes through.
-        renditions: how many results there may be of it at a time.
-        formats: of the last image, and of the raw.
-        keep: steps whose image is written, too.
-        beside: how many images of three floats there are beside it: the sum of sub-frames, and two
-            of each further exposure, of that and as kernels take it, and of each layer that goes
-            along, before and after it is moved, or as it is read and as kernels take it.
+        claim: the size that its file states.
+        chain: its chain.
+        renditions: how many of its results exist at a time.
+        formats: the formats of the last image and of the raw.
+        keep: the steps whose image is also written.
+        beside: the number of further images of three floats: one for the sum of sub-frames, and
+            two for each further exposure and each carried layer.
         in_numpy: whether NumPy develops it.
 
     Raises:
-        ImageError: it cannot have a size in this chain.
+        ImageError: the chain cannot process an image of this size.
     """
     pixels = claim.width * claim.height
     if not pixels:
@@ -73,17 +74,17 @@ def host_bytes(
 
 
 class Room:
-    """Lets images in while they fit, in the order in which they come.
+    """A budget of memory: images enter in order, as soon as they fit.
 
-    What fits only alone is let in alone, where need be with devices that hold little meanwhile.
-    What does not fit then is refused.
+    An image that fits only alone enters alone, if necessary with less memory for the devices. An
+    image that does not fit even then is rejected.
 
     Args:
-        size: bytes that several images may take at a time; None is no limit.
-        devices: where they are developed. Of those that work in this machine's memory their limits
-            count as taken.
-        drop: gives back what is kept for later images.
-        left: what this process can still take; None asks the system.
+        size: bytes that images in flight may take together. None is no limit.
+        devices: the devices that develop them. The memory limits of devices that share this
+            machine's memory count as taken.
+        drop: frees arrays that are kept for later images.
+        left: returns the memory that this process may still take. None asks the system.
     """
 
     def __init__(
@@ -96,23 +97,23 @@ class Room:
         self._size = size
         self._sharing = [each for each in devices if each and each.info.in_place]
         has_staged = any(each and not each.info.in_place for each in devices)
-        self._aside = size or 0 if has_staged else 0  # for what lies between here and a GPU
+        self._aside = size or 0 if has_staged else 0  # for staging buffers of GPUs
         self._starting = len(devices)
         self._drop = drop
         self._left = left or memory_left
-        self._limits: dict[Device, int] = {}  # of devices that hold little meanwhile
-        self._most = 0  # bytes that there ever were for one image and the devices
+        self._limits: dict[Device, int] = {}  # of devices that were given less for one image
+        self._most = 0  # the most bytes that were ever free for one image and the devices
         self._measured: tuple[float, Left | None] = 0.0, Left(0, "")
-        self._taken: dict[str, int] = {}  # bytes, by the name of an image
+        self._taken: dict[str, int] = {}  # bytes, by the stem of an image
         self._queue = threading.Lock()  # lets one image wait at a time, so none overtakes it
         self._changed = threading.Condition()  # guards all of the above; notified when they change
         self._is_open = False
 
     def enter(self, name: str, size: int) -> None:
-        """Take the room for an image, and wait until it is there.
+        """Wait until an image fits, and take its memory.
 
         Raises:
-            ImageError: it does not fit, not even alone; or nothing is to follow.
+            ImageError: it does not fit even alone, or the run has ended.
         """
         with self._queue, self._changed:
             self._changed.wait_for(lambda: self._is_open or self._fits(size) or self._is_alone)
@@ -123,25 +124,25 @@ class Room:
             self._taken[name] = size
 
     def fits(self, size: int) -> bool:
-        """Whether there is room for an image now."""
+        """Return whether an image of ``size`` bytes fits now."""
         with self._changed:
             return self._fits(size)
 
     def leave(self, name: str) -> None:
-        """Give back the room of an image, where it has any."""
+        """Give back the memory of an image, if it has any."""
         with self._changed:
             self._taken.pop(name, None)
             self._restore()
             self._changed.notify_all()
 
     def started(self) -> None:
-        """Note that a device has compiled its kernels, or never will."""
+        """Note that a device has compiled its kernels, or has failed to."""
         with self._changed:
             self._starting -= 1
             self._changed.notify_all()
 
     def open(self) -> None:
-        """Let nothing wait any more: nothing is to follow."""
+        """End the run: reject images that wait or come later."""
         with self._changed:
             self._is_open = True
             self._changed.notify_all()
@@ -151,7 +152,7 @@ class Room:
         return not self._taken and self._starting <= 0
 
     def _fits(self, size: int) -> bool:
-        """Whether an image fits now: into what is free, and beside others into the common room."""
+        """Return whether an image fits: into the free memory, and with others into the budget."""
         together = sum(self._taken.values()) + size
         if self._size is not None and self._taken and together > self._size:
             return False
@@ -159,7 +160,7 @@ class Room:
         return free is None or needed(size) <= free.bytes
 
     def _free(self, size: int) -> Left | None:
-        """What there is for one more image, measured anew where that matters for its size."""
+        """Return the memory for one more image. Small images may use a recent measurement."""
         when, free = self._measured
         now = time.monotonic()
         if free is None or now - when > LASTS or needed(size) > free.bytes // 32:
@@ -174,7 +175,7 @@ class Room:
         return free
 
     def _squeeze(self, size: int) -> None:
-        """Make room for an image that is alone; no device is at work then.
+        """Free memory for an image that is alone. No device is working at that time.
 
         Raises:
             ImageError: there is not enough.
@@ -184,7 +185,7 @@ class Room:
         free = self._free(size)
         least = min(LEAST, 4 * size + ASIDE // 2)  # the planes of a small image are no larger
         there = self._most - sum(min(each.memory, least) for each in self._sharing)
-        if needed(size) <= there:  # or nothing helps
+        if needed(size) <= there:
             for device in self._sharing:
                 if device.memory > least:
                     self._limits[device] = device.memory
@@ -211,5 +212,5 @@ class Room:
 
 
 def needed(size: int) -> int:
-    """The bytes that are to be free for an image that takes ``size``."""
+    """Return how many bytes must be free for an image that takes ``size`` bytes."""
     return size + size // 8 + ASIDE

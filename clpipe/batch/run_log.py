@@ -1,4 +1,4 @@
-"""The log of a run: a line of JSON for its start, each image and its end."""
+"""The log of a run: a line of JSON for its start, for each image, and for its end."""
 
 import contextlib
 import errno
@@ -23,7 +23,7 @@ from clpipe.inputs.find import Shard
 
 
 def log_name(shard: Shard) -> str:
-    """The name of the log of a run, or of a shard of one.
+    """Return the name of the log of a run, or of a shard of one.
 
     >>> log_name(Shard()), log_name(Shard(2, 12))
     ('run.jsonl', 'run.02-of-12.jsonl')
@@ -35,7 +35,7 @@ def log_name(shard: Shard) -> str:
 
 @dataclass
 class Summary:
-    """Counts of what became of the images of a run so far."""
+    """Counts of the outcomes of a run so far."""
 
     total: int
     counts: dict[str, int] = field(
@@ -47,12 +47,12 @@ class Summary:
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STEPS, 0.0))
     began: float = field(default_factory=time.perf_counter)
     interrupted: bool = False
-    much_clipped: int = 0  # images of which a share of MUCH or more is clipped
-    most_clipped: tuple[float, str] = (0.0, "")  # the largest share, and its image
-    old: int = 0  # pictures that were there, but were made by another program
+    much_clipped: int = 0  # images whose clipped share is MUCH or more
+    most_clipped: tuple[float, str] = (0.0, "")  # the largest clipped share, and its image
+    old: int = 0  # existing pictures that another version of the program made
 
     def add(self, outcome: Outcome) -> None:
-        """Count one more image."""
+        """Count the outcome of one image."""
         self.counts[outcome.status] += 1
         self.old += outcome.old
         if outcome.status == DONE:
@@ -69,22 +69,22 @@ class Summary:
 
     @property
     def finished(self) -> int:
-        """How many images have an outcome."""
+        """The number of images that have an outcome."""
         return sum(self.counts.values())
 
     @property
     def exit_status(self) -> int:
-        """What a command ends with: 130 after an interruption, 1 where something is missing."""
+        """The exit status of a command: 130 after an interruption, 1 if something is missing."""
         is_fruitless = self.counts[LEFT_OUT] > 0 == self.counts[DONE] + self.counts[SKIPPED]
         return INTERRUPTED if self.interrupted else int(bool(self.failures or is_fruitless))
 
     @property
     def elapsed(self) -> float:
-        """Seconds since the start."""
+        """The seconds since the start."""
         return time.perf_counter() - self.began
 
     def shares(self) -> str:
-        """The share of each step in the time of all threads.
+        """Return the share of each step in the time of all threads.
 
         >>> Summary(1, seconds={"decode": 1.0, "device": 2.0, "encode": 1.0}).shares()
         'decode 25 %, device 50 %, encode 25 %'
@@ -93,7 +93,7 @@ class Summary:
         return ", ".join(f"{s} {100 * t / whole:.0f} %" for s, t in self.seconds.items())
 
     def record(self) -> dict[str, Any]:
-        """The same as JSON values."""
+        """Return the counts as JSON values."""
         return {
             "images": self.total,
             **{status.replace(" ", "_"): n for status, n in self.counts.items()},
@@ -112,12 +112,12 @@ def _line(event: str, at: float, values: Mapping[str, Any]) -> bytes:
 
 
 class RunLog:
-    """The log of a run, behind those of earlier runs; nothing is written before the first image.
+    """Writes the log of a run after those of earlier runs. It begins with the first image.
 
     Args:
         path: the file.
-        start: what the line of the start says.
-        echo: gets each line, too.
+        start: the values of the first line.
+        echo: also called with each line.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class RunLog:
             self._echo(line)
 
     def _opened(self) -> int:
-        """The file, open behind its last whole line.
+        """Open the file after its last whole line.
 
         Raises:
             OSError: it cannot be opened, or is no regular file.
@@ -153,7 +153,7 @@ class RunLog:
         if status.st_size:
             os.lseek(file, -1, os.SEEK_END)
             if os.read(file, 1) != b"\n":
-                _append(file, b"\n")  # after a line that was cut off
+                _append(file, b"\n")  # the last line is cut off
         return file
 
     def add(self, outcome: Outcome) -> None:
@@ -185,7 +185,7 @@ class RunLog:
         self._write(line)
 
     def end(self, summary: Summary) -> None:
-        """Write the last line, where there is a first one.
+        """Write the last line, if there is a first one.
 
         Raises:
             OutputError: it cannot be written.
@@ -203,7 +203,7 @@ class RunLog:
 
 
 def _append(file: int, data: bytes) -> None:
-    """Write all of the data at the end of a file, or nothing.
+    """Append data to a file, all of it or nothing.
 
     Raises:
         OSError: it cannot be written.
@@ -219,7 +219,7 @@ def _append(file: int, data: bytes) -> None:
 
 
 def read_log(path: Path) -> Sequence[dict[str, Any]]:
-    """The lines of a log, without one that was cut off.
+    """Return the lines of a log, without one that is cut off.
 
     Raises:
         OSError: it cannot be read.

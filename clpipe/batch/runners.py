@@ -1,4 +1,4 @@
-"""What the renditions of many images share on a device: runners, and memory for results."""
+"""What renditions share on a device: runners, and arrays for results."""
 
 import threading
 from collections import deque
@@ -14,12 +14,12 @@ from clpipe.outputs.writer import OutputWriter
 
 
 class Runners:
-    """The runners of one device. Chains of one structure share plans and compiled kernels.
+    """The runners of one device. Chains of equal structure share plans and compiled kernels.
 
     Args:
-        writer: what of a rendition is written.
-        device: where to run; None is NumPy.
-        chain: that of the first image; its kernels are compiled.
+        writer: decides which results of a rendition are needed.
+        device: the device; None is NumPy.
+        chain: the chain of the first image, whose kernels are compiled.
         half: whether images are expected in half floats.
 
     Raises:
@@ -35,13 +35,13 @@ class Runners:
         first = writer.runner(Recipe(FIRST, chain, (), ""), device)
         try:
             first.compile(half)
-        except ImageError as error:  # not even one of 8x8 pixels fits
+        except ImageError as error:  # not even 8x8 pixels fit
             raise RequestError(f"--memory: too little for any image: {error}") from None
         self._latest = [(chain, first)]
         self._by_results = {(first.keep, first.encode, first.final): first}
 
     def of(self, recipe: Recipe) -> Runner:
-        """The runner of a rendition."""
+        """Return the runner of a rendition."""
         for chain, runner in self._latest:
             if chain is recipe.chain:
                 return runner
@@ -55,7 +55,7 @@ class Runners:
 
 
 class SpareArrays:
-    """Arrays that are not used any more, to be used again: new memory costs time.
+    """Arrays to be used again, because allocating new memory costs time.
 
     >>> import numpy as np
     >>> spare = SpareArrays(2)
@@ -69,7 +69,7 @@ class SpareArrays:
         self._lock = threading.Lock()  # guards the arrays
 
     def take(self, shape: tuple[int, ...]) -> Array | None:
-        """An array of that shape; None where there is none."""
+        """Return an array of a shape, or None if there is none."""
         with self._lock:
             for place, array in enumerate(self._arrays):
                 if array.shape == shape:
@@ -78,6 +78,6 @@ class SpareArrays:
         return None
 
     def give(self, array: Array) -> None:
-        """Take back an array that may be used again; beyond ``count`` the oldest is dropped."""
+        """Add an array. If there are more than ``count``, the oldest is dropped."""
         with self._lock:
             self._arrays.append(array)

@@ -1,6 +1,6 @@
-"""A run: images through a chain, from what is asked for to the outcome of each image.
+"""A run: from a request to the outcome of each image.
 
-The commands that make pictures and :func:`clpipe.run` all go this way.
+:func:`clpipe.run` and all commands that make pictures use it.
 """
 
 import logging
@@ -48,16 +48,16 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Images:
-    """Which images a run is about.
+    """The images of a run.
 
     Args:
-        inputs: files, folders, globs and manifests.
-        exclude: patterns of what is not taken from folders and globs.
-        poses: the file of the renders' cameras; None where they are not known.
-        series: cameras and ISOs, each of which makes pictures of its own.
-        shard: the part of them that is done.
-        per_tar: how many are packed into a tar; None is no tars.
-        found: images that are known already, in place of inputs.
+        inputs: files, directories, globs, URLs and manifests.
+        exclude: patterns of files that are skipped in directories and globs.
+        poses: the file with the renders' cameras and poses, if any.
+        series: several cameras and ISOs, whose pictures go to directories of their own.
+        shard: the part of the images to make.
+        per_tar: the number of images per tar. None writes no tars.
+        found: jobs that are known already, instead of inputs.
     """
 
     inputs: Sequence[str] = ()
@@ -70,14 +70,14 @@ class Images:
 
     @property
     def is_whole(self) -> bool:
-        """Whether the output folder has all of the run's pictures, as files, when it has ended."""
+        """Whether the output directory will hold all pictures, as files, when the run ends."""
         return bool(self.inputs) and not self.per_tar and self.shard.of == 1
 
     def jobs(self, loader: ImageLoader, output: Path) -> tuple[list[Job], list[Tar]]:
-        """The jobs of the run's part, and the tars that they go into.
+        """Return the jobs of this part of the run, and the tars that they go into.
 
         Raises:
-            RequestError: an input, a camera or an ISO is not there, or a name is there twice.
+            RequestError: an input, a camera or an ISO does not exist, or two outputs have one name.
         """
         jobs = self.found
         if not jobs:
@@ -92,23 +92,23 @@ class Images:
 
 
 class Run:
-    """Images through a chain: iterate over it for the outcome of each image, as it is finished.
+    """A run. Iterate over it to make the images, and to get the outcome of each as it finishes.
 
-    All that can be refused is refused when it is made; nothing is written before it is iterated.
-    A run is iterated once.
+    The constructor checks everything that can be checked early. Nothing is written before you
+    iterate, which you can do once.
 
     Args:
-        request: what is asked for.
-        images: of which images.
-        where: with which devices, to which folder.
-        dask: the address of a Dask scheduler whose workers do it; None is this machine.
-        arguments: what the log says that the run was begun with.
-        echo: gets each line of the log, too.
+        request: the pictures to make.
+        images: the images to make them of.
+        where: the output directory and the devices.
+        dask: the address of a Dask scheduler whose workers do the work. None is this machine.
+        arguments: command-line arguments for the log.
+        echo: also called with each line of the log.
 
     Attributes:
-        jobs: the images of the run's part; there may be none.
-        summary: counts of what became of them so far.
-        notes: what is to be said of the output folder, once the run has ended.
+        jobs: the images of this part of the run; may be empty.
+        summary: counts of outcomes so far.
+        notes: remarks about the output directory, complete when the run has ended.
 
     Raises:
         RequestError: a name or value is not allowed, or a result would overwrite something.
@@ -123,7 +123,7 @@ class Run:
         arguments: Sequence[str] = (),
         echo: Callable[[bytes], None] | None = None,
     ) -> None:
-        # A checkout asks git for the version that log and sidecars have; here nobody waits for it.
+        # In a checkout the version comes from git, which takes time; nothing waits for it here.
         threading.Thread(target=full_version, daemon=True).start()
         check_output(where.output, images.per_tar)
         check_processes(where, dask, images.per_tar)
@@ -159,21 +159,21 @@ class Run:
         return self.outcomes(self.jobs)
 
     def stop(self) -> None:
-        """Let no more images in; those in flight are finished. May be called by a signal."""
+        """Begin no more images, and finish those in flight. A signal handler may call it."""
         self._is_stopped = True
         if self._running:
             self._running.stop()
 
     def outcomes(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
-        """The outcome of each image, as it is finished, in any order.
+        """Make images, and yield the outcome of each as it finishes, in any order.
 
         Args:
-            jobs: those of the run, which may come one after the other.
+            jobs: jobs of this run. A lazy iterable may block.
 
         Raises:
-            RequestError: the output folder cannot be used, or the cluster.
-            OutputError: nothing can be written any more. What was in flight is reported before.
-            DeviceError: on no device is work possible any more.
+            RequestError: the output directory or the cluster cannot be used.
+            OutputError: nothing more can be written. Images in flight are reported first.
+            DeviceError: no device is usable any more.
         """
         if not self.jobs:
             return
@@ -204,22 +204,22 @@ class Run:
             self._look_behind(folders)
 
     def _send_log(self, url: str) -> None:
-        """Put the log beside the tars, under a name that no other run has."""
+        """Upload the log next to the tars, under a unique name."""
         path = self.where.output / log_name(self._images.shard)
         if path.exists():
             began = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
             try:
                 upload(path, f"{url}/{path.stem}.{began}-{secrets.token_hex(2)}.jsonl")
-            except OutputError as error:  # which is no reason to hide one of the run's own
+            except OutputError as error:  # it must not hide an error of the run
                 log.warning("%s; the log of this run is lost", error)
 
     def _counted(
         self, running: Iterable[Outcome], log: RunLog, trace: Trace | None
     ) -> Iterator[Outcome]:
-        """The outcomes, each counted and noted.
+        """Count and log outcomes, and yield them.
 
         Raises:
-            OutputError: the log cannot be written any more. What is in flight is finished before.
+            OutputError: the log cannot be written. Images in flight are finished first.
         """
         unlogged: OutputError | None = None
         try:
@@ -242,7 +242,7 @@ class Run:
                 log.end(self.summary)
 
     def _look_behind(self, folders: Sequence[Path]) -> None:
-        """Write the views of a run's folders, and note what else there is to say of it."""
+        """Write the camera files of a run's directories, and add notes."""
         if self.summary.interrupted:
             return
         if folders:
@@ -272,7 +272,7 @@ class Run:
         return kind(self.writer, where.redo, self._tars)
 
     def _executor(self, sink: Folder, jobs: Iterable[Job]) -> AbstractContextManager[Executor]:
-        """What does the jobs: threads or processes of this machine, or a cluster.
+        """Return what does the jobs: threads or processes of this machine, or a cluster.
 
         Raises:
             RequestError: the cluster cannot be used.
@@ -284,13 +284,13 @@ class Run:
             from clpipe.batch.dask_worker import DaskSpec
 
             return connected(self._dask, DaskSpec(self._request, where, self.jobs[0]))
-        # The first one's size stands for all, whose headers nobody has read.
+        # The size of the first image stands for all, because reading every header takes time.
         claim = self._loader.claim(self.jobs[0])
         if not sink.allows_processes:
             count = 1
         elif where.processes:
             count = where.processes
-        elif jobs is not self.jobs:  # they may come one after the other
+        elif jobs is not self.jobs:  # a lazy iterable, whose length is unknown
             count = 1
         else:
             count = usual_processes(len(self.jobs), claim, available_processors())
@@ -303,10 +303,10 @@ class Run:
 
 
 def check_processes(where: Where, dask: str | None, per_tar: int | None) -> None:
-    """See that several processes are only asked for where they do the work.
+    """Check that the number of processes fits the way the run is done.
 
     Raises:
-        RequestError: something else does it.
+        RequestError: a cluster does the work, or tars are packed.
     """
     if where.processes is None or where.processes == 1:
         return
@@ -319,10 +319,10 @@ def check_processes(where: Where, dask: str | None, per_tar: int | None) -> None
 
 
 def check_output(folder: Path, per_tar: int | None = None) -> None:
-    """See that the output folder is no file nor called like a picture, and that a URL gets tars.
+    """Check that the output is a directory, not a picture, and that a URL gets tars.
 
     Raises:
-        RequestError: it is, or gets pictures.
+        RequestError: it is not.
     """
     if (url := url_of(folder)) and not per_tar:
         raise RequestError(
@@ -337,10 +337,10 @@ def check_output(folder: Path, per_tar: int | None = None) -> None:
 
 
 def check_render_options(request: Request, source: Kind) -> None:
-    """See that options about renders are not set for other images.
+    """Check that options for renders are only set for renders.
 
     Raises:
-        RequestError: one is.
+        RequestError: one is set for another kind of image.
     """
     for option, value in (("--layer", request.layer), ("--transfer", request.transfer)):
         if value is not None and source is not Kind.RGB:

@@ -29,41 +29,41 @@ from clpipe.outputs.sealed import SIDECAR, outputs_in, read_sidecar
 from clpipe.outputs.sidecar import patch_text
 from clpipe.outputs.writer import OutputWriter
 
-# Where the bytes of a member are: in a file, or at an offset and size in the old tar; or they.
+# The bytes of a member: a file, an offset and size in the old tar, or the bytes themselves.
 Source = Path | tuple[int, int] | bytes
 
-COPIED = 1 << 20  # bytes at a time; tarfile's 16 KiB take three times as long
+COPIED = 1 << 20  # bytes that are copied at a time; tarfile's 16 KiB take three times as long
 
 
 @dataclass(frozen=True)
 class StagedWriter(OutputWriter):
-    """A writer that puts each picture into the folder of its tar."""
+    """A writer that puts each picture into the directory of its tar."""
 
     folders: Mapping[str, str] = field(default_factory=dict)  # by the stem of a job
 
     def name(self, job: Job, ending: str) -> str:
-        """The name of a job's file, until it is packed."""
+        """Return the name of a job's file before it is packed."""
         return f"{self.folder}/{self.folders[job.stem]}/{job.stem}{ending}"
 
     def existing(self, job: Job, rendition: Rendition) -> Existing:
-        """The files of a rendition, in a folder that is clpipe's own."""
-        # One that was passing at a loss of power may not even say whose it is.
+        """Return the files of a rendition in clpipe's own directory."""
+        # After a loss of power a temporary file may lack the mark that says whose it is.
         return replace(super().existing(job, rendition), is_ours=True)
 
     def write(self, *arguments: Any) -> dict[Path, Stored]:
-        """Write the images of one rendition, which pass into the tar; its sidecar is to last."""
+        """Write the images of one rendition. They go into the tar, so they need no fsync."""
         with passing_files():
             return super().write(*arguments)
 
 
 class Packer:
-    """Packs one tar: what an earlier run left in it, and what became of its jobs."""
+    """Packs one tar: members that an earlier run left in it, and the files of its jobs."""
 
     def __init__(self, tar: Tar, writer: OutputWriter) -> None:
         self.tar = tar
         self._writer = writer
         self._lock = threading.Lock()  # lets one thread read the old tar's index, once
-        self._reused: dict[str, list[str]] = {}  # sidecars of the tar, and the files that they name
+        self._reused: dict[str, list[str]] = {}  # files of the old tar that stay, by their sidecar
         self.statuses: dict[str, str] = {}  # of jobs, by stem
 
     @cached_property
@@ -71,7 +71,7 @@ class Packer:
         return Members(self.tar.path)
 
     def _member(self, job: Job, rendition: Rendition) -> str:
-        """The name of a rendition's sidecar in the tar."""
+        """Return the name of a rendition's sidecar in the tar."""
         folder = OF_PATCHES if self._writer.patches else ""
         return folder + self._packed_as(self._writer.path(job, SIDECAR, rendition))
 
@@ -81,11 +81,10 @@ class Packer:
     def found(
         self, job: Job, rendition: Rendition, request: Mapping[str, Any], redo: Redo
     ) -> Found:
-        """Whether the tar holds a rendition that was made by the same request.
+        """Return whether the tar holds a rendition of the same request. If so, it is reused.
 
-        If it is kept, it is reused. A tar does not say when its files were touched, so their
-        SHA-256 is always compared. Arguments as for
-        :meth:`clpipe.outputs.existing.Existing.found`.
+        A tar does not say when its files were changed, so their SHA-256 is always compared.
+        Arguments as for :meth:`clpipe.outputs.existing.Existing.found`.
         """
         member = self._member(job, rendition)
         with self._lock:
@@ -106,20 +105,20 @@ class Packer:
         return found
 
     def packed(self, outcome: Outcome) -> Outcome:
-        """An outcome that names the tar in place of the hidden folder."""
+        """Return an outcome that names the tar instead of the hidden directory."""
         job = replace(outcome.job, name=f"{self.tar.name}/{outcome.job.stem}")
         outputs = tuple(file.removeprefix(STAGING) for file in outcome.outputs)
         return replace(outcome, job=job, outputs=outputs)
 
     def add(self, outcome: Outcome) -> bool:
-        """Note what became of a job, and say whether it was the last one."""
+        """Add the outcome of a job. Returns whether it was the last one."""
         self.statuses[outcome.job.stem] = outcome.status
         return len(self.statuses) == len(self.tar.jobs)
 
     def pack(self) -> None:
-        """Write the tar, unless it would stay the same, and remove the folder of its pictures.
+        """Write the tar, unless it would stay the same, and remove the directory of its pictures.
 
-        Images that failed are left out. Where some failed and none is new, the tar stays as it is.
+        Failed images are not in it. If images failed and none is new, the tar stays as it is.
 
         Raises:
             OutputError: it cannot be written.
@@ -137,13 +136,13 @@ class Packer:
         shutil.rmtree(self.tar.staging, ignore_errors=True)
 
     def _is_new(self, name: str, source: Source) -> bool:
-        """Whether a member is not in the old tar as it is to be."""
+        """Return whether a member differs from the one in the old tar."""
         if isinstance(source, bytes):
             return self._old.sha256(name) != hashlib.sha256(source).hexdigest()
         return isinstance(source, Path)
 
     def _members(self) -> Iterator[tuple[str, Source]]:
-        """The members of the tar, in order."""
+        """Yield the members of the tar, in order."""
         for job in self.tar.jobs:
             if self.statuses[job.stem] in (DONE, SKIPPED):
                 members = self._members_of(job)
@@ -164,7 +163,7 @@ class Packer:
     def _by_patch(
         self, job: Job, members: Iterator[tuple[str, Source]]
     ) -> Iterator[tuple[str, Source]]:
-        """The same with the files of each patch together, and what is said of it behind them."""
+        """Yield the members with the files of each patch together, followed by its sidecar."""
         renditions = self._writer.renditions_of(job)
         first, *_ = names = [self._member(job, each) for each in renditions]
         samples: dict[str, list[tuple[str, Source]]] = {}
@@ -206,7 +205,7 @@ class Packer:
                         start, info.size = source
                         data.seek(start)
                     tar.addfile(info, data)
-        keep_names(self.tar.folder)  # its pictures are removed next
+        keep_names(self.tar.folder)  # before its pictures are removed
 
 
 class Tars(Folder):
@@ -233,7 +232,7 @@ class Tars(Folder):
         packed = self._packers[self._folders[job.stem]].found(job, rendition, request, self.redo)
         if packed is not Found.NOTHING:
             return packed
-        # After a loss of power a passing file may have its size and time, but not its bytes.
+        # After a loss of power an unsynchronised file may have its size and time, but not its bytes.
         return self.writer.existing(job, rendition).found(job, request, verify=True)
 
     def receive(self, executor: Executor, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:

@@ -1,4 +1,4 @@
-"""WebDataset tars: each holds the pictures of a number of images, with their sidecars."""
+"""WebDataset tars: each holds the pictures and sidecars of several images."""
 
 import hashlib
 import os
@@ -16,20 +16,20 @@ from clpipe.inputs.find import Job
 from clpipe.outputs.folder import remove_unfinished
 from clpipe.outputs.sealed import SIDECAR, SidecarError, is_sidecar, values_in
 
-STAGING = ".clpipe."  # begins the name of the folder that holds a tar's pictures until it is packed
+STAGING = ".clpipe."  # prefix of the directory that holds a tar's pictures until it is packed
 
 NUMBERED = re.compile(rf"({re.escape(STAGING)})?(\d{{6,}})\.tar")
 
-# What tarfile raises for a damaged tar; a header may claim more bytes than a number or memory has.
+# What tarfile raises for a damaged tar, whose header may state an absurd size.
 DAMAGED = (OSError, tarfile.TarError, ValueError, OverflowError, MemoryError)
 
-OF_PATCHES = "__clpipe__/"  # the folder for the sidecars of images whose samples are patches
+OF_PATCHES = "__clpipe__/"  # the directory of the sidecars of images that are cut into patches
 
-HIDDEN_BY_READERS = re.compile("__[^/]*__/")  # the webdataset package skips such folders
+HIDDEN_BY_READERS = re.compile("__[^/]*__/")  # the webdataset package skips these directories
 
 
 def sample_name(job: Job) -> str:
-    """The name of a job's sample: WebDataset ends it at the first dot of the last part.
+    """Return the key of a job's sample. WebDataset ends it at the first dot of the last part.
 
     >>> sample_name(Job(Path("x"), "shot.1/frame.0001.exr"))
     'shot.1/frame_0001'
@@ -40,7 +40,7 @@ def sample_name(job: Job) -> str:
 
 @dataclass(frozen=True)
 class Tar:
-    """One tar of a run, which has ``of`` of them; its jobs are named as samples."""
+    """One of the ``of`` tars of a run. Its jobs have the names of samples."""
 
     folder: Path
     name: str
@@ -54,15 +54,15 @@ class Tar:
 
     @property
     def staging(self) -> Path:
-        """The folder of its pictures until they are packed."""
+        """The directory of its pictures until they are packed."""
         return self.folder / f"{STAGING}{self.name}"
 
 
 def cut(jobs: Sequence[Job], count: int, folder: Path) -> list[Tar]:
-    """The tars of a run, of ``count`` jobs each, in the order of the jobs.
+    """Return the tars of a run, with ``count`` jobs each, in the order of the jobs.
 
     Raises:
-        RequestError: two jobs would be the same sample, or WebDataset would skip one.
+        RequestError: two jobs would have the same key, or WebDataset would skip one.
     """
     owners: dict[str, Job] = {}
     for job in jobs:
@@ -84,14 +84,14 @@ def cut(jobs: Sequence[Job], count: int, folder: Path) -> list[Tar]:
 
 
 def prepare(tars: Sequence[Tar], overwrite: bool) -> None:
-    """Remove what a killed run left of these tars, and see that they may be written.
+    """Remove what a killed run left of tars, and check that they may be written.
 
     Args:
-        tars: of this run.
+        tars: the tars of this run.
         overwrite: whether tars that clpipe did not write may be overwritten.
 
     Raises:
-        RequestError: a tar is somebody else's, or is one of a run with more tars.
+        RequestError: clpipe did not write a tar, or it belongs to a run with more tars.
     """
     folder, total = tars[0].folder, tars[0].of
     remove_unfinished(folder, [Job(tar.path, tar.name) for tar in tars])
@@ -115,7 +115,10 @@ def prepare(tars: Sequence[Tar], overwrite: bool) -> None:
 
 
 def is_own(path: Path) -> bool:
-    """Whether a file is a tar whose first JSON is a sidecar, or what a lost one leaves: zeros."""
+    """Return whether a file is a tar of clpipe: its first JSON is a sidecar, or it is all zeros.
+
+    A loss of power may leave zeros.
+    """
     try:
         check_regular(path)
         with open(path, "rb") as file:
@@ -134,11 +137,11 @@ def is_own(path: Path) -> bool:
 
 
 class Members:
-    """Where each file lies in a tar, up to the first damage; a missing tar is empty."""
+    """The index of a tar, up to the first damage. A missing tar has no members."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.names: list[str] = []  # one may be there twice
+        self.names: list[str] = []  # a name may occur twice
         self.places: dict[str, tuple[int, int]] = {}  # offset and size, in bytes
         try:
             whole = check_regular(path).st_size
@@ -151,7 +154,7 @@ class Members:
             pass
 
     def sidecar(self, name: str) -> Mapping[str, Any]:
-        """A sidecar's values; empty where it is missing, or is not as clpipe wrote it."""
+        """Return a sidecar's values. They are empty if it is missing or was changed."""
         if name not in self.places:
             return {}
         start, size = self.places[name]
@@ -163,7 +166,7 @@ class Members:
             return {}
 
     def sha256(self, name: str) -> str:
-        """The SHA-256 of a file; "" where it is missing or cannot be read."""
+        """Return the SHA-256 of a file, or "" if it is missing or cannot be read."""
         if name not in self.places:
             return ""
         start, left = self.places[name]

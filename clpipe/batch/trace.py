@@ -1,4 +1,4 @@
-"""A run as a trace, for Perfetto (ui.perfetto.dev) and chrome://tracing."""
+"""The timeline of a run, for Perfetto (ui.perfetto.dev) and chrome://tracing."""
 
 import contextlib
 import json
@@ -17,7 +17,7 @@ BEGINNING = b'{"traceEvents"'
 
 
 def check_trace(path: Path) -> None:
-    """See that a trace may be written to a file.
+    """Check that a trace may be written to a file.
 
     Raises:
         RequestError: the name does not end in .json, or the file exists and is no trace.
@@ -37,11 +37,11 @@ def check_trace(path: Path) -> None:
 
 
 class Trace:
-    """What each thread did when: the steps of each image, each launch and each transfer.
+    """Writes what each thread did when: steps of images, launches and transfers.
 
     The file is in Chrome's "Trace Event Format" (complete events, in microseconds). Events go to a
-    file beside it, which gets its name when the context is left, also by an error. A process that
-    is killed leaves that file; it can be read as it is, because the format needs no end.
+    temporary file, which is renamed when the context ends, also after an error. A killed process
+    leaves the temporary file, which is readable, because the format needs no end.
 
     Args:
         path: the file.
@@ -67,7 +67,7 @@ class Trace:
         return self
 
     def add(self, outcome: Outcome) -> None:
-        """Add the spans of one image. Where that fails, the error comes at the end."""
+        """Add the spans of one image. An error is raised when the context ends."""
         if self._error:
             return
         try:

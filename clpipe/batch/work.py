@@ -1,4 +1,4 @@
-"""One image's work: decode it, develop each rendition of it, encode the results."""
+"""The work on one image: decode it, develop each of its renditions, encode the results."""
 
 import threading
 import time
@@ -41,11 +41,11 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Written:
-    """A rendition that is written, but not under its names yet.
+    """The files of a rendition, still under temporary names.
 
     Args:
-        group: what gives its files their names.
-        files: all of them, relative to the output folder.
+        group: renames them into place.
+        files: their final names, relative to the output directory.
     """
 
     group: FileGroup
@@ -53,13 +53,13 @@ class Written:
 
 
 class ImageWorker:
-    """Does the work of one image at a time, in each of the threads that call it.
+    """Does the work on images. Several threads call it at the same time, each for its own image.
 
     Args:
-        loader: how images are loaded.
-        sink: where pictures go, and which are there already.
-        chain: that of the first image, for which kernels are compiled early.
-        trace: note each launch and transfer.
+        loader: loads images.
+        sink: where pictures go, and which exist already.
+        chain: the chain of the first image, whose kernels are compiled first.
+        trace: whether to record each launch and transfer.
     """
 
     def __init__(
@@ -77,26 +77,26 @@ class ImageWorker:
         self._spare = SpareArrays(0)
 
     def reserve(self, count: int) -> None:
-        """Keep so many arrays of results for later images."""
+        """Set how many arrays of results are kept for later images."""
         self._spare = SpareArrays(count)
 
     @property
     def layers(self) -> int:
-        """How many layers are read beside an image: those that go along with it, and its depth."""
+        """The number of layers that are read with an image: carried layers, and its depth."""
         return len(self.writer.request.carry) + bool(depth_steps(self.chain))
 
     @property
     def later(self) -> int:
-        """How many exposures there are behind the first one, between which the light changes."""
+        """The number of exposures after the first one, if the light changes between them."""
         exposures = exposures_of(self.chain)
         return len(exposures.spans) - 1 if exposures else 0
 
     def bytes_of(self, job: Job, most: int, in_numpy: bool) -> int:
-        """The bytes of memory that a job's image takes, see :func:`~clpipe.batch.room.host_bytes`.
+        """Return the bytes that a job's image takes, see :func:`~clpipe.batch.room.host_bytes`.
 
         Args:
             job: the image.
-            most: how many results there are at a time at most.
+            most: the most results that exist at a time.
             in_numpy: whether NumPy develops it.
         """
         writer = self.writer
@@ -104,13 +104,13 @@ class ImageWorker:
         beside = 2 * self.layers + self.later
         if shutter := self.loader.shutter(job):
             beside += 1 + self.later + bool(shutter.layer_of_light)
-        # Baselines are measured on floats.
+        # The noise of baselines is measured on floats.
         formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
         kinds = results, formats, writer.request.keep, beside, in_numpy
         return host_bytes(self.loader.claim(job), self.chain, *kinds)
 
     def runners(self, device: Device | None) -> "Runners":
-        """The runners of a device; the kernels of the first chain are compiled here.
+        """Return the runners of a device, with the kernels of the first chain compiled.
 
         Raises:
             RequestError: the memory of the device is too small for any image.
@@ -120,11 +120,11 @@ class ImageWorker:
         return Runners(self.writer, device, self.chain, half)
 
     def decode(self, job: Job, admit: Callable[[Job], None]) -> JobState:
-        """Load a job's image, unless all of its pictures are done already.
+        """Load a job's image, unless all of its pictures exist already.
 
         Args:
             job: the image.
-            admit: called where something is to be made, with the job as it is read; it may raise
+            admit: called before the image is loaded. Gets the job with local files; may raise
                 ImageError.
         """
         state, here = JobState(job, self.loader), job
@@ -151,7 +151,7 @@ class ImageWorker:
         return state
 
     def _request_of(self, job: Job) -> Mapping[str, Any]:
-        """The record of the request for a job's image."""
+        """Return the record of the request for a job's image."""
         if not self.loader.has_own_values(job):
             return {**self._general_request, "image_name": job.key}
         own = self.writer.request.for_image(job.key, job.values)
@@ -162,7 +162,7 @@ class ImageWorker:
         return self.writer.request.record()
 
     def _missing(self, state: JobState) -> Set[Rendition]:
-        """A job's renditions that are to be made."""
+        """Return the renditions of a job that must be made."""
         renditions, redo = self.writer.renditions_of(state.job), self._sink.redo
         if redo is Redo.ALL:
             return set(renditions)
@@ -175,15 +175,16 @@ class ImageWorker:
         return self.writer.plan_of(state.job).needed(missing)
 
     def _load(self, state: JobState, job: Job, renditions: Set[Rendition]) -> None:
-        """Load a state's image, and decide which renditions are made of it.
+        """Load a state's image, and set the recipes of its renditions.
 
         Args:
             state: the state.
-            job: its job, with the files where they are.
-            renditions: what is missing.
+            job: its job, with local files.
+            renditions: the renditions to make.
 
         Raises:
-            ImageError, RequestError, MemoryError: it cannot be read, or cannot enter the chain.
+            ImageError, RequestError, MemoryError: the image cannot be read, or does not fit the
+                chain.
         """
         state.stamps = [stamp_of(path) for path in job.paths]
         source = state.loader.read(job)
@@ -192,7 +193,7 @@ class ImageWorker:
             state.status = LEFT_OUT
             return
         self.writer.check_size(loaded.source, loaded.chain)
-        intrinsics_of(loaded.chain, loaded.source)  # or they are refused
+        intrinsics_of(loaded.chain, loaded.source)  # raises if they are impossible
         if patches := self.writer.patches:
             height, width = loaded.source.pixels.shape[:2]
             state.patches = every_patch(patches, loaded.chain, width, height, job.key)
@@ -208,7 +209,7 @@ class ImageWorker:
 
     @staticmethod
     def measured(state: JobState, recipe: Recipe) -> Recipe:
-        """A recipe with its noise, where that is measured on the results of those before it."""
+        """Return a recipe with its noise, if that follows from the results of earlier recipes."""
         if not recipe.spread:
             return recipe
         method, estimates = recipe.spread.method(recipe.rendition.role)
@@ -220,11 +221,11 @@ class ImageWorker:
     def start(
         self, asked: Sequence[tuple[JobState, Recipe, Runner]]
     ) -> list[Callable[[], Result | None]]:
-        """Begin to develop renditions on one device, small ones in common launches.
+        """Begin to develop renditions on one device. Small ones share launches.
 
         Returns:
-            A callable for each, which waits for its result and returns it, called in order. It
-            returns None where the rendition fails, and raises DeviceError, too.
+            For each rendition, a function that waits for its result and returns it. Call them in
+            order. A function returns None if the rendition fails, and may raise DeviceError.
 
         Raises:
             DeviceError: the device cannot be used any more.
@@ -241,7 +242,7 @@ class ImageWorker:
                 waits = [next(begun) if order else None for order in orders]
             except DeviceError:
                 raise
-            except Exception:  # of which it is not said, so each is tried alone when it is due
+            except Exception:  # it does not say whose it is, so each is run alone instead
                 waits = [partial(o[0].run, *o[1:]) if o else None for o in orders]
         return [
             partial(self._finish, state, recipe, start, order[3].timings if order else None, wait)
@@ -251,7 +252,7 @@ class ImageWorker:
     def _order(
         self, state: JobState, recipe: Recipe, runner: Runner
     ) -> tuple[Runner, Array, str, RunOptions]:
-        """What a rendition asks a runner for; nobody changes its image's pixels."""
+        """Return the arguments of a rendition's run. Nobody changes its image's pixels."""
         source = state.source
         assert source
         pixels, device = source.pixels, runner.device
@@ -271,7 +272,7 @@ class ImageWorker:
         timings: list[Timing] | None,
         wait: Callable[[], Result] | None,
     ) -> Result | None:
-        """Wait for the result of a rendition that was begun."""
+        """Wait for the result of a rendition."""
         result = self._tried(state, wait) if wait else None
         state.note("device", start)
         if result and result.final is not None:
@@ -287,7 +288,7 @@ class ImageWorker:
 
     @staticmethod
     def _tried(state: JobState, work: Callable[[], T]) -> T | None:
-        """What some work gives; None where it fails, which is noted as the state's error."""
+        """Return the result of some work. If it fails, note the state's error and return None."""
         try:
             return work()
         except (ImageError, RequestError, MemoryError) as error:
@@ -300,10 +301,10 @@ class ImageWorker:
         """Write one rendition and then its sidecar.
 
         Returns:
-            The files, which have not their names yet, see :meth:`commit`; None where it fails.
+            The files under temporary names, see :meth:`commit`. None if it fails.
 
         Raises:
-            OutputError: nothing can be written any more.
+            OutputError: nothing more can be written.
         """
         written = None
         with state.timed("encode"):
@@ -317,10 +318,10 @@ class ImageWorker:
         return written
 
     def commit(self, encoded: Sequence[tuple[JobState, Written]]) -> None:
-        """Bring renditions to the disk, together, and give their files their names.
+        """Synchronise renditions to the disk, all at once, and rename their files into place.
 
         Raises:
-            OutputError: nothing can be written any more; what could not is noted.
+            OutputError: nothing more can be written. The states say which files failed.
         """
         failure: OutputError | None = None
         errors = FileGroup.commit([written.group for _, written in encoded])
@@ -339,7 +340,7 @@ class ImageWorker:
         """Note that a state's files cannot be written.
 
         Raises:
-            OutputError: nothing can be written any more.
+            OutputError: nothing more can be written.
         """
         self.writer.check_folder()
         state.error = state.loader.error_text(state.job, error)
@@ -350,7 +351,7 @@ class ImageWorker:
         """Write one rendition and then its sidecar.
 
         Returns:
-            The files, relative to the output folder.
+            The files, relative to the output directory.
 
         Raises:
             ImageError, MemoryError: it cannot be written.
@@ -362,7 +363,7 @@ class ImageWorker:
             carried, state.aovs = state.aovs, None
         files = writer.write(job, recipe, state.source, result, carried, state.patches)
         clipped = None if recipe.noise else clipped_share(result, recipe.chain)
-        if recipe.chain.source is not Kind.DISPLAY:  # a photograph was clipped before
+        if recipe.chain.source is not Kind.DISPLAY:  # photographs are clipped already
             state.clipped = max(state.clipped, clipped or 0.0)
         path = writer.path(job, SIDECAR, recipe.rendition)
         record = sidecar(
