@@ -1,9 +1,9 @@
-"""Many images through the workers of a Dask cluster.
+"""The workers of a Dask cluster that share a run.
 
-The process that starts a run holds the output folder, cuts the jobs into chunks, hands them out,
-and reports outcomes; a worker runs a :class:`clpipe.batch.threads.Batch` on its chunk.
-Where a worker dies, Dask gives its chunk to another one, which sees by the sidecars what is done
-already and reports it as skipped.
+The process that starts the run holds the output directory, cuts the jobs into chunks, submits
+them, and reports outcomes. A worker runs a :class:`clpipe.batch.threads.Batch` on each chunk. If a
+worker dies, Dask gives its chunk to another one, which sees from the sidecars what is finished and
+reports it as skipped.
 """
 
 import asyncio
@@ -38,18 +38,18 @@ from clpipe.outputs.folder import remove_unfinished
 
 TIMEOUT = 10.0  # s, for the scheduler to answer and for its first worker
 
-PATIENCE = 60.0  # s without any worker, because nannies and job queues start new ones
+PATIENCE = 60.0  # s without any worker; nannies and job queues start new ones
 
 RETRIES = 2  # of a chunk that ended with an unexpected error
 
 FIRST, LARGEST = 4, 64  # images in a chunk
 
-SHORT, LONG = 15.0, 60.0  # s; after a shorter chunk they grow, after a longer one they shrink
+SHORT, LONG = 15.0, 60.0  # s; chunks grow after a shorter one, and shrink after a longer one
 
 
 @contextlib.contextmanager
 def connected(address: str, spec: DaskSpec) -> Iterator["Cluster"]:
-    """The cluster of a scheduler.
+    """Connect to the cluster of a scheduler.
 
     Raises:
         RequestError: distributed is not installed, the scheduler does not answer, it has no
@@ -87,7 +87,7 @@ def connected(address: str, spec: DaskSpec) -> Iterator["Cluster"]:
 
 
 async def _reach(address: str) -> None:
-    """Connect to a scheduler. A Client would wait for ever where something listens but is silent.
+    """Connect to a scheduler, with a limit. A Client waits for ever for a port that is silent.
 
     Raises:
         OSError, ValueError: no scheduler answers there, or it is no address.
@@ -101,42 +101,40 @@ async def _reach(address: str) -> None:
 
 
 class Cluster:
-    """The workers of a cluster, with the interface of a :class:`clpipe.batch.threads.Batch`."""
+    """The workers of a cluster; an :class:`~clpipe.batch.sinks.Executor`."""
 
     def __init__(self, client: Any, address: str, spec: DaskSpec) -> None:
         self._client = client
         self._address = address
         self._spec = spec.anchored()
         self.is_stopping = False
-        self._finished: queue.SimpleQueue[Any] = queue.SimpleQueue()  # futures; None means stop
+        self._finished: queue.SimpleQueue[Any] = queue.SimpleQueue()  # futures; None: stop
         self._running: dict[Any, tuple[list[Job], bool]] = {}  # chunks, and whether each runs alone
-        self._seen = time.monotonic()  # when there was a worker
+        self._seen = time.monotonic()  # when there was a worker last
 
     def stop(self) -> None:
-        """Let no more images in; those in flight are finished. May be called by a signal."""
+        """Begin no more images, and finish those in flight. A signal handler may call it."""
         self.is_stopping = True
         self._finished.put(None)
 
     def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
-        """Do every job; one that fails is reported and the others go on.
-
-        Outcomes come as chunks are finished, in any order.
+        """Do every job, and yield outcomes as chunks finish, in any order.
 
         Raises:
-            RequestError: workers have different environments, no such device, or do not see the
+            RequestError: workers have different environments, lack the device, or do not see the
                 files.
             DeviceError: a kernel does not compile.
-            OutputError: nothing can be written any more.
-            ClusterError: the scheduler or all workers have gone.
+            OutputError: nothing more can be written.
+            ClusterError: the scheduler or all workers are gone.
         """
         anchored = list(map(self._spec.anchored_job, jobs))
         self._probe(anchored)
         return self._outcomes(anchored)
 
     def _probe(self, jobs: Sequence[Job]) -> None:
-        """See that all workers have one environment, and see the same files as this machine."""
+        """Check that all workers have one environment, and see the same files as this machine."""
         takes = ImageLoader(self._spec.request).raw.takes
-        # The chain of a raw is compiled only where all inputs are raws, as in first_chain().
+        # As in first_chain(), the chain of a raw is compiled only if all inputs are raws.
         able = [job for job in jobs if not job.problem] or jobs
         first = next((job for job in able if not takes(job.path)), able[0])
         spec = replace(self._spec, first=first)
@@ -188,10 +186,10 @@ class Cluster:
     def _hand_out(self, chunks: "_Chunks") -> None:
         """Submit chunks until there are as many as workers.
 
-        Dask chooses the worker; a chunk that is tied to one would wait for ever where it dies.
+        Dask chooses the worker. A chunk that is bound to one would wait for ever if it dies.
 
         Raises:
-            ClusterError: there have been no workers for long, or the scheduler has gone.
+            ClusterError: there has been no worker for long, or the scheduler is gone.
         """
         try:
             addresses = tuple(sorted(self._client.nthreads()))
@@ -216,10 +214,10 @@ class Cluster:
         future.add_done_callback(self._finished.put)
 
     def _report(self, future: Any, chunks: "_Chunks") -> ChunkReport:
-        """What became of a chunk that is finished.
+        """Return the report of a finished chunk.
 
         Raises:
-            ClusterError: the scheduler has gone.
+            ClusterError: the scheduler is gone.
         """
         from distributed import KilledWorker
 
@@ -237,15 +235,15 @@ class Cluster:
                 raise self._gone() from None
             return _failed(chunk, f"on a worker: {type(error).__name__}: {error}")
         finally:
-            future.release()  # else Dask does it again where its worker dies
+            future.release()  # otherwise Dask repeats it if its worker dies
 
     def _halt(self) -> None:
-        """Let the workers finish what is in flight."""
+        """Let the workers finish the images in flight, and begin no others."""
         self.is_stopping = True
         self._client.run(halt, self._spec.run, on_error="ignore")
 
     def _finish(self) -> None:
-        """Wait until no worker is busy with the run."""
+        """Stop, and wait until no worker is busy with the run."""
         from distributed import wait
 
         self._halt()
@@ -264,7 +262,7 @@ class _Chunks:
     """The jobs that are left, to be cut into chunks.
 
     Chunks grow while they take little time, and get smaller towards the end. ``suspects`` are jobs
-    whose workers died; each is tried alone in the end.
+    whose workers died. Each is tried alone at the end.
 
     >>> from pathlib import Path
     >>> chunks = _Chunks(deque(Job(Path(str(i)), "") for i in range(100)))
@@ -284,12 +282,12 @@ class _Chunks:
         return bool(self.jobs or self.suspects)
 
     def cut(self, workers: int) -> list[Job]:
-        """The next chunk."""
+        """Return the next chunk."""
         size = max(1, min(self.size, len(self.jobs) // (2 * workers)))
         return [self.jobs.popleft() for _ in range(size)]
 
     def took(self, seconds: float) -> None:
-        """Adapt the size of chunks to how long one took."""
+        """Adapt the size of chunks to the seconds that one took."""
         if seconds < SHORT:
             self.size = min(2 * self.size, LARGEST)
         elif seconds > LONG:

@@ -1,7 +1,6 @@
-"""What a Dask worker does of a run: it says what it is, and runs chunks of jobs.
+"""The functions that a Dask worker runs: they report its environment, and run chunks of jobs.
 
-A worker keeps its devices open from chunk to chunk, and shares those of its machine with the
-workers beside it.
+A worker keeps its devices open between chunks, and shares them with other workers of its machine.
 """
 
 import secrets
@@ -31,13 +30,13 @@ from clpipe.outputs.program import program_digest
 
 @dataclass(frozen=True)
 class DaskSpec(RunSpec):
-    """A run, as it is sent to a worker of Dask's.
+    """The description of a run that a Dask worker receives.
 
     Args:
-        folder: where relative paths start.
-        run: a name that no other run has.
-        workers: the addresses of all workers there are.
-        environment: what every worker must be.
+        folder: the directory that relative paths start from.
+        run: a unique name of the run.
+        workers: the addresses of all workers.
+        environment: the environment that every worker must have.
     """
 
     folder: Path = field(default_factory=Path.cwd)
@@ -46,7 +45,7 @@ class DaskSpec(RunSpec):
     environment: "WorkerEnvironment | None" = None
 
     def anchored(self) -> "DaskSpec":
-        """The same run with names of files absolute, for workers in other folders."""
+        """Return the description with absolute names of files, for workers in other directories."""
         folder, asked = self.folder, self.request
         request = replace(
             asked,
@@ -58,14 +57,14 @@ class DaskSpec(RunSpec):
         return replace(self, request=request, where=where)
 
     def anchored_job(self, job: Job) -> Job:
-        """A job of the run with names of files absolute."""
+        """Return a job with absolute names of files."""
         values = from_folder(self.folder, job.values)
         first, *others = (self.folder / path for path in job.paths)
         return replace(job, path=first, subframes=tuple(others), values=values, written=job.input)
 
 
 def as_written(outcome: Outcome) -> Outcome:
-    """The outcome of an anchored job, with its path as the user wrote it."""
+    """Return the outcome of an anchored job, with its path as the user wrote it."""
     job = outcome.job
     return replace(
         outcome,
@@ -76,7 +75,7 @@ def as_written(outcome: Outcome) -> Outcome:
 
 @dataclass(frozen=True)
 class WorkerEnvironment:
-    """What the bytes of a picture depend on, the same on all workers of a run."""
+    """Everything that a picture's bytes depend on. It must be equal on all workers of a run."""
 
     version: str
     program: str
@@ -86,7 +85,7 @@ class WorkerEnvironment:
 
 @dataclass(frozen=True)
 class ChunkReport:
-    """What became of a chunk, and the error because of which the run cannot go on, if any."""
+    """The outcomes of a chunk, its seconds, and the error that ends the run, if any."""
 
     outcomes: Sequence[Outcome]
     seconds: float
@@ -104,12 +103,12 @@ _batches: dict[str, Batch] = {}  # by the name of the run
 def _devices(
     selectors: tuple[str, ...], memory: int | None, share: tuple[int, int]
 ) -> Sequence[Device | None]:
-    """The devices, open from chunk to chunk; [None] is NumPy."""
+    """Return the devices, which stay open between chunks. [None] is NumPy."""
     return open_devices(selectors, memory, share) or [None]
 
 
 def share_of(worker: str, workers: Collection[str]) -> tuple[int, int]:
-    """Which of the workers of its machine one is, from 0 on, and how many there are, by address.
+    """Return a worker's number among those of its machine, from 0, and how many these are.
 
     >>> share_of("tcp://b:2", ["tcp://b:1", "tcp://a:1", "tcp://b:3", "tcp://b:2"])
     (1, 3)
@@ -122,12 +121,12 @@ def share_of(worker: str, workers: Collection[str]) -> tuple[int, int]:
 
 
 def close_devices() -> None:
-    """Let go of the devices, on a worker."""
+    """Close the devices of a worker."""
     _devices.cache_clear()
 
 
 def worker_environment(selectors: Sequence[str]) -> WorkerEnvironment:
-    """The environment of this process, as a worker with these devices.
+    """Return the environment of this process as a worker with these devices.
 
     Raises:
         DeviceError: there is no such device.
@@ -146,19 +145,19 @@ def worker_environment(selectors: Sequence[str]) -> WorkerEnvironment:
 
 
 def device_text(info: DeviceInfo) -> str:
-    """All of a device that bits may depend on."""
+    """Describe everything about a device that bits may depend on."""
     platform = info.handle.platform.version.strip()
     target = f" for {info.target.name}" if info.target.name else ""
     return f"{info.label}, driver {info.driver}, {platform}, {info.lanes} lanes{target}"
 
 
 def probe_worker(spec: DaskSpec, probe: str, size: int | None) -> WorkerEnvironment | str:
-    """The environment of this process; where it cannot be a worker of a run, the reason.
+    """Return the environment of this process, or the reason why it cannot work for a run.
 
     Args:
         spec: the run.
-        probe: the name of a file that lies in the output folder.
-        size: of the first input, in bytes; None where nobody can see it.
+        probe: the name of a file in the output directory.
+        size: the size of the first input, in bytes. None if the client cannot see it.
     """
     try:
         environment = worker_environment(spec.where.devices)
@@ -213,31 +212,31 @@ def run_chunk(spec: DaskSpec, jobs: Sequence[Job]) -> ChunkReport:
 
 
 def halt(run: str) -> None:
-    """Let a run's images in flight be finished and no more be begun, on a worker."""
+    """Begin no more images of a run on this worker, and finish those in flight."""
     _halted.add(run)
     if batch := _batches.get(run):
         batch.stop()
 
 
 def check_same_environment(environments: Mapping[str, Any]) -> None:
-    """See that workers have the same environment.
+    """Check that workers have the same environment.
 
     Raises:
-        RequestError: they have not.
+        RequestError: they differ.
     """
     for what in ("version", "device", "libraries"):
         check_same(what, {worker: getattr(e, what) for worker, e in environments.items()})
 
 
 def check_same(what: str, values: Mapping[str, str]) -> None:
-    """See that workers have the same value of something.
+    """Check that a value is the same on all workers.
 
     Args:
-        what: what it is called, for the message.
-        values: of each worker.
+        what: the name of the value, for the message.
+        values: the value of each worker.
 
     Raises:
-        RequestError: they have not.
+        RequestError: they differ.
     """
     workers: dict[str, list[str]] = {}
     for worker, value in values.items():
@@ -248,7 +247,7 @@ def check_same(what: str, values: Mapping[str, str]) -> None:
 
 
 def _some(names: Collection[str]) -> str:
-    """The first names, and how many more there are.
+    """List the first names, and the number of others.
 
     >>> _some("abcdef")
     'a, b, c, d and 2 more'

@@ -1,8 +1,9 @@
-"""Tars behind a URL: which are there, and how finished ones get there.
+"""The sink that uploads finished tars to a URL.
 
-Beside each tar lies an index, ``000000.index.json``: what the tar was asked for as, its size and
-SHA-256, and what became of its images. It is begun before the tar is sent and completed when that
-is there. So a tar without one is somebody else's; where it is not complete the tar is made again.
+Next to each tar is an index, ``000000.index.json``, with a digest of its request, its size and
+SHA-256, and the images that failed. The index is written before the tar is uploaded, and completed
+afterwards. So clpipe did not write a tar without an index, and a tar whose index is incomplete is
+made again.
 """
 
 import glob
@@ -49,7 +50,7 @@ class RemoteTars(Tars):
         assert url
         below = [each.removeprefix(f"{url}/") for each in listed(url, may_be_missing=True)]
         self._there = {name for name in below if "/" not in name}
-        self._keys = {tar.name: self._key(tar) for tar in tars}  # of inputs as they are now
+        self._keys = {tar.name: self._key(tar) for tar in tars}  # of the present inputs
         for name in sorted(self._there):
             match = NUMBERED.fullmatch(name)
             if match and int(match[2]) >= tars[0].of:
@@ -90,7 +91,7 @@ class RemoteTars(Tars):
         self._send(packer.tar, packer.statuses)
 
     def has(self, tar: Tar) -> bool:
-        """Whether a tar is there, whole, made by the same request of the same inputs.
+        """Return whether a tar is there, whole, made by the same request of the same inputs.
 
         Raises:
             OutputError: its index cannot be read.
@@ -117,9 +118,9 @@ class RemoteTars(Tars):
             OutputError: it cannot be sent.
         """
         failed = sorted(stem for stem, status in statuses.items() if status == FAILED)
-        if not tar.path.exists():  # all of them failed
+        if not tar.path.exists():  # all images failed
             return
-        self._write(tar, {})  # it is ours from now on
+        self._write(tar, {})  # marks the tar as ours
         digest, size = sha256_of(tar.path)
         url = url_of(tar.path)
         assert url
@@ -128,7 +129,7 @@ class RemoteTars(Tars):
         discard(tar.path)
 
     def _key(self, tar: Tar) -> str:
-        """A digest of what decides a tar, besides the program."""
+        """Return a digest of everything that a tar depends on, except the program."""
         jobs = [
             (
                 job.stem,
@@ -143,11 +144,11 @@ class RemoteTars(Tars):
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _record_of(self, job: Job) -> Mapping[str, Any]:
-        """What a job's own values ask for, with the digests of files that they name."""
+        """Return the request of a job's own values, with the digests of files that they name."""
         return self.writer.request.for_image(job.key, job.values).record() if job.values else {}
 
     def _index_of(self, tar: Tar) -> dict[str, Any]:
-        """What a tar's index says; nothing where it is damaged."""
+        """Return the values of a tar's index. They are empty if it is damaged."""
         data = read_url(f"{url_of(tar.folder)}/{_stem(tar)}{INDEX}")
         try:
             found = json.loads(data or b"{}")
@@ -171,7 +172,7 @@ class RemoteTars(Tars):
 
 
 def files_of(job: Job) -> list[Path]:
-    """A job's files, and those on this machine that go with it by their names."""
+    """Return a job's files, and local files next to it with its name as prefix."""
     beside = [
         each
         for path in job.paths
@@ -186,7 +187,7 @@ def _stem(tar: Tar) -> str:
 
 
 def _is_whole(tar: Tar, index: Mapping[str, Any]) -> bool:
-    """Whether a tar's bytes are those that its index says."""
+    """Return whether a tar's bytes have the SHA-256 of its index."""
     try:
         with fetched([tar.path]) as (path,):
             return sha256_of(path)[0] == index.get("sha256")

@@ -232,7 +232,7 @@ class Tars(Folder):
         packed = self._packers[self._folders[job.stem]].found(job, rendition, request, self.redo)
         if packed is not Found.NOTHING:
             return packed
-        # After a loss of power an unsynchronised file may have its size and time, but not its bytes.
+        # Without fsync a file may have its size and time after a loss of power, but not its bytes.
         return self.writer.existing(job, rendition).found(job, request, verify=True)
 
     def receive(self, executor: Executor, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
