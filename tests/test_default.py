@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from clpipe.analysis.signature import signature
+from clpipe.analysis.matching.columns import signature
 from clpipe.camera.profile import DEFAULT_CAMERA, load_camera
 from clpipe.chain.files import load_settings
 from clpipe.chain.making import make_chain
@@ -77,7 +77,7 @@ def test_saturated_colours_have_no_dots():
     def noise(**settings):
         noisy, clean = (finished(image, iso=1600, skip=s, **settings) for s in ((), QUIET))
         found = signature(noisy, clean, places)
-        return found.kurtosis, found.rms, dots(noisy, clean)
+        return found["kurtosis"], found["rms"], dots(noisy, clean)
 
     kurtosis, rms, spots = noise()
     assert 2.5 < kurtosis <= 4.5

@@ -38,7 +38,7 @@ from clpipe.analysis.matching.space import (
     space_for,
     variants_of,
 )
-from clpipe.analysis.signature import flat_places, luma, signature
+from clpipe.analysis.signature import flat_places, luma
 from clpipe.chain.files import load_config, load_settings
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings, overlay
@@ -89,15 +89,6 @@ def saved(folder, **pictures):
     for name, pixels in pictures.items():
         Image.fromarray(pixels).save(folder / f"{name}.png")
     return [str(folder / f"{name}.png") for name in pictures]
-
-
-def test_the_columns_of_the_signature_are_the_signature(burst):
-    mean = np.mean(burst, axis=0)
-    noise = noise_of_frames([burst[0].astype(np.float64)], mean)
-    mask = flat_places(mean)
-    own = signature(burst[0], mean, mask).record()
-    found = figures_of(noise, Places(mask, noise.level))
-    assert {name: found[name] for name in own} == pytest.approx(own, rel=1e-5, abs=1e-5)
 
 
 def test_independent_noise(grey):
