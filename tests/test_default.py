@@ -19,7 +19,7 @@ from clpipe.reference.curve import curve_index, to_8_bit
 from clpipe.reference.roots import root_of
 from clpipe.stage import Context, ReferenceContext, run_reference
 from clpipe.stages.demosaic.bounded import Bounded
-from clpipe.stages.demosaic.edge_directed_median import EdgeDirectedMedian
+from clpipe.stages.demosaic.median import EdgeDirectedMedian
 from clpipe.stages.denoise.bilateral import Bilateral
 from clpipe.stages.sharpen import Unsharp
 from clpipe.stages.tone_curve import CameraRaw
