@@ -319,40 +319,6 @@ def test_bops_masks_are_of_all_or_of_none(clpipe, coco, bop):
     assert not Path("p/mask").exists()
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [("Car 0 0", "line 1"), ("Car 0 0 0 9 9 1 1 1 1 1 1 1 1 1", "a box with left <= right")],
-)
-def test_labels_that_are_none(clpipe, kitti, text, message):
-    Path("kitti/label_2/a.txt").write_text(text)
-    said = clpipe("run", "in", "-o", "o", *AS_KITTI, status=2).stderr
-    assert message in " ".join(said.split()) and not Path("o").exists()
-    Path("kitti/label_2/a.txt").unlink()
-    assert "has no labels" in clpipe("run", "in", "-o", "o", *AS_KITTI, status=2).stderr
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda c: c.pop("images"), "has no list 'images'"),
-        (lambda c: c["annotations"][0].update(image_id=9), "annotations[0]: found image_id 9"),
-        (lambda c: c["annotations"][1].update(bbox=[1, 2]), "annotations[1].bbox: found [1, 2]"),
-        (
-            lambda c: c["annotations"][0].update(segmentation=[[1, 2]]),
-            "found [[1, 2]]",
-        ),
-        (lambda c: c["images"][0].update(width="a"), "images[0]: found width and height"),
-    ],
-)
-def test_what_is_refused(clpipe, coco, change, message):
-    change(coco)
-    Path("coco.json").write_text(json.dumps(coco))
-    said = clpipe("run", "in", "-o", "o", *RUN, status=2).stderr
-    assert message in said and not Path("o").exists()
-    Path("coco.json").write_text("no json")
-    assert "no valid JSON" in clpipe("run", "in", "-o", "o", *RUN, status=2).stderr
-
-
 def test_annotations_of_another_size_are_told(clpipe, coco):
     coco["images"][0]["width"] = 100
     del coco["annotations"][3]  # a mask, which is refused
@@ -376,6 +342,11 @@ def mask_with(counts, size=(HEIGHT, WIDTH)):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
+        (lambda coco: coco.pop("images"), "has no list 'images'"),
+        (lambda coco: first(coco, image_id=9), "annotations[0]: found image_id 9"),
+        (lambda coco: first(coco, bbox=[1, 2]), "annotations[0].bbox: found [1, 2]"),
+        (lambda coco: first(coco, segmentation=[[1, 2]]), "found [[1, 2]]"),
+        (lambda coco: coco["images"][0].update(width="a"), "images[0]: found width and height"),
         (mask_with([-5, HEIGHT * WIDTH + 5]), "annotations[0].segmentation.counts"),
         (mask_with([5, 5]), "found runs of 10 pixels; expected 19200 in all"),
         (mask_with("zzzz"), "found zzzz; expected run lengths"),
@@ -411,6 +382,10 @@ def test_coco_files_that_are_none(clpipe, coco, damage, message):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
+        ("label_2/a.txt", "Car 0 0", "line 1"),
+        ("label_2/a.txt", "Car 0 0 0 9 9 1 1 1 1 1 1 1 1 1", "a box with left <= right"),
+        ("label_2/readme.md", "", "has no labels"),
+        ("coco.json", "no json", "no valid JSON"),
         ("label_2/a.txt", "Car 0 0 0 a b c d 1 1 1 1 1 1 1", "a type and 14 numbers"),
         ("label_2/a.txt", "Car 0 0 0 1e9 1e9 2e9 2e9 1 1 1 1 1 1 1", "a box with left <= right"),
         ("label_2/a.txt", "Car 0 0 0 1 1 nan 3 1 1 1 1 1 1 1", "a type and 14 numbers"),
@@ -421,7 +396,7 @@ def test_coco_files_that_are_none(clpipe, coco, damage, message):
         ("scene_gt.json", '{"4": [{}]}', "4[0].px_count_all: found 1000000000000000000000000000"),
     ],
 )
-def test_kittis_and_bops_files_that_are_none(clpipe, write_exr, name, text, message):
+def test_files_that_are_of_no_format(clpipe, write_exr, name, text, message):
     write_exr("in/a.exr", np.zeros((8, 9, 3), np.float32))
     path = Path("of", name)
     path.parent.mkdir(parents=True)

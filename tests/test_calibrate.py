@@ -6,8 +6,8 @@ import pytest
 from clpipe import Pipeline
 from clpipe.analysis.calibration.calibrate import ROUNDING, calibrate
 from clpipe.analysis.calibration.gain_stages import gain_stages
-from clpipe.analysis.calibration.line_fit import Estimate, Line, Table, fit_line
-from clpipe.analysis.calibration.repeats import Sensor, neighbours
+from clpipe.analysis.calibration.line_fit import Estimate, Line
+from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.analysis.calibration.result import Calibration
 from clpipe.base.errors import ImageError
 from clpipe.camera.profile import load_camera
@@ -143,25 +143,6 @@ def test_two_noisy_frames_give_no_flat_line():
     gains = np.array([c.pooled.gain.value for c in many])
     assert abs(gains.mean() / 40 - 1) < 3 * gains.std() / 40 / len(gains) ** 0.5
     assert abs(gains.mean() / 40 - 1) < 0.01
-
-
-def test_a_plain_line_would_be_too_flat():
-    random = np.random.default_rng(0)
-    light = np.repeat([200.0, 900.0], 20000)
-    noisy = light + random.normal(0, 200, light.shape)
-    rows = np.arange(len(light))
-    steep = fit_line([Table.of(light, noisy, light, rows, 1000, 7)])
-    flat = fit_line([Table.of(light, noisy, noisy, rows, 1000, 7)])
-    assert steep.gain.value == pytest.approx(1, abs=0.02)
-    assert flat.gain.value < 0.9
-
-
-def test_neighbours_share_no_row_with_the_pixel():
-    image = np.zeros((12, 12), np.float32)
-    image[6] = 1
-    around = neighbours(image, (2, 2))
-    assert not around[6].any() and around[4].all() and around[8].all()
-    assert neighbours(np.tile(np.arange(12, dtype=np.float32), (12, 1)), (2, 2))[5, 5] == 5
 
 
 @pytest.mark.slow

@@ -7,26 +7,16 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import rawpy
-from click.testing import CliRunner
 from PIL import Image
 
 from clpipe.analysis.calibration.frames import FrameOverrides, find_frames, read_frame
 from clpipe.camera.profile import load_camera
-from clpipe.commands.main import main
 from clpipe.images.raw import read_facts, read_raw
 from tests.conftest import DATA, WRITTEN
+from tests.conftest import run_cli as call
 from tests.test_calibrate import frames, scene
 
 LEVELS = ("--black-level", 512, "--white-level", 16383, "--pattern", "RGGB", "--iso", 400)
-
-
-def call(*arguments, status=0):
-    result = CliRunner().invoke(main, [str(a) for a in arguments])
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    assert result.exit_code == status, result.output
-    assert "Traceback" not in result.output
-    return result
 
 
 def write(path, pixels, kind=oiio.FLOAT):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from clpipe.analysis.signature import signature
+from clpipe.analysis.matching.columns import signature
 from clpipe.camera.profile import DEFAULT_CAMERA, load_camera
 from clpipe.chain.files import load_settings
 from clpipe.chain.making import make_chain
@@ -19,7 +19,7 @@ from clpipe.reference.curve import curve_index, to_8_bit
 from clpipe.reference.roots import root_of
 from clpipe.stage import Context, ReferenceContext, run_reference
 from clpipe.stages.demosaic.bounded import Bounded
-from clpipe.stages.demosaic.edge_directed_median import EdgeDirectedMedian
+from clpipe.stages.demosaic.median import EdgeDirectedMedian
 from clpipe.stages.denoise.bilateral import Bilateral
 from clpipe.stages.sharpen import Unsharp
 from clpipe.stages.tone_curve import CameraRaw
@@ -77,7 +77,7 @@ def test_saturated_colours_have_no_dots():
     def noise(**settings):
         noisy, clean = (finished(image, iso=1600, skip=s, **settings) for s in ((), QUIET))
         found = signature(noisy, clean, places)
-        return found.kurtosis, found.rms, dots(noisy, clean)
+        return found["kurtosis"], found["rms"], dots(noisy, clean)
 
     kurtosis, rms, spots = noise()
     assert 2.5 < kurtosis <= 4.5

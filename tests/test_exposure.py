@@ -139,10 +139,7 @@ NUMPY = ("--device", "numpy", "--format", "exr", "--until", "quantize", "--iso",
 
 
 def raw_of(path):
-    file = oiio.ImageInput.open(str(path))
-    pixels = file.read_image("float")
-    file.close()
-    return pixels
+    return oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT)
 
 
 def test_a_bracket_has_an_exposure_for_each_ev(clpipe, write_exr, tmp_path, scene):

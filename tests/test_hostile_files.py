@@ -135,7 +135,9 @@ def test_images_that_claim_too_much_are_refused_in_little_memory(tmp_path):
         "data.exr": exr(planes, 60_000, 60_000),
         "window.exr": exr(planes, 60_000, 60_000, display=(4, 4)),
         "display.exr": exr(planes, 1, 4, display=(60_000, 60_000)),
+        "tall.exr": exr(planes, 1, 1_000_000_000),
         "chroma.exr": exr(chroma, 60_000, 60_000),
+        "chroma_display.exr": exr(chroma, 2, 4, display=(60_000, 60_000)),
         "deep.exr": deep(tmp_path / "deep.exr", 60_000, 60_000),
         "sensor.dng": write_dng(tmp_path / "a.dng", dn, changes=sizes).read_bytes(),
     }
@@ -150,7 +152,8 @@ def test_images_that_claim_too_much_are_refused_in_little_memory(tmp_path):
         command, cwd=ROOT, capture_output=True, text=True, timeout=120, env=environment
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    for name in ("rgb.png", "rgb.tif", "mosaic.tif", "rgb.pfm", "window.exr", "sensor.dng"):
+    told = ("rgb.png", "rgb.tif", "mosaic.tif", "rgb.pfm", "window.exr", "sensor.dng")
+    for name in (*told, "display.exr", "chroma.exr", "chroma_display.exr"):
         assert (
             f"{name}: 60000x60000 pixels; at most 200000000 are read. To read more," in done.stdout
         )

@@ -77,17 +77,22 @@ def test_a_jsonl(manifest, tmp_path):
     lines = [
         '{"path": "a.exr", "iso": 800, "sensor_noise": {"a": 1e-4, "b": null}, "name": null}',
         "",
-        '{"path": "b.exr", "name": "b.\u2028x", "sensor_noise.a": 2e-4, "frames": 2}',
+        '{"path": "b.exr", "name": "b.\u2028x", "sensor_noise.a": {"uniform": [1e-4, 2e-4]}, '
+        '"demosaic.method": {"choice": ["bilinear", "median"]}, "frames": 2}',
         '{"path": "c.exr", "camera": {"choice": ["sony-a7r2", "canon-5d2"]}}',
     ]
     rows = manifest("\r\n".join(lines), "frames.JSONL")
     assert [row.values for row in rows] == [
         {"iso": 800, "sensor_noise": {"a": 1e-4}},
-        {"sensor_noise": {"a": 2e-4}},
+        {
+            "sensor_noise": {"a": {"uniform": [1e-4, 2e-4]}},
+            "demosaic": {"method": {"choice": ["bilinear", "median"]}},
+        },
         {"camera": {"choice": ["sony-a7r2", "canon-5d2"]}},
     ]
     assert [(row.name, row.frames) for row in rows] == [("", None), ("b.\u2028x", 2), ("", None)]
     assert [row.place[-5:] for row in rows] == ["row 1", "row 3", "row 4"]
+    check_rows(rows, DEFAULT)
 
 
 @pytest.mark.parametrize(
@@ -313,19 +318,6 @@ def test_an_image_that_brings_its_own_camera_may_have_its_isos(manifest):
     assert check_rows(rows, DEFAULT, lambda path: path.suffix == ".ARW")[0].iso == 50
 
 
-def test_draws_under_dotted_keys_of_jsonl(tmp_path):
-    (tmp_path / "list.jsonl").write_text(
-        '{"path": "a.exr", "sensor_noise.a": {"uniform": [1e-4, 1e-3]}, '
-        '"demosaic.method": {"choice": ["bilinear", "median"]}}\n'
-    )
-    (row,) = read_manifest(tmp_path / "list.jsonl")
-    assert row.values == {
-        "sensor_noise": {"a": {"uniform": [1e-4, 1e-3]}},
-        "demosaic": {"method": {"choice": ["bilinear", "median"]}},
-    }
-    check_rows([row], settings_from({}))
-
-
 def test_a_row_completes_and_replaces_what_options_set(tmp_path, monkeypatch):
     (tmp_path / "noise.json").write_text(json.dumps(noise_report(0.02, 0.02, 0.02)))
     monkeypatch.chdir(tmp_path)  # what a row names is found beside the manifest, not here
@@ -349,27 +341,6 @@ def test_a_row_completes_and_replaces_what_options_set(tmp_path, monkeypatch):
     assert sigma(own, "picture_noise.measured=rows/noise.json") == (0.3, 0.3, 0.3)
     with pytest.raises(RequestError, match="picture_noise: needs sigma, or measured"):
         sigma(("iso", "400"))
-
-
-def test_values_that_rows_share_are_checked_once(tmp_path, monkeypatch):
-    rows = [f"{number}{ending}.{ending},rggb" for number in range(50) for ending in ("dng", "exr")]
-    (tmp_path / "m.csv").write_text("path,mosaic.method\n" + "\n".join(rows))
-    overlaid = []
-
-    def counted(settings, values):
-        overlaid.append(values)
-        return settings
-
-    monkeypatch.setattr("clpipe.inputs.manifest.overlay", counted)
-    without_mosaic = settings_from({"stages": ["exposure"]})
-    rows = read_manifest(tmp_path / "m.csv")
-    carries = [row.path.suffix == ".dng" for row in rows]
-    assert carries[:2] == [True, False]
-    with pytest.raises(RequestError, match="row 3: unknown stage in this chain 'mosaic'"):
-        check_rows(rows, without_mosaic, lambda path: path.suffix == ".dng")
-    checked = check_rows(rows, settings_from({}), lambda path: path.suffix == ".dng")
-    assert len(checked) == 100
-    assert len(overlaid) == 1 + 50 + 2  # the faulty ones are named one by one
 
 
 @pytest.mark.parametrize(

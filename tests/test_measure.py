@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
 from clpipe.analysis.measure import measure
@@ -17,11 +16,10 @@ from clpipe.analysis.pictures import Picture, load_picture
 from clpipe.analysis.pooling import pool_by_iso
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import load_camera
-from clpipe.commands.main import main
 from clpipe.commands.measure import measure_tables
 from clpipe.images.read import read_image
 from clpipe.images.write import write_exr
-from tests.conftest import STILL_LIFE
+from tests.conftest import STILL_LIFE, run_cli
 
 
 @pytest.fixture
@@ -44,8 +42,8 @@ def developed(tmp_path_factory):
     def develop(*options):
         folder = tmp_path_factory.mktemp("developed")
         iso = () if "--iso" in options else ("--iso", "3200")
-        arguments = ["run", str(render), "-o", str(folder), *iso, *options]
-        assert CliRunner().invoke(main, arguments).exit_code == 0
+        arguments = ["run", render, "-o", folder, *iso, *options]
+        run_cli(*arguments)
         return f"{folder}/still_life"
 
     return develop

@@ -16,13 +16,12 @@ from clpipe.chain.overscan import steps_of_overscan, with_overscan
 from clpipe.chain.settings import settings_from
 from clpipe.engine.check import example
 from clpipe.engine.runner import Runner
-from clpipe.engine.tiles import buffer_sizes, tiling_of, whole_image
 from clpipe.images.read import read_image
 from clpipe.inputs.subframes import weights_of
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.stage import Kind
 from clpipe.stages.shutter import Rows
-from tests.test_tiles import same
+from tests.test_tiles import in_less_memory
 
 K1, FX = -0.12, 50.3
 BARREL = {"method": "brown_conrady", "fx": FX, "k1": K1}
@@ -106,15 +105,7 @@ def test_tiles_have_the_same_bits(device, monkeypatch, k1):
     whole = runner.run(image, "k")
     assert whole.final.shape == (540, 301, 3)
     assert np.array_equal(whole.final, bent(image, margins, distortion=own).final)
-    plan, lanes, (height, width) = runner.plan(half=False), device.info.lanes, image.shape[:2]
-    memory = sum(buffer_sizes(plan, whole_image(plan, width, height, lanes)).values()) * 6 // 10
-    tiling = tiling_of(plan, width, height, lanes, memory, memory)
-    assert len(tiling.tiles) > 1
-    for extents in tiling.tiles:
-        sizes = buffer_sizes(plan, extents)
-        assert all(each <= tiling.sizes[name] for name, each in sizes.items())
-    monkeypatch.setattr(device, "memory", memory)
-    same(whole, runner.run(image, "k"))
+    in_less_memory(runner, image, monkeypatch)
 
 
 def test_fit_makes_no_use_of_more_than_fills_the_picture():

@@ -4,17 +4,16 @@ import json
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
 from clpipe.base.errors import RequestError
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
-from clpipe.commands.main import main
 from clpipe.engine.plan import make_plan
 from clpipe.stage import Kind
 from clpipe.stages.picture_noise import measured_noise
 from tests.conftest import STILL_LIFE, noise_report
+from tests.conftest import cli_output as clpipe
 
 CLEAN = ("sensor_noise", "row_noise", "column_noise", "denoise")
 
@@ -204,15 +203,8 @@ def test_a_configuration_names_the_report_relative_to_itself(report, tmp_path):
     report()
     text = '[picture_noise]\nmethod = "iid_gaussian"\nmeasured = "report.json"\n'
     (tmp_path / "baseline.toml").write_text(text)
-    printed = CliRunner().invoke(main, ["plan", "--toml", "-c", str(tmp_path / "baseline.toml")])
-    assert printed.exit_code == 0, printed.output
-    assert "# sigma = [0.01, 0.02, 0.03]  # automatic: as measured" in printed.output
-
-
-def clpipe(*arguments):
-    result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.stdout
+    printed = clpipe("plan", "--toml", "-c", tmp_path / "baseline.toml")
+    assert "# sigma = [0.01, 0.02, 0.03]  # automatic: as measured" in printed
 
 
 @pytest.fixture(scope="module")

@@ -168,25 +168,3 @@ def test_pooled_curves():
     assert both.count.tolist() == whole.count.tolist()
     assert both.mean == pytest.approx(whole.mean)
     assert both.sigma == pytest.approx(whole.sigma, rel=2e-3)
-
-
-@pytest.mark.parametrize("shape", [(1, 2, 2), (1, 1, 3), (2, 9, 3), (1, 3, 40)])
-def test_tiny_images(shape):
-    mask = np.ones(shape[1:], bool)
-    intensity = RANDOM.random(shape[1:], np.float32)
-    curve, without, standard = noise_by_intensity(intensity, normal(*shape), mask, EDGES)
-    one = channel_statistics("R", curve, without, standard, mask, count_pairs(mask), fits_line=True)
-    assert one.count == np.prod(shape)
-    assert one.sigma > 0
-    assert one.law is None
-
-
-def test_no_noise_at_all():
-    curve, without, standard = noise_by_intensity(
-        RAMP, np.zeros((1, *SIZE), np.float32), ALL, EDGES
-    )
-    one = channel_statistics("R", curve, without, standard, ALL, count_pairs(ALL), fits_line=True)
-    assert one.sigma == 0
-    assert one.law is None
-    assert np.isnan([one.energy_left, one.tails.skewness, one.autocorrelation[8, 8]]).all()
-    assert one.rows.sigma == 0

@@ -75,6 +75,23 @@ def in_tiles(
     return whole, len(tiling.tiles)
 
 
+def in_less_memory(
+    runner: Runner, image: np.ndarray, monkeypatch: pytest.MonkeyPatch, half: bool = False
+) -> None:
+    """See that an image is the same in three fifths of the memory, and that each tile has its."""
+    whole, device = runner.run(image, "k"), runner.device
+    plan, size = runner.plan(half), (*image.shape[1::-1], device.info.lanes)
+    memory = sum(buffer_sizes(plan, whole_image(plan, *size)).values()) * 6 // 10
+    tiling = tiling_of(plan, *size, memory, memory)
+    assert len(tiling.tiles) > 1
+    for extents in tiling.tiles:
+        sizes = buffer_sizes(plan, extents)
+        assert all(each <= tiling.sizes[name] for name, each in sizes.items())
+    with monkeypatch.context() as patch:
+        patch.setattr(device, "memory", memory)
+        same(whole, runner.run(image, "k"))
+
+
 def patches_in(whole: Result) -> list[Box]:
     """Two patches of one size: one at an odd place, and one that ends with the image."""
     images = [x for x in (whole.final, whole.encoded, *whole.kept.values()) if x is not None]

@@ -4,14 +4,12 @@ import json
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 from PIL.TiffImagePlugin import IFDRational
 
 from clpipe import Pipeline
 from clpipe.base.errors import RequestError
-from clpipe.commands.main import main
 from clpipe.images.read import read_finished
 from clpipe.images.tags import orientation_of
 from clpipe.reference.curve import curve_index
@@ -23,7 +21,7 @@ from clpipe.stages.inverse_tone_curve import CameraRaw as InverseCameraRaw
 from clpipe.stages.inverse_tone_curve import File as InverseFile
 from clpipe.stages.inverse_tone_curve import Neutral as InverseNeutral
 from clpipe.stages.tone_curve import CameraRaw, Neutral
-from tests.conftest import written
+from tests.conftest import run_cli, written
 
 QUIET = ["sensor_noise", "row_noise", "denoise"]
 
@@ -112,9 +110,7 @@ def test_pictures_from_the_command_line(tmp_path):
     Image.fromarray(smooth()).save(folder / "two.png")
     (folder / "three.jpg").write_bytes(b"\xff\xd8\xff not a picture")
     out = tmp_path / "out"
-    arguments = ["run", str(folder), "-o", str(out), "-c", "unprocess", "--iso", "1600"]
-    result = CliRunner().invoke(main, arguments, catch_exceptions=False)
-    assert result.exit_code == 1
+    result = run_cli("run", folder, "-o", out, "-c", "unprocess", "--iso", 1600, status=1)
     assert "three.jpg" in result.output and "2 of 3 images done" in result.output
     assert written(out) == ["one.jpg", "one.json", "two.jpg", "two.json"]
 
@@ -134,10 +130,8 @@ def photograph(path, focal_length=35.0, equivalent=56, orientation=1) -> None:
 @pytest.mark.parametrize("ending", ["jpg", "png"])
 def test_what_a_photograph_says_of_its_shot_stays(tmp_path, ending):
     photograph(tmp_path / f"photo.{ending}", orientation=6)
-    arguments = ["-o", str(tmp_path / "out"), "-c", "unprocess", "--iso", "1600"]
-    arguments = ["run", str(tmp_path / f"photo.{ending}"), *arguments, "--format", "jpg"]
-    result = CliRunner().invoke(main, arguments, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    options = ("-o", tmp_path / "out", "-c", "unprocess", "--iso", 1600, "--format", "jpg")
+    run_cli("run", tmp_path / f"photo.{ending}", *options)
     with Image.open(tmp_path / "out" / "photo.jpg") as picture:
         assert picture.size == (96, 128)  # upright
         top_right = np.asarray(picture)[20:50, -45:-25].mean()
@@ -173,10 +167,7 @@ def test_each_chain_wants_its_own_kind(tmp_path, write_exr):
         (render, ["-c", "unprocess"], "holds linear light, but the chain starts on finished"),
         (tmp_path / "photo.png", [], "For a photograph, use -c unprocess"),
     ):
-        arguments = ["run", str(path), "-o", str(tmp_path / "out"), *more]
-        result = CliRunner().invoke(main, arguments, catch_exceptions=False)
-        assert result.exit_code == 1
-        assert message in result.output
+        assert message in run_cli("run", path, "-o", tmp_path / "out", *more, status=1).output
 
 
 def test_a_camera_without_a_matrix_leaves_colours():
@@ -193,9 +184,8 @@ def test_a_chain_that_does_not_fit_a_picture():
 
 def test_white_of_a_photograph_is_no_warning(tmp_path, recwarn):
     Image.fromarray(np.full((24, 32, 3), 255, np.uint8)).save(tmp_path / "white.png")
-    command = ["run", str(tmp_path / "white.png"), "-o", str(tmp_path / "out"), "-c", "unprocess"]
-    made = CliRunner().invoke(main, [*command, "--device", "numpy"])
-    assert made.exit_code == 0 and "clipped" not in made.stderr
+    command = ("run", tmp_path / "white.png", "-o", tmp_path / "out", "-c", "unprocess")
+    assert "clipped" not in run_cli(*command, "--device", "numpy").stderr
     assert json.loads((tmp_path / "out/white.json").read_text())["clipped"] > 0.9
     Pipeline("unprocess", device="numpy").process(np.full((8, 8, 3), 255, np.uint8), "white")
     assert not [each for each in recwarn if "clipped" in str(each.message)]

@@ -1,31 +1,18 @@
 """The picture of a noise report: noise by intensity, tails, autocorrelation."""
 
-from io import BytesIO
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
+from clpipe.analysis.drawing import INK, page, png_of
 from clpipe.analysis.report import UNITS, NoiseReport
 from clpipe.analysis.spatial import LAGS
 from clpipe.analysis.statistics import HISTOGRAM, Channel, gaussian_beyond
 from clpipe.base.files import write_new
-
-INK = {
-    "R": "#c8102e",
-    "G": "#2e8b3d",
-    "G1": "#2e8b3d",
-    "G2": "#8ab800",
-    "B": "#1f5fbf",
-    "Y": "#222222",
-    "Cb": "#18a0b0",
-    "Cr": "#b0389a",
-    "mosaic": "#222222",
-}
 
 # The channels whose autocorrelation is drawn: of pictures by their kind, and of mosaics.
 MAPS = {"display": ("Y", "Cb", "Cr"), "rgb": ("Y", "Cb", "Cr")}
@@ -39,15 +26,15 @@ def draw(report: NoiseReport, path: Path) -> None:
         ImageError: the file cannot be written.
     """
     with mpl.rc_context({"font.size": 12, "axes.grid": True, "grid.alpha": 0.3}):
-        figure = _figure(report)
-    FigureCanvasAgg(figure)
-    png = BytesIO()
-    figure.savefig(png)
-    write_new(path, png.getvalue())
+        write_new(path, png_of(_figure(report)))
 
 
 def _figure(report: NoiseReport) -> Figure:
-    figure = Figure(figsize=(16, 11), dpi=100, layout="constrained")
+    first, *more = report.images
+    subject = short_name(first) + (f" and {len(more)} more" if more else "")
+    against = short_name(report.truth) if report.truth else "their mean"
+    title = f"Noise of {subject} against {against} ({report.kind}, {report.share:.0%} used)"
+    figure = page(11, title)
     grid = figure.add_gridspec(2, 1, height_ratios=(1.15, 1))
     above, below = figure.add_subfigure(grid[0]), figure.add_subfigure(grid[1])
     intensity, tails = above.subplots(1, 2)
@@ -59,11 +46,6 @@ def _figure(report: NoiseReport) -> Figure:
     for axis, one in zip(axes, shown, strict=True):
         picture = draw_autocorrelation(axis, one, limit, report)
     below.colorbar(picture, ax=axes, shrink=0.85, label="correlation (lag 0 is 1)")
-    first, *more = report.images
-    subject = short_name(first) + (f" and {len(more)} more" if more else "")
-    against = short_name(report.truth) if report.truth else "their mean"
-    title = f"Noise of {subject} against {against} ({report.kind}, {report.share:.0%} used)"
-    figure.suptitle(title, fontsize=15)
     return figure
 
 

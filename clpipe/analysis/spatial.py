@@ -88,32 +88,6 @@ def line_noise(noise: Floats, mask: Mask) -> LineNoise:
     return LineNoise(math.sqrt(max(float(variance), 0.0)), math.sqrt(3 * float(error)))
 
 
-def over_white(plane: NDArray[np.floating[Any]], mask: Mask, size: int) -> float:
-    """The variance of means of ``size`` x ``size`` pixels over that of independent noise's.
-
-    It is 1 for independent noise, and more for coarse noise. Blocks of which a tenth or more does
-    not count are left out, and what does not count is no part of the others' means.
-
-    Args:
-        plane: (frame, height, width).
-        mask: the pixels that count.
-        size: of the blocks, px.
-
-    >>> noise = np.random.default_rng(0).normal(size=(1, 512, 512))
-    >>> 0.8 < over_white(noise, np.ones((512, 512), bool), 16) < 1.2
-    True
-    """
-    height, width = (side // size * size for side in mask.shape)
-    blocks = (height // size, size, width // size, size)
-    count = mask[:height, :width].reshape(blocks).sum((1, 3))
-    sums = (plane * mask)[:, :height, :width].reshape(len(plane), *blocks).sum((2, 4))
-    kept = count > 0.9 * size**2
-    variance = float((plane[:, mask] ** 2).mean()) if mask.any() else 0.0
-    if not kept.any() or variance == 0:
-        return math.nan
-    return float((sums[:, kept] ** 2 / count[kept]).mean() / variance)
-
-
 def energy_left(standard: NDArray[np.floating[Any]], mask: Mask) -> float:
     """The share of the noise's energy that remains after averaging 2x2 pixels.
 

@@ -17,8 +17,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from clpipe.analysis.drawing import INK
 from clpipe.analysis.plot import (
-    INK,
     draw_autocorrelation,
     draw_intensity,
     draw_tails,
@@ -29,7 +29,7 @@ from clpipe.analysis.report import NoiseReport
 from clpipe.analysis.spatial import LAGS
 from clpipe.base.text import one_line
 
-NEUTRAL = INK["mosaic"]  # in :mod:`clpipe.analysis.plot`
+NEUTRAL = INK["mosaic"]
 PAGE_COLOURS = resources.files("clpipe.analysis") / "colours.css"  # of the pages
 PAGE = "#010203"  # stands for the page's colour until the drawing is text
 COLOURS = ("#1f8a8a", "#d9822b", "#7a5bb5", "#c8102e")

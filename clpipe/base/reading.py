@@ -10,15 +10,18 @@ import os
 import re
 import stat
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache, wraps
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from clpipe.base.errors import ImageError, MissingError, RequestError
 from clpipe.base.memory import in_words
 from clpipe.base.text import alike
+
+T = TypeVar("T")
 
 TEXT_BYTES = 16 * 2**20  # the largest text but a manifest: a configuration, a curve, a sidecar
 
@@ -52,6 +55,24 @@ def check_regular(path: Path) -> os.stat_result:
     if kind != stat.S_IFREG:
         raise OSError(errno.EINVAL, f"it is {KINDS.get(kind, 'something else')}, not a file")
     return status
+
+
+def read_when_changed(read: Callable[[str], T]) -> Callable[[str], T]:
+    """A function of a file's path that keeps what it reads, and reads again when it changes.
+
+    It raises an OSError where the path is no regular file.
+    """
+
+    @lru_cache(maxsize=16)
+    def kept(path: str, time: int, size: int) -> T:
+        return read(path)
+
+    @wraps(read)
+    def current(path: str) -> T:
+        status = check_regular(Path(path))
+        return kept(path, status.st_mtime_ns, status.st_size)
+
+    return current
 
 
 def check_exists(path: Path) -> None:

@@ -49,13 +49,18 @@ def margins_of(x: int, y: int, data: Sequence[int], display: Sequence[int]) -> M
 
 
 @CpuTimer("convert")
-def display_window(data: Array, x: int, y: int, width: int, height: int) -> Array:
-    """The display window of an image, (height, width, channel), black outside its data window.
+def display_window(
+    data: Array, x: int, y: int, width: int, height: int, outside: float = 0
+) -> Array:
+    """Return the display window of an image, (height, width, channel).
 
-    ``data`` is the data window, (rows, columns, channel); its upper left pixel is at column ``x``
-    and row ``y`` of the display window.
+    Args:
+        data: the data window, (rows, columns, channel).
+        x, y: column and row of its upper left pixel in the display window.
+        width, height: of the display window.
+        outside: the value of pixels outside the data window.
     """
-    window = np.zeros((height, width, data.shape[2]), data.dtype)
+    window = np.full((height, width, data.shape[2]), outside, data.dtype)
     left, top = max(x, 0), max(y, 0)
     right, bottom = min(x + data.shape[1], width), min(y + data.shape[0], height)
     if left < right and top < bottom:

@@ -45,6 +45,22 @@ def jpeg_bytes(pixels: Array, quality: int = 93) -> bytes:
     return file.getvalue()
 
 
+def thumbnail(file: Path | io.BytesIO, name: str, side: int) -> Image.Image:
+    """Return a picture of eight bits, made at most ``side`` pixels wide and high.
+
+    Raises:
+        ImageError: it cannot be read; the message has its name.
+    """
+    try:
+        with Image.open(file) as picture:
+            picture.draft("RGB", (2 * side, 2 * side))
+            small = picture.convert("RGB")
+            small.thumbnail((side, side), Image.Resampling.LANCZOS)
+            return small
+    except DAMAGED as error:
+        raise ImageError(f"{name}: cannot be shown: {error}") from None
+
+
 def thumbnail_bytes(data: bytes, name: str, side: int) -> bytes:
     """A small WebP of a picture, at most ``side`` pixels wide and high.
 
@@ -57,15 +73,10 @@ def thumbnail_bytes(data: bytes, name: str, side: int) -> bytes:
         ImageError: it cannot be read.
     """
     if name.endswith(".jpg"):
-        try:
-            with Image.open(io.BytesIO(data)) as picture:
-                picture.draft("RGB", (2 * side, 2 * side))
-                small = picture.convert("RGB")
-        except DAMAGED as error:
-            raise ImageError(f"{name}: cannot be shown: {error}") from None
+        small = thumbnail(io.BytesIO(data), name, side)
     else:
         small = Image.fromarray(decoded(data, name))
-    small.thumbnail((side, side), Image.Resampling.LANCZOS)
+        small.thumbnail((side, side), Image.Resampling.LANCZOS)
     file = io.BytesIO()
     small.save(file, "WEBP", quality=75)
     return file.getvalue()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-from clpipe.base.errors import ImageError
+from clpipe.images.preview import thumbnail
 
 SHOWN = (".jpg", ".png", ".tif")  # endings of pictures that can be on a sheet
 
@@ -29,7 +29,7 @@ def contact_sheet(
     Raises:
         ImageError: a picture cannot be read.
     """
-    small = [[_thumbnail(path) for path in row] for row in rows]
+    small = [[thumbnail(path, str(path), THUMBNAIL) for path in row] for row in rows]
     width = max(each.width for row in small for each in row)
     height = max(each.height for row in small for each in row)
     across, down = width + GAP, height + TEXT + 2 * GAP
@@ -47,14 +47,3 @@ def contact_sheet(
     data = io.BytesIO()
     sheet.save(data, "JPEG", quality=90)
     return data.getvalue()
-
-
-def _thumbnail(path: Path) -> Image.Image:
-    try:
-        with Image.open(path) as picture:
-            picture.draft("RGB", (2 * THUMBNAIL, 2 * THUMBNAIL))
-            small = picture.convert("RGB")
-            small.thumbnail((THUMBNAIL, THUMBNAIL), Image.Resampling.LANCZOS)
-            return small
-    except (OSError, ValueError) as error:
-        raise ImageError(f"{path}: cannot be shown: {error}") from None

@@ -112,16 +112,14 @@ def carry(
     found = find_all(path, layers)
     read: list[Layer] = []
     attributes: dict[str, str] = {}
-    sums: dict[Path, str] = {}
     for each in found:
         pixels, (x, y) = read_found(each, path, (width, height), max_pixels)
-        sums |= {each.file: digests([str(each.file)]).get(str(each.file), "")}
         attributes |= cryptomatte_attributes(each.file, each.location.part)
         x, y = x + source.margins.left, y + source.margins.top
         read.append(Layer(each.kind, pixels, x, y, each.vectors))
     moved, valid = warp(read, geometry_of(chain, orientation), *whole)
     carried = tuple(
-        Aov(each.name, each.kind, each.channels, pixels, record_of(path, each, sums))
+        Aov(each.name, each.kind, each.channels, pixels, record_of(path, each))
         for each, pixels in zip(found, moved, strict=True)
     )
     return Aovs(carried, valid, attributes)
@@ -184,22 +182,20 @@ def geometry_of(chain: Chain, orientation: int) -> Geometry | None:
     return Composition((*parts, *turned)) if parts or turned else None
 
 
-def record_of(path: Path, layer: FoundLayer, sums: Mapping[Path, str]) -> dict[str, Any]:
-    """What a sidecar says of a layer that goes along.
-
-    Args:
-        path: of the image.
-        layer: the layer.
-        sums: the SHA-256 of files.
-    """
-    size, modified = stamp_of(layer.file)
+def record_of(path: Path, layer: FoundLayer) -> dict[str, Any]:
+    """What the sidecar of the image ``path`` says of a layer that goes along."""
     return {
         "layer": layer.name,
         "kind": layer.kind,
         "resampling": RESAMPLING[layer.kind],
         "channels": list(layer.channels),
-        "file": os.path.relpath(layer.file, path.parent),
-        "size": size,
-        "modified": modified,
-        "sha256": sums[layer.file],
+        **file_record(path, layer.file),
     }
+
+
+def file_record(path: Path, file: Path) -> dict[str, Any]:
+    """What the sidecar of the image ``path`` says of a file that belongs to it."""
+    size, modified = stamp_of(file)
+    sha256 = digests([str(file)]).get(str(file), "")
+    name = os.path.relpath(file, path.parent)
+    return {"file": name, "size": size, "modified": modified, "sha256": sha256}

@@ -5,17 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
-from clpipe.base.digests import digests
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
 from clpipe.chain.carry import AovSpec
 from clpipe.chain.chain import Chain
 from clpipe.chain.panorama import projection_of
 from clpipe.images.passes import cryptomatte_attributes
+from clpipe.images.pixels import display_window
 from clpipe.images.read import SourceImage
 from clpipe.inputs.around import pieces
 from clpipe.inputs.carry import Aov, Aovs, geometry_of, read_found, record_of
-from clpipe.inputs.companions import FoundLayer, find_all
+from clpipe.inputs.companions import find_all
 from clpipe.reference.carried import Layer, warp
 from clpipe.reference.geometry import Composition, Geometry
 from clpipe.reference.panorama import LatitudeLongitude, Panorama, Views
@@ -57,18 +57,13 @@ def carry_around(
     for path, own in zip(paths, names, strict=True):
         if own != names[0]:
             raise ImageError(f"{path}: its layers are not those of {paths[0]}; render all alike")
-    sums = {
-        file: digests([str(file)]).get(str(file), "")
-        for file in dict.fromkeys(each.file for found in of_files for each in found)
-    }
     size = file_size(panorama, len(paths))
     read = []
     for same in zip(*of_files, strict=True):
-        images = [
-            piece
-            for path, each in zip(paths, same, strict=True)
-            for piece in pieces(panorama, _whole(each, path, size, max_pixels))
-        ]
+        images: list[Array] = []
+        for path, each in zip(paths, same, strict=True):
+            pixels, place = read_found(each, path, size, max_pixels)
+            images += pieces(panorama, display_window(pixels, *place, *size))
         first = same[0]
         if first.kind == "depth" and isinstance(panorama, Views):
             images = [
@@ -82,7 +77,7 @@ def carry_around(
     ahead = _ahead(geometry, projection, source.pixels.shape[1::-1])
     carried: list[Aov] = []
     for each, pixels in zip(of_files[0], moved, strict=True):
-        record = record_of(paths[0], each, sums)
+        record = record_of(paths[0], each)
         if each.kind != "depth":
             carried.append(Aov(each.name, each.kind, each.channels, pixels, record))
             continue
@@ -105,19 +100,6 @@ def file_size(panorama: Panorama, files: int) -> tuple[int, int]:
     assert isinstance(panorama, Views)
     first = panorama.views[0]
     return first.width, first.height * len(panorama.views) // files
-
-
-def _whole(layer: FoundLayer, path: Path, size: tuple[int, int], max_pixels: int) -> Array:
-    """The samples of a layer of a whole file, 0 where it has none."""
-    pixels, (x, y) = read_found(layer, path, size, max_pixels)
-    width, height = size
-    if (x, y, *pixels.shape[:2]) == (0, 0, height, width):
-        return pixels
-    whole = np.zeros((height, width, pixels.shape[2]), pixels.dtype)
-    top, left = max(y, 0), max(x, 0)
-    part = pixels[top - y : height - y, left - x : width - x]
-    whole[top : top + part.shape[0], left : left + part.shape[1]] = part
-    return whole
 
 
 def _ahead(geometry: Geometry | None, projection: Projection, size: tuple[int, int]) -> Array:

@@ -45,7 +45,17 @@ OPENEXR_CUBE = (
 
 
 class Panorama(Protocol):
-    """Where directions are in an atlas."""
+    """Where directions are in an atlas.
+
+    A subclass has a ``border``, px around each view in the atlas.
+    """
+
+    border: int
+
+    @property
+    def count(self) -> int:
+        """How many images the atlas is made of."""
+        return 1
 
     @property
     def size(self) -> tuple[int, int]:
@@ -79,7 +89,25 @@ class Panorama(Protocol):
             filter_: how borders are filled from other views: of :data:`FILTERS`, "linear" or
                 "nearest"; "" leaves them as the view's own edge, as what counts in its pixels.
         """
-        ...
+        if not self.border:
+            return np.concatenate(images)
+        sides = ((self.border, self.border), (self.border, self.border), (0, 0))
+        whole = np.concatenate([np.pad(image, sides, "edge") for image in images])
+        row, column, x, y = self._borders
+        for _ in range(ROUNDS if filter_ else 0):
+            whole[row, column] = sampled(whole, x, y, filter_)
+        return whole
+
+    @cached_property
+    def _borders(self) -> tuple[Array, Array, Array, Array]:
+        """Rows and columns of border pixels that are seen elsewhere, and the places there."""
+        width, height = self.size
+        is_border = np.ones((height // self.count, width), bool)
+        is_border[self.border : -self.border, self.border : -self.border] = False
+        row, column = np.nonzero(np.tile(is_border, (self.count, 1)))
+        x, y = self.places(self.rays(column + 0.5, row + 0.5))
+        known = np.isfinite(x)
+        return row[known], column[known], x[known], y[known]
 
 
 @dataclass(frozen=True)
@@ -108,7 +136,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Views:
+class Views(Panorama):
     """Perspective views from one point; a direction is taken from where it is farthest from edges.
 
     Args:
@@ -118,6 +146,11 @@ class Views:
 
     views: tuple[View, ...]
     border: int = BORDER
+
+    @property
+    def count(self) -> int:
+        """See :attr:`Panorama.count`."""
+        return len(self.views)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -164,31 +197,9 @@ class Views:
             result = np.where(number == each, turned, result)
         return result
 
-    def atlas(self, images: Sequence[Array], filter_: str) -> Array:
-        """See :meth:`Panorama.atlas`."""
-        if not self.border:
-            return np.concatenate(images)
-        sides = ((self.border, self.border), (self.border, self.border), (0, 0))
-        whole = np.concatenate([np.pad(image, sides, "edge") for image in images])
-        row, column, x, y = self._borders
-        for _ in range(ROUNDS if filter_ else 0):
-            whole[row, column] = sampled(whole, x, y, filter_)
-        return whole
-
-    @cached_property
-    def _borders(self) -> tuple[Array, Array, Array, Array]:
-        """Rows and columns of border pixels that another view shows, and the places there."""
-        width, height = self.size
-        is_border = np.ones((height // len(self.views), width), bool)
-        is_border[self.border : -self.border, self.border : -self.border] = False
-        row, column = np.nonzero(np.tile(is_border, (len(self.views), 1)))
-        x, y = self.places(self.rays(column + 0.5, row + 0.5))
-        known = np.isfinite(x)
-        return row[known], column[known], x[known], y[known]
-
 
 @dataclass(frozen=True)
-class LatitudeLongitude:
+class LatitudeLongitude(Panorama):
     """All directions by longitude, to the right, and latitude; the middle is ahead.
 
     Args:
@@ -236,25 +247,6 @@ class LatitudeLongitude:
         latitude = (y - self.border - self.height / 2) * down
         flat = np.cos(latitude)
         return np.stack([np.sin(longitude) * flat, np.sin(latitude), np.cos(longitude) * flat])
-
-    def atlas(self, images: Sequence[Array], filter_: str) -> Array:
-        """See :meth:`Panorama.atlas`."""
-        (image,) = images
-        sides = ((self.border, self.border), (self.border, self.border), (0, 0))
-        whole = np.pad(image, sides, "edge")
-        row, column, x, y = self._borders
-        for _ in range(ROUNDS if filter_ else 0):
-            whole[row, column] = sampled(whole, x, y, filter_)
-        return whole
-
-    @cached_property
-    def _borders(self) -> tuple[Array, Array, Array, Array]:
-        """Rows and columns of border pixels, and the places beyond the ends that they show."""
-        width, height = self.size
-        is_border = np.ones((height, width), bool)
-        is_border[self.border : -self.border, self.border : -self.border] = False
-        row, column = np.nonzero(is_border)
-        return row, column, *self.places(self.rays(column + 0.5, row + 0.5))
 
 
 def sampled(pixels: Array, x: Array, y: Array, filter_: str) -> Array:

@@ -13,7 +13,7 @@ from clpipe.reference.geometry import Destined
 from clpipe.reference.intrinsics import AGREEMENT, Intrinsics
 from clpipe.reference.panorama import CUBE, FRONT, LatitudeLongitude, Panorama, View, Views
 from clpipe.reference.resample import PADDING, Axis, Parameters
-from clpipe.reference.warp import FILTERS, gather, reach_of
+from clpipe.reference.warp import FILTERS, Gathering, gather, within_border
 from clpipe.reference.wide import WideLens
 
 FACE = 256  # places across a face, at which it is looked for
@@ -24,7 +24,7 @@ Facts = tuple[tuple[str, float], ...]
 
 
 @dataclass(frozen=True)
-class Projection(Destined):
+class Projection(Gathering, Destined):
     """How a wide picture is made of an image: its geometry, and its resampling.
 
     It is a :class:`~clpipe.reference.geometry.Geometry`, and a
@@ -94,16 +94,6 @@ class Projection(Destined):
                 f"{view.width}x{view.height} pixels is {view.fx:.4g} px by its angle; leave one out"
             )
 
-    @property
-    def support(self) -> int:
-        """How many pixels on either side of a place have a weight."""
-        return len(FILTERS[self.filter]) // 2
-
-    @property
-    def scale(self) -> float:
-        """See :attr:`Resampler.scale`."""
-        return 1.0
-
     def size(self, width: int, height: int) -> tuple[int, int]:
         """See :meth:`Geometry.size`."""
         return self.lens.picture
@@ -133,15 +123,8 @@ class Projection(Destined):
         flat = {"across": across.reshape(-1), "down": down.reshape(-1)}
         return {**flat, "pitch": np.uint32(pitch), "lines": np.uint32(lines)}
 
-    def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
-        """See :meth:`Resampler.needed`."""
-        first, last = _lines(self, axis, *size)
-        return int(first[start:stop].min()), int(last[start:stop].max()) + 1
-
-    def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
-        """See :meth:`Resampler.reach`."""
-        of_image = size[1 if axis == "rows" else 0]
-        return reach_of(*_lines(self, axis, *size), of_image, low, high)
+    def lines(self, axis: Axis, width: int, height: int) -> tuple[Array, Array]:
+        return _lines(self, axis, width, height)
 
     def reference(self, image: Floats) -> Floats:
         """The picture, (height, width, 3) float32, of an image; black where nothing is seen."""
@@ -185,7 +168,7 @@ def _ways(projection: Projection, width: int, height: int) -> tuple[Floats, Floa
 
 @lru_cache(maxsize=8)
 def _lines(projection: Projection, axis: Axis, width: int, height: int) -> tuple[Array, Array]:
-    """The first and the last old row, or column, of which each new one is made at most."""
+    """See :meth:`Gathering.lines`."""
     columns, rows = projection.lens.picture
     number, size = (1, height) if axis == "rows" else (0, width)
     way = _ways(projection, width, height)[number][:rows, :columns]
@@ -197,7 +180,4 @@ def _lines(projection: Projection, axis: Axis, width: int, height: int) -> tuple
     same = np.arange(len(first)) * size // len(first)
     first = np.where(np.isinf(first), same, np.floor(first) - support)
     last = np.where(np.isinf(last), same, np.floor(last) + support + 1)
-    # The border mirrors as many lines as the filter has beyond the edge.
-    first = np.clip(np.minimum(first, size - 1 - support), 0, size - 1)
-    last = np.clip(np.maximum(last, support), 0, size - 1)
-    return first.astype(np.int64), last.astype(np.int64)
+    return within_border(first, last, size, support)

@@ -103,6 +103,13 @@ def tail_probability(words: Words) -> Floats:
     return (low.astype(np.float32) + np.float32(0.5)) * np.float32(2.3283064e-10)
 
 
+def exponential_of(words: Words, limit: int) -> tuple[NDArray[np.int32], Floats]:
+    """The upper 31 bits of words, and an exponential of mean 1 where they are below the limit."""
+    bits = (words >> np.uint32(1)).view(np.int32)
+    u = (bits.astype(np.float32) + np.float32(0.5)) * np.float32(1 / max(limit, 1))
+    return bits, np.maximum(negative_log(u), np.float32(0))
+
+
 def in_upper_half(words: Words) -> NDArray[np.bool_]:
     """Whether the word stands for the upper half of the distribution: its top bit is 0."""
     return words.view(np.int32) >= 0

@@ -102,8 +102,50 @@ def lagrange(t: Floats) -> list[Floats]:
     ]
 
 
+class Gathering:
+    """A resampler that gathers each pixel at a place of its own, with one of :data:`FILTERS`."""
+
+    filter: str
+
+    @property
+    def scale(self) -> float:
+        """See :attr:`Resampler.scale`."""
+        return 1.0
+
+    @property
+    def support(self) -> int:
+        """How many pixels on either side of a place have a weight."""
+        return len(FILTERS[self.filter]) // 2
+
+    def lines(self, axis: Axis, width: int, height: int) -> tuple[Array, Array]:
+        """The first and the last old row, or column, of which each new one is made at most."""
+        raise NotImplementedError(type(self).__name__)
+
+    def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
+        """See :meth:`Resampler.needed`."""
+        first, last = self.lines(axis, *size)
+        return int(first[start:stop].min()), int(last[start:stop].max()) + 1
+
+    def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
+        """See :meth:`Resampler.reach`."""
+        first, last = self.lines(axis, *size)
+        of_image, of_picture = size[1 if axis == "rows" else 0], len(first)
+        line = np.arange(of_picture) * of_image
+        before = int((-(-line // of_picture) - first).max())
+        behind = int((last - line // of_picture).max())
+        low, high = (-(-each * of_image // of_picture) for each in (low, high))
+        return max(low + before, 0), max(high + behind + 1, 0)
+
+
+def within_border(first: Array, last: Array, size: int, support: int) -> tuple[Array, Array]:
+    """Lines of an image, with those that its border mirrors: as many as the filter reaches."""
+    first = np.clip(np.minimum(first, size - 1 - support), 0, size - 1)
+    last = np.clip(np.maximum(last, support), 0, size - 1)
+    return first.astype(np.int64), last.astype(np.int64)
+
+
 @dataclass(frozen=True)
-class Warp:
+class Warp(Gathering):
     """A lens as a resampling of the image, see :class:`clpipe.reference.resample.Resampler`.
 
     Args:
@@ -121,16 +163,6 @@ class Warp:
 
     lens: DistortionMap
     filter: str
-
-    @property
-    def scale(self) -> float:
-        """See :attr:`Resampler.scale`."""
-        return 1.0
-
-    @property
-    def support(self) -> int:
-        """How many pixels on either side of a place have a weight."""
-        return len(FILTERS[self.filter]) // 2
 
     def resized(self, width: int, height: int) -> tuple[int, int]:
         """See :meth:`Resampler.resized`."""
@@ -152,15 +184,8 @@ class Warp:
         numbers = {name: np.uint32(n) for name, n in counts.items()}
         return {"nodes": grid.flat, "share": np.float32(1 / grid.step), **numbers}
 
-    def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
-        """See :meth:`Resampler.needed`."""
-        first, last = _lines(self, axis, *size)
-        return int(first[start:stop].min()), int(last[start:stop].max()) + 1
-
-    def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
-        """See :meth:`Resampler.reach`."""
-        number = 1 if axis == "rows" else 0
-        return reach_of(*_lines(self, axis, *size), size[number], low, high)
+    def lines(self, axis: Axis, width: int, height: int) -> tuple[Array, Array]:
+        return _lines(self, axis, width, height)
 
     def reference(self, image: Floats) -> Floats:
         """The bent image, (height, width, 3) float32 in and out; black where the lens sees none."""
@@ -171,22 +196,6 @@ class Warp:
         for channel, ways in enumerate(zip(fields, fields, strict=True)):
             result[..., channel] = gather(image[..., channel], *ways, FILTERS[self.filter])
         return result
-
-
-def reach_of(first: Array, last: Array, of_image: int, low: int, high: int) -> tuple[int, int]:
-    """See :meth:`clpipe.reference.resample.Resampler.reach`.
-
-    Args:
-        first, last: the first and the last old line of which each new one is made.
-        of_image: how many old ones there are.
-        low, high: how far new lines begin before and end behind a place.
-    """
-    of_picture = len(first)
-    line = np.arange(of_picture) * of_image
-    before = int((-(-line // of_picture) - first).max())
-    behind = int((last - line // of_picture).max())
-    low, high = (-(-each * of_image // of_picture) for each in (low, high))
-    return max(low + before, 0), max(high + behind + 1, 0)
 
 
 def gather(plane: Floats, across: Floats, down: Floats, polynomials: Floats) -> Floats:
@@ -292,7 +301,7 @@ OVERSHOOT = (1.632**2 - 1) / 2
 
 @lru_cache(maxsize=32)
 def _lines(warp: Warp, axis: Axis, width: int, height: int) -> tuple[Array, Array]:
-    """The first and the last old row, or column, of which each new one is made at most."""
+    """See :meth:`Gathering.lines`."""
     grid, support = warp.grid(width, height), warp.support
     sizes = warp.resized(width, height)
     # How far the pixels among each four by four nodes look to either side, of all channels.
@@ -317,7 +326,4 @@ def _lines(warp: Warp, axis: Axis, width: int, height: int) -> tuple[Array, Arra
     same = line + (warp.lens.margins.top if axis == "rows" else warp.lens.margins.left)
     first = np.where(np.isinf(least[window]), same, line + least[window] - (support - 1))
     last = np.where(np.isinf(most[window]), same, line + most[window] + support)
-    # The border mirrors as many lines as the filter has beyond the edge.
-    first = np.clip(np.minimum(first, size - 1 - support), 0, size - 1)
-    last = np.clip(np.maximum(last, support), 0, size - 1)
-    return first.astype(np.int64), last.astype(np.int64)
+    return within_border(first, last, size, support)

@@ -3,7 +3,7 @@
 from typing import Annotated, ClassVar
 
 import numpy as np
-from pydantic import BeforeValidator
+from pydantic import Field
 
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
@@ -23,10 +23,6 @@ from clpipe.stage import (
 )
 
 Bias = tuple[float, float, float, float]
-
-
-def _as_tuple(value: object) -> object:
-    return tuple(value) if isinstance(value, list) else value
 
 
 class Offsets(Method):
@@ -57,7 +53,7 @@ class Offsets(Method):
         ge=0,
         le=1,
     )
-    bias: Annotated[Bias, BeforeValidator(_as_tuple)] | None = parameter(
+    bias: Annotated[Bias, Field(strict=False)] | None = parameter(
         None,
         "Fixed offsets of R, G in the rows of R, G in the rows of B and B.",
         "signal",

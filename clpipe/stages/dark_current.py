@@ -7,8 +7,8 @@ import numpy as np
 
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
-from clpipe.reference.math import negative_log, square_root
-from clpipe.reference.random import normal_at, word_at
+from clpipe.reference.math import square_root
+from clpipe.reference.random import exponential_of, normal_at, word_at
 from clpipe.stage import (
     Arguments,
     Context,
@@ -149,9 +149,8 @@ class Thermal(Method):
             return image
         (mean, spread, electron), zero = self._charge, np.float32(0)
         words = word_at(image.shape, 0, given.stream[NoiseScope.CAMERA])
-        bits = (words >> np.uint32(1)).view(np.int32)
-        u = (bits.astype(np.float32) + np.float32(0.5)) * np.float32(4.6566129e-10)
-        more = (np.maximum(negative_log(u), zero) - np.float32(1)) * spread
+        _, charge = exponential_of(words, 1 << 31)
+        more = (charge - np.float32(1)) * spread
         shot = square_root(np.maximum(more + mean, zero) * electron)
         return image + more + normal_at(image.shape, 1, given.stream[NoiseScope.IMAGE]) * shot
 

@@ -1,6 +1,5 @@
 """Dark shading: smooth maps that a sensor adds to every frame, in the dark as well."""
 
-from functools import lru_cache
 from math import sqrt
 from pathlib import Path
 from typing import ClassVar
@@ -9,7 +8,7 @@ import numpy as np
 from pydantic import field_validator
 
 from clpipe.base.errors import ImageError
-from clpipe.base.reading import check_regular
+from clpipe.base.reading import read_when_changed
 from clpipe.base.tracing import float32
 from clpipe.base.types import Array, Floats
 from clpipe.reference.random import Stream, normal_of, philox
@@ -162,16 +161,15 @@ def measured(path: str) -> Floats:
         ValueError: the file cannot be read, or holds no such map.
     """
     try:
-        status = check_regular(Path(path))
-        return _measured(path, status.st_mtime_ns, status.st_size)
+        return _measured(path)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
     except ImageError as error:
         raise ValueError(str(error)) from None
 
 
-@lru_cache(maxsize=8)
-def _measured(path: str, time: int, size: int) -> Floats:
+@read_when_changed
+def _measured(path: str) -> Floats:
     from clpipe.images.read import read_image  # few need what it imports
 
     return np.asarray(read_image(Path(path), mosaic=True).pixels, np.float32)

@@ -5,8 +5,7 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.reference.math import negative_log
-from clpipe.reference.random import word_at
+from clpipe.reference.random import exponential_of, word_at
 from clpipe.stage import (
     Arguments,
     Context,
@@ -91,9 +90,7 @@ class Random(Method):
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         hot_limit, dead_limit = self.limits()
         words = word_at(image.shape, 0, given.stream[NoiseScope.CAMERA])
-        bits = (words >> np.uint32(1)).view(np.int32)
-        u = (bits.astype(np.float32) + np.float32(0.5)) * np.float32(1 / max(hot_limit, 1))
-        excess = np.maximum(negative_log(u), np.float32(0))
+        bits, excess = exponential_of(words, hot_limit)
         hot = image + np.float32(self.hot_level) * (np.float32(1) + excess)
         alive = np.where(bits < hot_limit, hot, image)
         return np.where(bits > dead_limit, np.float32(0), alive)

@@ -44,6 +44,17 @@ class NoDistortion(Unchanged):
     summary: ClassVar = "straight lines stay straight"
 
 
+def filter_arguments(name: str) -> Arguments:
+    """The kernel's arguments for the filter of this name."""
+    filter_ = warp.FILTERS[name]
+    taps, powers = filter_.shape
+    return {
+        "filter": filter_,
+        "taps": CompileTime(str(taps)),
+        "powers": CompileTime(str(powers)),
+    }
+
+
 class HasPicture(AboutAxis):
     """Parameters of the picture, whatever the lens."""
 
@@ -112,14 +123,8 @@ class Distortion(HasPicture):
         resampling = self.resampling
         if resampling.lens.is_identity:
             return ()
-        arguments = ("filter", "taps", "powers")
-        return (
-            Pass(
-                "distortion",
-                Resample(resampling, resampling.support),
-                arguments,
-            ),
-        )
+        access = Resample(resampling, resampling.support)
+        return (Pass("distortion", access, ("filter", "taps", "powers")),)
 
     def geometry(self) -> DistortionMap | None:
         return self.lens() if self.passes() else None
@@ -129,13 +134,7 @@ class Distortion(HasPicture):
         return {"focal_length_factor": self.lens().scale(width, height)} if self.fit else {}
 
     def arguments(self, context: Context) -> Arguments:
-        filter_ = warp.FILTERS[self.filter]
-        taps, powers = filter_.shape
-        return {
-            "filter": filter_,
-            "taps": CompileTime(str(taps)),
-            "powers": CompileTime(str(powers)),
-        }
+        return filter_arguments(self.filter)
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         return self.resampling.reference(image) if self.passes() else image

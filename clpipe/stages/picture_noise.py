@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from clpipe.base.errors import RequestError
-from clpipe.base.reading import check_regular, parse_json, read_bytes
+from clpipe.base.reading import parse_json, read_bytes, read_when_changed
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.correlated import correlated_normals, mixing
@@ -41,7 +41,7 @@ CHANNELS = Kind.DISPLAY.channels
 MIXING = ("green_red", "green_green", "blue_red", "blue_green", "blue_blue")  # kernel arguments
 
 Sigma = Annotated[float, Field(ge=0, le=1)]
-Sigmas = Annotated[tuple[Sigma, ...], Field(min_length=2, max_length=ENTRIES)]
+Sigmas = Annotated[tuple[Sigma, ...], Field(strict=False, min_length=2, max_length=ENTRIES)]
 
 
 Correlation = Annotated[float, Field(ge=-1, le=1)]
@@ -80,11 +80,6 @@ def _as_three(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _as_tuples(value: Any) -> Any:
-    """Nested lists, as TOML has them, as the tuples that strict validation needs."""
-    return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple) else value
-
-
 class IndependentNoise(Matched):
     """Gaussian noise, independent in each pixel and image; sigma is set or measured."""
 
@@ -96,7 +91,7 @@ class IndependentNoise(Matched):
         file=True,
     )
     correlation: (
-        Annotated[tuple[Correlation, Correlation, Correlation], BeforeValidator(_as_tuples)] | None
+        Annotated[tuple[Correlation, Correlation, Correlation], Field(strict=False)] | None
     ) = parameter(
         None,
         "Correlation of red with green, of red with blue, and of green with blue.",
@@ -237,7 +232,7 @@ class IntensityDependent(IndependentNoise):
     summary: ClassVar = "independent Gaussian noise, sigma from a table by intensity (SyB3R)"
     example: ClassVar = {"sigma": [0.01, 0.08, 0.03], "correlation": [0.6, -0.3, 0.5]}
 
-    sigma: Annotated[Sigmas | tuple[Sigmas, Sigmas, Sigmas], BeforeValidator(_as_tuples)] | None = (
+    sigma: Sigmas | Annotated[tuple[Sigmas, Sigmas, Sigmas], Field(strict=False)] | None = (
         parameter(
             None,
             "Standard deviations at intensities evenly spaced from 0 to 1, linear between them: "
@@ -308,16 +303,13 @@ def measured_noise(path: str) -> Mapping[float | None, Mapping[str, MeasuredNois
             values.
     """
     try:
-        status = check_regular(Path(path))
-        return _measured_noise(path, status.st_mtime_ns, status.st_size)
+        return _measured_noise(path)
     except OSError as error:
         raise ValueError(f"cannot be read: {error.strerror}") from None
 
 
-@lru_cache(maxsize=16)
-def _measured_noise(
-    path: str, time: int, size: int
-) -> Mapping[float | None, Mapping[str, MeasuredNoise]]:
+@read_when_changed
+def _measured_noise(path: str) -> Mapping[float | None, Mapping[str, MeasuredNoise]]:
     try:
         report = parse_json(read_bytes(Path(path)))
         reports = report.get("by_iso", {UNKNOWN: report})

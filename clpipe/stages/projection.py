@@ -16,11 +16,9 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.reference.panorama import Panorama
 from clpipe.reference.projection import Projection
-from clpipe.reference.warp import FILTERS
 from clpipe.reference.wide import WideLens
 from clpipe.stage import (
     Arguments,
-    CompileTime,
     Context,
     Kind,
     Method,
@@ -33,6 +31,7 @@ from clpipe.stage import (
     Unchanged,
     parameter,
 )
+from clpipe.stages.distortion import filter_arguments
 
 
 class NoProjection(Unchanged):
@@ -134,13 +133,7 @@ class Wide(OfPanorama):
         return (Pass("projection", access, ("filter", "taps", "powers")),)
 
     def arguments(self, context: Context) -> Arguments:
-        filter_ = FILTERS[self.filter]
-        taps, powers = filter_.shape
-        return {
-            "filter": filter_,
-            "taps": CompileTime(str(taps)),
-            "powers": CompileTime(str(powers)),
-        }
+        return filter_arguments(self.filter)
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         return self.geometry().reference(image)

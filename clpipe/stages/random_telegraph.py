@@ -6,8 +6,7 @@ import numpy as np
 
 from clpipe.base.tracing import float32, int32
 from clpipe.base.types import Floats
-from clpipe.reference.math import negative_log
-from clpipe.reference.random import word_at
+from clpipe.reference.random import exponential_of, word_at
 from clpipe.stage import (
     Arguments,
     Context,
@@ -92,11 +91,10 @@ class TwoLevels(Method):
         return before + np.float32(self.share) * np.float32(self.amplitude) ** 2 / np.float32(2)
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        (limit, scale), half = self._chosen, np.float32(0.5)
+        (limit, _), half = self._chosen, np.float32(0.5)
         words = word_at(image.shape, 0, given.stream[NoiseScope.CAMERA])
-        bits = (words >> np.uint32(1)).view(np.int32)
-        u = (bits.astype(np.float32) + half) * scale
-        step = np.maximum(negative_log(u), np.float32(0)) * np.float32(self.amplitude) * half
+        bits, distance = exponential_of(words, int(limit))
+        step = distance * np.float32(self.amplitude) * half
         step = np.where(bits < limit, step, np.float32(0))
         up = word_at(image.shape, 1, given.stream[NoiseScope.IMAGE]).view(np.int32) >= 0
         return np.where(up, image + step, image - step)

@@ -6,8 +6,8 @@ import numpy as np
 
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
-from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stage, parameter
-from clpipe.stages.white_balance.gains import CameraGains
+from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stage
+from clpipe.stages.white_balance.gains import CameraGains, gain_parameter
 
 
 class Brooks2019(CameraGains):
@@ -29,12 +29,8 @@ class Brooks2019(CameraGains):
     kernel: ClassVar = "restore_highlights"
     summary: ClassVar = "raise red and blue of nearly white pixels by the gains"
 
-    red_gain: float | None = parameter(
-        None, "Gain of red, green = 1.", auto="as inverse_white_balance uses it", gt=0, le=64
-    )
-    blue_gain: float | None = parameter(
-        None, "Gain of blue, green = 1.", auto="as inverse_white_balance uses it", gt=0, le=64
-    )
+    red_gain: float | None = gain_parameter("red", auto="as inverse_white_balance uses it")
+    blue_gain: float | None = gain_parameter("blue", auto="as inverse_white_balance uses it")
 
     def resolve(self, context: Context) -> CameraGains:
         red, blue = context.gains_of_light

@@ -6,7 +6,7 @@
 develop the DNGs (Debian: apt-get install dcraw darktable rawtherapee). Those that are missing are
 named and left out. Three tables are printed, and crops written to the output folder:
 
-Noise: the signature of clpipe.analysis.signature, of a noisy development less the same without
+Noise: the signature (clpipe.analysis.matching.columns) of a noisy development less the same without
 noise, and dots that noise makes. Kurtosis also on the flat patches of a saturated chart.
 
 Colours: the patches of a ColorChecker at ISO 100 without noise, against the chart, in CIELAB.
@@ -35,7 +35,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from clpipe.analysis.signature import BRIGHTEST, DARKEST, flat_places, luma, signature
+from clpipe.analysis.matching.columns import signature
+from clpipe.analysis.signature import BRIGHTEST, DARKEST, flat_places, luma
 from clpipe.base.errors import ClpipeError
 from clpipe.base.types import Array, Floats, Mask
 from clpipe.images.read import read_image
@@ -229,7 +230,7 @@ def noise_rows(
             chart = [comparison.picture(maker, iso, SATURATED, noisy) for noisy in (True, False)]
             y = luma(chart[1])
             patches = patch_places(len(y)) & (y >= DARKEST) & (y <= BRIGHTEST)
-            saturated = signature(*chart, patches).kurtosis
+            saturated = signature(*chart, patches)["kurtosis"]
             for name in names:
                 noisy, clean = (comparison.picture(maker, iso, name, n) for n in (True, False))
                 found = signature(noisy, clean, flat_places(clean) & inside(clean.shape))

@@ -35,13 +35,12 @@ from clpipe.analysis.matching.columns import (
 from clpipe.analysis.matching.scenes import Scene, load_scenes
 from clpipe.analysis.matching.search import target_of
 from clpipe.analysis.matching.simulation import Simulator
-from clpipe.analysis.spatial import over_white
 from clpipe.base.types import Doubles
 from clpipe.chain.files import load_settings
 from clpipe.chain.settings import overlay
 from clpipe.engine.device import open_device
 from clpipe.images.jpeg import JpegEncoding
-from tools.compare.telling import PATCH, Judged, distance, statistics, told
+from tools.compare.telling import PATCH, Judged, distance, over_white, statistics, told
 
 FEWEST = 4  # patches of a camera
 COVERED = 0.6  # share of a patch that is flat, neither dark nor bright

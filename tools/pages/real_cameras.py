@@ -14,15 +14,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import clpipe
-from clpipe.analysis.signature import (
-    BIN,
-    FEWEST,
-    Signature,
-    flat_places,
-    luma,
-    noise_of,
-    signature,
-)
+from clpipe.analysis.matching.columns import Figures, signature
+from clpipe.analysis.signature import BIN, FEWEST, flat_places, luma, noise_of
 from clpipe.analysis.spatial import LAGS, autocorrelation, count_pairs
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.engine.device import open_device
@@ -35,9 +28,9 @@ TRUTH, PICTURE = "_mean.png", "_real.png"
 RINGS = 16  # of spatial frequency, up to half a cycle per pixel
 
 # Cameras' own JPEGs in their native size, each less the mean of many of the same scene: medians
-# over pictures, measured by clpipe.analysis.signature. The pictures are not shipped. They are of
-# Nam, Hwang, Matsushita and Kim, "A holistic approach to cross-channel image noise modeling and its
-# application to image denoising" (CVPR 2016).
+# over pictures, measured by clpipe.analysis.matching.columns. The pictures are not shipped. They
+# are of Nam, Hwang, Matsushita and Kim, "A holistic approach to cross-channel image noise modeling
+# and its application to image denoising" (CVPR 2016).
 MEASURED: dict[str, dict[str, float]] = {
     name: dict(zip((attribute for _, attribute, _ in COLUMNS), values, strict=True))
     for name, values in {
@@ -68,7 +61,7 @@ class Pair:
     noisy: Array
     clean: Array
 
-    def signature(self) -> Signature:
+    def signature(self) -> Figures:
         """The columns."""
         return signature(self.noisy, self.clean)
 
@@ -115,7 +108,7 @@ def develop(render: Floats, iso: float, device: str | None = None) -> Pair:
 
 def medians(pairs: Iterable[Pair]) -> dict[str, float]:
     """The columns of several pairs: the median of each."""
-    records = [pair.signature().record() for pair in pairs]
+    records = [pair.signature() for pair in pairs]
     return {name: float(np.median([record[name] for record in records])) for name in records[0]}
 
 

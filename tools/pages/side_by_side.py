@@ -6,7 +6,6 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from clpipe.analysis.crops import HEIGHT, WIDTH, Place, choose_places
-from clpipe.analysis.signature import Signature
 from clpipe.base.types import Array
 
 SCALE = 4  # of crops
@@ -27,9 +26,8 @@ COLUMNS = (
 )
 
 
-def cells(signature: Signature | Mapping[str, float]) -> list[str]:
+def cells(record: Mapping[str, float]) -> list[str]:
     """The columns of a signature as texts."""
-    record = signature.record() if isinstance(signature, Signature) else signature
     return [format(record[name], form) if name in record else "" for _, name, form in COLUMNS]
 
 

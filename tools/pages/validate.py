@@ -359,7 +359,7 @@ percentile of the gradient, luma of 30 to 225. Medians over pictures. The rms is
 sigma are of luma over the sigma of its intensity (Gaussian: 3.0 and 0.6); right, below, diagonal and 2 right are autocorrelations of luma; half is the
 share of its variance that 2x2 averaging leaves (independent: .25); chroma right is the autocorrelation of Cb and Cr, R-G the correlation of red and
 green. The first rows are of the pictures of Nam, Hwang, Matsushita and Kim ("A holistic approach to cross-channel image noise modeling and its
-application to image denoising", CVPR 2016), measured by `clpipe.analysis.signature`. **Bold** is outside what is asked
+application to image denoising", CVPR 2016), measured by `clpipe.analysis.matching.columns`. **Bold** is outside what is asked
 for. The rms is not asked for: it is the sensor's, the exposure's and the scene's.
 """
 

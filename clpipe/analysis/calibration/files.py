@@ -11,7 +11,6 @@ from clpipe.analysis.calibration.frames import (
     read_frame,
 )
 from clpipe.analysis.calibration.groups import calibrate_group, group_frames
-from clpipe.analysis.calibration.plot import calibration_png
 from clpipe.analysis.calibration.profile import calibrated_profile
 from clpipe.analysis.calibration.result import Calibration
 from clpipe.base.errors import ImageError, RequestError
@@ -65,6 +64,8 @@ def write_profile(path: Path, frame: CalibrationFrame, calibrations: Sequence[Ca
     Raises:
         ImageError: a file cannot be written, or the estimates make no valid profile.
     """
+    from clpipe.analysis.calibration.plot import calibration_png  # imports Matplotlib
+
     text = calibrated_profile(
         path.stem, frame.make, frame.model, calibrations, frame.gains, frame.xyz_to_camera
     )

@@ -5,7 +5,6 @@ from pathlib import Path
 from clpipe.analysis.calibration.files import write_with_picture
 from clpipe.analysis.emva.figures import Figures, figures
 from clpipe.analysis.emva.moments import Moments, read_moments
-from clpipe.analysis.emva.plot import emva_png
 from clpipe.analysis.emva.profile import emva_profile
 from clpipe.analysis.emva.series import read_series
 from clpipe.base.errors import RequestError
@@ -47,6 +46,8 @@ def write_emva_profile(
     Raises:
         ImageError: a file cannot be written, or the figures make no valid profile.
     """
+    from clpipe.analysis.emva.plot import emva_png  # imports Matplotlib
+
     source = series.absolute().parent.name
     text = emva_profile(path.stem, iso or USUAL_ISO, source, moments, found)
     return write_with_picture(path, text, emva_png(moments, found, f"EMVA 1288: {source}"))

@@ -1,19 +1,17 @@
 """The picture of a series: the standard's curves, spectrograms and histograms."""
 
 from collections.abc import Callable
-from io import BytesIO
-from typing import TYPE_CHECKING
+from functools import partial
 
 import numpy as np
+from matplotlib.axes import Axes
+from scipy.ndimage import uniform_filter
 
+from clpipe.analysis.drawing import finish, page, png_of
 from clpipe.analysis.emva.figures import Figures
 from clpipe.analysis.emva.moments import Moments
 from clpipe.base.types import Doubles
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-WIDTH = 1600  # px
 MEASURED, MODEL, OTHER, LIMIT = "#1f5fbf", "#222222", "#c8102e", "#8a8a8a"
 BOX = 5  # px, of the mean that is subtracted before the histogram of PRNU
 BINS = 256
@@ -25,32 +23,24 @@ def emva_png(moments: Moments, figures: Figures, title: str) -> bytes:
     They are sensitivity, photon transfer, signal-to-noise ratio, linearity,
     spectrograms of rows and of columns, and histograms of DSNU and PRNU.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(16, 20), dpi=WIDTH / 16, layout="constrained")
-    figure.suptitle(title, fontsize=17)
+    figure = page(20, title)
     panels: tuple[Callable[[Axes, Moments, Figures], None], ...] = (
         _sensitivity,
         _photon_transfer,
         _signal_to_noise,
         _linearity,
-        _rows,
-        _columns,
+        partial(_spectra, across=False),
+        partial(_spectra, across=True),
         _dsnu,
         _prnu,
     )
     for panel, each in zip(figure.subplots(4, 2).ravel(), panels, strict=True):
         each(panel, moments, figures)
-        panel.grid(alpha=0.25, which="both")
-        panel.legend(fontsize=10)
-    canvas = FigureCanvasAgg(figure)
-    picture = BytesIO()
-    canvas.print_png(picture)
-    return picture.getvalue()
+        finish(panel)
+    return png_of(figure)
 
 
-def _fitted(panel: "Axes", x: Doubles, y: Doubles, figures: Figures, at: float) -> None:
+def _fitted(panel: Axes, x: Doubles, y: Doubles, figures: Figures, at: float) -> None:
     """Draw points, those that were not fitted hollow, and the saturation."""
     used = figures.fitted
     panel.plot(x[used], y[used], "o", ms=4, color=MEASURED, label="fitted")
@@ -58,7 +48,7 @@ def _fitted(panel: "Axes", x: Doubles, y: Doubles, figures: Figures, at: float) 
     panel.axvline(at, color=LIMIT, lw=1, ls=":", label="saturation")
 
 
-def _sensitivity(panel: "Axes", moments: Moments, figures: Figures) -> None:
+def _sensitivity(panel: Axes, moments: Moments, figures: Figures) -> None:
     photons = moments.bright.photons
     _fitted(panel, photons, moments.light, figures, figures.saturation.value)
     ends = np.array([0, figures.saturation.value])
@@ -72,19 +62,21 @@ def _sensitivity(panel: "Axes", moments: Moments, figures: Figures) -> None:
     )
 
 
-def _photon_transfer(panel: "Axes", moments: Moments, figures: Figures) -> None:
+def _photon_transfer(panel: Axes, moments: Moments, figures: Figures) -> None:
     light, end = moments.light, float(moments.light[figures.saturated])
     _fitted(panel, light, moments.noise, figures, end)
     slope = figures.system_gain.value
     panel.plot([0, end], [0, slope * end], color=MODEL, lw=1.2, label=f"K = {slope:.4g} DN/e⁻")
     panel.set(
-        title="Photon transfer", xlabel="mean above dark, DN", ylabel="variance above dark, DN²"
+        title="Photon transfer",
+        xlabel="mean above dark, DN",
+        ylabel="variance above dark, DN²",
+        xlim=(0, None),
+        ylim=(0, None),
     )
-    panel.set_xlim(0)
-    panel.set_ylim(0)
 
 
-def _signal_to_noise(panel: "Axes", moments: Moments, figures: Figures) -> None:
+def _signal_to_noise(panel: Axes, moments: Moments, figures: Figures) -> None:
     """SNR over photons with its model, and that with DSNU and PRNU."""
     bright = moments.bright
     seen = (bright.variance > 0) & (moments.light > 0)
@@ -129,7 +121,7 @@ def _signal_to_noise(panel: "Axes", moments: Moments, figures: Figures) -> None:
     )
 
 
-def _linearity(panel: "Axes", moments: Moments, figures: Figures) -> None:
+def _linearity(panel: Axes, moments: Moments, figures: Figures) -> None:
     linearity = figures.linearity
     used = linearity.used
     panel.plot(
@@ -145,17 +137,7 @@ def _linearity(panel: "Axes", moments: Moments, figures: Figures) -> None:
     panel.set(title="Linearity", xlabel="photons per pixel", ylabel="off the line, %")
 
 
-def _rows(panel: "Axes", moments: Moments, figures: Figures) -> None:
-    _spectra(panel, moments, figures, across=False)
-    panel.set_title("Spectrogram along rows")
-
-
-def _columns(panel: "Axes", moments: Moments, figures: Figures) -> None:
-    _spectra(panel, moments, figures, across=True)
-    panel.set_title("Spectrogram along columns")
-
-
-def _spectra(panel: "Axes", moments: Moments, figures: Figures, across: bool) -> None:
+def _spectra(panel: Axes, moments: Moments, figures: Figures, across: bool) -> None:
     """Draw the roots of the mean power spectra of lines, both in e-."""
     gain = figures.system_gain.value
     lit = moments.bright_stack.mean_frame - moments.dark_stack.mean_frame
@@ -169,7 +151,8 @@ def _spectra(panel: "Axes", moments: Moments, figures: Figures, across: bool) ->
         own = spectrum(frame.T if across else frame) / gain
         panel.plot(np.linspace(0, 0.5, len(own)), own, color=colour, lw=1, label=name)
         panel.axhline(residue**0.5 / gain, color=colour, lw=1, ls=":", label="temporal noise left")
-    panel.set(yscale="log", xlabel="cycles per pixel", ylabel="deviation, e⁻")
+    title = f"Spectrogram along {'columns' if across else 'rows'}"
+    panel.set(title=title, yscale="log", xlabel="cycles per pixel", ylabel="deviation, e⁻")
 
 
 def spectrum(frame: Doubles) -> Doubles:
@@ -184,7 +167,7 @@ def spectrum(frame: Doubles) -> Doubles:
     return np.asarray(np.sqrt(power))
 
 
-def _dsnu(panel: "Axes", moments: Moments, figures: Figures) -> None:
+def _dsnu(panel: Axes, moments: Moments, figures: Figures) -> None:
     frame = moments.dark_stack.mean_frame
     _histogram(panel, (frame - frame.mean()) / figures.system_gain.value)
     panel.set(
@@ -193,9 +176,7 @@ def _dsnu(panel: "Axes", moments: Moments, figures: Figures) -> None:
     )
 
 
-def _prnu(panel: "Axes", moments: Moments, figures: Figures) -> None:
-    from scipy.ndimage import uniform_filter
-
+def _prnu(panel: Axes, moments: Moments, figures: Figures) -> None:
     frame = moments.bright_stack.mean_frame - moments.dark_stack.mean_frame
     detail = frame - uniform_filter(frame, BOX, mode="mirror")
     _histogram(panel, 100 * detail / frame.mean())
@@ -205,7 +186,7 @@ def _prnu(panel: "Axes", moments: Moments, figures: Figures) -> None:
     )
 
 
-def _histogram(panel: "Axes", values: Doubles) -> None:
+def _histogram(panel: Axes, values: Doubles) -> None:
     """Draw how many pixels have a value, and how many of a Gaussian of that deviation."""
     counts, edges = np.histogram(values, BINS)
     centres, step = (edges[1:] + edges[:-1]) / 2, edges[1] - edges[0]

@@ -1,8 +1,8 @@
-"""The columns in which two developments are compared: the signature, and more of the same noise.
+"""The signature of a finished picture's noise: the columns by which developments are compared.
 
-The columns of :mod:`clpipe.analysis.signature` are joined by more lags, correlations of channels,
-the power spectrum of luma in four bands, and the size and the skew of luma noise by intensity,
-which go further into the shadows than the others.
+They hold the size and the tails of luma noise, autocorrelations of luma and chroma, correlations of
+channels and the power spectrum of luma in four bands. The size and the skew of luma noise by
+intensity go further into the shadows than the other columns.
 """
 
 import itertools
@@ -13,7 +13,16 @@ from functools import cached_property
 import numpy as np
 
 from clpipe.analysis.edges import Slopes
-from clpipe.analysis.signature import BIN, DARKEST, FEWEST, LUMA, chroma, luma, noise_of
+from clpipe.analysis.signature import (
+    BIN,
+    DARKEST,
+    FEWEST,
+    LUMA,
+    chroma,
+    flat_places,
+    luma,
+    noise_of,
+)
 from clpipe.analysis.spatial import energy_left
 from clpipe.base.types import Array, Doubles, Floats, Mask
 
@@ -184,6 +193,24 @@ def figures_of(noise: Noise, places: Places) -> Figures:
     return found
 
 
+def signature(picture: Array, mean: Array, mask: Mask | None = None) -> Figures:
+    """The columns of the noise of one picture.
+
+    Args:
+        picture: (height, width, 3), 0 to 255.
+        mean: the same scene without noise, or the mean of many pictures of it.
+        mask: the pixels that count; None: :func:`clpipe.analysis.signature.flat_places`.
+
+    >>> generator = np.random.default_rng(0)
+    >>> grey = np.full((200, 200, 3), 128.0)
+    >>> found = signature(grey + generator.normal(0, 5, grey.shape), grey)
+    >>> round(found["kurtosis"], 1), round(found["half"], 2), abs(found["right"]) < 0.02
+    (3.0, 0.25, True)
+    """
+    noise = noise_of_frames([picture], mean)
+    return figures_of(noise, Places(flat_places(mean) if mask is None else mask, noise.level))
+
+
 PLACES = {"right": (0, 1), "below": (1, 0), "diagonal": (1, 1), "two_right": (0, 2)}
 PLACES["two_below"] = (2, 0)
 FURTHER_RIGHT = {f"right_{lag}": (0, lag) for lag in FURTHER}
@@ -218,7 +245,7 @@ def products(planes: Doubles) -> Doubles:
 def autocorrelation(plane: Doubles, places: Places) -> Doubles:
     """The autocorrelation of noise at all lags up to 6 px, (13, 13) with lag 0 in the middle.
 
-    As :func:`clpipe.analysis.signature.lag`, over all frames, and with the mean of opposite lags.
+    It is over all frames, and of opposite lags it is the mean.
 
     Args:
         plane: (frame, height, width).

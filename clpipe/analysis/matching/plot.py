@@ -1,14 +1,12 @@
 """The picture of a match: theirs and ours, side by side."""
 
 from collections.abc import Sequence
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
+from clpipe.analysis.drawing import finish, page, png_of
 from clpipe.analysis.matching.columns import (
     COLUMNS,
     REACH,
@@ -32,19 +30,15 @@ def draw(match: Match, path: Path) -> None:
     Raises:
         ImageError: the file cannot be written.
     """
-    figure = Figure(figsize=(16, 11), dpi=100, layout="constrained")
+    first = match.scenes.each[0].name
+    more = f" and {len(match.noises) - 1} more" if len(match.noises) > 1 else ""
+    figure = page(11, f"Noise of {first}{more}, and of the development that was found")
     grid = figure.subplots(2, 2)
     draw_lags(grid[0, 0], match)
     draw_spectrum(grid[0, 1], match)
     draw_intensity(grid[1, 0], match)
     draw_residuals(grid[1, 1], match.unseen)
-    first = match.scenes.each[0].name
-    more = f" and {len(match.noises) - 1} more" if len(match.noises) > 1 else ""
-    figure.suptitle(f"Noise of {first}{more}, and of the development that was found", fontsize=15)
-    FigureCanvasAgg(figure)
-    png = BytesIO()
-    figure.savefig(png)
-    write_new(path, png.getvalue())
+    write_new(path, png_of(figure))
 
 
 def mean_table(match: Match, who: str, planes: Sequence[int]) -> Doubles:
@@ -64,9 +58,7 @@ def draw_lags(axes: Axes, match: Match) -> None:
         for planes, style, what in (((0,), "-o", "luma"), ((1, 2), "--s", "chroma")):
             table = mean_table(match, who, planes)
             axes.plot(lags, table[REACH, REACH:], style, color=ink, label=f"{what}, {who}")
-    axes.set(title="Autocorrelation", xlabel="lag right, px", ylabel="correlation")
-    axes.grid(alpha=0.3)
-    axes.legend()
+    finish(axes, title="Autocorrelation", xlabel="lag right, px", ylabel="correlation")
 
 
 def draw_spectrum(axes: Axes, match: Match) -> None:
@@ -77,14 +69,8 @@ def draw_spectrum(axes: Axes, match: Match) -> None:
         rings = np.digitize(radius, edges)
         power = [spectrum[rings == k].mean() for k in range(1, len(edges))]
         axes.plot((edges[1:] + edges[:-1]) / 2, power, "-o", color=ink, label=who)
-    axes.set(
-        title="Power spectrum of luma; independent noise: 1",
-        xlabel="cycles/px",
-        ylabel="power over variance",
-        ylim=(0, None),
-    )
-    axes.grid(alpha=0.3)
-    axes.legend()
+    title = "Power spectrum of luma; independent noise: 1"
+    finish(axes, title=title, xlabel="cycles/px", ylabel="power over variance", ylim=(0, None))
 
 
 def draw_intensity(axes: Axes, match: Match) -> None:
@@ -101,14 +87,8 @@ def draw_intensity(axes: Axes, match: Match) -> None:
         middle = (np.arange(len(count)) + 0.5) * STEP
         sigma = np.sqrt(squares[kept] / count[kept])
         axes.plot(middle[kept], sigma, "-o", color=ink, label=who)
-    axes.set(
-        title="Noise of luma by intensity",
-        xlabel="luma, levels",
-        ylabel="sigma, levels",
-        ylim=(0, None),
-    )
-    axes.grid(alpha=0.3)
-    axes.legend()
+    title = "Noise of luma by intensity"
+    finish(axes, title=title, xlabel="luma, levels", ylabel="sigma, levels", ylim=(0, None))
 
 
 def draw_residuals(axes: Axes, rows: Sequence[Row]) -> None:
@@ -123,5 +103,4 @@ def draw_residuals(axes: Axes, rows: Sequence[Row]) -> None:
     )
     names = [COLUMNS[r.name].text + (" (share)" if r.relative else "") for r in shown]
     axes.set_yticks(places, names, fontsize=9)
-    axes.set_title("Ours less theirs in places that were not searched; grey: within 0.1")
-    axes.grid(alpha=0.3, axis="x")
+    finish(axes, title="Ours less theirs in places that were not searched; grey: within 0.1")

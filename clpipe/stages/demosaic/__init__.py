@@ -5,10 +5,9 @@ from clpipe.stages.demosaic.bilinear import Bilinear
 from clpipe.stages.demosaic.bounded import Bounded
 from clpipe.stages.demosaic.directional_mmse import DirectionalMmse
 from clpipe.stages.demosaic.edge_directed import EdgeDirected
-from clpipe.stages.demosaic.edge_directed_median import EdgeDirectedMedian
 from clpipe.stages.demosaic.linear_mmse import Gray, LinearMmse
 from clpipe.stages.demosaic.malvar2004 import Malvar2004
-from clpipe.stages.demosaic.median import Median
+from clpipe.stages.demosaic.median import EdgeDirectedMedian, Median
 from clpipe.stages.demosaic.menon2007 import Menon2007
 
 

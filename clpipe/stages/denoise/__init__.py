@@ -4,8 +4,7 @@ from clpipe.stage import Context, Kind, Stage, StageRole
 from clpipe.stages.denoise import strength
 from clpipe.stages.denoise.bilateral import Bilateral
 from clpipe.stages.denoise.biweight import Biweight
-from clpipe.stages.denoise.mean import Mean
-from clpipe.stages.denoise.median import Median
+from clpipe.stages.denoise.blended import Mean, Median
 from clpipe.stages.denoise.non_local_means import NonLocalMeans
 
 METHODS = (Biweight, Bilateral, NonLocalMeans, Median, Mean)

@@ -1,4 +1,4 @@
-"""The base of mean and median: filters that ignore the noise, blended with the image by it."""
+"""Mean and median: filters that ignore the noise, blended with the image by it."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -8,8 +8,10 @@ import numpy as np
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
+from clpipe.reference.image import tap
+from clpipe.reference.median import median_filter
 from clpipe.stage import Context, ReferenceContext
-from clpipe.stages.denoise.strength import WindowDenoiser
+from clpipe.stages.denoise.strength import WindowDenoiser, size_parameter
 
 # Assumed standard deviation of detail against its neighbours, signal units. Chosen, not derived;
 # tools/pages/quality.py measures the PSNR that it gives, and no test holds it to be the best.
@@ -54,3 +56,55 @@ class BlendedFilter(WindowDenoiser):
         y = y + luma * (self.window(y, self.reaches[0]) - y)
         c = c + chroma * (self.window(c, self.reaches[1]) - c)
         return ycbcr_to_rgb(np.concatenate([y, c], axis=-1))
+
+
+class Mean(BlendedFilter):
+    """Mean of a square window, blended with the image.
+
+    It blurs edges as much as noise; it is a baseline to compare with.
+    """
+
+    method: ClassVar = "mean"
+    kernel: ClassVar = "denoise_mean"
+    summary: ClassVar = "mean of a window, blended in more strongly where there is more noise"
+    tolerance: ClassVar = 2e-6  # sums come in another order
+    function: ClassVar = "mean_filter"
+    vectors_per_row: ClassVar = 1
+
+    luma_size: int = size_parameter("luma", 3, 15)
+    chroma_size: int = size_parameter("chroma", 3, 15)
+
+    def window(self, image: Floats, reach: int) -> Floats:
+        return box(image, reach)
+
+
+def box(image: Floats, reach: int) -> Floats:
+    """Mean of the (2*reach + 1)^2 pixels around each pixel.
+
+    >>> box(np.float32([[1, 1, 4, 1]]), 1).tolist()
+    [[1.0, 2.0, 2.0, 3.0]]
+    """
+    offsets = range(-reach, reach + 1)
+    rows = sum((tap(image, 0, dy) for dy in offsets), np.zeros_like(image))
+    total = sum((tap(rows, dx, 0) for dx in offsets), np.zeros_like(image))
+    return total * np.float32(1 / len(offsets) ** 2)
+
+
+class Median(BlendedFilter):
+    """Median of a square window (Tukey, Exploratory Data Analysis, 1977), blended with the image.
+
+    Each plane is filtered by itself.
+    """
+
+    method: ClassVar = "median"
+    kernel: ClassVar = "denoise_median"
+    summary: ClassVar = "median of a window, blended in more strongly where there is more noise"
+    tolerance: ClassVar = 1e-6  # luma and chroma are not exact
+    function: ClassVar = "median_filter"
+    largest_size: ClassVar = 5
+
+    luma_size: int = size_parameter("luma", 3, 5)
+    chroma_size: int = size_parameter("chroma", 3, 5)
+
+    def window(self, image: Floats, reach: int) -> Floats:
+        return median_filter(image, 2 * reach + 1)

@@ -9,8 +9,8 @@ from clpipe.base.types import Floats
 from clpipe.reference.math import square_root
 from clpipe.reference.random import normal_at
 from clpipe.stage import Context, NoiseScope, Pass, ReferenceContext
-from clpipe.stages.sensor_noise.common import NEVER_FULL, or_default
 from clpipe.stages.sensor_noise.model import SensorNoise
+from clpipe.stages.sensor_noise.no_noise import NEVER_FULL, or_default
 
 
 class Gaussian(SensorNoise):

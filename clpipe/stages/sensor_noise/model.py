@@ -13,8 +13,7 @@ from clpipe.camera.noise import Emva, NoiseModel, Paper
 from clpipe.reference.random import normal_at, word_at
 from clpipe.reference.tukey_lambda import shape_and_scale, tukey_lambda_of
 from clpipe.stage import Arguments, Context, Method, NoiseScope, ReferenceContext, parameter
-from clpipe.stages.sensor_noise.common import NEVER_FULL, or_default
-from clpipe.stages.sensor_noise.no_noise import NoNoise
+from clpipe.stages.sensor_noise.no_noise import NEVER_FULL, NoNoise, or_default
 
 EMVA = ("system_gain", "read_noise", "adc_noise")
 PAPER = ("chi", "theta", "b_before", "b_after", "p0")

@@ -6,7 +6,13 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, parameter
-from clpipe.stages.sensor_noise.common import NEVER_FULL, or_default
+
+NEVER_FULL = 1e30  # stands for no full well, in electrons or in signal units
+
+
+def or_default(value: float | None, default: float) -> float:
+    """The value, or the default for None."""
+    return default if value is None else value
 
 
 class NoNoise(Method):

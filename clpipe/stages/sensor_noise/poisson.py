@@ -10,8 +10,8 @@ from clpipe.base.types import Floats
 from clpipe.reference.poisson import poisson_of
 from clpipe.reference.random import word_at
 from clpipe.stage import Context, NoiseScope, Pass, ReferenceContext
-from clpipe.stages.sensor_noise.common import NEVER_FULL
 from clpipe.stages.sensor_noise.model import SensorNoise
+from clpipe.stages.sensor_noise.no_noise import NEVER_FULL
 
 
 class Poisson(SensorNoise):

@@ -22,9 +22,8 @@ from clpipe.stage import (
     ReferenceContext,
     parameter,
 )
-from clpipe.stages.sensor_noise.common import NEVER_FULL, or_default
 from clpipe.stages.sensor_noise.model import SensorNoise
-from clpipe.stages.sensor_noise.no_noise import NoNoise
+from clpipe.stages.sensor_noise.no_noise import NEVER_FULL, NoNoise, or_default
 
 RATIO = 16.0  # of a sensor that does not say its own
 MOST = 4  # readouts

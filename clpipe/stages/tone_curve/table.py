@@ -5,12 +5,11 @@ Knots are (n, 2): x and y of the curve, x ascending.
 
 import re
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from clpipe.base.reading import check_regular, read_text
+from clpipe.base.reading import read_text, read_when_changed
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.curve import tabulate
 
@@ -157,16 +156,15 @@ def table_of(path: str) -> Floats:
         ValueError: the file cannot be read, has an unknown format, or holds no curve.
     """
     try:
-        status = check_regular(Path(path))
-        return _table_of(path, status.st_mtime_ns, status.st_size)
+        return _table_of(path)
     except OSError as error:
         raise ValueError(f"cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise ValueError("not a text file") from None
 
 
-@lru_cache(maxsize=16)
-def _table_of(path: str, time: int, size: int) -> Floats:
+@read_when_changed
+def _table_of(path: str) -> Floats:
     ending = Path(path).suffix.lower()
     if ending not in FORMATS:
         raise ValueError(f"expected a file that ends in {' or '.join(FORMATS)}")

@@ -1,7 +1,7 @@
 """White balance with gains that do not depend on the image, and the base of those that do."""
 
 from dataclasses import replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from pydantic import PrivateAttr
@@ -63,15 +63,16 @@ class EstimatedGains(Method):
         return apply_gains(image, given.context, red, blue)
 
 
+def gain_parameter(colour: str, text: str = "Gain", auto: str = "from the camera") -> Any:
+    """Declare the gain of red or blue."""
+    return parameter(None, f"{text} of {colour}, green = 1.", auto=auto, gt=0, le=64)
+
+
 class CameraGains(Method):
     """Gains of red and blue, from the camera where they are not set. A subclass says what for."""
 
-    red_gain: float | None = parameter(
-        None, "White balance gain of red, green = 1.", auto="from the camera", gt=0, le=64
-    )
-    blue_gain: float | None = parameter(
-        None, "White balance gain of blue, green = 1.", auto="from the camera", gt=0, le=64
-    )
+    red_gain: float | None = gain_parameter("red", "White balance gain")
+    blue_gain: float | None = gain_parameter("blue", "White balance gain")
 
     def resolve(self, context: Context) -> "CameraGains":
         red, blue = context.camera.white_balance_gains
@@ -162,12 +163,8 @@ class AsShot(Gains):
     method: ClassVar = "as_shot"
     summary: ClassVar = "the gains that inverse_white_balance divided by"
 
-    red_gain: float | None = parameter(
-        None, "Gain of red, green = 1.", auto="as inverse_white_balance used it", gt=0, le=64
-    )
-    blue_gain: float | None = parameter(
-        None, "Gain of blue, green = 1.", auto="as inverse_white_balance used it", gt=0, le=64
-    )
+    red_gain: float | None = gain_parameter("red", auto="as inverse_white_balance used it")
+    blue_gain: float | None = gain_parameter("blue", auto="as inverse_white_balance used it")
 
     def resolve(self, context: Context) -> CameraGains:
         red, blue = context.gains
