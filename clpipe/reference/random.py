@@ -103,11 +103,15 @@ def tail_probability(words: Words) -> Floats:
     return (low.astype(np.float32) + np.float32(0.5)) * np.float32(2.3283064e-10)
 
 
-def exponential_of(words: Words, limit: int) -> tuple[NDArray[np.int32], Floats]:
-    """The upper 31 bits of words, and an exponential of mean 1 where they are below the limit."""
-    bits = (words >> np.uint32(1)).view(np.int32)
+def upper_bits(words: Words) -> NDArray[np.int32]:
+    """Return the upper 31 bits of words."""
+    return (words >> np.uint32(1)).view(np.int32)
+
+
+def exponential_of(bits: NDArray[np.int32], limit: int = 1 << 31) -> Floats:
+    """Return exponential numbers of mean 1 from whole numbers that are uniform below a limit."""
     u = (bits.astype(np.float32) + np.float32(0.5)) * np.float32(1 / max(limit, 1))
-    return bits, np.maximum(negative_log(u), np.float32(0))
+    return np.maximum(negative_log(u), np.float32(0))
 
 
 def in_upper_half(words: Words) -> NDArray[np.bool_]:

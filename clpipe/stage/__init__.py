@@ -44,6 +44,7 @@ from clpipe.stage.passes import (
     bytes_of,
     typed_arguments,
 )
+from clpipe.stage.signal import Backend, Numbers, Signal, SignalMethod, sensor_bits, sensor_normals
 
 __all__ = [
     "PERIOD",
@@ -51,6 +52,7 @@ __all__ = [
     "Argument",
     "Arguments",
     "Array",
+    "Backend",
     "CompileTime",
     "Context",
     "Curve",
@@ -64,6 +66,7 @@ __all__ = [
     "Method",
     "NoiseScope",
     "Noiseless",
+    "Numbers",
     "OfDepth",
     "OfExposures",
     "OfPanorama",
@@ -72,6 +75,8 @@ __all__ = [
     "Reduction",
     "ReferenceContext",
     "Resample",
+    "Signal",
+    "SignalMethod",
     "Span",
     "Stage",
     "StageRole",
@@ -84,6 +89,8 @@ __all__ = [
     "parameter",
     "period_of",
     "run_reference",
+    "sensor_bits",
+    "sensor_normals",
     "typed_arguments",
     "variant_label",
     "variants",

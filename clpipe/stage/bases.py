@@ -13,6 +13,7 @@ from clpipe.reference.panorama import Panorama
 from clpipe.stage.context import Context, ReferenceContext
 from clpipe.stage.method import Method, parameter
 from clpipe.stage.passes import Arguments, Pass, TableLookup
+from clpipe.stage.signal import SignalMethod
 
 
 class Unchanged(Method):
@@ -197,10 +198,10 @@ class Curve(Method):
         return np.asarray(self.table()[curve_index(image)])
 
 
-class GaussianNoise(Method):
+class GaussianNoise(SignalMethod):
     """Gaussian noise of one sigma; at sigma 0 the image stays as it is, at no cost.
 
-    A subclass gives the default of sigma, the passes and the reference; and the variance, if the
+    A subclass gives the default of sigma, the passes and :meth:`apply`; and the variance, if the
     noise is not an offset.
     """
 

@@ -1,21 +1,23 @@
 """Banding: a periodic disturbance of the readout, as a power supply makes it."""
 
+from collections.abc import Callable
 from typing import ClassVar
 
 import numpy as np
 
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
-from clpipe.reference.random import philox
 from clpipe.stage import (
     Arguments,
+    Backend,
     Context,
     Kind,
     LineTable,
-    Method,
     NoiseScope,
+    Numbers,
     Pass,
-    ReferenceContext,
+    Signal,
+    SignalMethod,
     Stage,
     parameter,
 )
@@ -23,25 +25,25 @@ from clpipe.stage import (
 SINE = tuple(map(np.float32, (42.058693, -76.705859, 81.605249, -41.341702, 6.2831853)))
 
 
-def sine_of_turns(turns: Floats) -> Floats:
+def sine_of_turns(turns: Signal, where: Callable[..., Signal] = np.where) -> Signal:
     """The sine of an angle in whole turns, to 4e-6, by * and + alone.
 
     >>> sine_of_turns(np.float32([0, 0.125, 0.25, 0.5, 7.75])).round(3).tolist()
     [0.0, 0.7070000171661377, 1.0, 0.0, -1.0]
     """
-    whole = np.float32(12582912)
+    whole = 12582912.0
     part = turns - ((turns + whole) - whole)
-    z = np.float32(0.25) - abs(abs(part) - np.float32(0.25))
+    z = 0.25 - abs(abs(part) - 0.25)
     z2 = z * z
-    sum_, *others = SINE
-    total = z2 * sum_
-    for coefficient in others[:-1]:
+    first, *others, last = map(float, SINE)
+    total = z2 * first
+    for coefficient in others:
         total = (total + coefficient) * z2
-    sine = (total + others[-1]) * z
-    return np.where(part < 0, -sine, sine)
+    sine = (total + last) * z
+    return where(part < 0, -sine, sine)
 
 
-class Sine(Method):
+class Sine(SignalMethod):
     """y + amplitude * sin(2 pi (row / period + phase)): a wave, of another phase in each frame.
 
     Rows are read one after the other, so what disturbs the readout in time is a wave over the rows
@@ -91,16 +93,10 @@ class Sine(Method):
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
         return before + np.float32(self.amplitude) ** 2 / np.float32(2)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        if not self.amplitude:
-            return image
-        stream, zero = given.stream[NoiseScope.IMAGE], np.zeros(1, np.uint32)
-        word = philox(zero, zero, zero, np.full(1, stream.stage, np.uint32), stream)[0]
-        bits = (word >> np.uint32(1)).view(np.int32)
-        phase = bits.astype(np.float32) * np.float32(4.6566129e-10)
-        rows = np.arange(image.shape[0], dtype=np.float32)
-        wave = sine_of_turns(rows * self.frequency + phase) * np.float32(self.amplitude)
-        return image + wave[:, None]
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        turns = backend.rows() * n["frequency"] + backend.uniform()
+        return y + sine_of_turns(turns, backend.where) * n["amplitude"]
 
 
 STAGE = Stage("banding", "Add a wave over the rows.", Kind.MOSAIC, Kind.MOSAIC, (Sine,))

@@ -7,17 +7,18 @@ from pydantic import Field
 
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
-from clpipe.reference.random import normal_of_line
 from clpipe.stage import (
     Arguments,
+    Backend,
     CompileTime,
     Context,
     Kind,
     LineTable,
-    Method,
     NoiseScope,
+    Numbers,
     Pass,
-    ReferenceContext,
+    Signal,
+    SignalMethod,
     Stage,
     parameter,
 )
@@ -25,7 +26,7 @@ from clpipe.stage import (
 Bias = tuple[float, float, float, float]
 
 
-class Offsets(Method):
+class Offsets(SignalMethod):
     """y + bias + sigma * n: one offset for each place of the filter array in each frame.
 
     bias is fixed for a camera and ISO, one number for R, G in the rows of R, G in the rows of B
@@ -96,12 +97,13 @@ class Offsets(Method):
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
         return before + np.float32(self.sigma) ** 2
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        normals = normal_of_line(4, given.stream[NoiseScope.IMAGE]) * np.float32(self.sigma)
-        result = image.copy()
-        for (column, row), bias in self._places(given.context.pattern).items():
-            result[row::2, column::2] += bias + normals[row + 2 * column]
-        return result
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        normals = backend.lines(4)[..., None] * n["sigma"]
+        cell = [
+            [n[f"bias_{c}{r}"] + normals[..., r + 2 * c, :, None] for c in (0, 1)] for r in (0, 1)
+        ]
+        return y + backend.tiled(cell)
 
 
 STAGE = Stage(

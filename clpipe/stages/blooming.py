@@ -2,18 +2,16 @@
 
 from typing import ClassVar
 
-import numpy as np
-
 from clpipe.base.tracing import float32
-from clpipe.base.types import Floats
-from clpipe.reference.image import tap
 from clpipe.stage import (
     Arguments,
+    Backend,
     Context,
     Kind,
-    Method,
+    Numbers,
     Pass,
-    ReferenceContext,
+    Signal,
+    SignalMethod,
     Stage,
     Stencil,
     Unchanged,
@@ -30,7 +28,7 @@ class NoBlooming(Unchanged):
     summary: ClassVar = "no blooming, as of sensors with a drain"
 
 
-class Column(Method):
+class Column(SignalMethod):
     """Charge above the full well goes on along the column, half up and half down.
 
     The pixel k places on gets the share (1 - spill) * spill^(k - 1) of each half, up to 16 px, and
@@ -68,15 +66,15 @@ class Column(Method):
         first, spill = float32((1 - self.spill) / 2), float32(self.spill)
         return {"full": self.full_signal, "first": first, "spill": spill}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        full, spill = np.float32(self.full_signal), np.float32(self.spill)
-        weight = np.float32((1 - self.spill) / 2)
-        excess = np.maximum(image - full, np.float32(0))
-        got = np.zeros_like(image)
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        full, weight = n["full"], n["first"]
+        excess = (y - full).clip(min=0)
+        got = 0.0
         for k in range(1, REACH + 1):
-            got = got + (tap(excess, 0, -k) + tap(excess, 0, k)) * weight
-            weight = weight * spill
-        return np.minimum(np.minimum(image, full) + got, full)
+            got = got + (backend.tap(excess, 0, -k) + backend.tap(excess, 0, k)) * weight
+            weight = weight * n["spill"]
+        return backend.minimum(backend.minimum(y, full) + got, full)
 
 
 STAGE = Stage(

@@ -2,24 +2,22 @@
 
 from typing import ClassVar
 
-import numpy as np
-
-from clpipe.base.types import Floats
-from clpipe.reference.image import tap
 from clpipe.stage import (
     Arguments,
+    Backend,
     Context,
     Kind,
-    Method,
+    Numbers,
     Pass,
-    ReferenceContext,
+    Signal,
+    SignalMethod,
     Stage,
     Stencil,
     parameter,
 )
 
 
-class Neighbours(Method):
+class Neighbours(SignalMethod):
     """y + share * (the four neighbours - 4 y): each pixel gives a share of its charge to each side.
 
     Neighbours have other colours, so colours come nearer to grey, and edges become softer. It is
@@ -56,10 +54,11 @@ class Neighbours(Method):
     def arguments(self, context: Context) -> Arguments:
         return {"share": self.share}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        across = tap(image, -1, 0) + tap(image, 1, 0)
-        down = tap(image, 0, -1) + tap(image, 0, 1)
-        return image + ((across + down) - image * np.float32(4)) * np.float32(self.share)
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        across = backend.tap(y, -1, 0) + backend.tap(y, 1, 0)
+        down = backend.tap(y, 0, -1) + backend.tap(y, 0, 1)
+        return y + ((across + down) - y * 4) * n["share"]
 
 
 STAGE = Stage(

@@ -7,22 +7,24 @@ import numpy as np
 
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
-from clpipe.reference.math import square_root
-from clpipe.reference.random import exponential_of, normal_at, word_at
+from clpipe.reference.random import Stream, exponential_of
 from clpipe.stage import (
     Arguments,
+    Backend,
     Context,
     Kind,
-    Method,
     NoiseScope,
+    Numbers,
     Pass,
-    ReferenceContext,
+    Signal,
+    SignalMethod,
     Stage,
     parameter,
+    sensor_bits,
 )
 
 
-class Thermal(Method):
+class Thermal(SignalMethod):
     """The dark current's shot noise and fixed pattern; its mean is taken off with the black level.
 
     A pixel gathers D = current * 2^((temperature - reference) / doubling) * time electrons in the
@@ -144,15 +146,16 @@ class Thermal(Method):
         mean, spread, electron = self._charge
         return before + (mean * electron + spread * spread)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        if not self.electrons:
-            return image
-        (mean, spread, electron), zero = self._charge, np.float32(0)
-        words = word_at(image.shape, 0, given.stream[NoiseScope.CAMERA])
-        _, charge = exponential_of(words, 1 << 31)
-        more = (charge - np.float32(1)) * spread
-        shot = square_root(np.maximum(more + mean, zero) * electron)
-        return image + more + normal_at(image.shape, 1, given.stream[NoiseScope.IMAGE]) * shot
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        more = backend.fixed(charge_of_sensor) * n["spread"]
+        shot = backend.square_root((more + n["mean"]).clip(min=0) * n["per_electron"])
+        return y + more + backend.normals(1) * shot
+
+
+def charge_of_sensor(height: int, width: int, stream: Stream) -> Floats:
+    """Return exponential numbers of mean 1, less 1."""
+    return exponential_of(sensor_bits(height, width, stream)) - np.float32(1)
 
 
 STAGE = Stage("dark_current", "Add what heat sets free.", Kind.MOSAIC, Kind.MOSAIC, (Thermal,))

@@ -14,14 +14,17 @@ from clpipe.base.types import Array, Floats
 from clpipe.reference.random import Stream, normal_of, philox
 from clpipe.stage import (
     Arguments,
+    Backend,
     CompileTime,
     Context,
     Kind,
     LineTable,
     Method,
     NoiseScope,
+    Numbers,
     Pass,
-    ReferenceContext,
+    Signal,
+    SignalMethod,
     Stage,
     parameter,
 )
@@ -59,7 +62,7 @@ def curve(count: int, number: int, per_px: np.float32, stream: Stream) -> Floats
     return np.asarray(total * np.float32(0.24078))
 
 
-class Smooth(Method):
+class Smooth(SignalMethod):
     """y + ISO * k(x, y) + b(x, y): two smooth maps, fixed for a camera.
 
     Feng et al., "Learnability enhancement for low-light raw image denoising: A data perspective"
@@ -140,18 +143,19 @@ class Smooth(Method):
         """That of noise: what is the same in every frame of a camera, and smooth, is none."""
         return before
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        if not self.slope and not self.offset:
-            return image
-        stream, (height, width) = given.stream[NoiseScope.CAMERA], image.shape[:2]
-        products = []
-        for k in range(MAPS):
-            down = curve(height, 2 * k, self._per_px, stream)
-            across = curve(width, 2 * k + 1, self._per_px, stream)
-            products.append(down[:, None] * across)
-        slope, offset = self._amplitudes(given.context.iso)
-        of_iso, fixed = products[0] + products[1], products[2] + products[3]
-        return np.asarray(image + (of_iso * slope + fixed * offset))
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        of_iso = backend.fixed(shading, lambda method, _: (method._per_px, 0))
+        fixed = backend.fixed(shading, lambda method, _: (method._per_px, MAPS))
+        return y + (of_iso * n["slope"] + fixed * n["offset"])
+
+
+def shading(height: int, width: int, stream: Stream, per_px: np.float32, first: int) -> Floats:
+    """Return the sum of two products of a curve over the rows and one over the columns."""
+    down, across, other_down, other_across = (
+        curve(width if k % 2 else height, first + k, per_px, stream) for k in range(4)
+    )
+    return down[:, None] * across + other_down[:, None] * other_across
 
 
 def measured(path: str) -> Floats:
@@ -190,7 +194,7 @@ def combined(slope: str | None, offset: str | None, iso: float, unit: float) -> 
     return np.asarray(total / unit, np.float32)
 
 
-class File(Method):
+class File(SignalMethod):
     """y + ISO * k(x, y) + b(x, y): the maps of a sensor, from files.
 
     Each is an image of one channel (EXR or TIFF of floats) in DN, such as means over blocks; from
@@ -241,11 +245,9 @@ class File(Method):
     def without_noise(self) -> Method | None:
         return None if self.passes() else self
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        if not self.passes():
-            return image
-        height, width = image.shape[:2]
-        return np.asarray(image + self.at_iso(height, width, given.context.iso))
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        return y + backend.fixed(map_at_iso, lambda method, context: (method, context.iso))
 
     def at_iso(self, height: int, width: int, iso: float) -> Floats:
         """What is added, (height, width), signal."""
@@ -260,6 +262,11 @@ class File(Method):
         upper, lower = rows
         total: Floats = upper + (lower - upper) * v[:, None]
         return total
+
+
+def map_at_iso(height: int, width: int, stream: Stream, method: File, iso: float) -> Floats:
+    """Return what a method adds, (height, width), signal. It depends on no random numbers."""
+    return method.at_iso(height, width, iso)
 
 
 def between(pixels: int, per_px: np.float32, count: int) -> tuple[Array, Array, Floats]:

@@ -5,24 +5,27 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.reference.random import exponential_of, word_at
+from clpipe.reference.random import Stream, exponential_of
 from clpipe.stage import (
     Arguments,
+    Backend,
     Context,
     Kind,
-    Method,
     NoiseScope,
+    Numbers,
     Pass,
-    ReferenceContext,
+    Signal,
+    SignalMethod,
     Stage,
     parameter,
+    sensor_bits,
 )
 
 WORDS = 1 << 31  # the number of different random words that choose the pixels
 DEFAULT_LEVEL = 0.1  # signal units; chosen to be visible, where the camera gives no charge
 
 
-class Random(Method):
+class Random(SignalMethod):
     """Hot and dead pixels at random places, the same in every image of a camera.
 
     A hot pixel gets y + hot_level * (1 + e), e from an exponential distribution of mean 1; in
@@ -87,13 +90,22 @@ class Random(Method):
         """The variance without the defect pixels: they are few, and not part of the noise model."""
         return before
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        hot_limit, dead_limit = self.limits()
-        words = word_at(image.shape, 0, given.stream[NoiseScope.CAMERA])
-        bits, excess = exponential_of(words, hot_limit)
-        hot = image + np.float32(self.hot_level) * (np.float32(1) + excess)
-        alive = np.where(bits < hot_limit, hot, image)
-        return np.where(bits > dead_limit, np.float32(0), alive)
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        hot = backend.fixed(hot_charge, lambda method, _: method.limits()[:1]) * n["hot_level"]
+        alive = backend.fixed(alive_pixels, lambda method, _: method.limits()[1:])
+        return backend.where(alive > 0, y + hot, 0.0)
+
+
+def hot_charge(height: int, width: int, stream: Stream, limit: int) -> Floats:
+    """Return the charge of hot pixels over the smallest, and 0 elsewhere."""
+    bits = sensor_bits(height, width, stream)
+    return np.where(bits < limit, np.float32(1) + exponential_of(bits, limit), np.float32(0))
+
+
+def alive_pixels(height: int, width: int, stream: Stream, limit: int) -> Floats:
+    """Return 1 for each pixel that is not dead, and 0 for the others."""
+    return (sensor_bits(height, width, stream) <= limit).astype(np.float32)
 
 
 STAGE = Stage("defect_pixels", "Make some pixels hot or dead.", Kind.MOSAIC, Kind.MOSAIC, (Random,))

@@ -2,11 +2,18 @@
 
 from typing import ClassVar
 
-import numpy as np
-
-from clpipe.base.types import Floats
-from clpipe.reference.random import normal_at
-from clpipe.stage import Context, GaussianNoise, Kind, NoiseScope, Pass, ReferenceContext, Stage
+from clpipe.stage import (
+    Backend,
+    Context,
+    GaussianNoise,
+    Kind,
+    NoiseScope,
+    Numbers,
+    Pass,
+    Signal,
+    Stage,
+    sensor_normals,
+)
 
 
 class Gaussian(GaussianNoise):
@@ -31,9 +38,9 @@ class Gaussian(GaussianNoise):
     def draw(self) -> tuple[Pass, ...]:
         return (Pass("dsnu", arguments=("sigma",), random=NoiseScope.CAMERA),)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        normals = normal_at(image.shape, 0, given.stream[NoiseScope.CAMERA])
-        return image + normals * np.float32(self.sigma)
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        return y + backend.fixed(sensor_normals) * n["sigma"]
 
 
 STAGE = Stage("dsnu", "Add a fixed offset to each pixel.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,))

@@ -11,12 +11,16 @@ from clpipe.base.types import Floats
 from clpipe.reference.companding import along_pieces, knots_in, pieces_of
 from clpipe.stage import (
     Arguments,
+    Backend,
     CompileTime,
     Context,
     Kind,
     Method,
+    Numbers,
     Pass,
     ReferenceContext,
+    Signal,
+    SignalMethod,
     Stage,
     StageRole,
     parameter,
@@ -24,7 +28,7 @@ from clpipe.stage import (
 from clpipe.stages.quantize import MAX_DN
 
 
-class Linear(Method):
+class Linear(SignalMethod):
     """(DN - black) / (white - black); values below black stay negative.
 
     >>> from clpipe.stage import run_reference
@@ -104,10 +108,9 @@ class Linear(Method):
         assert self.black_level is not None and self.white_level is not None
         return before * np.float32((self.white_level - self.black_level) ** -2)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        assert self.black_level is not None and self.white_level is not None
-        scale = np.float32(1 / (self.white_level - self.black_level))
-        return (image - np.float32(self.black_level)) * scale
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        return (y - n["black_level"]) * n["scale"]
 
 
 class Pwl(Linear):

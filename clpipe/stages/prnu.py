@@ -5,16 +5,18 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.reference.random import normal_at
 from clpipe.stage import (
+    Backend,
     Context,
     GaussianNoise,
     Kind,
     NoiseScope,
+    Numbers,
     Pass,
-    ReferenceContext,
+    Signal,
     Stage,
     parameter,
+    sensor_normals,
 )
 
 
@@ -51,9 +53,9 @@ class Gaussian(GaussianNoise):
         """(1 + sigma^2) * before + sigma^2 * signal^2, exact for independent noise."""
         return (signal * signal + before) * np.float32(self.sigma) ** 2 + before
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        normals = normal_at(image.shape, 0, given.stream[NoiseScope.CAMERA])
-        return image * (normals * np.float32(self.sigma) + np.float32(1))
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        return y * (backend.fixed(sensor_normals) * n["sigma"] + 1)
 
 
 STAGE = Stage("prnu", "Make pixels differ in sensitivity.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,))

@@ -16,12 +16,15 @@ from clpipe.reference.companding import (
 )
 from clpipe.stage import (
     Arguments,
+    Backend,
     CompileTime,
     Context,
     Kind,
-    Method,
+    Numbers,
     Pass,
     ReferenceContext,
+    Signal,
+    SignalMethod,
     Stage,
     parameter,
 )
@@ -30,7 +33,7 @@ MAX_BITS = 24  # whole DN that a float32 holds
 MAX_DN = 2**MAX_BITS - 1
 
 
-class Linear(Method):
+class Linear(SignalMethod):
     """Signal to DN: black + y * (white - black), rounded to nearest and clipped to 0..white.
 
     Behind several readouts white is the last one's, and there are as many bits more.
@@ -111,10 +114,10 @@ class Linear(Method):
         scale = self._range / context.full_scale
         return before * np.float32(scale**2) + np.float32(1 / 12)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        scale = np.float32(self._range / given.context.full_scale)
-        dn = np.rint(image * scale + np.float32(self.black_level))
-        return np.minimum(np.maximum(dn, np.float32(0)), np.float32(self.white_level))
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        dn = backend.rounded(y * n["range"] + n["black_level"])
+        return backend.minimum(dn.clip(min=0), n["white_level"])
 
 
 class Pwl(Linear):

@@ -6,23 +6,26 @@ import numpy as np
 
 from clpipe.base.tracing import float32, int32
 from clpipe.base.types import Floats
-from clpipe.reference.random import exponential_of, word_at
+from clpipe.reference.random import Stream, exponential_of
 from clpipe.stage import (
     Arguments,
+    Backend,
     Context,
     Kind,
-    Method,
     NoiseScope,
+    Numbers,
     Pass,
-    ReferenceContext,
+    Signal,
+    SignalMethod,
     Stage,
     parameter,
+    sensor_bits,
 )
 
 WORDS = 1 << 31  # the number of different random words that choose the pixels
 
 
-class TwoLevels(Method):
+class TwoLevels(SignalMethod):
     """y + A / 2 or y - A / 2 in a share of the pixels, at random in each frame.
 
     A trap in a pixel's transistor catches an electron and sets it free again, which moves the
@@ -90,14 +93,17 @@ class TwoLevels(Method):
         """The mean variance over the sensor: share * E[A^2] / 4, E[A^2] = 2 amplitude^2."""
         return before + np.float32(self.share) * np.float32(self.amplitude) ** 2 / np.float32(2)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        (limit, _), half = self._chosen, np.float32(0.5)
-        words = word_at(image.shape, 0, given.stream[NoiseScope.CAMERA])
-        bits, distance = exponential_of(words, int(limit))
-        step = distance * np.float32(self.amplitude) * half
-        step = np.where(bits < limit, step, np.float32(0))
-        up = word_at(image.shape, 1, given.stream[NoiseScope.IMAGE]).view(np.int32) >= 0
-        return np.where(up, image + step, image - step)
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        levels = backend.fixed(levels_of_sensor, lambda method, _: (method.share,))
+        step = levels * n["amplitude"] * 0.5
+        return backend.where(backend.in_upper_half(backend.words(1)), y + step, y - step)
+
+
+def levels_of_sensor(height: int, width: int, stream: Stream, share: float) -> Floats:
+    """Return the distance of a pixel's two levels over the mean distance, and 0 without levels."""
+    bits, limit = sensor_bits(height, width, stream), round(share * WORDS)
+    return np.where(bits < limit, exponential_of(bits, limit), np.float32(0))
 
 
 STAGE = Stage(

@@ -2,19 +2,19 @@
 
 from typing import ClassVar
 
-import numpy as np
-
 from clpipe.base.types import Floats
-from clpipe.reference.random import normal_of_line
+from clpipe.reference.random import Stream, normal_of_line
 from clpipe.reference.resample import Axis
 from clpipe.stage import (
+    Backend,
     Context,
     GaussianNoise,
     Kind,
     LineTable,
     NoiseScope,
+    Numbers,
     Pass,
-    ReferenceContext,
+    Signal,
     Stage,
 )
 
@@ -33,11 +33,16 @@ class LineNoise(GaussianNoise):
             Pass(f"{self.axis[:-1]}_noise", arguments=("lines",)),
         )
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        is_row = self.axis == "rows"
-        offsets = normal_of_line(image.shape[not is_row], given.stream[self.scope])
-        offsets *= np.float32(self.sigma)
-        return image + (offsets[:, None] if is_row else offsets)
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        if cls.axis == "rows":
+            return y + backend.lines(y.shape[-2])[..., None] * n["sigma"]
+        return y + backend.fixed(sensor_columns) * n["sigma"]
+
+
+def sensor_columns(height: int, width: int, stream: Stream) -> Floats:
+    """Return a standard normal for each column, (1, width)."""
+    return normal_of_line(width, stream)[None]
 
 
 class Gaussian(LineNoise):

@@ -1,6 +1,6 @@
 """Many chains side by side: what each stage needs of each of them, as tensors."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,9 +12,10 @@ from clpipe.base.errors import RequestError
 from clpipe.chain.chain import Chain, Step
 from clpipe.reference.cfa import sites
 from clpipe.reference.random import Stream
-from clpipe.stage import Argument, CompileTime, NoiseScope
+from clpipe.stage import NoiseScope, SignalMethod
+from clpipe.stage.signal import numbers_in
+from clpipe.torch.backend import TorchBackend
 from clpipe.torch.numbers import Streams
-from clpipe.torch.stages import TWINS, Group
 
 AT_ONCE = 1 << 17  # pixels on a CPU, whose cache holds them
 
@@ -43,14 +44,14 @@ class Variant:
     """One method of a stage, and the chains that have it.
 
     Args:
-        twin: the method on tensors.
+        method: the method.
         steps: of each chain, its step; None where it has another method.
         sensors: of each chain, the stream of what is fixed to its camera.
         numbers: the kernel's arguments by name, (chain,); 0 where it has another method.
         stage: the stage's number in random streams.
     """
 
-    twin: Callable[[Tensor, Group], Tensor]
+    method: type[SignalMethod]
     steps: Sequence[Step | None]
     sensors: Sequence[Stream]
     numbers: dict[str, NDArray[np.float32]]
@@ -68,16 +69,16 @@ class Variant:
             own, samples, chains = mosaics[rows], samples[has], chains[has]
         values = np.array([each[chains] for each in self.numbers.values()], np.float32)
         tensors = torch.from_numpy(values).to(on)[..., None, None]
-        group = Group(
+        backend = TorchBackend(
             steps=[step for chain in chains if (step := self.steps[chain])],
-            numbers=dict(zip(self.numbers, tensors, strict=False)),
             streams=Streams(drawn.keys[:, torch.from_numpy(samples)].to(on), self.stage),
             sensors=[self.sensors[chain] for chain in chains],
             places=[drawn.places[sample] for sample in samples],
             area=drawn.area,
             size=(mosaics.shape[1], mosaics.shape[2]),
         )
-        noisy = self.twin(own, group)
+        numbers = dict(zip(self.numbers, tensors, strict=True))
+        noisy = self.method.apply(own, numbers, backend)
         return noisy if has.all() else mosaics.index_copy(0, rows, noisy)
 
 
@@ -88,7 +89,7 @@ class Table:
         chains: of which all have the same steps.
 
     Raises:
-        RequestError: a method has no twin on tensors.
+        RequestError: a method does not run on tensors.
     """
 
     def __init__(self, chains: Sequence[Chain]) -> None:
@@ -126,7 +127,7 @@ def _variants(chains: Sequence[Chain], position: int) -> list[Variant]:
     """The methods of a step that do something, each with the chains that have it.
 
     Raises:
-        RequestError: one has no twin on tensors.
+        RequestError: one does not run on tensors.
     """
     found: dict[tuple[object, ...], dict[int, Step]] = {}
     for number, chain in enumerate(chains):
@@ -137,13 +138,13 @@ def _variants(chains: Sequence[Chain], position: int) -> list[Variant]:
     variants = []
     for steps in found.values():
         number, example = next(iter(steps.items()))
-        twin = TWINS.get(type(example.method))
-        if twin is None:
+        method = type(example.method)
+        if not issubclass(method, SignalMethod) or not method.on_tensors():
             raise RequestError(
                 f"{example.name}.method={example.method.method}: clpipe.torch has no such method; "
                 "clpipe.RawNoise runs it"
             )
-        arguments = {number: _numbers(step) for number, step in steps.items()}
+        arguments = {number: numbers_in(step.arguments) for number, step in steps.items()}
         numbers = {
             name: np.array(
                 [arguments[k][name] if k in steps else 0 for k in range(len(chains))], np.float32
@@ -153,14 +154,5 @@ def _variants(chains: Sequence[Chain], position: int) -> list[Variant]:
         sensors = [chain.stream(example.name, NoiseScope.CAMERA, "") for chain in chains]
         stage = sensors[0].stage
         own = [steps.get(k) for k in range(len(chains))]
-        variants.append(Variant(twin, own, sensors, numbers, stage))
+        variants.append(Variant(method, own, sensors, numbers, stage))
     return variants
-
-
-def _numbers(step: Step) -> dict[str, Argument]:
-    """The numbers among the arguments of a step's kernels."""
-    return {
-        name: value
-        for name, value in step.arguments.items()
-        if not isinstance(value, CompileTime | np.ndarray)
-    }

@@ -1,15 +1,13 @@
 """Sensor noise as one heteroscedastic Gaussian."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
-from clpipe.reference.math import square_root
-from clpipe.reference.random import normal_at
-from clpipe.stage import Context, NoiseScope, Pass, ReferenceContext
-from clpipe.stages.sensor_noise.model import SensorNoise
+from clpipe.stage import Backend, Context, NoiseScope, Numbers, Pass, Signal
+from clpipe.stages.sensor_noise.model import SensorNoise, unit_read_noise
 from clpipe.stages.sensor_noise.no_noise import NEVER_FULL, or_default
 
 
@@ -51,16 +49,13 @@ class Gaussian(SensorNoise):
             return {**numbers, "b": float32(self.b)}
         return {**numbers, **self.read_noise_numbers()}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        n = self.numbers()
-        normals = normal_at(image.shape, 0, given.stream[NoiseScope.IMAGE])
-        noise = self.noise(normals, image, n["a"], n.get("b", np.float32(0)))
-        noisy = np.minimum(image + noise, n["full_well"])
-        if self.tukey_lambda is None:
-            return noisy
-        return noisy + self.unit_read_noise(image, given) * n["read_noise"]
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        noise = cls.noise(backend.normals(), y, n["a"], n.get("b", 0.0), backend)
+        noisy = backend.minimum(y + noise, n["full_well"])
+        return noisy if "b" in n else noisy + unit_read_noise(n, backend) * n["read_noise"]
 
     @staticmethod
-    def noise(normals: Floats, y: Floats, a: np.float32, b: np.float32) -> Floats:
-        """The noise in a signal y that standard normals make."""
-        return normals * square_root(np.maximum(a * y + b, np.float32(0)))
+    def noise(normals: Signal, y: Signal, a: Any, b: Any, backend: Backend) -> Signal:
+        """Return the noise in a signal y that standard normals make."""
+        return normals * backend.square_root((a * y + b).clip(min=0))

@@ -10,16 +10,24 @@ from clpipe.base.errors import RequestError
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.camera.noise import Emva, NoiseModel, Paper
-from clpipe.reference.random import normal_at, word_at
-from clpipe.reference.tukey_lambda import shape_and_scale, tukey_lambda_of
-from clpipe.stage import Arguments, Context, Method, NoiseScope, ReferenceContext, parameter
+from clpipe.reference.tukey_lambda import shape_and_scale
+from clpipe.stage import (
+    Arguments,
+    Backend,
+    Context,
+    Method,
+    Numbers,
+    Signal,
+    SignalMethod,
+    parameter,
+)
 from clpipe.stages.sensor_noise.no_noise import NEVER_FULL, NoNoise, or_default
 
 EMVA = ("system_gain", "read_noise", "adc_noise")
 PAPER = ("chi", "theta", "b_before", "b_after", "p0")
 
 
-class SensorNoise(Method):
+class SensorNoise(SignalMethod):
     """The strength of the noise in one of three parametrisations, and the full well.
 
     The parametrisations are those of :mod:`clpipe.camera.noise`: a and b, EMVA 1288's or the
@@ -203,10 +211,9 @@ class SensorNoise(Method):
         shape, scale = shape_and_scale(self.tukey_lambda)
         return {**sigma, "shape": shape, "scale": scale}
 
-    def unit_read_noise(self, image: Floats, given: ReferenceContext) -> Floats:
-        """Read noise of variance 1 for each pixel, in NumPy; (height, width)."""
-        stream = given.stream[NoiseScope.IMAGE]
-        if self.tukey_lambda is None:
-            return normal_at(image.shape, 1, stream)
-        words = word_at(image.shape, 1, stream)
-        return tukey_lambda_of(words, *shape_and_scale(self.tukey_lambda))
+
+def unit_read_noise(n: Numbers, backend: Backend) -> Signal:
+    """Return read noise of variance 1 for each pixel: Gaussian, or of a Tukey lambda law."""
+    if "shape" not in n:
+        return backend.normals(1)
+    return backend.tukey_lambda(backend.words(1), n["shape"], n["scale"])

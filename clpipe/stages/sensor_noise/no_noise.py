@@ -2,10 +2,8 @@
 
 from typing import ClassVar
 
-import numpy as np
-
 from clpipe.base.types import Floats
-from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, parameter
+from clpipe.stage import Arguments, Backend, Context, Numbers, Pass, Signal, SignalMethod, parameter
 
 NEVER_FULL = 1e30  # stands for no full well, in electrons or in signal units
 
@@ -15,7 +13,7 @@ def or_default(value: float | None, default: float) -> float:
     return default if value is None else value
 
 
-class NoNoise(Method):
+class NoNoise(SignalMethod):
     """No noise: min(y, full_signal), since an ideal sensor still has a full well.
 
     >>> from clpipe.stage import run_reference
@@ -50,5 +48,6 @@ class NoNoise(Method):
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
         return before
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return np.minimum(image, np.float32(or_default(self.full_signal, NEVER_FULL)))
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        return backend.minimum(y, n["full_signal"])

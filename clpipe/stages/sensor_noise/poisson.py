@@ -6,11 +6,8 @@ import numpy as np
 
 from clpipe.base.errors import RequestError
 from clpipe.base.tracing import float32
-from clpipe.base.types import Floats
-from clpipe.reference.poisson import poisson_of
-from clpipe.reference.random import word_at
-from clpipe.stage import Context, NoiseScope, Pass, ReferenceContext
-from clpipe.stages.sensor_noise.model import SensorNoise
+from clpipe.stage import Backend, Context, NoiseScope, Numbers, Pass, Signal
+from clpipe.stages.sensor_noise.model import SensorNoise, unit_read_noise
 from clpipe.stages.sensor_noise.no_noise import NEVER_FULL
 
 
@@ -62,9 +59,8 @@ class Poisson(SensorNoise):
             **self.read_noise_numbers(),
         }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        n = self.numbers()
-        words = word_at(image.shape, 0, given.stream[NoiseScope.IMAGE])
-        mean = np.maximum(image, np.float32(0)) * n["chi"]
-        electrons = np.minimum(poisson_of(mean, words), n["full_well"])
-        return electrons * n["a"] + self.unit_read_noise(image, given) * n["read_noise"]
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        electrons = backend.photons(y.clip(min=0) * n["chi"], backend.words())
+        counted = backend.minimum(electrons, n["full_well"])
+        return counted * n["a"] + unit_read_noise(n, backend) * n["read_noise"]

@@ -1,12 +1,13 @@
 """Sensor noise as a Gaussian that is skewed as shot noise is."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
-from clpipe.base.types import Floats
-from clpipe.reference.math import inverse_root
+from clpipe.stage import Backend, Signal
 from clpipe.stages.sensor_noise.gaussian import Gaussian
+
+SMALLEST, SIXTH = float(np.float32(1e-30)), float(np.float32(1 / 6))
 
 
 class SkewedGaussian(Gaussian):
@@ -35,10 +36,10 @@ class SkewedGaussian(Gaussian):
     functions: ClassVar = ("skewed_noise", "skewed_noise_tukey")
 
     @staticmethod
-    def noise(normals: Floats, y: Floats, a: np.float32, b: np.float32) -> Floats:
-        shot = np.maximum(a * y, np.float32(0))
-        variance = np.maximum(a * y + b, np.float32(1e-30))
-        inverse = inverse_root(variance)
-        skew = shot * inverse * inverse * (a * np.float32(1 / 6))
+    def noise(normals: Signal, y: Signal, a: Any, b: Any, backend: Backend) -> Signal:
+        shot = (a * y).clip(min=0)
+        variance = (a * y + b).clip(min=SMALLEST)
+        inverse = backend.inverse_root(variance)
+        skew = shot * inverse * inverse * (a * SIXTH)
         linear = (variance - skew * skew) * inverse
         return (linear + skew * normals) * normals - skew

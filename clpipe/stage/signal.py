@@ -1,0 +1,199 @@
+"""Methods on the signal of a mosaic, written once for NumPy and for PyTorch.
+
+Such a method overrides :meth:`SignalMethod.apply` instead of ``reference``. NumPy runs it on one
+image, as the reference of the kernel; :mod:`clpipe.torch` runs it on a batch.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clpipe.base.types import Floats
+from clpipe.reference.image import tap
+from clpipe.reference.math import inverse_root, square_root
+from clpipe.reference.poisson import poisson_of
+from clpipe.reference.random import (
+    Stream,
+    in_upper_half,
+    normal_at,
+    normal_of_line,
+    philox,
+    upper_bits,
+    word_at,
+)
+from clpipe.reference.tukey_lambda import tukey_lambda_of
+from clpipe.stage.context import Context, ReferenceContext
+from clpipe.stage.method import Method
+from clpipe.stage.passes import CompileTime, NoiseScope
+
+# float32: an array (height, width), or a tensor (sample, height, width). Both have the operators
+# + - * < and the methods clip and abs.
+Signal: TypeAlias = Any
+Numbers: TypeAlias = Mapping[str, Any]  # np.float32 each, or a tensor (sample, 1, 1)
+
+
+Own: TypeAlias = Callable[[Any, Context], tuple[Any, ...]]
+
+
+def nothing(method: Any, context: Context) -> tuple[Any, ...]:
+    """Return no further arguments."""
+    return ()
+
+
+class Backend:
+    """What :meth:`SignalMethod.apply` uses besides operators: functions, and random numbers.
+
+    Random numbers are new in each image, except those of :meth:`fixed`.
+    """
+
+    where: ClassVar[Callable[..., Any]]
+    minimum: ClassVar[Callable[..., Any]]
+    square_root: ClassVar[Callable[..., Any]]
+    inverse_root: ClassVar[Callable[..., Any]]
+    rounded: ClassVar[Callable[..., Any]]  # to the nearest whole number, ties to even
+    photons: ClassVar[Callable[..., Any]]  # Poisson numbers, from means and words
+    tukey_lambda: ClassVar[Callable[..., Any]]  # from words, shape and scale
+    in_upper_half: ClassVar[Callable[..., Any]]  # whether a word's top bit is 0
+    tap: ClassVar[Callable[..., Any]]  # of a signal, the value dx to the right and dy below
+
+    def normals(self, draw: int = 0) -> Signal:
+        """Return a standard normal for each pixel."""
+        raise NotImplementedError
+
+    def words(self, draw: int = 0) -> Any:
+        """Return a random word of 32 bits for each pixel."""
+        raise NotImplementedError
+
+    def lines(self, count: int) -> Signal:
+        """Return ``count`` standard normals, (..., count)."""
+        raise NotImplementedError
+
+    def uniform(self) -> Signal:
+        """Return one number from 0 to 1, (..., 1, 1)."""
+        raise NotImplementedError
+
+    def rows(self) -> Signal:
+        """Return the numbers of the rows, from 0, (..., height, 1)."""
+        raise NotImplementedError
+
+    def tiled(self, cell: list[list[Signal]]) -> Signal:
+        """Repeat a cell of 2x2 numbers, (..., 1, 1) each, over the image."""
+        raise NotImplementedError
+
+    def fixed(self, make: Callable[..., Floats], own: Own = nothing) -> Signal:
+        """Return what is fixed to a sensor.
+
+        Args:
+            make: a NumPy function of the height, the width, the stream of the sensor, and ``own``.
+                Returns (height or 1, width).
+            own: further arguments, from the method and its context.
+        """
+        raise NotImplementedError
+
+
+class SignalMethod(Method):
+    """A method on the signal of a mosaic that NumPy and PyTorch share."""
+
+    @classmethod
+    def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
+        """Return the signal after this method.
+
+        Only ``+ - *``, comparisons and what ``backend`` has round alike everywhere; constants are
+        Python numbers that float32 represents exactly.
+
+        Args:
+            y: the signal before.
+            n: the numbers among :meth:`arguments`, by name.
+            backend: functions and random numbers.
+        """
+        raise NotImplementedError(cls.__name__)
+
+    @classmethod
+    def on_tensors(cls) -> bool:
+        """Return whether :meth:`apply` is all of it: a subclass may have a reference of its own."""
+        return cls.reference is SignalMethod.reference
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        if not self.passes():
+            return image
+        numbers = numbers_in(self.arguments(given.context))
+        result: Floats = self.apply(image, numbers, NumpyBackend(self, given, image.shape))
+        return result
+
+
+def sensor_normals(height: int, width: int, stream: Stream) -> Floats:
+    """Return a standard normal for each pixel of a sensor, for :meth:`Backend.fixed`."""
+    return normal_at((height, width), 0, stream)
+
+
+def sensor_bits(height: int, width: int, stream: Stream) -> NDArray[np.int32]:
+    """Return a whole number from 0 to 2^31 - 1 for each pixel of a sensor."""
+    return upper_bits(word_at((height, width), 0, stream))
+
+
+def numbers_in(arguments: Mapping[str, Any]) -> dict[str, np.float32]:
+    """Return the numbers among the arguments of a kernel."""
+    return {
+        name: np.float32(value)
+        for name, value in arguments.items()
+        if not isinstance(value, CompileTime | np.ndarray)
+    }
+
+
+@dataclass(frozen=True)
+class NumpyBackend(Backend):
+    """The backend of one image in NumPy.
+
+    Args:
+        method: the (resolved) method.
+        given: its context and streams.
+        size: height and width of the image.
+    """
+
+    method: Method
+    given: ReferenceContext
+    size: tuple[int, ...]
+
+    where = staticmethod(np.where)
+    minimum = staticmethod(np.minimum)
+    square_root = staticmethod(square_root)
+    inverse_root = staticmethod(inverse_root)
+    rounded = staticmethod(np.rint)
+    photons = staticmethod(poisson_of)
+    tukey_lambda = staticmethod(tukey_lambda_of)
+    in_upper_half = staticmethod(in_upper_half)
+    tap = staticmethod(tap)
+
+    @property
+    def _own(self) -> Stream:
+        return self.given.stream[NoiseScope.IMAGE]
+
+    def normals(self, draw: int = 0) -> Signal:
+        return normal_at(self.size, draw, self._own)
+
+    def words(self, draw: int = 0) -> Any:
+        return word_at(self.size, draw, self._own)
+
+    def lines(self, count: int) -> Signal:
+        return normal_of_line(count, self._own)
+
+    def uniform(self) -> Signal:
+        zero = np.zeros((1, 1), np.uint32)
+        word = philox(zero, zero, zero, np.full((1, 1), self._own.stage, np.uint32), self._own)[0]
+        return upper_bits(word).astype(np.float32) * np.float32(4.6566129e-10)
+
+    def rows(self) -> Signal:
+        return np.arange(self.size[0], dtype=np.float32)[:, None]
+
+    def tiled(self, cell: list[list[Signal]]) -> Signal:
+        height, width = self.size[:2]
+        repeats = (height + 1) // 2, (width + 1) // 2
+        return np.tile(np.block(cell), repeats)[:height, :width]
+
+    def fixed(self, make: Callable[..., Floats], own: Own = nothing) -> Signal:
+        height, width = self.size[:2]
+        stream = self.given.stream.get(NoiseScope.CAMERA)
+        return make(height, width, stream, *own(self.method, self.given.context))

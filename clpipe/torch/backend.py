@@ -1,0 +1,155 @@
+"""The backend of :class:`clpipe.stage.SignalMethod` for PyTorch: a batch of samples at a time.
+
+Its functions do what NumPy's do, with the same operations in the same order, so bits are equal.
+What is fixed to a sensor comes from NumPy, once for each camera and size.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from clpipe.base.types import Floats
+from clpipe.chain.chain import Step
+from clpipe.reference.image import mirror
+from clpipe.reference.random import Stream
+from clpipe.stage.signal import Backend, Own, nothing
+from clpipe.torch import numbers
+from clpipe.torch.numbers import Streams, f32
+from clpipe.torch.poisson import poisson_of
+
+MOST_MAPS = 256  # of sensors that are kept, of some MB each at most
+
+
+def tapped(y: Tensor, dx: int, dy: int) -> Tensor:
+    """As :func:`clpipe.reference.image.tap`."""
+    if dx:
+        columns = mirror(np.arange(y.shape[2]) + dx, y.shape[2])
+        y = y[:, :, torch.from_numpy(columns).to(y.device)]
+    if dy:
+        rows = mirror(np.arange(y.shape[1]) + dy, y.shape[1])
+        y = y[:, torch.from_numpy(rows).to(y.device)]
+    return y
+
+
+def tukey_lambda_of(words: Tensor, shape: Tensor, scale: Tensor) -> Tensor:
+    """As :func:`clpipe.reference.tukey_lambda.tukey_lambda_of`."""
+    p = numbers.tail_probability(words)
+    low, high = (numbers.exponential_minus_1(numbers.negative_log(q) * -shape) for q in (p, 1 - p))
+    z = (high - low) * scale
+    return torch.where(words >= 0, z, -z)
+
+
+class Photons(torch.autograd.Function):
+    """Poisson numbers; their derivative is taken as that of their mean."""
+
+    @staticmethod
+    def forward(ctx: Any, mean: Tensor, words: Tensor) -> Tensor:
+        return poisson_of(mean, words)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        return gradients[0], None
+
+
+class Rounded(torch.autograd.Function):
+    """Whole numbers, ties to even; the derivative is that of the number before (straight through:
+    Bengio et al., "Estimating or propagating gradients through stochastic neurons", 2013).
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        return x.round()
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        return gradients[0]
+
+
+@dataclass(frozen=True)
+class TorchBackend(Backend):
+    """The backend of a batch: samples that have one method.
+
+    Args:
+        steps: the step of each sample with the method.
+        streams: the streams of noise that is new in each sample.
+        sensors: the stream of each sample's sensor.
+        places: the row and column of each sample's upper left corner on its sensor.
+        area: height and width of the part of a sensor that contains the places.
+        size: height and width of the samples.
+    """
+
+    steps: Sequence[Step]
+    streams: Streams
+    sensors: Sequence[Stream]
+    places: Sequence[tuple[int, int]]
+    area: tuple[int, int]
+    size: tuple[int, int]
+
+    where = staticmethod(torch.where)
+    minimum = staticmethod(torch.minimum)
+    square_root = staticmethod(numbers.square_root)
+    inverse_root = staticmethod(numbers.inverse_root)
+    rounded = staticmethod(Rounded.apply)
+    photons = staticmethod(Photons.apply)
+    tukey_lambda = staticmethod(tukey_lambda_of)
+    tap = staticmethod(tapped)
+
+    @staticmethod
+    def in_upper_half(words: Tensor) -> Tensor:
+        return words >= 0
+
+    def normals(self, draw: int = 0) -> Tensor:
+        return numbers.normal_at(*self.size, draw, self.streams)
+
+    def words(self, draw: int = 0) -> Tensor:
+        return numbers.word_at(*self.size, draw, self.streams)
+
+    def lines(self, count: int) -> Tensor:
+        return numbers.normal_of_line(count, self.streams)
+
+    def uniform(self) -> Tensor:
+        zero = torch.zeros(1, 1, 1, dtype=torch.int64, device=self._on)
+        bits = (numbers.philox(zero, 0, 0, self.streams)[0] >> 1) & numbers.LOW
+        return bits.float() * f32(4.6566129e-10)
+
+    def rows(self) -> Tensor:
+        return torch.arange(self.size[0], dtype=torch.float32, device=self._on)[None, :, None]
+
+    def tiled(self, cell: list[list[Tensor]]) -> Tensor:
+        height, width = self.size
+        together = torch.cat([torch.cat(row, 2) for row in cell], 1)
+        return together.repeat(1, (height + 1) // 2, (width + 1) // 2)[:, :height, :width]
+
+    @property
+    def _on(self) -> torch.device:
+        return self.streams.keys.device
+
+    def fixed(self, make: Callable[..., Floats], own: Own = nothing) -> Tensor:
+        height, width = self.size
+        maps = [
+            _map(make, self.area, stream, own(step.method, step.context), self._on)
+            for step, stream in zip(self.steps, self.sensors, strict=True)
+        ]
+        each = list(zip(maps, self.places, strict=True))
+        if all(m is maps[0] for m in maps) and len(set(self.places)) == 1:
+            each = each[:1]
+        rows = [y if len(m) > 1 else 0 for m, (y, _) in each]
+        return torch.stack(
+            [m[y : y + height, x : x + width] for y, (m, (_, x)) in zip(rows, each, strict=True)]
+        )
+
+
+@lru_cache(maxsize=MOST_MAPS)
+def _map(
+    make: Callable[..., Floats],
+    area: tuple[int, int],
+    stream: Stream,
+    own: tuple[Any, ...],
+    on: torch.device,
+) -> Tensor:
+    return torch.from_numpy(np.array(make(*area, stream, *own), np.float32)).to(on)
