@@ -34,6 +34,7 @@ class Column(SignalMethod):
     The pixel k places on gets the share (1 - spill) * spill^(k - 1) of each half, up to 16 px, and
     holds no more than its own full well. Bright lamps so get streaks.
 
+    >>> import numpy as np
     >>> from clpipe.stage import run_reference
     >>> lamp = np.zeros((65, 1), np.float32)
     >>> lamp[32] = 3

@@ -24,6 +24,7 @@ class Neighbours(SignalMethod):
     before shot noise, which stays independent (Holst and Lomheim, CMOS/CCD Sensors and Camera
     Systems, 2nd ed. 2011).
 
+    >>> import numpy as np
     >>> from clpipe.stage import run_reference
     >>> dot = np.zeros((5, 5), np.float32)
     >>> dot[2, 2] = 1

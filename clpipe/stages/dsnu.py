@@ -22,6 +22,7 @@ class Gaussian(GaussianNoise):
     n is a standard normal of the pixel; sigma is in signal units. In electrons, the camera's sigma
     is the same at every ISO.
 
+    >>> import numpy as np
     >>> from clpipe.stage import run_reference
     >>> uneven = run_reference(Gaussian(sigma=0.01), np.zeros((300, 300), np.float32))
     >>> round(float(uneven.std()), 3)

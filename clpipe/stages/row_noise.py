@@ -50,6 +50,7 @@ class Gaussian(LineNoise):
 
     n_r is a standard normal of row r; sigma is in signal units.
 
+    >>> import numpy as np
     >>> from clpipe.stage import run_reference
     >>> noisy = run_reference(Gaussian(sigma=0.01), np.zeros((1000, 2), np.float32))
     >>> round(float(noisy.std()), 3), bool((noisy[:, 0] == noisy[:, 1]).all())

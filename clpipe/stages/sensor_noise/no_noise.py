@@ -16,6 +16,7 @@ def or_default(value: float | None, default: float) -> float:
 class NoNoise(SignalMethod):
     """No noise: min(y, full_signal), since an ideal sensor still has a full well.
 
+    >>> import numpy as np
     >>> from clpipe.stage import run_reference
     >>> run_reference(NoNoise(full_signal=0.5), np.float32([[0.25, 0.75]])).tolist()
     [[0.25, 0.5]]
