@@ -23,8 +23,8 @@ import pytest
 from clpipe.base.errors import DeviceError, ImageError, OutputError, RequestError
 from clpipe.batch import job_state, replay, threads
 from clpipe.batch.job_state import JobState
+from clpipe.batch.memory_budget import MemoryBudget, host_bytes
 from clpipe.batch.outcome import DONE, Outcome, Span
-from clpipe.batch.room import Room, host_bytes
 from clpipe.batch.run_log import read_log
 from clpipe.batch.sinks import Folder
 from clpipe.batch.threads import Batch
@@ -843,8 +843,8 @@ def test_what_a_device_leaves_another_does(renders, tmp_path, monkeypatch, caplo
         list(Batch(worker_of(tmp_path)[0], [None]).run(jobs))
 
 
-@pytest.mark.parametrize(("room", "together"), [(1, 1), (2, 2), (100, 4)])
-def test_images_wait_for_room(renders, tmp_path, monkeypatch, room, together):
+@pytest.mark.parametrize(("budget", "together"), [(1, 1), (2, 2), (100, 4)])
+def test_images_wait_for_memory(renders, tmp_path, monkeypatch, budget, together):
     """As many images as fit are in memory at a time: they wait for each other, and no more come."""
     renders(12)
     (tmp_path / "out").mkdir()
@@ -869,16 +869,16 @@ def test_images_wait_for_room(renders, tmp_path, monkeypatch, room, together):
     monkeypatch.setattr(ImageLoader, "read", reading)
     monkeypatch.setattr(ImageWorker, "encode", encoding)
     large = worker.bytes_of(jobs[1], 1, in_numpy=True)
-    outcomes = list(Batch(worker, [None], threads=4, room=room * large).run(jobs))
+    outcomes = list(Batch(worker, [None], threads=4, memory=budget * large).run(jobs))
     assert [o.status for o in outcomes] == ["done"] * 12
     assert together == 4 or max(seen) == together
 
 
-def test_waiting_for_room_is_not_time_of_decoding(renders, tmp_path, monkeypatch):
+def test_waiting_for_memory_is_not_time_of_decoding(renders, tmp_path, monkeypatch):
     renders(3)
     (tmp_path / "out").mkdir()
     worker, jobs = worker_of(tmp_path)
-    waited, enter = [0.0], Room.enter
+    waited, enter = [0.0], MemoryBudget.acquire
 
     def clock():
         return time.perf_counter() + waited[0]
@@ -889,7 +889,7 @@ def test_waiting_for_room_is_not_time_of_decoding(renders, tmp_path, monkeypatch
 
     for module in (threads, job_state):
         monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=clock, time=time.time))
-    monkeypatch.setattr(Room, "enter", slow)
+    monkeypatch.setattr(MemoryBudget, "acquire", slow)
     outcomes = list(Batch(worker, [None], threads=1).run(jobs))
     assert waited == [3e6]
     assert all(0 < o.seconds("decode") < 1e6 for o in outcomes)

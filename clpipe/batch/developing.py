@@ -12,7 +12,7 @@ from itertools import chain
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.errors import DeviceError, OutputError
 from clpipe.batch.job_state import JobState, failure_text
-from clpipe.batch.room import Room
+from clpipe.batch.memory_budget import MemoryBudget
 from clpipe.batch.runners import Runners
 from clpipe.batch.work import ImageWorker, Written
 from clpipe.engine.device import Device
@@ -64,7 +64,7 @@ class Developers:
         worker: does the work of each image.
         devices: the devices; None is NumPy.
         threads: the number of renditions that are encoded at a time.
-        room: notified when a device has compiled its kernels.
+        budget: notified when a device has compiled its kernels.
         compiled: called at the same time.
         fail: called with an error after which the run cannot continue.
     """
@@ -74,14 +74,14 @@ class Developers:
         worker: ImageWorker,
         devices: Sequence[Device | None],
         threads: int,
-        room: Room,
+        budget: MemoryBudget,
         compiled: Callable[[], None],
         fail: Callable[[BaseException], None],
     ) -> None:
         self.devices = devices
         self.most = threads + len(devices)  # renditions of one image that are in flight at a time
         self._worker = worker
-        self._room = room
+        self._budget = budget
         self._tell = compiled
         self._fail = fail
         self._orders: queue.SimpleQueue[Order | None] = queue.SimpleQueue()
@@ -142,7 +142,7 @@ class Developers:
                 runners = self._worker.runners(device)
                 self._tell()
             finally:
-                self._room.started()
+                self._budget.device_ready()
             while asked := self._taken(started, device):
                 if len(started) >= depth_of(device):
                     self._finish(started, device)

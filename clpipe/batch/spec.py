@@ -4,8 +4,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from clpipe.batch.memory_budget import default_budget
 from clpipe.batch.outcome import Outcome
-from clpipe.batch.room import usual_room
 from clpipe.batch.sinks import Folder
 from clpipe.batch.threads import Batch
 from clpipe.batch.where import Where
@@ -58,8 +58,8 @@ class RunSpec:
             in_flight, compiled: as for :class:`~clpipe.batch.threads.Batch`.
         """
         number = self.where.threads or threads
-        room = usual_room(sharing)
-        return Batch(self.worker(), devices, number, room, in_flight, compiled)
+        memory = default_budget(sharing)
+        return Batch(self.worker(), devices, number, memory, in_flight, compiled)
 
 
 def shifted(outcome: Outcome, seconds: float, prefix: str = "") -> Outcome:

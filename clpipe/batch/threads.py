@@ -22,8 +22,8 @@ from clpipe.base.errors import OutputError, RequestError
 from clpipe.base.processors import available_processors
 from clpipe.batch.developing import TOGETHER, Developers, depth_of
 from clpipe.batch.job_state import JobState, failure_text
+from clpipe.batch.memory_budget import MemoryBudget, default_budget
 from clpipe.batch.outcome import Outcome
-from clpipe.batch.room import Room, usual_room
 from clpipe.batch.work import ImageWorker, Written
 from clpipe.engine.device import Device
 from clpipe.images.openimageio import set_codec_threads
@@ -44,8 +44,8 @@ class Batch:
         devices: the devices that develop, each with its own thread; [None] is NumPy.
         threads: the number of images that are decoded at a time, and of those that are encoded.
             None is one for each processor.
-        room: bytes that images in flight may take. None is
-            :func:`~clpipe.batch.room.usual_room`.
+        memory: bytes that images in flight may take. None is
+            :func:`~clpipe.batch.memory_budget.default_budget`.
         in_flight: the number of threads that make images. None is enough to keep all others busy.
             A single thread takes several small images at a time.
         compiled: called when a device has compiled its kernels.
@@ -56,7 +56,7 @@ class Batch:
         worker: ImageWorker,
         devices: Sequence[Device | None],
         threads: int | None = None,
-        room: int | None = None,
+        memory: int | None = None,
         in_flight: int | None = None,
         compiled: Callable[[], None] = lambda: None,
     ) -> None:
@@ -66,13 +66,13 @@ class Batch:
         self.in_flight = in_flight or results + 1
         self._worker = worker
         worker.reserve(results)
-        size = usual_room() if room is None else room
-        self._room = Room(size, self.devices, partial(worker.reserve, results))
+        size = default_budget() if memory is None else memory
+        self._budget = MemoryBudget(size, self.devices, partial(worker.reserve, results))
         self._failure: Exception | None = None
         self._stopping = threading.Event()
         self._decoding = threading.Semaphore(self.threads)  # limits the threads that decode
         self._developers = Developers(
-            worker, self.devices, self.threads, self._room, compiled, self._fail
+            worker, self.devices, self.threads, self._budget, compiled, self._fail
         )
         self._jobs: Jobs = queue.SimpleQueue()
         # None: one of the threads has ended.
@@ -126,7 +126,7 @@ class Batch:
             is_over = True
         finally:
             self.stop()
-            self._room.open()
+            self._budget.close()
             for _ in range(self.in_flight - makers):  # threads that could not be started
                 self._made.put(None)
             while not is_over and self._outcomes.get() is not None:
@@ -199,7 +199,7 @@ class Batch:
                     self._make(decoded)
         except BaseException as error:  # of the run, not of one image
             self._fail(error)
-            self._room.open()
+            self._budget.close()
         finally:
             self._made.put(None)
 
@@ -233,9 +233,9 @@ class Batch:
         developers.begin()
         size = worker.bytes_of(job, developers.most, None in self.devices)
         start = time.perf_counter()
-        if beside and not self._room.fits(size):
+        if beside and not self._budget.fits(size):
             self._make(beside)  # which frees their memory
-        self._room.enter(job.stem, size)
+        self._budget.acquire(job.stem, size)
         waits.append(time.perf_counter() - start)
 
     def _make(self, decoded: list[JobState]) -> None:
@@ -247,7 +247,7 @@ class Batch:
         failure: Exception | None = None
         for state, orders in zip(decoded, self._developers.order(decoded), strict=True):
             state.drop_pixels()
-            self._room.leave(state.job.stem)
+            self._budget.release(state.job.stem)
             try:
                 results = [order.written.result() for order in orders]
             except Exception as error:

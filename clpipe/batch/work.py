@@ -13,8 +13,8 @@ from clpipe.base.errors import DeviceError, ImageError, NoPictureError, OutputEr
 from clpipe.base.files import FileGroup, deferred_files
 from clpipe.base.types import Array
 from clpipe.batch.job_state import JobState
+from clpipe.batch.memory_budget import host_bytes
 from clpipe.batch.outcome import LEFT_OUT, SKIPPED, Span
-from clpipe.batch.room import host_bytes
 from clpipe.batch.runners import Runners, SpareArrays
 from clpipe.batch.sinks import Folder
 from clpipe.chain.baseline import with_noise
@@ -92,7 +92,7 @@ class ImageWorker:
         return len(exposures.spans) - 1 if exposures else 0
 
     def bytes_of(self, job: Job, most: int, in_numpy: bool) -> int:
-        """Return the bytes that a job's image takes, see :func:`~clpipe.batch.room.host_bytes`.
+        """Return the bytes that a job's image takes; see :func:`host_bytes`.
 
         Args:
             job: the image.

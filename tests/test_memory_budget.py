@@ -12,8 +12,8 @@ import pytest
 from clpipe.base import memory
 from clpipe.base.errors import DeviceError, ImageError, RequestError
 from clpipe.base.memory import Left
-from clpipe.batch import room as rooms
-from clpipe.batch.room import LEAST, STARTING, Room, needed
+from clpipe.batch import memory_budget
+from clpipe.batch.memory_budget import LEAST, STARTING, MemoryBudget, needed
 from clpipe.batch.threads import Batch
 from clpipe.engine.discovery import find_devices
 from clpipe.images.claims import claim_of
@@ -37,45 +37,49 @@ class SharingDevice:
         self.limits.append(limit)
 
 
-def room_of(free, *devices, size=None, drop=lambda: None):
-    """A room in which so many bytes are free, less what devices hold."""
-    room = Room(size, devices, drop, lambda: Left(free - sum(d.bytes_held for d in devices), "x"))
+def budget_of(free, *devices, size=None, drop=lambda: None):
+    """A budget in which so many bytes are free, less what devices hold."""
+    budget = MemoryBudget(
+        size, devices, drop, lambda: Left(free - sum(d.bytes_held for d in devices), "x")
+    )
     for _ in devices:
-        room.started()
-    return room
+        budget.device_ready()
+    return budget
 
 
 @pytest.fixture(autouse=True)
 def clock(monkeypatch):
-    """The rooms' clock in s, which only sleeping moves, and the test."""
+    """The memory_budget' clock in s, which only sleeping moves, and the test."""
     now = [0.0]
 
     def sleep(seconds):
         now[0] += seconds
 
-    monkeypatch.setattr(rooms, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
+    monkeypatch.setattr(
+        memory_budget, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep)
+    )
     return now
 
 
 class Entering:
-    """A thread that takes room, and whether it has to wait for it."""
+    """A thread that takes budget, and whether it has to wait for it."""
 
-    def __init__(self, room, *arguments):
-        self._room, self._arguments = room, arguments
+    def __init__(self, budget, *arguments):
+        self._budget, self._arguments = budget, arguments
         self._settled, self._has_entered = threading.Event(), False
-        wait = room._changed.wait
+        wait = budget._changed.wait
 
         def noted(timeout=None):
             self._settled.set()
             return wait(timeout)
 
-        room._changed.wait = noted
+        budget._changed.wait = noted
         self._thread = threading.Thread(target=self._enter, daemon=True)
         self._thread.start()
 
     def _enter(self):
         try:
-            self._room.enter(*self._arguments)
+            self._budget.acquire(*self._arguments)
             self._has_entered = True
         finally:
             self._settled.set()
@@ -91,75 +95,77 @@ class Entering:
 
 
 def test_what_never_fits_is_refused_and_what_fits_is_let_in():
-    room = room_of(100 * MIB)
+    budget = budget_of(100 * MIB)
     for _ in range(2):
-        room.enter("small", 10 * MIB)
-        room.leave("small")
+        budget.acquire("small", 10 * MIB)
+        budget.release("small")
         with pytest.raises(ImageError, match=r"about 233\.0 MiB of memory; 100\.0 MiB are left by"):
-            room.enter("large", 200 * MIB)
+            budget.acquire("large", 200 * MIB)
 
 
 def test_what_fits_alone_waits_for_the_others():
-    room = room_of(200 * MIB, size=100 * MIB)
-    room.enter("small", 10 * MIB)
-    large = Entering(room, "large", 120 * MIB)
+    budget = budget_of(200 * MIB, size=100 * MIB)
+    budget.acquire("small", 10 * MIB)
+    large = Entering(budget, "large", 120 * MIB)
     assert large.has_to_wait
-    room.leave("small")
+    budget.release("small")
     large.finish()
 
 
 def test_for_a_large_image_devices_hold_little():
     device, dropped = SharingDevice(150 * MIB, held=100 * MIB), []
-    room = room_of(300 * MIB, device, drop=lambda: dropped.append(1))
-    room.enter("fits", 100 * MIB)
-    room.leave("fits")
+    budget = budget_of(300 * MIB, device, drop=lambda: dropped.append(1))
+    budget.acquire("fits", 100 * MIB)
+    budget.release("fits")
     assert not device.limits
-    room.enter("large", 200 * MIB)
+    budget.acquire("large", 200 * MIB)
     assert device.limits == [LEAST]
     assert dropped
-    room.leave("large")
+    budget.release("large")
     assert device.memory == 150 * MIB
     with pytest.raises(ImageError, match=r"268\.0 MiB are left"):
-        room.enter("too large", 280 * MIB)
+        budget.acquire("too large", 280 * MIB)
     assert device.limits == [LEAST]  # it would not have helped
 
 
 def test_what_was_taken_before_may_be_freed_late(clock):
-    freed = rooms.PATIENCE / 2  # s
-    room = Room(None, (), left=lambda: Left((60 if 0 < clock[0] < freed else 200) * MIB, ""))
-    room.enter("a", 150 * MIB)
-    room.leave("a")
+    freed = memory_budget.PATIENCE / 2  # s
+    budget = MemoryBudget(
+        None, (), left=lambda: Left((60 if 0 < clock[0] < freed else 200) * MIB, "")
+    )
+    budget.acquire("a", 150 * MIB)
+    budget.release("a")
     clock[0] = 1e-3
-    room.enter("b", 150 * MIB)
+    budget.acquire("b", 150 * MIB)
     assert clock[0] >= freed
 
 
 def test_large_images_wait_for_the_compiler():
-    room = Room(None, (SharingDevice(0),), left=lambda: Left(STARTING + 100 * MIB, ""))
-    room.enter("small", 10 * MIB)
-    room.leave("small")
-    large = Entering(room, "large", 150 * MIB)
+    budget = MemoryBudget(None, (SharingDevice(0),), left=lambda: Left(STARTING + 100 * MIB, ""))
+    budget.acquire("small", 10 * MIB)
+    budget.release("small")
+    large = Entering(budget, "large", 150 * MIB)
     assert large.has_to_wait
-    room.started()
+    budget.device_ready()
     large.finish()
 
 
 def test_nothing_is_let_in_at_the_end():
-    room = room_of(100 * MIB)
-    room.enter("a", 50 * MIB)
-    room.open()
+    budget = budget_of(100 * MIB)
+    budget.acquire("a", 50 * MIB)
+    budget.close()
     with pytest.raises(ImageError, match="ended"):
-        room.enter("b", 60 * MIB)
+        budget.acquire("b", 60 * MIB)
 
 
 def test_small_images_are_not_slowed_by_measuring(clock):
     count = []
-    room = Room(None, (), left=lambda: count.append(1) or Left(2**34, ""))
+    budget = MemoryBudget(None, (), left=lambda: count.append(1) or Left(2**34, ""))
     for number in range(100):
-        room.enter(str(number), MIB)
+        budget.acquire(str(number), MIB)
     assert len(count) == 1
-    clock[0] += 2 * rooms.LASTS
-    room.enter("later", MIB)
+    clock[0] += 2 * memory_budget.LASTS
+    budget.acquire("later", MIB)
     assert len(count) == 2
 
 
@@ -185,7 +191,7 @@ def test_one_that_is_too_large_costs_one_line(write_exr, clpipe, tmp_path, monke
     for i in range(3):
         write_exr(f"in/r{i}.exr", np.full((8, 12, 3), 0.2, np.float32))
     (tmp_path / "in" / "b.pfm").write_bytes(b"PF\n6000 4000\n-1.0\n")
-    monkeypatch.setattr(rooms, "memory_left", lambda: Left(300 * MIB, "a limit"))
+    monkeypatch.setattr(memory_budget, "memory_left", lambda: Left(300 * MIB, "a limit"))
     for _ in range(2):
         result = clpipe("run", "in", "-o", "out", "--device", "numpy", status=1)
         lines = [line for line in result.stderr.splitlines() if "b.pfm" in line]

@@ -23,7 +23,7 @@ PATIENCE = 1.0  # s to wait for memory that earlier images free a little after t
 LASTS = 0.1  # s for which a measurement is used: it takes 0.4 ms, a small image 10 ms
 
 
-def usual_room(sharing: int = 1) -> int | None:
+def default_budget(sharing: int = 1) -> int | None:
     """Return the bytes that images in flight may take: half of the free memory.
 
     The other half is for devices. ``sharing`` is the number of processes that share the memory.
@@ -73,7 +73,7 @@ def host_bytes(
     return most + pixels * (FLOATS * beside + IN_NUMPY * in_numpy)
 
 
-class Room:
+class MemoryBudget:
     """A budget of memory: images enter in order, as soon as they fit.
 
     An image that fits only alone enters alone, if necessary with less memory for the devices. An
@@ -107,17 +107,17 @@ class Room:
         self._taken: dict[str, int] = {}  # bytes, by the stem of an image
         self._queue = threading.Lock()  # lets one image wait at a time, so none overtakes it
         self._changed = threading.Condition()  # guards all of the above; notified when they change
-        self._is_open = False
+        self._is_closed = False
 
-    def enter(self, name: str, size: int) -> None:
+    def acquire(self, name: str, size: int) -> None:
         """Wait until an image fits, and take its memory.
 
         Raises:
             ImageError: it does not fit even alone, or the run has ended.
         """
         with self._queue, self._changed:
-            self._changed.wait_for(lambda: self._is_open or self._fits(size) or self._is_alone)
-            if self._is_open:
+            self._changed.wait_for(lambda: self._is_closed or self._fits(size) or self._is_alone)
+            if self._is_closed:
                 raise ImageError("the run ended before it was begun")
             if not self._fits(size):
                 self._squeeze(size)
@@ -128,23 +128,23 @@ class Room:
         with self._changed:
             return self._fits(size)
 
-    def leave(self, name: str) -> None:
+    def release(self, name: str) -> None:
         """Give back the memory of an image, if it has any."""
         with self._changed:
             self._taken.pop(name, None)
             self._restore()
             self._changed.notify_all()
 
-    def started(self) -> None:
+    def device_ready(self) -> None:
         """Note that a device has compiled its kernels, or has failed to."""
         with self._changed:
             self._starting -= 1
             self._changed.notify_all()
 
-    def open(self) -> None:
+    def close(self) -> None:
         """End the run: reject images that wait or come later."""
         with self._changed:
-            self._is_open = True
+            self._is_closed = True
             self._changed.notify_all()
 
     @property
