@@ -67,11 +67,6 @@ class Scene:
         """The flat places that the search sees."""
         return np.asarray(self.flat & ~self.kept_out)
 
-    @property
-    def holdout(self) -> Mask:
-        """The flat places that it does not see."""
-        return np.asarray(self.flat & self.kept_out)
-
     def places(self, part: Mask | None = None) -> Places:
         """Where noise is compared: everywhere, or in a part of the picture, (height, width)."""
         slopes = slopes_of(luma(self.mean), self.counted)
