@@ -5,17 +5,21 @@ from pathlib import Path
 
 import numpy as np
 
+from clpipe.images import tiff
+
 # A camera's colours at D65, as DNG's ColorMatrix2 has them.
 MATRIX = ((0.4716, 0.0603, -0.0830), (-0.7798, 1.5474, 0.2480), (-0.1496, 0.1937, 0.6651))
-FORMATS = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 10: "ii", 12: "d"}  # of TIFF's field types
+MAKERS = {
+    **{1: tiff.byte, 3: tiff.short, 4: tiff.long, 5: tiff.rational, 10: tiff.signed_rational},
+    12: tiff.double,
+}  # by TIFF's field types
 
 
-def field(tag: int, type_: int, *values) -> tuple[int, int, int, bytes]:
-    """A TIFF field; rationals are given as floats, text as bytes."""
+def field(tag: int, type_: int, *values) -> tuple[int, tiff.Field]:
+    """A TIFF field; text is given as bytes."""
     if type_ == 2:
-        return tag, type_, len(values[0]) + 1, values[0] + b"\0"
-    flat = [n for v in values for n in ((round(v * 10000), 10000) if type_ in (5, 10) else (v,))]
-    return tag, type_, len(values), struct.pack(f"<{len(flat)}{FORMATS[type_][0]}", *flat)
+        return tag, tiff.Field(2, len(values[0]) + 1, values[0] + b"\0")
+    return tag, MAKERS[type_](*values)
 
 
 def write_dng(
@@ -70,18 +74,8 @@ def write_dng(
         fields.append(field(33422, 1, *("RGB".index(c) for c in pattern)))
         fields.append(field(50713, 3, 2, 2))
         fields.append(field(50714, 5, *black))
-    by_tag = {f[0]: f for f in (*fields, *changes)}
-    by_tag[273] = field(273, 4, 0)
-    body, blob, start = b"", b"", 14 + 12 * len(by_tag)
-    longer = sum(len(f[3]) + len(f[3]) % 2 for f in by_tag.values() if len(f[3]) > 4)
-    by_tag[273] = field(273, 4, start + longer)
-    for tag, type_, count, data in sorted(by_tag.values()):
-        if len(data) > 4:
-            place = struct.pack("<I", start + len(blob))
-            blob += data + b"\0" * (len(data) % 2)
-        else:
-            place = data.ljust(4, b"\0")
-        body += struct.pack("<HHI", tag, type_, count) + place
-    head = b"II*\0" + struct.pack("<IH", 8, len(by_tag))
-    path.write_bytes(head + body + bytes(4) + blob + dn.tobytes())
+    directory = {**dict(fields), **dict(changes), 273: tiff.long(0)}
+    directory[273] = tiff.long(8 + tiff.directory_size(directory))
+    head = b"II*\0" + struct.pack("<I", 8) + tiff.directory_bytes(directory, 8)
+    path.write_bytes(head + dn.tobytes())
     return path

@@ -143,7 +143,7 @@ def test_images_that_claim_too_much_are_refused_in_little_memory(tmp_path):
     }
     for name, data in files.items():
         (tmp_path / name).write_bytes(data)
-        os.truncate(tmp_path / name, 64 << 20)  # else OpenImageIO sees that the file is too small
+        os.truncate(tmp_path / name, 16 << 20)  # else OpenImageIO sees that the file is too small
     command = [sys.executable, "-c", REFUSE_ALL, *(str(tmp_path / name) for name in files)]
     # Threads and their heaps take address space on machines with many cores.
     few = {"OPENBLAS_NUM_THREADS": "1", "OPENIMAGEIO_THREADS": "1", "MALLOC_ARENA_MAX": "1"}

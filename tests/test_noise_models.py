@@ -1,7 +1,6 @@
 """Noise models of others as camera profiles: a DNG's, Android's, darktable's."""
 
 import json
-import struct
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import pytest
 from clpipe.analysis.noise_models.read import import_camera
 from clpipe.base.errors import ClpipeError, ImageError, RequestError
 from clpipe.camera.profile import load_camera
-from tests.dng import write_dng
+from tests.dng import field, write_dng
 
 ANDROID = """
 /* planes in R, Gr, Gb, B order */
@@ -27,7 +26,7 @@ double compute_noise_model_entry_O(int plane, int sens) {
 
 
 def noise_profile(*values):
-    return (51041, 12, len(values), struct.pack(f"<{len(values)}d", *values))
+    return field(51041, 12, *values)
 
 
 def dng(path, *values, shape=(32, 32), **options):

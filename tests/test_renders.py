@@ -286,7 +286,7 @@ def test_other_formats(tmp_path, ending):
 @pytest.mark.slow
 def test_mutated_files_make_no_traceback_hang_or_crash():
     """A few of every kind; ``tools/stress/fuzz.py --cases 20000`` tries more."""
-    command = [sys.executable, "-m", "tools.stress.fuzz", "--cases", "400"]
+    command = [sys.executable, "-m", "tools.stress.fuzz", "--cases", "200"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1200)
     assert done.returncode == 0, done.stdout + done.stderr
     assert re.search(r"\d+ read, \d+ refused", done.stdout)

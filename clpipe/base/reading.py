@@ -164,6 +164,18 @@ def read_bytes(path: Path, most: int = TEXT_BYTES) -> bytes:
     return data
 
 
+def read_named(option: str, path: Path, most: int) -> bytes:
+    """The content of a file that an option names, of at most ``most`` bytes.
+
+    Raises:
+        RequestError: as :func:`read_bytes`.
+    """
+    try:
+        return read_bytes(path, most)
+    except OSError as error:
+        raise RequestError(f"{option} {path}: cannot be read: {error.strerror}") from None
+
+
 def read_text(path: Path) -> str:
     """The text of a small file in UTF-8, with or without a byte order mark.
 

@@ -23,7 +23,6 @@ from clpipe.reference.resample import Resampler, sizes
 from clpipe.stage import (
     Argument,
     Context,
-    InTime,
     Kind,
     Method,
     Noiseless,
@@ -35,6 +34,7 @@ from clpipe.stage import (
     bytes_of,
     typed_arguments,
 )
+from clpipe.stages.shutter import Rows
 
 # Properties of a chain, and those whose values are the same in chains of one structure.
 COMPUTED = "optics", "filters", "context_after", "context_of_raw", "geometry"
@@ -153,7 +153,7 @@ class Chain:
     def lit_by_layers(self) -> tuple[str, ...]:
         """The steps that must have the light of a layer of the image's file."""
         named = ((step.name, step.method) for step in self.steps)
-        return tuple(n for n, each in named if isinstance(each, InTime) and each.layer_of_light)
+        return tuple(n for n, each in named if isinstance(each, Rows) and each.layer_of_light)
 
     @cached_property
     def maker_of_raw(self) -> str | None:

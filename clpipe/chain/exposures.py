@@ -9,7 +9,9 @@ import numpy as np
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.chain.chain import Chain, Step, of_structure
-from clpipe.stage import InTime, OfExposures, Reduction, Span
+from clpipe.stage import Reduction, Span
+from clpipe.stages.sensor_noise.staggered import Staggered
+from clpipe.stages.shutter import Rows
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Exposures:
     def _before(self, number: int) -> Chain:
         steps = tuple(
             replace(step, method=step.method.during(self.spans, number))
-            if isinstance(step.method, InTime)
+            if isinstance(step.method, Rows)
             else step
             for step in self.chain.steps[: self.place]
         )
@@ -48,7 +50,7 @@ class Exposures:
     def merging(self, images: Sequence[Floats]) -> Chain:
         """The chain with what all exposures but the first became in :attr:`later`."""
         method = self.step.method
-        assert isinstance(method, OfExposures)
+        assert isinstance(method, Staggered)
         own = replace(self.step, method=method.with_later(np.stack(images)))
         before, after = self.chain.steps[: self.place], self.chain.steps[self.place + 1 :]
         return replace(self.chain, steps=(*before, own, *after))
@@ -60,7 +62,7 @@ def exposures_of(chain: Chain) -> Exposures | None:
     if place is None:
         return None
     method = chain.steps[place].method
-    assert isinstance(method, OfExposures)
+    assert isinstance(method, Staggered)
     return Exposures(chain, place, method.spans)
 
 
@@ -68,7 +70,7 @@ def exposures_of(chain: Chain) -> Exposures | None:
 def _place(chain: Chain) -> int | None:
     """The place of the step that merges the exposures of a chain, see :func:`exposures_of`."""
     for place, step in enumerate(chain.steps):
-        if isinstance(step.method, OfExposures) and len(step.method.spans) > 1:
+        if isinstance(step.method, Staggered) and len(step.method.spans) > 1:
             return place
     return None
 

@@ -22,11 +22,11 @@ from clpipe.stage import (
     FromLens,
     Kind,
     Method,
-    OfPanorama,
     Stage,
     StageRole,
     Unchanged,
 )
+from clpipe.stages.projection import Wide
 
 
 def make_chain(
@@ -151,7 +151,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
             takes_lens |= isinstance(own, FromLens) and not isinstance(method, Unchanged)
             if wide and is_resolved and method.passes():
                 _check_behind(wide, name, own)
-            if fits and isinstance(method, OfPanorama):
+            if fits and isinstance(method, Wide):
                 wide = f"{name}.method={method.method}"
             if not fits:
                 if isinstance(method, Unchanged) and stage.reads is stage.writes:

@@ -19,18 +19,17 @@ from clpipe.stage import Kind
 DAMAGED = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
 
 
-def png_bytes(pixels: Array, side: int = 1024) -> bytes:
-    """A PNG of an image, at most ``side`` pixels wide and high.
+def png_bytes(pixels: Array) -> bytes:
+    """A PNG of an image; larger ones than 1024 pixels keep every second, third, ... pixel.
 
     Args:
         pixels: (height, width) or (height, width, 3), uint8, or floats that show 0 as black and 1
             as white.
-        side: larger images keep every second, third, ... pixel.
 
     >>> png_bytes(np.zeros((2, 3), np.float32))[:4]
     b'\\x89PNG'
     """
-    step = -(-max(pixels.shape[:2]) // side)
+    step = -(-max(pixels.shape[:2]) // 1024)
     small = np.ascontiguousarray(pixels[::step, ::step])
     picture = Image.fromarray(small if small.dtype == np.uint8 else to_8_bit(small))
     file = io.BytesIO()

@@ -1,12 +1,13 @@
 """The bytes of a TIFF file: fields and directories, little-endian (TIFF 6.0, 1992).
 
-Each function named after a TIFF type makes a field of that type from its values.
+What is named after a TIFF type makes a field of that type from its values.
 """
 
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 
 from clpipe.base.types import Array
 
@@ -28,47 +29,28 @@ class Field:
 Directory = dict[int, Field]  # by tag
 
 
-def byte(*values: int) -> Field:
-    """BYTE: whole numbers of 8 bits."""
-    return Field(1, len(values), bytes(values))
+def _numbers(type_: int, code: str, *values: float) -> Field:
+    return Field(type_, len(values), struct.pack(f"<{len(values)}{code}", *values))
+
+
+def _fractions(type_: int, code: str, *values: float) -> Field:
+    parts = [part for value in values for part in fraction(value)]
+    return Field(type_, len(values), struct.pack(f"<{len(parts)}{code}", *parts))
+
+
+byte = partial(_numbers, 1, "B")
+short = partial(_numbers, 3, "H")
+long = partial(_numbers, 4, "I")
+rational = partial(_fractions, 5, "I")
+signed_rational = partial(_fractions, 10, "i")
+float32 = partial(_numbers, 11, "f")
+double = partial(_numbers, 12, "d")
 
 
 def text(value: str) -> Field:
     """ASCII: text, with ? for other characters, and a NUL at its end."""
     data = value.encode("ascii", "replace") + b"\0"
     return Field(2, len(data), data)
-
-
-def short(*values: int) -> Field:
-    """SHORT: whole numbers of 16 bits."""
-    return Field(3, len(values), struct.pack(f"<{len(values)}H", *values))
-
-
-def long(*values: int) -> Field:
-    """LONG: whole numbers of 32 bits."""
-    return Field(4, len(values), struct.pack(f"<{len(values)}I", *values))
-
-
-def rational(*values: float) -> Field:
-    """RATIONAL: fractions of whole numbers of 32 bits, not negative."""
-    parts = [part for value in values for part in fraction(value)]
-    return Field(5, len(values), struct.pack(f"<{len(parts)}I", *parts))
-
-
-def signed_rational(*values: float) -> Field:
-    """SRATIONAL: fractions of signed whole numbers of 32 bits."""
-    parts = [part for value in values for part in fraction(value)]
-    return Field(10, len(values), struct.pack(f"<{len(parts)}i", *parts))
-
-
-def float32(*values: float) -> Field:
-    """FLOAT: float32."""
-    return Field(11, len(values), struct.pack(f"<{len(values)}f", *values))
-
-
-def double(*values: float) -> Field:
-    """DOUBLE: float64."""
-    return Field(12, len(values), struct.pack(f"<{len(values)}d", *values))
 
 
 def fraction(value: float) -> tuple[int, int]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
 from clpipe.base.errors import RequestError
-from clpipe.base.reading import parse_json, read_bytes
+from clpipe.base.reading import parse_json, read_named
 
 LARGEST = 1 << 30  # bytes of a file
 
@@ -53,9 +53,7 @@ def parsed(path: Path) -> Any:
         RequestError: it cannot be read, or is no JSON.
     """
     try:
-        return parse_json(read_bytes(path, LARGEST))
-    except OSError as error:
-        raise RequestError(f"--annotations {path}: cannot be read: {error.strerror}") from None
+        return parse_json(read_named("--annotations", path, LARGEST))
     except ValueError as error:
         raise RequestError(f"--annotations {path}: no valid JSON ({error})") from None
 

@@ -6,7 +6,6 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from clpipe.base.digests import joint_digest
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import unchanged
 from clpipe.base.types import Array
@@ -17,6 +16,7 @@ from clpipe.inputs.companions import SEPARATORS
 from clpipe.inputs.find import Job
 from clpipe.inputs.poses import stem_of
 from clpipe.inputs.render_cameras import read_views
+from clpipe.inputs.subframes import check_values, of_files
 from clpipe.reference.panorama import (
     CUBE,
     OPENEXR_CUBE,
@@ -141,11 +141,7 @@ def grouped(jobs: Sequence[Job], wide: Wide | None) -> list[Job]:
             result.append(first)
             continue
         (name, first), *others = sorted(own, key=lambda each: order.index(each[0]))
-        if different := next((job for _, job in others if job.values != first.values), None):
-            raise RequestError(
-                f"{different.label}: its values differ from those of {first.label}, which is seen "
-                "from the same point"
-            )
+        check_values([first, *(job for _, job in others)], "seen from the same point")
         if any(job.subframes for _, job in own):
             raise RequestError(
                 f"{first.path}: views of one point cannot be sub-frames, too; set "
@@ -187,22 +183,8 @@ def read_around(job: Job, read: Callable[[Path], SourceImage], wide: Wide) -> So
     if panorama is None:
         return first
     images = [piece for each in sources for piece in pieces(panorama, each.pixels)]
-    warnings = [
-        f"{path.name}: {warning}"
-        for path, each in zip(job.paths, sources, strict=True)
-        for warning in each.warnings
-    ]
-    digests = [each.sha256 for each in sources]
-    several = len(sources) > 1
-    names = [path.name for path in job.paths]
-    return replace(
-        first,
-        pixels=panorama.atlas(images, wide.filter),
-        sha256=joint_digest(digests) if several else first.sha256,
-        warnings=tuple(dict.fromkeys(warnings)) if several else first.warnings,
-        subframes=tuple(zip(names, digests, strict=True)) if several else (),
-        panorama=panorama,
-    )
+    atlas = panorama.atlas(images, wide.filter)
+    return of_files(replace(first, pixels=atlas, panorama=panorama), job, sources)
 
 
 def panorama_of(

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from clpipe.base.errors import RequestError
-from clpipe.base.reading import read_bytes
+from clpipe.base.reading import read_named
 from clpipe.base.types import Doubles
 from clpipe.inputs.annotations import FARTHEST, LARGEST, AnnotatedRender, refuse
 
@@ -74,9 +74,7 @@ def read_kitti(folder: Path) -> Kitti:
 
 def _lines(path: Path) -> list[str]:
     try:
-        return read_bytes(path, LARGEST).decode().splitlines()
-    except OSError as error:
-        raise RequestError(f"--annotations {path}: cannot be read: {error.strerror}") from None
+        return read_named("--annotations", path, LARGEST).decode().splitlines()
     except UnicodeDecodeError:
         raise RequestError(f"--annotations {path}: it is no text") from None
 

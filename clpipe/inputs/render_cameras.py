@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.errors import RequestError
-from clpipe.base.reading import parse_json, read_bytes
+from clpipe.base.reading import parse_json, read_named
 from clpipe.base.types import Array
 from clpipe.inputs.manifest import MANIFEST_BYTES
 from clpipe.reference.pose import from_opengl, from_quaternion
@@ -59,7 +59,7 @@ def read_views(path: Path) -> list[View]:
             raise RequestError(f"--poses {path}: its images.txt has no image")
         return views
     try:
-        values = parse_json(_read(path))
+        values = parse_json(read_named("--poses", path, MANIFEST_BYTES))
     except ValueError as error:
         raise RequestError(
             f"--poses {path}: no valid JSON ({error}); it is a cameras.json, a transforms.json, or "
@@ -75,13 +75,6 @@ def read_views(path: Path) -> list[View]:
         f"--poses {path}: has neither a list 'views', as a cameras.json, nor 'frames', as a "
         "transforms.json"
     )
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return read_bytes(path, MANIFEST_BYTES)
-    except OSError as error:
-        raise RequestError(f"--poses {path}: cannot be read: {error.strerror}") from None
 
 
 Parser = Callable[[Mapping[str, Any], Mapping[str, Any]], View]
@@ -202,7 +195,7 @@ def _from_colmap(folder: Path) -> Iterator[View]:
 
 def _lines(path: Path) -> Iterator[str]:
     try:
-        text = _read(path).decode("utf-8-sig")
+        text = read_named("--poses", path, MANIFEST_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise RequestError(f"--poses {path}: not a text in UTF-8") from None
     return iter([line.strip() for line in text.split("\n")])

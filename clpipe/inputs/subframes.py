@@ -1,7 +1,7 @@
 """Exposures that a renderer gives as several frames: grouped, and averaged without loading all."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -64,11 +64,7 @@ def exposures(jobs: Sequence[Job], settings: Settings) -> list[Job]:
             )
         for start in range(0, len(files), count):
             first, *others = files[start : start + count]
-            if different := next((job for job in others if job.values != first.values), None):
-                raise RequestError(
-                    f"{different.label}: its values differ from those of {first.label}, which is "
-                    "a part of the same exposure"
-                )
+            check_values([first, *others], "a part of the same exposure")
             grouped.append(replace(first, subframes=tuple(job.path for job in others)))
     return grouped
 
@@ -124,16 +120,42 @@ def average(
         warnings = (*source.warnings, *(light.warnings if light else ()))
         found.append(replace(source, pixels=pixels[:0], warnings=warnings))
     averaged = replace(found[0], pixels=totals[0], later=tuple(totals[1:]))
-    if len(found) == 1:
-        return averaged
+    return of_files(averaged, job, found)
+
+
+def of_files(image: SourceImage, job: Job, sources: Sequence[SourceImage]) -> SourceImage:
+    """An image that was made of a job's files, with their digests and what is to be said of each.
+
+    Of one file it has them already.
+    """
+    if len(sources) == 1:
+        return image
+    digests = [source.sha256 for source in sources]
     names = (os.path.relpath(path, job.path.parent) for path in job.paths)
-    digests = [source.sha256 for source in found]
+    warnings = (
+        f"{path.name}: {warning}"
+        for path, source in zip(job.paths, sources, strict=True)
+        for warning in source.warnings
+    )
     return replace(
-        averaged,
+        image,
         sha256=joint_digest(digests),
-        warnings=tuple(dict.fromkeys(_warnings(job, found))),
+        warnings=tuple(dict.fromkeys(warnings)),
         subframes=tuple(zip(names, digests, strict=True)),
     )
+
+
+def check_values(jobs: Sequence[Job], why: str) -> None:
+    """See that the same is known of jobs that become one.
+
+    Raises:
+        RequestError: it differs.
+    """
+    first = jobs[0]
+    if different := next((job for job in jobs if job.values != first.values), None):
+        raise RequestError(
+            f"{different.label}: its values differ from those of {first.label}, which is {why}"
+        )
 
 
 def _add(total: Floats, weights: Doubles, pixels: Array) -> None:
@@ -161,8 +183,3 @@ def _size(source: SourceImage, pixels: Array) -> str:
     width, height = source.margins.inside(*pixels.shape[1::-1])
     beyond = f" with {tuple(source.margins)} px of overscan" if source.margins else ""
     return f"{width}x{height}{beyond}"
-
-
-def _warnings(job: Job, sources: Sequence[SourceImage]) -> Iterator[str]:
-    for path, source in zip(job.paths, sources, strict=True):
-        yield from (f"{path.name}: {warning}" for warning in source.warnings)

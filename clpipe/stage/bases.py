@@ -1,6 +1,6 @@
 """Parts that several methods have in common: bases to derive from, and a check of window sizes."""
 
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -9,7 +9,6 @@ from clpipe.base.types import Floats
 from clpipe.camera.lens import LensCalibration
 from clpipe.reference.curve import curve_index
 from clpipe.reference.defocus import Depth
-from clpipe.reference.panorama import Panorama
 from clpipe.stage.context import Context, ReferenceContext
 from clpipe.stage.method import Method, parameter
 from clpipe.stage.passes import Arguments, Pass, TableLookup
@@ -127,49 +126,6 @@ class Span(NamedTuple):
     def end(self) -> float:
         """When it ends."""
         return self.start + self.length
-
-
-class InTime(Method):
-    """A method whose image depends on when it is exposed, see :attr:`Context.light_changes`."""
-
-    def during(self, spans: tuple[Span, ...], number: int) -> Self:
-        """The method for one of several exposures.
-
-        Args:
-            spans: of all of them.
-            number: of the one.
-        """
-        raise NotImplementedError(type(self).__name__)
-
-    @property
-    def layer_of_light(self) -> str:
-        """The layer of the image's file of which it must have the light; "" is none."""
-        return ""
-
-
-class OfExposures(Method):
-    """A method that may make its image of several exposures, one behind the other."""
-
-    @property
-    def spans(self) -> tuple[Span, ...]:
-        """Of the exposures that the (resolved) method is to get; one where all see the same."""
-        raise NotImplementedError(type(self).__name__)
-
-    def with_later(self, images: Floats) -> Self:
-        """The (resolved) method with what all exposures but the first see.
-
-        Args:
-            images: of its kind, (exposure, height, width).
-        """
-        raise NotImplementedError(type(self).__name__)
-
-
-class OfPanorama(Method):
-    """A method that makes a picture of what is seen all around."""
-
-    def with_panorama(self, panorama: Panorama) -> Self:
-        """The (resolved) method for an image that is the atlas of a panorama."""
-        raise NotImplementedError(type(self).__name__)
 
 
 class Noiseless(Unchanged):

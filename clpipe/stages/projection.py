@@ -22,7 +22,6 @@ from clpipe.stage import (
     Context,
     Kind,
     Method,
-    OfPanorama,
     Pass,
     ReferenceContext,
     Resample,
@@ -41,7 +40,7 @@ class NoProjection(Unchanged):
     summary: ClassVar = "the render's own perspective"
 
 
-class Wide(OfPanorama):
+class Wide(Method):
     """A wide lens, with the sensor behind it."""
 
     kernel: ClassVar = "projection"
@@ -92,6 +91,7 @@ class Wide(OfPanorama):
     _shot: tuple[tuple[str, float], ...] = PrivateAttr(())
 
     def with_panorama(self, panorama: Panorama) -> Self:
+        """The (resolved) method for an image that is the atlas of a panorama."""
         other = self.model_copy()
         other._panorama = panorama
         return other

@@ -130,16 +130,12 @@ class LinearMmse(Method):
 
     def arguments(self, context: Context) -> Arguments:
         weights = weights_of(context.filters, self.pattern)
-        return {"weights": table_of(context.filters, self.pattern), **_period(weights)}
+        return {"weights": table_of(context.filters, self.pattern), **period_of(weights.shape[:2])}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         array = given.context.filters
         made = weights_of(array, self.pattern)
         return filtered(image, array.period, made[..., None])[..., 0]
-
-
-def _period(weights: Floats) -> Arguments:
-    return period_of(weights.shape[:2])
 
 
 @lru_cache(maxsize=16)

@@ -12,9 +12,9 @@ from clpipe.camera.optics import USUAL_TIME
 from clpipe.stage import (
     Arguments,
     Context,
-    InTime,
     Kind,
     LineTable,
+    Method,
     Pass,
     ReferenceContext,
     Span,
@@ -29,7 +29,7 @@ def _sinc(x: float) -> float:
     return float(np.sinc(x))
 
 
-class Rows(InTime):
+class Rows(Method):
     """Row y is exposed from y * line_time on, for exposure_time.
 
     Further exposures of a sensor that staggers them follow in each row, one behind the other.
@@ -129,9 +129,16 @@ class Rows(InTime):
 
     @property
     def layer_of_light(self) -> str:
+        """The layer of the image's file of which it must have the light; "" is none."""
         return self.flicker_layer if self.depth else ""
 
     def during(self, spans: tuple[Span, ...], number: int) -> Self:
+        """The method for one of several exposures.
+
+        Args:
+            spans: of all of them.
+            number: of the one.
+        """
         other = self.model_copy()
         other._span, other._end = spans[number], spans[-1].end
         return other

@@ -127,22 +127,16 @@ class _Lines:
     def error(self, number: int, message: str) -> RequestError:
         return RequestError(f"{self._path}, line {number}: {message}")
 
-    def number(self, number: int, word: str, name: str, low: float, high: float) -> float:
-        """A number of a line, in which a comma may stand for the point."""
+    def number(
+        self, number: int, word: str, name: str, low: float, high: float, whole: bool = False
+    ) -> float:
+        """A number of a line, in which a comma may stand for the point, or a whole number."""
         try:
-            value = float(word.replace(",", "."))
+            value = whole_number(word) if whole else float(word.replace(",", "."))
         except ValueError:
             value = np.nan
         if not low <= value <= high:
             allowed = f"{low:g} to {high:g}"
-            raise self.error(number, f"{name}: found {one_line(word)!r}; allowed: {allowed}")
-        return value
-
-    def count(self, number: int, word: str, name: str, low: int, high: int) -> int:
-        """A whole number of a line."""
-        value = whole_number(word)
-        if not low <= value <= high:
-            allowed = f"{low} to {high}"
             raise self.error(number, f"{name}: found {one_line(word)!r}; allowed: {allowed}")
         return value
 
@@ -167,8 +161,11 @@ def read_series(path: Path) -> Series:
         if letter == "n":
             if size:
                 raise lines.error(number, "a second line n; there can be but one")
-            size = [lines.count(number, words[0], "bits", 1, MOST_BITS)]
-            size += [lines.count(number, word, "side", *SIDES) for word in words[1:]]
+            limits = (("bits", 1, MOST_BITS), ("side", *SIDES), ("side", *SIDES))
+            size = [
+                int(lines.number(number, word, *limit, whole=True))
+                for word, limit in zip(words, limits, strict=True)
+            ]
         elif letter == "i":
             raise lines.error(number, "a frame of no exposure; a line b or d comes first")
         elif letter in "bd":

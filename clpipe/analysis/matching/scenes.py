@@ -67,11 +67,6 @@ class Scene:
         """The flat places that the search sees."""
         return np.asarray(self.flat & ~self.kept_out)
 
-    @property
-    def holdout(self) -> Mask:
-        """The flat places that it does not see."""
-        return np.asarray(self.flat & self.kept_out)
-
     def places(self, part: Mask | None = None) -> Places:
         """Where noise is compared: everywhere, or in a part of the picture, (height, width)."""
         slopes = slopes_of(luma(self.mean), self.counted)
@@ -160,15 +155,14 @@ def load_scenes(frames: Sequence[str], means: Sequence[str]) -> Scenes:
             f"{encoding_text(encodings[0])}; give pictures of one setting of the camera"
         )
     notes: list[str] = []
-    whole: list[Scene] = []
-    if len(mean_paths) in (0, 1):
-        mean = read_picture(mean_paths[0]) if mean_paths else None
-        mean_name = mean_paths[0] if mean_paths else None
-        whole.append(checked_scene(paths, pictures, mean, mean_name, encodings[0], notes))
+    if len(mean_paths) > 1:
+        groups = [([path], [p]) for path, p in zip(paths, pictures, strict=True)]
     else:
-        for path, picture, mean_path in zip(paths, pictures, mean_paths, strict=True):
-            mean = read_picture(mean_path)
-            whole.append(checked_scene([path], [picture], mean, mean_path, encodings[0], notes))
+        groups = [(paths, pictures)]
+    whole = [
+        checked_scene(*group, mean_path, encodings[0], notes)
+        for group, mean_path in zip(groups, mean_paths or (None,), strict=True)
+    ]
     if whole[0].left_out:
         notes.append(
             f"{len(paths)} frames without a mean: kurtosis and tails are left out; "
@@ -208,7 +202,6 @@ def encoding_text(encoding: JpegEncoding | None) -> str:
 def checked_scene(
     paths: Sequence[Path],
     frames: Sequence[Floats],
-    mean: Floats | None,
     mean_path: Path | None,
     jpeg: JpegEncoding | None,
     notes: list[str],
@@ -218,12 +211,12 @@ def checked_scene(
     Raises:
         RequestError: sizes or scenes differ, or things move.
     """
+    mean = read_picture(mean_path) if mean_path else None
     own = mean is None
-    for path, frame in zip(
-        [*paths, *([mean_path] if mean_path else [])],
-        [*frames, *([mean] if mean is not None else [])],
-        strict=True,
-    ):
+    named = list(zip(paths, frames, strict=True))
+    if mean_path and mean is not None:
+        named.append((mean_path, mean))
+    for path, frame in named:
         if frame.shape != frames[0].shape:
             (height, width), (first_height, first_width) = frame.shape[:2], frames[0].shape[:2]
             raise RequestError(

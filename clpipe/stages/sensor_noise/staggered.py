@@ -8,13 +8,13 @@ from pydantic import PrivateAttr
 
 from clpipe.base.types import Floats
 from clpipe.reference.filter_array import LANES
-from clpipe.stage import Arguments, Context, OfExposures, Span, parameter
+from clpipe.stage import Arguments, Context, Span, parameter
 from clpipe.stages.sensor_noise.readouts import MOST, Readout, Readouts
 
 NOTHING = np.zeros((MOST - 1, 1, 1), np.float32)  # is there before there is an image
 
 
-class Staggered(Readouts, OfExposures):
+class Staggered(Readouts):
     """Staggered exposures (DOL): 2 to 4 in a row, each ``ratio`` times shorter than the one before.
 
     In each row the longest comes first, and the next begins where it ends. Where the light changes
@@ -43,12 +43,18 @@ class Staggered(Readouts, OfExposures):
 
     @property
     def spans(self) -> tuple[Span, ...]:
+        """Of the exposures that the (resolved) method is to get; one where all see the same."""
         lengths = [each.share for each in self.readouts]
         starts = accumulate(lengths, initial=0.0)
         is_open = self._is_apart and self._later is None
         return tuple(map(Span, starts, lengths)) if is_open else (Span(),)
 
     def with_later(self, images: Floats) -> Self:
+        """The (resolved) method with what all exposures but the first see.
+
+        Args:
+            images: of its kind, (exposure, height, width).
+        """
         other = self.model_copy()
         other._later = images
         return other
