@@ -107,6 +107,12 @@ def test_every_byte_counts():
                 values_in(data, "a.json")
 
 
+def test_file_names_that_are_not_utf_8():
+    assert values_in(sealed({"clpipe": "0", "input": "\udcff"}), "a.json")["input"] == "\udcff"
+    with pytest.raises(SidecarError):
+        values_in(sealed({"clpipe": "0", "input": "\ud800"}), "a.json")
+
+
 @pytest.mark.parametrize("text", ["", "{}", "[1, 2]", '{"a": "clpipe"}', "no JSON", "\0" * 50])
 def test_what_others_wrote_is_no_sidecar(tmp_path, text):
     assert values_in(text.encode(), "a.json") is None

@@ -19,7 +19,7 @@ from clpipe.base.system import open_plain
 from clpipe.images.whole import is_whole
 from clpipe.inputs.find import Job
 from clpipe.outputs.program import program_digest
-from clpipe.outputs.sealed import Parts, SidecarError, outputs_in, read_sidecar
+from clpipe.outputs.sealed import SidecarError, outputs_in, read_sidecar
 
 MARKED = 1 << 16  # bytes at either end of a file, in which a format of clpipe names clpipe
 
@@ -90,7 +90,7 @@ class Existing:
             ImageError: a file that would be written is somebody else's.
         """
         try:
-            values = read_sidecar(self.sidecar, Parts)
+            values = read_sidecar(self.sidecar)
         except (FileNotFoundError, SidecarError):
             values = {}
         listed = outputs_in(values)
