@@ -13,7 +13,7 @@ from clpipe.batch.run_log import read_log
 from clpipe.chain.formats import EVERY_FORMAT, ending_of
 from clpipe.images.whole import is_whole
 from clpipe.outputs.existing import is_marked
-from clpipe.outputs.sealed import outputs_in
+from clpipe.outputs.sidecar import outputs_in
 from tests.conftest import reseal
 
 RUN = ("-o", "out", "--device", "numpy", "--keep", "normalize", "--truth", "mosaic")
@@ -258,7 +258,7 @@ def program(monkeypatch):
     """Be another program from now on."""
 
     def be(digest):
-        for module in ("existing", "sidecar"):
+        for module in ("existing", "record"):
             monkeypatch.setattr(f"clpipe.outputs.{module}.program_digest", lambda: digest)
 
     return be

@@ -14,7 +14,7 @@ import pytest
 
 from clpipe.base.errors import ImageError
 from clpipe.batch.run_log import read_log
-from clpipe.outputs.sealed import SEAL, SidecarError, read_sidecar, sealed, values_in
+from clpipe.outputs.sidecar import SEAL, SidecarError, read_sidecar, sealed, values_in
 from tests.conftest import reseal
 
 CHANGED = f"was changed since clpipe wrote it (its {SEAL} does not fit)"

@@ -16,7 +16,7 @@ from clpipe.chain.request import Request
 from clpipe.inputs.find import Job
 from clpipe.inputs.manifest import check_output_name
 from clpipe.inputs.spool import place_of_url
-from clpipe.outputs.sealed import SidecarError, outputs_in, read_sidecar
+from clpipe.outputs.sidecar import SidecarError, outputs_in, read_sidecar
 
 CODE = (".py", ".cl")  # the endings of files that are run
 

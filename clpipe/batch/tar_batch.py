@@ -31,8 +31,8 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.existing import Existing, Found, Redo, found_in
 from clpipe.outputs.folder import RESUMABLE
-from clpipe.outputs.sealed import SIDECAR, outputs_in, read_sidecar
-from clpipe.outputs.sidecar import patch_text
+from clpipe.outputs.record import patch_text
+from clpipe.outputs.sidecar import SIDECAR, outputs_in, read_sidecar
 from clpipe.outputs.writer import OutputWriter
 
 # Where the bytes of a member are: in a file, or at an offset and size in the old tar; or they.

@@ -31,8 +31,8 @@ from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.existing import Found, Redo
 from clpipe.outputs.patches import every_patch
 from clpipe.outputs.recipes import Recipe
-from clpipe.outputs.sealed import SIDECAR, write_sidecar
-from clpipe.outputs.sidecar import intrinsics_of, sidecar
+from clpipe.outputs.record import intrinsics_of, picture_record
+from clpipe.outputs.sidecar import SIDECAR, write_sidecar
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
@@ -380,7 +380,7 @@ class ImageWorker:
         if recipe.chain.source is not Kind.DISPLAY:  # a photograph was clipped before
             state.clipped = max(state.clipped, clipped or 0.0)
         path = writer.path(job, SIDECAR, recipe.rendition)
-        record = sidecar(
+        record = picture_record(
             job,
             writer.record_of(state.request, recipe.rendition),
             state.stamps,

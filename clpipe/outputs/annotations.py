@@ -3,14 +3,12 @@
 They go through what moves the pixels (distortion, resizing, patches), as the sidecars say it.
 """
 
-import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.base.errors import ClpipeError, ImageError, RequestError
-from clpipe.base.reading import read_bytes
 from clpipe.chain.chain import Chain
 from clpipe.chain.overscan import with_overscan
 from clpipe.chain.rendition import NOISY, Rendition
@@ -24,7 +22,7 @@ from clpipe.outputs.annotated import Way
 from clpipe.outputs.annotation_files import files_for
 from clpipe.outputs.patches import patch_name
 from clpipe.outputs.photographs import picture_of
-from clpipe.outputs.sealed import SIDECAR, SidecarError, values_in
+from clpipe.outputs.sidecar import SIDECAR, SidecarError, sidecar_files, values_at
 from clpipe.reference.geometry import (
     Composition,
     Crop,
@@ -81,19 +79,13 @@ def write_annotations(folder: Path, annotations: Annotations) -> list[str]:
 
 def _sidecars(folder: Path) -> Iterator[tuple[Path, Mapping[str, Any]]]:
     """The sidecars of noisy pictures, sorted."""
-    found = sorted(
-        Path(place, name)
-        for place, _, names in os.walk(folder)
-        for name in names
-        if name.endswith(f".{SIDECAR}") and not name.startswith(".")
-    )
-    for path in found:
+    for path in sorted(sidecar_files(folder)):
         try:
-            values = values_in(read_bytes(path), path)
+            values = values_at(path)
             if values and Rendition.from_record(values).role == NOISY:
                 yield path, values
-        except (SidecarError, OSError, KeyError, TypeError, ValueError):
-            continue  # which the run has told
+        except (SidecarError, KeyError, TypeError, ValueError):
+            continue  # the run has reported it
 
 
 def _pictures(

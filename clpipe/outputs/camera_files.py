@@ -16,7 +16,7 @@ from clpipe.base.files import keep_names, make_folder_of, write_whole
 from clpipe.base.reading import read_bytes
 from clpipe.outputs.existing import is_marked
 from clpipe.outputs.photographs import MODELS, Photograph, photographs
-from clpipe.outputs.sealed import is_sidecar
+from clpipe.outputs.sidecar import is_sidecar
 from clpipe.outputs.views import CAMERAS, COLMAP, TRANSFORMS, cameras_json, colmap, nerfstudio
 
 FILES = tuple(

@@ -19,7 +19,7 @@ from clpipe.base.system import open_plain
 from clpipe.images.whole import is_whole
 from clpipe.inputs.find import Job
 from clpipe.outputs.program import program_digest
-from clpipe.outputs.sealed import SidecarError, outputs_in, read_sidecar
+from clpipe.outputs.sidecar import SidecarError, outputs_in, read_sidecar
 
 MARKED = 1 << 16  # bytes at either end of a file, in which a format of clpipe names clpipe
 

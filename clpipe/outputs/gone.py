@@ -7,7 +7,7 @@ from pathlib import Path
 from clpipe.base.reading import read_bytes
 from clpipe.inputs.find import Job
 from clpipe.outputs.planned import PlannedOutputs, ending_behind
-from clpipe.outputs.sealed import SIDECAR, SidecarError, values_in
+from clpipe.outputs.sidecar import SIDECAR, SidecarError, values_in
 
 
 def pictures_without_input(

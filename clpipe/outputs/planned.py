@@ -26,7 +26,7 @@ from clpipe.outputs.existing import Existing
 from clpipe.outputs.negative import dng_of
 from clpipe.outputs.patches import Patches, patch_name, variance_steps
 from clpipe.outputs.recipes import RenditionPlan
-from clpipe.outputs.sealed import SIDECAR
+from clpipe.outputs.sidecar import SIDECAR
 from clpipe.stage import Kind
 
 

@@ -25,8 +25,8 @@ from clpipe.outputs.patches import Patch
 from clpipe.outputs.planned import PlannedOutputs
 from clpipe.outputs.recipes import Recipe
 from clpipe.outputs.results import results_of
-from clpipe.outputs.sealed import SIDECAR, remove_sidecar
 from clpipe.outputs.shot import kept_tags, shown_tags, tags_of
+from clpipe.outputs.sidecar import SIDECAR, remove_sidecar
 from clpipe.reference.geometry import NO_MARGINS
 from clpipe.stage import Kind
 

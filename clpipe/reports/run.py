@@ -15,7 +15,7 @@ from clpipe.batch.run_log import read_log
 from clpipe.batch.tars import DAMAGED
 from clpipe.chain.keys import KEYS as SINGLE
 from clpipe.chain.rendition import Rendition
-from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, values_in
+from clpipe.outputs.sidecar import SIDECAR, SidecarError, outputs_in, values_in
 
 TAR = ".tar"
 # What is kept of sidecars, of which there may be hundreds of thousands.

@@ -4,14 +4,14 @@ import logging
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from clpipe.chain.rendition import NOISY, Rendition
 from clpipe.outputs.carried import png_ending
-from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, read_sidecar
+from clpipe.outputs.sidecar import SidecarError, outputs_in, sidecar_files, values_at
 
 PICTURE, CARRIED = "picture", "carried"
 SERIES = re.compile(r"(?:[^/]+/)?iso[0-9.e+]+(?=/)|")  # the folder of a camera and an ISO
@@ -87,12 +87,12 @@ def members_of(folder: Path, renders: str) -> list[Member]:
         renders: the name of its folder that has no pictures.
     """
     found: dict[str, dict[str, tuple[Path, Mapping[str, Any]]]] = defaultdict(dict)
-    for path in _sidecars(folder, renders):
-        try:
-            values = read_sidecar(path)
-            found[str(values["name"])][str(values["picture"])] = path, values
-        except FileNotFoundError:
+    for path in sidecar_files(folder):
+        if path.parts[len(folder.parts)] == renders:
             continue
+        try:
+            if values := values_at(path):
+                found[str(values["name"])][str(values["picture"])] = path, values
         except (SidecarError, *DAMAGED):
             log.warning("%s; the card goes without it", SidecarError(path))
     members = []
@@ -104,22 +104,6 @@ def members_of(folder: Path, renders: str) -> list[Member]:
             path = next(path for path, _ in renditions.values())
             log.warning("%s; the card goes without it", SidecarError(path))
     return sorted(members, key=lambda each: (each.view, each.folder))
-
-
-def _sidecars(folder: Path, renders: str) -> Iterator[Path]:
-    for place, folders, names in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        if Path(place) == folder and renders in folders:
-            folders.remove(renders)
-        yield from (
-            Path(place, name)
-            for name in sorted(names)
-            if name.endswith(f".{SIDECAR}") and not name.startswith(".") and _is_of_picture(name)
-        )
-
-
-def _is_of_picture(name: str) -> bool:
-    return name not in ("dataset.json", "cameras.json", "transforms.json", "run.json")
 
 
 def _member(
