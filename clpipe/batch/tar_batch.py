@@ -29,7 +29,7 @@ from clpipe.chain.rendition import Rendition
 from clpipe.engine.device import Device
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.existing import Existing, Found, Redo, found_in
+from clpipe.outputs.existing import Found, Redo, find, found_in
 from clpipe.outputs.folder import RESUMABLE
 from clpipe.outputs.record import patch_text
 from clpipe.outputs.sidecar import SIDECAR, outputs_in, read_sidecar
@@ -50,11 +50,6 @@ class StagedWriter(OutputWriter):
     def name(self, job: Job, ending: str) -> str:
         """The name of a job's file, until it is packed."""
         return f"{self.folder}/{self.folders[job.stem]}/{job.stem}{ending}"
-
-    def existing(self, job: Job, rendition: Rendition) -> Existing:
-        """The files of a rendition, in a folder that is clpipe's own."""
-        # One that was passing at a loss of power may not even say whose it is.
-        return replace(super().existing(job, rendition), is_ours=True)
 
     def write(self, *arguments: Any) -> dict[Path, Stored]:
         """Write the images of one rendition, which pass into the tar; its sidecar is to last."""
@@ -91,13 +86,13 @@ class Packer:
 
         If it is kept, it is reused. A tar does not say when its files were touched, so their
         SHA-256 is always compared. Arguments as for
-        :meth:`clpipe.outputs.existing.Existing.found`.
+        :func:`clpipe.outputs.existing.find`.
         """
         member = self._member(job, rendition)
         with self._lock:
             values = self._old.sidecar(member)
         listed = outputs_in(values)
-        pictures = {path.name for path in self._writer.existing(job, rendition).pictures}
+        pictures = {path.name for path in self._writer.files(job, rendition).pictures}
         if not pictures <= listed.keys():
             return Found.NOTHING
         found = found_in(values, job, request, redo.verifies)
@@ -232,8 +227,10 @@ class TarWorker(ImageWorker):
         packed = self._packers.of(job).found(job, rendition, request, self._redo)
         if packed is not Found.NOTHING:
             return packed
-        # After a loss of power a passing file may have its size and time, but not its bytes.
-        return self.writer.existing(job, rendition).found(job, request, verify=True)
+        # After a loss of power a passing file may have its size and time, but not its bytes, and
+        # may not even say whose it is.
+        files = self.writer.files(job, rendition)
+        return find(files, job, request, verify=True, is_ours=True)
 
 
 class Packers:

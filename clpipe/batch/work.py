@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, TypeVar
@@ -28,9 +28,9 @@ from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.runner import Result, Runner, submit_together
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.existing import Found, Redo
+from clpipe.outputs.existing import Found, Redo, find
 from clpipe.outputs.patches import every_patch
-from clpipe.outputs.recipes import Recipe
+from clpipe.outputs.recipes import Recipe, recipes
 from clpipe.outputs.record import intrinsics_of, picture_record
 from clpipe.outputs.sidecar import SIDECAR, write_sidecar
 from clpipe.outputs.writer import OutputWriter
@@ -163,18 +163,18 @@ class ImageWorker:
     def _general_request(self) -> Mapping[str, Any]:
         return self.writer.request.record()
 
-    def _missing(self, state: JobState) -> Set[Rendition]:
-        """A job's renditions that are to be made."""
+    def _missing(self, state: JobState) -> Sequence[Rendition]:
+        """Return a job's renditions that are to be made."""
         renditions = self.writer.renditions_of(state.job)
         if self._redo is Redo.ALL:
-            return set(renditions)
+            return self.writer.needed(state.job, renditions)
         found = {
             each: self.found(state.job, each, self.writer.record_of(state.request, each))
             for each in renditions
         }
         state.old = sum(there is Found.OLD for there in found.values())
         missing = [each for each, there in found.items() if not self._redo.keeps(there)]
-        return self.writer.plan_of(state.job).needed(missing)
+        return self.writer.needed(state.job, missing)
 
     def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> Found:
         """Whether a rendition is there already, made by the same request.
@@ -187,9 +187,10 @@ class ImageWorker:
         Raises:
             ImageError: a file of its name is somebody else's.
         """
-        return self.writer.existing(job, rendition).found(job, request, self._redo.verifies)
+        files = self.writer.files(job, rendition)
+        return find(files, job, request, self._redo.verifies)
 
-    def _load(self, state: JobState, job: Job, renditions: Set[Rendition]) -> None:
+    def _load(self, state: JobState, job: Job, renditions: Sequence[Rendition]) -> None:
         """Load a state's image, and decide which renditions are made of it.
 
         Args:
@@ -217,8 +218,7 @@ class ImageWorker:
             if patches and patches.augment:
                 state.aovs.check_turns()
         state.source = loaded.source
-        recipes = self.writer.plan_of(job).recipes(loaded.chain, loaded.key)
-        state.recipes = [recipe for recipe in recipes if recipe.rendition in renditions]
+        state.recipes = recipes(renditions, loaded.chain, loaded.key)
         state.unwritten = len(state.recipes)
 
     @staticmethod
