@@ -10,6 +10,7 @@ from typing import Any
 
 from clpipe.base.errors import ClpipeError, ImageError, RequestError
 from clpipe.chain.chain import Chain
+from clpipe.chain.formats import ending_of
 from clpipe.chain.overscan import with_overscan
 from clpipe.chain.rendition import NOISY, Rendition
 from clpipe.chain.request import Request
@@ -20,9 +21,9 @@ from clpipe.inputs.poses import Views, stem_of
 from clpipe.inputs.render_cameras import View
 from clpipe.outputs.annotated import Way
 from clpipe.outputs.annotation_files import files_for
-from clpipe.outputs.patches import patch_name
 from clpipe.outputs.photographs import picture_of
-from clpipe.outputs.sidecar import SIDECAR, SidecarError, sidecar_files, values_at
+from clpipe.outputs.plan import ending_behind
+from clpipe.outputs.sidecar import SidecarError, sidecar_files, values_at
 from clpipe.reference.geometry import (
     Composition,
     Crop,
@@ -120,13 +121,13 @@ def _pictures(
             yield file, Way(Composition(parts) if parts else None, *own, chain.margins, size)
         return
     side = values["request"]["patch"]
-    formats = values["request"]["formats"]
-    stem = path.name.removesuffix(f".{SIDECAR}")
+    ending, rendition = ending_of(values["request"]["formats"][0]), Rendition.from_record(values)
+    stem = Path(values["name"]).name
     for number, patch in enumerate(values["patches"]):
         left, top = patch["place"]
         turned = Orientation(*FLIPS[patch["turn"]])
         cut = (*parts, Crop(left, top, side, side), turned)
-        file = path.with_name(f"{stem}{patch_name(number)}.{formats[0]}")
+        file = path.with_name(stem + ending_behind(ending, rendition, number))
         yield file, Way(Composition(cut), *own, chain.margins, (side, side))
 
 
