@@ -58,7 +58,7 @@ class Patch:
 def first_place(pattern: str, orientation: int, size: int) -> tuple[int, int] | None:
     """The first column and row of a patch that has the pattern when it is turned.
 
-    None where there is none. ``pattern`` is as :func:`pattern_of` gives it.
+    None where there is none. ``pattern`` is a Bayer pattern, such as "RGGB", or rows of letters.
 
     So a mosaic keeps its pattern, and no pixel is interpolated or thrown away: the CFA-preserving
     augmentation of Liu et al., "Learning Raw Image Denoising with Bayer Pattern Unification and
@@ -89,7 +89,7 @@ class Cutting:
     Args:
         size: of the sides of a patch, in px.
         width, height: of the picture, at least as large.
-        pattern: of its mosaic, as :func:`pattern_of` gives it.
+        pattern: of its mosaic, such as "RGGB", or rows of letters.
         augment: whether patches are flipped and turned.
     """
 
@@ -206,7 +206,7 @@ class Patches:
                 f"its picture has {width}x{height} pixels, and patches are to have "
                 f"{self.size}x{self.size}; make them smaller, or leave the image out"
             )
-        return Cutting(self.size, width, height, pattern_of(chain), self.augment)
+        return Cutting(self.size, width, height, chain.filters.pattern, self.augment)
 
     @property
     def least(self) -> int:
@@ -240,11 +240,6 @@ def without_patch(name: str) -> str:
     ('frame_12', 'frame_12')
     """
     return re.sub(r"_\d{4,}$", "", name)
-
-
-def pattern_of(chain: Chain) -> str:
-    """The filter array of a chain's raw: a Bayer pattern, such as "RGGB", or rows of letters."""
-    return chain.filters.pattern
 
 
 def every_patch(patches: Patches, chain: Chain, width: int, height: int, key: str) -> list[Patch]:
@@ -299,7 +294,7 @@ def facts_of(chain: Chain) -> dict[str, Any]:
     except RequestError:  # there is no raw
         return facts
     return facts | {
-        "cfa": pattern_of(chain),
+        "cfa": chain.filters.pattern,
         "black_level": float(raw.black_level),
         "white_level": float(raw.white_level),
         "gains": np.array([raw.array.gains[0], 1, raw.array.gains[1]], np.float32),
