@@ -125,8 +125,8 @@ def _pictures(
     stem = Path(values["name"]).name
     for number, patch in enumerate(values["patches"]):
         left, top = patch["place"]
-        turned = Orientation(*FLIPS[patch["turn"]])
-        cut = (*parts, Crop(left, top, side, side), turned)
+        turned = [Orientation(*FLIPS[patch["turn"]])] if patch["turn"] != 1 else []
+        cut = (*parts, Crop(left, top, side, side), *turned)
         file = path.with_name(stem + ending_behind(ending, rendition, number))
         yield file, Way(Composition(cut), *own, chain.margins, (side, side))
 
