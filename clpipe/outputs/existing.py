@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.buckets import url_of
-from clpipe.base.digests import digests, joint_digest, stamp_of
+from clpipe.base.digests import digests, stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.base.system import open_plain
@@ -22,6 +22,7 @@ from clpipe.outputs.program import program_digest
 from clpipe.outputs.sidecar import (
     SIDECAR,
     SidecarError,
+    inputs_in,
     outputs_in,
     read_sidecar,
     sidecar_files,
@@ -174,51 +175,28 @@ def found_in(
 
 
 def _same_input(values: Mapping[str, Any], job: Job, verify: bool) -> bool:
-    """Whether a sidecar's values are of a job's files.
-
-    An input each of whose files has the same size and time of change is taken for the same; else,
-    and with ``verify``, its SHA-256 decides.
-    """
+    """Return whether a sidecar is of a job's files, see :func:`_is_same`."""
     try:
-        was, now = stamps_in(values), [stamp_of(path) for path in job.paths]
-        if [size for size, _ in was] != [size for size, _ in now]:
-            return False
-        reads = verify and url_of(job.path) is None  # what is behind a URL is told by its stamp
-        if (was != now or reads) and values["sha256"] != _digest_of(job):
-            return False
-        layers = (*values.get("carried", ()), *values.get("depth", ()))
-        return all(_is_same(job, each, verify) for each in layers)
-    except (KeyError, TypeError):  # the sidecar is damaged
+        return all(_is_same(path, was, verify) for path, was in inputs_in(values, job.paths))
+    except (KeyError, TypeError, ValueError):  # the sidecar is damaged, or of more files
         return False
 
 
-def stamps_in(values: Mapping[str, Any]) -> list[tuple[int, int]]:
-    """The size and the time of change of each file of the input, as a sidecar's values say them.
+def _is_same(path: Path, was: Mapping[str, Any], verify: bool) -> bool:
+    """Return whether an input file is what a sidecar says of it.
 
-    Raises:
-        KeyError, TypeError: the values are damaged.
-    """
-    if "subframes" in values:
-        return [(each["size"], each["modified"]) for each in values["subframes"]]
-    return [(values["input_size"], values["input_modified"])]
-
-
-def _digest_of(job: Job) -> str | None:
-    """The SHA-256 of a job's input; None where it cannot be read."""
-    found = digests(map(str, job.paths))
-    return joint_digest(list(found.values())) if len(found) == len(set(job.paths)) else None
-
-
-def _is_same(job: Job, carried: Mapping[str, Any], verify: bool) -> bool:
-    """Whether the file of a carried layer is what a sidecar says of it.
+    A file with the same size and time of change counts as the same, and a URL always by these.
+    Otherwise, and with ``verify``, the SHA-256 decides.
 
     Raises:
         KeyError, TypeError: the sidecar is damaged.
     """
-    file = job.path.parent / carried["file"]
-    if (carried["size"], carried["modified"]) == stamp_of(file) and not verify:
+    size, modified = stamp_of(path)
+    if size != was["size"]:
+        return False
+    if modified == was["modified"] and not (verify and url_of(path) is None):
         return True
-    return carried["sha256"] in digests([str(file)]).values()
+    return was["sha256"] in digests([str(path)]).values()
 
 
 def _same_request(one: Any, other: Mapping[str, Any]) -> bool:

@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -173,6 +173,28 @@ def outputs_in(values: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
         if isinstance(each["name"], str) and os.path.basename(each["name"]) == each["name"] != ""
         if "\0" not in each["name"]
     }
+
+
+def inputs_in(
+    values: Mapping[str, Any], paths: Sequence[Path]
+) -> list[tuple[Path, Mapping[str, Any]]]:
+    """Return the files that a picture was made of: those of its image and of its layers.
+
+    Each comes with what the sidecar says of it: its size, time of change and SHA-256.
+
+    Args:
+        values: of the sidecar.
+        paths: the files of the image.
+
+    Raises:
+        KeyError, TypeError, ValueError: the values are damaged, or of more or fewer files.
+    """
+    one = {"size": values["input_size"], "modified": values["input_modified"]}
+    layers = (*values.get("carried", ()), *values.get("depth", ()))
+    return [
+        *zip(paths, values.get("subframes", [one | {"sha256": values["sha256"]}]), strict=True),
+        *((paths[0].parent / each["file"], each) for each in layers),
+    ]
 
 
 class Constant(dict[str, Any]):
