@@ -23,7 +23,7 @@ from clpipe.chain.rendition import (
 )
 from clpipe.chain.settings import overlay
 from clpipe.chain.truth import noisy_mosaic, picture_without_noise, signal_and_noise
-from clpipe.outputs.spread import Spread
+from clpipe.outputs.baseline_noise import Spread
 from clpipe.stage import StageRole
 
 
