@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 from clpipe.chain.formats import DNG, ending_of
 from clpipe.chain.render_camera import Matrix, Vector
 from clpipe.chain.rendition import BASELINES, NOISY, PICTURES, Rendition, Role
-from clpipe.outputs.carried import png_ending
+from clpipe.outputs.carried import carried_files
 from clpipe.outputs.sidecar import SIDECAR, SidecarError, outputs_in, sidecar_files, values_at
 from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
 
@@ -77,9 +77,10 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
             camera = CAMERA.validate_python(values["intrinsics"])
             pose = values["pose"]
             r_and_t = pose and POSE.validate_python((pose["R"], pose["t"]))
-            depth = _depth_of(path, values)
-            below = depth.relative_to(folder).as_posix() if depth else ""
-            told = *_light_and_motion(values), str(values["name"]), below
+            layers, files = values.get("carried", ()), carried_files(values)
+            depths = [files.get(each["layer"]) for each in layers if each["kind"] == "depth"]
+            depth = next((Path(shown).with_name(name).as_posix() for name in depths if name), "")
+            told = *_light_and_motion(values), str(values["name"]), depth
             yield Photograph(shown, role, simplest(camera), r_and_t, *told)
         except SidecarError:
             left_out[f"{CHANGED}, so not used; the same clpipe run makes it again"].append(shown)
@@ -117,20 +118,6 @@ def picture_of(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
         return None
     file = sidecar.with_name(f"{sidecar.name.removesuffix(SIDECAR)}{ending_of(formats[0])}")
     return file if file.name in outputs_in(values) and file.exists() else None
-
-
-def _depth_of(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
-    """The PNG of a picture's depth; None where there is none.
-
-    Raises:
-        KeyError, TypeError: the values are damaged.
-    """
-    stem = Path(values["name"]).name
-    for layer in values.get("carried", ()):
-        name = f"{stem}.{png_ending(layer['layer'])}"
-        if layer["kind"] == "depth" and name in outputs_in(values):
-            return sidecar.with_name(name)
-    return None
 
 
 def simplest(camera: Intrinsics) -> Intrinsics:

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from clpipe.chain.rendition import NOISY, Rendition
-from clpipe.outputs.carried import png_ending
+from clpipe.outputs.carried import carried_files
 from clpipe.outputs.sidecar import SidecarError, outputs_in, sidecar_files, values_at
 
-PICTURE, CARRIED = "picture", "carried"
+PICTURE = "picture"
 SERIES = re.compile(r"(?:[^/]+/)?iso[0-9.e+]+(?=/)|")  # the folder of a camera and an ISO
 SPLITS = {3: "val", 7: "test"}  # of eight views
 
@@ -120,20 +120,14 @@ def _member(
     files: dict[str, str] = {}
     noisy: Mapping[str, Any] | None = None
     for suffix, (path, values) in sorted(renditions.items()):
-        first, *others = outputs_in(values)
+        first, *_ = outputs_in(values)
         place = path.parent.relative_to(folder)
         if not (path.parent / first).exists():
             continue
         if Rendition.from_record(values).role == NOISY and noisy is None:
             noisy = values
         files[suffix.removeprefix(".") or PICTURE] = (place / first).as_posix()
-        stem = Path(name).name
-        for each in others:
-            if each == f"{stem}.{CARRIED}.exr":
-                files[CARRIED] = (place / each).as_posix()
-        for layer in values.get("carried", ()):
-            if (png := f"{stem}.{png_ending(layer['layer'])}") in others:
-                files[str(layer["layer"])] = (place / png).as_posix()
+        files |= {k: (place / file).as_posix() for k, file in carried_files(values).items()}
     if noisy is None:
         return None
     own = SERIES.match(name)
