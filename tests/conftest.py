@@ -22,7 +22,7 @@ from clpipe.engine.device import Device
 from clpipe.engine.discovery import choose, find_devices
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.write import write_exr as write_file
-from clpipe.outputs.sealed import SEAL, sealed
+from clpipe.outputs.sidecar import SEAL, sealed
 from clpipe.stage import Kind
 
 ROOT = Path(__file__).resolve().parent.parent

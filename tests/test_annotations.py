@@ -151,6 +151,13 @@ def test_patches_have_their_own(clpipe, coco):
         assert seen(Path("o") / told.imgs[number]["file_name"]).max() < 0.5
 
 
+def test_patches_of_a_burst_are_named_as_their_files(clpipe, coco):
+    patches = ("--frames", 2, "--patch", 48, "--patches-per-image", 2)
+    clpipe("run", "in/a.exr", "-o", "o", *RUN[:2], *RUN[4:-1], "png16", *patches)
+    names = {each["file_name"] for each in read_back()[0].imgs.values()}
+    assert names == {path.name for path in Path("o").glob("*.frame?.png")} and len(names) == 4
+
+
 @pytest.mark.slow
 def test_each_series_and_a_resumed_run_have_theirs(clpipe, coco):
     run = ("run", "in", "-o", "o", "--iso", "100,800", *RUN[:2], *RUN[4:])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clpipe.outputs.places import select_flat
+from clpipe.outputs.noise_areas import select_flat
 
 ENDS = ("", ".truth", ".truth_clean", ".iid")
 NUMPY = ("--device", "numpy", "-c", "paper", "--iso", 3200)

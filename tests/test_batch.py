@@ -38,7 +38,7 @@ from clpipe.images import write
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs import folder as output_folders
-from clpipe.outputs import sidecar
+from clpipe.outputs import record
 from clpipe.outputs.folder import LOCK, output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
 from tests.conftest import ROOT, contents, reseal, statuses, written
@@ -632,7 +632,7 @@ def test_a_sidecar_whose_picture_cannot_be_the_same(clpipe, renders, monkeypatch
     assert Path("b/r000.jpg").read_bytes() == Path("out/r000.jpg").read_bytes()
     Path("mine.toml").write_text(Path("mine.toml").read_text() + "\n")
     assert "mine.toml: has changed since" in refused("moved.exr")
-    for module in (sidecar, replay):
+    for module in (record, replay):
         monkeypatch.setattr(module, "__version__", "9.9.9")
     assert "it is of clpipe 0" in refused("moved.exr")
     assert "clpipe did not write" in clpipe("replay", "mine.toml", "-o", "b", status=2).stderr

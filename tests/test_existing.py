@@ -13,7 +13,7 @@ from clpipe.batch.run_log import read_log
 from clpipe.chain.formats import EVERY_FORMAT, ending_of
 from clpipe.images.whole import is_whole
 from clpipe.outputs.existing import is_marked
-from clpipe.outputs.sealed import outputs_in
+from clpipe.outputs.sidecar import outputs_in
 from tests.conftest import reseal
 
 RUN = ("-o", "out", "--device", "numpy", "--keep", "normalize", "--truth", "mosaic")
@@ -222,16 +222,6 @@ def test_what_is_no_file_is_not_ours(clpipe, write_exr, tmp_path, name, kind):
     assert not list(Path("out").glob("*.truth*"))
 
 
-def test_every_format_marks_its_files(clpipe, write_exr):
-    formats = ("jpg", "png", "tif", "exr", "dng")
-    options = [o for name in formats for o in ("--format", name)]
-    render = write_exr("a.exr", np.full((8, 8, 3), 0.3, np.float32))
-    run = ("run", render, "-o", "out", "--device", "numpy", "--until", "gamma", *options)
-    clpipe(*run)
-    Path("out/a.json").unlink()
-    clpipe(*run)  # a killed run may have left pictures without a sidecar: they are ours
-
-
 def test_pictures_of_inputs_that_are_gone_are_counted(clpipe, write_exr):
     for name in ("in/a", "in/b", "in/sub/c", "other/d"):
         write_exr(f"{name}.exr", np.full((8, 8, 3), 0.3, np.float32))
@@ -258,7 +248,7 @@ def program(monkeypatch):
     """Be another program from now on."""
 
     def be(digest):
-        for module in ("existing", "sidecar"):
+        for module in ("existing", "record"):
             monkeypatch.setattr(f"clpipe.outputs.{module}.program_digest", lambda: digest)
 
     return be

@@ -24,7 +24,7 @@ from clpipe.images.read import read_image
 from clpipe.images.tags import Tags
 from clpipe.outputs.annotated import Way
 from clpipe.outputs.negative import dng_of
-from clpipe.outputs.patches import facts_of, pattern_of
+from clpipe.outputs.patches import facts_of
 from clpipe.pipeline import Pipeline
 from clpipe.reference.carried import Layer, warp
 from clpipe.reference.cfa import PATTERNS
@@ -605,12 +605,12 @@ def test_a_remosaiced_picture_is_as_the_array_saw_it(develop):
 
 def test_the_array_of_a_raw_is_that_of_its_pixels():
     quad, wanted = "RRGG/RRGG/GGBB/GGBB", {"method": "linear_mmse", "pattern": "GBRG"}
-    assert pattern_of(remosaiced("quad-RGGB", "binning")) == quad
-    assert pattern_of(remosaiced("quad-RGGB", "linear_mmse")) == quad
-    assert pattern_of(on("RGGB", stages=WITH_REMOSAIC, remosaic=wanted)) == "RGGB"
+    assert remosaiced("quad-RGGB", "binning").filters.pattern == quad
+    assert remosaiced("quad-RGGB", "linear_mmse").filters.pattern == quad
+    assert on("RGGB", stages=WITH_REMOSAIC, remosaic=wanted).filters.pattern == "RGGB"
     charge = [*DEFAULT_CHAIN]
     charge.insert(charge.index("mosaic") + 1, "remosaic")
-    assert pattern_of(on("quad-RGGB", stages=charge, remosaic={"method": "binning"})) == "RGGB"
+    assert on("quad-RGGB", stages=charge, remosaic={"method": "binning"}).filters.pattern == "RGGB"
 
 
 @pytest.mark.parametrize("array", ["x-trans", "RGGB"])

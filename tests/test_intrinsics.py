@@ -9,7 +9,7 @@ import pytest
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.images.read import SourceImage
-from clpipe.outputs.sidecar import intrinsics_of
+from clpipe.outputs.record import intrinsics_of
 from clpipe.reference.geometry import destinations
 
 WIDTH, HEIGHT = 640, 420

@@ -111,14 +111,14 @@ def test_packed_planes():
 
 
 def test_places_are_everywhere_and_fit():
-    cutting = Cutting(8, 21, 16, "RGGB", augment=True)
-    patches = cutting.drawn(range(400), "owner")
+    cutting = Cutting(api.Patches(8, augment=True), 21, 16, "RGGB", 0)
+    patches = cutting.cut(range(400), "key")
     assert {p.left for p in patches} == set(range(14)) and {p.top for p in patches} == set(range(9))
-    assert cutting.drawn([7], "owner") == patches[7:8] != cutting.drawn([7], "other")
-    for edge in (cutting, Cutting(16, 16, 16, "RGGB", augment=True)):
-        for patch in edge.drawn(range(50), "owner"):
+    assert cutting.cut([7], "key") == patches[7:8] != cutting.cut([7], "other")
+    for edge in (cutting, Cutting(api.Patches(16, augment=True), 16, 16, "RGGB", 0)):
+        for patch in edge.cut(range(50), "key"):
             assert patch.left + patch.size <= edge.width and patch.top + patch.size <= edge.height
-    plain = Cutting(8, 21, 16, "RGGB", augment=False).drawn(range(50), "owner")
+    plain = Cutting(api.Patches(8), 21, 16, "RGGB", 0).cut(range(50), "key")
     assert {(p.left % 2, p.top % 2, p.orientation) for p in plain} == {(0, 0, 1)}
 
 
@@ -155,9 +155,9 @@ def test_a_patch_with_draws_of_its_own_is_of_the_picture_with_these(renders):
 
 @pytest.mark.parametrize("augment", [False, True])
 def test_a_grid_covers_the_picture(augment):
-    cutting = Cutting(8, 37, 24, "RGGB", augment)
+    cutting = Cutting(api.Patches(8, "grid", augment), 37, 24, "RGGB", 0)
     covered = np.zeros((24, 37), int)
-    for patch in cutting.in_grid(range(cutting.count), "owner"):
+    for patch in cutting.cut(range(cutting.count), "key"):
         place = first_place("RGGB", patch.orientation, 8)
         assert (patch.left % 2, patch.top % 2) == place
         covered[patch.top : patch.top + 8, patch.left : patch.left + 8] += 1

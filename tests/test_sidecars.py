@@ -14,7 +14,7 @@ import pytest
 
 from clpipe.base.errors import ImageError
 from clpipe.batch.run_log import read_log
-from clpipe.outputs.sealed import SEAL, SidecarError, read_sidecar, sealed, values_in
+from clpipe.outputs.sidecar import SEAL, SidecarError, read_sidecar, sealed, values_in
 from tests.conftest import reseal
 
 CHANGED = f"was changed since clpipe wrote it (its {SEAL} does not fit)"
@@ -105,6 +105,12 @@ def test_every_byte_counts():
                 continue
             with pytest.raises(SidecarError, match=r"a\.json: was changed since"):
                 values_in(data, "a.json")
+
+
+def test_file_names_that_are_not_utf_8():
+    assert values_in(sealed({"clpipe": "0", "input": "\udcff"}), "a.json")["input"] == "\udcff"
+    with pytest.raises(SidecarError):
+        values_in(sealed({"clpipe": "0", "input": "\ud800"}), "a.json")
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[1, 2]", '{"a": "clpipe"}', "no JSON", "\0" * 50])

@@ -9,7 +9,7 @@ from clpipe.analysis.intensity import bin_edges, fit_variance, noise_by_intensit
 from clpipe.analysis.selection import select_unclipped
 from clpipe.analysis.spatial import LAGS, autocorrelation, count_pairs, energy_left, line_noise
 from clpipe.analysis.statistics import SIGMAS, channel_statistics, correlation, tails
-from clpipe.outputs.places import select_flat
+from clpipe.outputs.noise_areas import select_flat
 
 RANDOM = np.random.default_rng(5)
 START = RANDOM.bit_generator.state

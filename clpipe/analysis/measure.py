@@ -17,7 +17,7 @@ from clpipe.analysis.spatial import count_pairs
 from clpipe.analysis.statistics import Channel, channel_statistics, correlation
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Doubles, Floats, Mask
-from clpipe.outputs.places import FLAT, HALVED, PICTURE, covariance, halved, select_flat
+from clpipe.outputs.noise_areas import FLAT, HALVED, PICTURE, covariance, halved, select_flat
 from clpipe.reference.cfa import sites
 from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.stage import Kind
@@ -33,9 +33,9 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
 
     Against the mean of n frames, noise is the difference times sqrt(n / (n - 1)). What all frames
     share, such as column noise, is then part of the mean and not measured. Clipped intensities are
-    left out, see :func:`clpipe.analysis.selection.select_unclipped`; of pictures, only flat places
-    count, see :func:`clpipe.outputs.places.select_flat`. The whole sigma and the covariances of
-    the whole picture, and of it after averaging 2x2, are those of every pixel.
+    ignored, see :func:`clpipe.analysis.selection.select_unclipped`. In pictures only flat areas
+    count, see :func:`clpipe.outputs.noise_areas.select_flat`. The whole sigma, and the covariances
+    of the whole picture before and after averaging 2x2, are those of every pixel.
 
     Args:
         images: of one kind and size.

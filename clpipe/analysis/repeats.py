@@ -7,7 +7,7 @@ import numpy as np
 from clpipe.analysis.pictures import Picture
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
-from clpipe.outputs.places import halved
+from clpipe.outputs.noise_areas import halved
 
 # A repeat with less than this share of the others' noise energy is taken for a truth among them.
 # Among n frames and against their mean, a truth has (n - 1) / (n^2 - n - 1), at most 0.4.

@@ -16,7 +16,7 @@ from clpipe.chain.request import Request
 from clpipe.inputs.find import Job
 from clpipe.inputs.manifest import check_output_name
 from clpipe.inputs.spool import place_of_url
-from clpipe.outputs.sealed import SidecarError, outputs_in, read_sidecar
+from clpipe.outputs.sidecar import SidecarError, inputs_in, outputs_in, read_sidecar
 
 CODE = (".py", ".cl")  # the endings of files that are run
 
@@ -116,11 +116,8 @@ def replay_of(
     try:
         replay = _replay(values, inputs, max_pixels)
         files = {str(name): str(digest) for name, digest in values["request"]["files"].items()}
-        frames = values.get("subframes") or [{"sha256": values["sha256"]}]
-        for file, each in zip(replay.job.paths, frames, strict=True):
-            files[str(file)] = str(each["sha256"])
-        for layer in (*values.get("carried", ()), *values.get("depth", ())):
-            files[str(replay.job.path.parent / layer["file"])] = str(layer["sha256"])
+        of = inputs_in(values, replay.job.paths)
+        files |= {str(path): str(was["sha256"]) for path, was in of}
     except (KeyError, TypeError, ValueError, AttributeError, RequestError) as error:
         raise RequestError(f"{path}: it is damaged: {error}") from None
     code = {name: files.pop(name) for name in list(files) if Path(name).suffix in CODE}

@@ -38,8 +38,8 @@ from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.poses import with_views
 from clpipe.inputs.series import Series
+from clpipe.outputs.existing import pictures_without_input
 from clpipe.outputs.folder import output_folder, remove_unfinished
-from clpipe.outputs.gone import pictures_without_input
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 from clpipe.batch.outcome import Outcome
 from clpipe.chain.rendition import Rendition
 from clpipe.inputs.find import Job
-from clpipe.outputs.existing import Found, Redo
+from clpipe.outputs.existing import Found, Redo, find
 from clpipe.outputs.writer import OutputWriter
 
 
@@ -71,7 +71,7 @@ class Folder:
         Raises:
             ImageError: a file with the name of an output was not written by clpipe.
         """
-        return self.writer.existing(job, rendition).found(job, request, self.redo.verifies)
+        return find(self.writer.files(job, rendition), job, request, self.redo.verifies)
 
     def receive(self, executor: Executor, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
         """Let an executor do the jobs, and yield their outcomes.

@@ -23,10 +23,10 @@ from clpipe.batch.sinks import Executor, Folder
 from clpipe.batch.tars import OF_PATCHES, STAGING, Members, Tar, prepare
 from clpipe.chain.rendition import Rendition
 from clpipe.inputs.find import Job
-from clpipe.outputs.existing import Existing, Found, Redo, found_in
+from clpipe.outputs.existing import Found, Redo, find, found_in
 from clpipe.outputs.folder import RESUMABLE
-from clpipe.outputs.sealed import SIDECAR, outputs_in, read_sidecar
-from clpipe.outputs.sidecar import patch_text
+from clpipe.outputs.record import patch_text
+from clpipe.outputs.sidecar import SIDECAR, outputs_in, read_sidecar
 from clpipe.outputs.writer import OutputWriter
 
 # The bytes of a member: a file, an offset and size in the old tar, or the bytes themselves.
@@ -44,11 +44,6 @@ class StagedWriter(OutputWriter):
     def name(self, job: Job, ending: str) -> str:
         """Return the name of a job's file before it is packed."""
         return f"{self.folder}/{self.folders[job.stem]}/{job.stem}{ending}"
-
-    def existing(self, job: Job, rendition: Rendition) -> Existing:
-        """Return the files of a rendition in clpipe's own directory."""
-        # After a loss of power a temporary file may lack the mark that says whose it is.
-        return replace(super().existing(job, rendition), is_ours=True)
 
     def write(self, *arguments: Any) -> dict[Path, Stored]:
         """Write the images of one rendition. They go into the tar, so they need no fsync."""
@@ -84,13 +79,13 @@ class Packer:
         """Return whether the tar holds a rendition of the same request. If so, it is reused.
 
         A tar does not say when its files were changed, so their SHA-256 is always compared.
-        Arguments as for :meth:`clpipe.outputs.existing.Existing.found`.
+        Arguments as for :func:`clpipe.outputs.existing.find`.
         """
         member = self._member(job, rendition)
         with self._lock:
             values = self._old.sidecar(member)
         listed = outputs_in(values)
-        pictures = {path.name for path in self._writer.existing(job, rendition).pictures}
+        pictures = {path.name for path in self._writer.files(job, rendition).pictures}
         if not pictures <= listed.keys():
             return Found.NOTHING
         found = found_in(values, job, request, redo.verifies)
@@ -232,8 +227,10 @@ class Tars(Folder):
         packed = self._packers[self._folders[job.stem]].found(job, rendition, request, self.redo)
         if packed is not Found.NOTHING:
             return packed
-        # Without fsync a file may have its size and time after a loss of power, but not its bytes.
-        return self.writer.existing(job, rendition).found(job, request, verify=True)
+        # Without fsync a file may have its size and time after a loss of power, but neither its
+        # bytes nor the mark that says whose it is.
+        files = self.writer.files(job, rendition)
+        return find(files, job, request, verify=True, is_ours=True)
 
     def receive(self, executor: Executor, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
         """Let an executor do the jobs, and yield their outcomes. Remnants are removed first.

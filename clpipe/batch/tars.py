@@ -14,7 +14,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.reading import TEXT_BYTES, check_regular
 from clpipe.inputs.find import Job
 from clpipe.outputs.folder import remove_unfinished
-from clpipe.outputs.sealed import SIDECAR, SidecarError, is_sidecar, values_in
+from clpipe.outputs.sidecar import SIDECAR, SidecarError, is_sidecar, values_in
 
 STAGING = ".clpipe."  # prefix of the directory that holds a tar's pictures until it is packed
 

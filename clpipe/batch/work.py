@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, TypeVar
@@ -31,9 +31,9 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.existing import Found, Redo
 from clpipe.outputs.patches import every_patch
-from clpipe.outputs.recipes import Recipe
-from clpipe.outputs.sealed import SIDECAR, write_sidecar
-from clpipe.outputs.sidecar import intrinsics_of, sidecar
+from clpipe.outputs.recipes import Recipe, recipes
+from clpipe.outputs.record import intrinsics_of, picture_record
+from clpipe.outputs.sidecar import SIDECAR, write_sidecar
 from clpipe.stage import Kind
 
 T = TypeVar("T")
@@ -161,20 +161,20 @@ class ImageWorker:
     def _general_request(self) -> Mapping[str, Any]:
         return self.writer.request.record()
 
-    def _missing(self, state: JobState) -> Set[Rendition]:
+    def _missing(self, state: JobState) -> Sequence[Rendition]:
         """Return the renditions of a job that must be made."""
         renditions, redo = self.writer.renditions_of(state.job), self._sink.redo
         if redo is Redo.ALL:
-            return set(renditions)
+            return self.writer.needed(state.job, renditions)
         found = {
             each: self._sink.found(state.job, each, self.writer.record_of(state.request, each))
             for each in renditions
         }
         state.old = sum(there is Found.OLD for there in found.values())
         missing = [each for each, there in found.items() if not redo.keeps(there)]
-        return self.writer.plan_of(state.job).needed(missing)
+        return self.writer.needed(state.job, missing)
 
-    def _load(self, state: JobState, job: Job, renditions: Set[Rendition]) -> None:
+    def _load(self, state: JobState, job: Job, renditions: Sequence[Rendition]) -> None:
         """Load a state's image, and set the recipes of its renditions.
 
         Args:
@@ -203,8 +203,7 @@ class ImageWorker:
             if patches and patches.augment:
                 state.aovs.check_turns()
         state.source = loaded.source
-        recipes = self.writer.plan_of(job).recipes(loaded.chain, loaded.key)
-        state.recipes = [recipe for recipe in recipes if recipe.rendition in renditions]
+        state.recipes = recipes(renditions, loaded.chain, loaded.key)
         state.unwritten = len(state.recipes)
 
     @staticmethod
@@ -366,7 +365,7 @@ class ImageWorker:
         if recipe.chain.source is not Kind.DISPLAY:  # photographs are clipped already
             state.clipped = max(state.clipped, clipped or 0.0)
         path = writer.path(job, SIDECAR, recipe.rendition)
-        record = sidecar(
+        record = picture_record(
             job,
             writer.record_of(state.request, recipe.rendition),
             state.stamps,

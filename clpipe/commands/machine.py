@@ -7,7 +7,7 @@ import click
 
 from clpipe.base.about import full_version
 from clpipe.engine.device import Device
-from clpipe.outputs.sidecar import all_versions, device_record
+from clpipe.outputs.program import all_versions, device_record
 
 
 def machine_record(device: Device) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
 from clpipe.commands.options import EXISTING, Command, json_option
 from clpipe.commands.printing import Rows, number, show, show_json
-from clpipe.outputs.places import FLAT, HALVED, PICTURE
+from clpipe.outputs.noise_areas import FLAT, HALVED, PICTURE
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.stage import Kind
 from clpipe.stages.picture_noise import UNKNOWN

@@ -136,7 +136,7 @@ class Reporter:
 
     def _files(self, outcome: Outcome) -> str:
         first, *others = self._writer.renditions_of(outcome.job)
-        path = self._writer.existing(outcome.job, first).pictures[0]
+        path = self._writer.files(outcome.job, first).pictures[0]
         text = url_of(path) or str(path)
         if others:
             text += f" and {len(others)} more"

@@ -67,12 +67,12 @@ def replay(
     if made.summary.exit_status:
         sys.exit(made.summary.exit_status)
     (rendition,) = made.writer.renditions_of(again.job)
-    existing = made.writer.existing(again.job, rendition)
+    files = made.writer.files(again.job, rendition)
     try:
-        same, text = again.comparison(existing.sidecar)
+        same, text = again.comparison(files.sidecar)
     except ImageError as error:
         raise RequestError(str(error)) from None
-    picture = existing.pictures[0]
+    picture = files.pictures[0]
     if as_json:
         show_json({"picture": str(picture), "same": same, "text": text})
     else:

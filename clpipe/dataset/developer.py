@@ -20,7 +20,7 @@ from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result, Runner, submit_together
 from clpipe.images.read import SourceImage
-from clpipe.outputs.patches import Patch, Patches, facts_of, pattern_of, variance_at, variance_steps
+from clpipe.outputs.patches import Patch, Patches, facts_of, variance_at, variance_steps
 from clpipe.stage import Kind
 
 Sample = dict[str, Any]
@@ -247,7 +247,7 @@ class Developer:
             part: returns the sample's part of an image of a result.
         """
         arrays = self._spec.arrays
-        pattern = pattern_of(chain)
+        pattern = chain.filters.pattern
 
         def turned(image: Array) -> Array:
             return patch.turned(part(image)) if patch else image

@@ -13,7 +13,6 @@ from clpipe.base.types import Array
 from clpipe.base.validation import typed
 from clpipe.dataset.arrays import packed, unpacked
 from clpipe.images.arrays import as_array
-from clpipe.outputs.patches import pattern_of
 from clpipe.pipeline import Pipeline
 from clpipe.reference.cfa import PATTERNS
 
@@ -63,7 +62,7 @@ class RawNoise(ReadOnly):
         self._settings = {**settings, "camera": str(camera), "iso": iso, "seed": seed or 0}
         self._seed = seed
         self._device = device
-        self._pattern = pattern_of(self._pipeline("numpy").chain)
+        self._pattern = self._pipeline("numpy").chain.filters.pattern
         self._opened: tuple[int, Pipeline, np.random.Generator] | None = None
 
     def __getstate__(self) -> Mapping[str, Any]:

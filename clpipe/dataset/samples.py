@@ -160,7 +160,7 @@ class SampleLoader:
         with self._errors_of(job):
             if self.patches:
                 cutting = self.patches.cutting(chain, *pixels.shape[1::-1])
-                patches = self.patches.cut(cutting, batch.numbers, chain, job.key, batch.epoch)
+                patches = cutting.cut(batch.numbers, job.key, batch.epoch)
             else:
                 self._spec.arrays.check_size(*chain.size(*pixels.shape[1::-1]))
         key = noise_key(chain.settings, loaded.key, batch.epoch)

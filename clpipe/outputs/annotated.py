@@ -1,7 +1,7 @@
 """Annotations in COCO's form moved as pixels are: boxes, outlines, masks and keypoints."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -13,7 +13,6 @@ from clpipe.inputs.coco import runs_of
 from clpipe.reference.carried import Layer, warp
 from clpipe.reference.geometry import (
     Composition,
-    Crop,
     Geometry,
     Margins,
     Orientation,
@@ -66,16 +65,11 @@ class Way:
     @property
     def is_turned(self) -> bool:
         """Whether the picture is flipped or turned."""
-        turns = [part for part in self.parts if isinstance(part, Orientation)]
-        return any(turn != Orientation(False, False, False) for turn in turns)
-
-    @property
-    def parts(self) -> tuple[Geometry, ...]:
-        """What moves pixels, one after the other."""
-        return self.geometry.parts if isinstance(self.geometry, Composition) else ()
+        parts = self.geometry.parts if isinstance(self.geometry, Composition) else ()
+        return any(isinstance(part, Orientation) for part in parts)
 
     def camera(self, before: Intrinsics) -> Intrinsics | None:
-        """The intrinsics of the picture, which is not turned; None where they are not known.
+        """Return the intrinsics of the picture; None if they are not known, or it is turned.
 
         Args:
             before: those of the render.
@@ -83,16 +77,8 @@ class Way:
         Raises:
             RequestError: what moves pixels contradicts them.
         """
-        found: Intrinsics | None = before
         size = self.margins.around(self.width, self.height)
-        for part in self.parts:
-            if isinstance(part, Crop) and found:
-                cx, cy = found.cx - part.left, found.cy - part.top
-                found = replace(found, width=part.width, height=part.height, cx=cx, cy=cy)
-            elif not isinstance(part, Orientation):
-                found = part.intrinsics(found, *size)
-            size = part.size(*size)
-        return found
+        return self.geometry.intrinsics(before, *size) if self.geometry else before
 
 
 def mapped_annotation(annotation: Record, way: Way) -> Record | None:

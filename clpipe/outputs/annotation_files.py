@@ -18,7 +18,7 @@ from clpipe.inputs.coco import Coco
 from clpipe.inputs.kitti import CALIBRATION, CENTRE, MATRICES, Kitti, KittiObject
 from clpipe.outputs.annotated import Way, mapped_annotation, mapped_box, moved_mask
 from clpipe.outputs.photographs import lens_record, simplest
-from clpipe.outputs.sealed import json_text
+from clpipe.outputs.sidecar import json_text
 from clpipe.reference.intrinsics import PINHOLE, Intrinsics
 
 ANNOTATIONS = "annotations.json"

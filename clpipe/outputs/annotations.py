@@ -3,15 +3,14 @@
 They go through what moves the pixels (distortion, resizing, patches), as the sidecars say it.
 """
 
-import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.base.errors import ClpipeError, ImageError, RequestError
-from clpipe.base.reading import read_bytes
 from clpipe.chain.chain import Chain
+from clpipe.chain.formats import ending_of
 from clpipe.chain.overscan import with_overscan
 from clpipe.chain.rendition import NOISY, Rendition
 from clpipe.chain.request import Request
@@ -22,9 +21,9 @@ from clpipe.inputs.poses import Views, stem_of
 from clpipe.inputs.render_cameras import View
 from clpipe.outputs.annotated import Way
 from clpipe.outputs.annotation_files import files_for
-from clpipe.outputs.patches import patch_name
 from clpipe.outputs.photographs import picture_of
-from clpipe.outputs.sealed import SIDECAR, SidecarError, values_in
+from clpipe.outputs.plan import ending_behind
+from clpipe.outputs.sidecar import SidecarError, sidecar_files, values_at
 from clpipe.reference.geometry import (
     Composition,
     Crop,
@@ -81,19 +80,13 @@ def write_annotations(folder: Path, annotations: Annotations) -> list[str]:
 
 def _sidecars(folder: Path) -> Iterator[tuple[Path, Mapping[str, Any]]]:
     """The sidecars of noisy pictures, sorted."""
-    found = sorted(
-        Path(place, name)
-        for place, _, names in os.walk(folder)
-        for name in names
-        if name.endswith(f".{SIDECAR}") and not name.startswith(".")
-    )
-    for path in found:
+    for path in sorted(sidecar_files(folder)):
         try:
-            values = values_in(read_bytes(path), path)
+            values = values_at(path)
             if values and Rendition.from_record(values).role == NOISY:
                 yield path, values
-        except (SidecarError, OSError, KeyError, TypeError, ValueError):
-            continue  # which the run has told
+        except (SidecarError, KeyError, TypeError, ValueError):
+            continue  # the run has reported it
 
 
 def _pictures(
@@ -128,13 +121,13 @@ def _pictures(
             yield file, Way(Composition(parts) if parts else None, *own, chain.margins, size)
         return
     side = values["request"]["patch"]
-    formats = values["request"]["formats"]
-    stem = path.name.removesuffix(f".{SIDECAR}")
+    ending, rendition = ending_of(values["request"]["formats"][0]), Rendition.from_record(values)
+    stem = Path(values["name"]).name
     for number, patch in enumerate(values["patches"]):
         left, top = patch["place"]
-        turned = Orientation(*FLIPS[patch["turn"]])
-        cut = (*parts, Crop(left, top, side, side), turned)
-        file = path.with_name(f"{stem}{patch_name(number)}.{formats[0]}")
+        turned = [Orientation(*FLIPS[patch["turn"]])] if patch["turn"] != 1 else []
+        cut = (*parts, Crop(left, top, side, side), *turned)
+        file = path.with_name(stem + ending_behind(ending, rendition, number))
         yield file, Way(Composition(cut), *own, chain.margins, (side, side))
 
 

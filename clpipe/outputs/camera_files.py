@@ -16,7 +16,7 @@ from clpipe.base.files import keep_names, make_folder_of, write_whole
 from clpipe.base.reading import read_bytes
 from clpipe.outputs.existing import is_marked
 from clpipe.outputs.photographs import MODELS, Photograph, photographs
-from clpipe.outputs.sealed import is_sidecar
+from clpipe.outputs.sidecar import is_sidecar
 from clpipe.outputs.views import CAMERAS, COLMAP, TRANSFORMS, cameras_json, colmap, nerfstudio
 
 FILES = tuple(
@@ -86,13 +86,9 @@ def write_camera_files(folder: Path, splits: Mapping[str, str] = MappingProxyTyp
         texts |= {
             model + name: text for name, text in texts_of(own, model, left_out, splits).items()
         }
-    taken = [name for name in texts if _is_taken(folder / name)]
-    for name in taken:
-        del texts[name]
-    for name in FILES:
+    taken = [name for name in FILES if _is_taken(folder / name)]
+    for name in (name for name in FILES if name not in taken):
         path = folder / name
-        if _is_taken(path):
-            continue
         if name in texts:
             make_folder_of(path)
             write_whole(path, texts[name].encode())
@@ -108,8 +104,10 @@ def write_camera_files(folder: Path, splits: Mapping[str, str] = MappingProxyTyp
         f"{folder / name} is the sidecar of a picture, so the cameras are not written there; give "
         "that image another name"
         for name in taken
+        if name in texts
     )
-    return Written(tuple(name for name in FILES if name in texts), len(found), reasons)
+    written = tuple(name for name in FILES if name in texts and name not in taken)
+    return Written(written, len(found), reasons)
 
 
 def texts_of(

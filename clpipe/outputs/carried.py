@@ -1,6 +1,8 @@
 """Writes the layers that go along with a picture: one EXR of all, and PNGs of depth and labels."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +14,7 @@ from clpipe.images.attributes import PREFIX
 from clpipe.images.write import write_grey_png, write_planes
 from clpipe.inputs.carry import Aovs
 from clpipe.inputs.companions import CARRIED
+from clpipe.outputs.sidecar import outputs_in
 
 MM = 1000  # in a metre
 
@@ -50,6 +53,18 @@ def png_ending(layer: str) -> str:
     'Object_Index.png'
     """
     return f"{layer.replace(' ', '_')}.png"
+
+
+def carried_files(values: Mapping[str, Any]) -> dict[str, str]:
+    """Return the files of layers that a sidecar lists: the EXR, "carried", and PNGs by layer.
+
+    Raises:
+        KeyError, TypeError: the values are damaged.
+    """
+    layers = [str(layer["layer"]) for layer in values.get("carried", ())]
+    endings = {CARRIED: f"{CARRIED}.exr", **{layer: png_ending(layer) for layer in layers}}
+    stem, listed = Path(str(values["name"])).name, outputs_in(values)
+    return {key: name for key, each in endings.items() if (name := f"{stem}.{each}") in listed}
 
 
 def numbers(path: Path, labels: Array) -> Array:

@@ -1,4 +1,4 @@
-"""What lies in the output folder already: pictures that are done, ours to replace, or others'."""
+"""What exists in the output folder: finished pictures, files of ours to replace, others' files."""
 
 import json
 import os
@@ -6,20 +6,28 @@ import re
 import stat
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 from clpipe.base.buckets import url_of
-from clpipe.base.digests import digests, joint_digest, stamp_of
+from clpipe.base.digests import digests, stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.base.system import open_plain
 from clpipe.images.whole import is_whole
 from clpipe.inputs.find import Job
+from clpipe.outputs.plan import OutputPlan, RenditionFiles
 from clpipe.outputs.program import program_digest
-from clpipe.outputs.sealed import Parts, SidecarError, outputs_in, read_sidecar
+from clpipe.outputs.sidecar import (
+    SIDECAR,
+    SidecarError,
+    inputs_in,
+    outputs_in,
+    read_sidecar,
+    sidecar_files,
+    values_at,
+)
 
 MARKED = 1 << 16  # bytes at either end of a file, in which a format of clpipe names clpipe
 
@@ -59,97 +67,90 @@ class Redo(Enum):
         return found is Found.DONE or (found is Found.OLD and self is Redo.MISSING)
 
 
-@dataclass(frozen=True)
-class Existing:
-    """The files of one rendition that may be there.
+def find(
+    files: RenditionFiles,
+    job: Job,
+    request: Mapping[str, Any],
+    verify: bool = False,
+    is_ours: bool = False,
+) -> Found:
+    """Return what exists of a rendition: unchanged, made of the same input by the same request.
+
+    A file counts as unchanged if it has its size and was last touched before its sidecar was
+    written. Otherwise its SHA-256 decides.
 
     Args:
-        sidecar: the path of its sidecar.
-        pictures: those that every such rendition has.
-        others: further files that may be written.
-        is_ours: whether they lie in a folder of clpipe's own, where nobody else has files.
+        files: of the rendition.
+        job: the image.
+        request: the record of the request for the image.
+        verify: let the SHA-256 of each file, and of the input, decide.
+        is_ours: whether the files are in a folder where nobody else has files.
+
+    Raises:
+        ImageError: a file that would be written is somebody else's.
     """
+    try:
+        values = read_sidecar(files.sidecar)
+    except (FileNotFoundError, SidecarError):
+        values = {}
+    listed = outputs_in(values)
+    written = _written(files.sidecar)
+    intact = {
+        name
+        for name, was in listed.items()
+        if _is_intact(files.sidecar.with_name(name), was, written, verify)
+    }
+    if {path.name for path in files.pictures} <= intact == listed.keys():
+        found = found_in(values, job, request, verify)
+        if found is not Found.NOTHING:
+            return found
+    if not is_ours:
+        for path in (*files.pictures, *files.others):
+            if path.name not in intact and os.path.lexists(path):
+                _check_own(path, files.sidecar if path.name in listed else None, written)
+    return Found.NOTHING
 
-    sidecar: Path
-    pictures: Sequence[Path]
-    others: Sequence[Path] = ()
-    is_ours: bool = False
 
-    def found(self, job: Job, request: Mapping[str, Any], verify: bool = False) -> Found:
-        """Whether all is there, unchanged, made of the same input by the same request.
+def _is_intact(path: Path, was: Mapping[str, Any], written: int, verify: bool) -> bool:
+    """Return whether a file is what a sidecar says of it.
 
-        A file counts as unchanged where it has its size and was last touched before its sidecar was
-        written; else its SHA-256 decides.
-
-        Args:
-            job: the image.
-            request: the record of the request for the image.
-            verify: let the SHA-256 of each file, and of the input, decide.
-
-        Raises:
-            ImageError: a file that would be written is somebody else's.
-        """
-        try:
-            values = read_sidecar(self.sidecar, Parts)
-        except (FileNotFoundError, SidecarError):
-            values = {}
-        listed = outputs_in(values)
-        written = _written(self.sidecar)
-        intact = {
-            name for name, was in listed.items() if self._is_intact(name, was, written, verify)
-        }
-        pictures = {path.name for path in self.pictures}
-        if pictures <= intact == listed.keys():
-            found = found_in(values, job, request, verify)
-            if found is not Found.NOTHING:
-                return found
-        if not self.is_ours:
-            for path in (*self.pictures, *self.others):
-                if path.name not in intact and os.path.lexists(path):
-                    self._check_own(path, path.name in listed, written)
-        return Found.NOTHING
-
-    def _is_intact(self, name: str, was: Mapping[str, Any], written: int, verify: bool) -> bool:
-        """Whether a file is what a sidecar says of it.
-
-        Args:
-            name: of the file.
-            was: its size and SHA-256.
-            written: when the sidecar was written, in ns since 1970.
-            verify: compare the SHA-256 in any case.
-        """
-        path = self.sidecar.with_name(name)
-        try:
-            status = os.lstat(path)
-            if not stat.S_ISREG(status.st_mode) or status.st_size != was["size"]:
-                return False
-            is_untouched = not verify and status.st_ctime_ns <= written
-            return is_untouched or sha256_of(path)[0] == was["sha256"]
-        except OSError:
+    Args:
+        path: the file.
+        was: its size and SHA-256.
+        written: when the sidecar was written, in ns since 1970.
+        verify: compare the SHA-256 in any case.
+    """
+    try:
+        status = os.lstat(path)
+        if not stat.S_ISREG(status.st_mode) or status.st_size != was["size"]:
             return False
+        is_untouched = not verify and status.st_ctime_ns <= written
+        return is_untouched or sha256_of(path)[0] == was["sha256"]
+    except OSError:
+        return False
 
-    def _check_own(self, path: Path, is_listed: bool, written: int) -> None:
-        """See that a file that would be overwritten is clpipe's.
 
-        Args:
-            path: the file, which is not as a sidecar says.
-            is_listed: whether the sidecar lists it.
-            written: when the sidecar was written, in ns since 1970.
+def _check_own(path: Path, sidecar: Path | None, written: int) -> None:
+    """Check that a file that would be overwritten is clpipe's.
 
-        Raises:
-            ImageError: it is somebody else's, or somebody changed it.
-        """
-        if not is_marked(path):
-            raise ImageError(
-                f"{path}: clpipe did not write this file, or it was changed since, and "
-                f"{OVERWRITTEN}"
-            )
-        # What nobody has touched since was changed by the disk, which has no title to it.
-        if is_listed and os.lstat(path).st_ctime_ns > written and is_whole(path):
-            raise ImageError(
-                f"{path}: was changed since clpipe wrote it (its SHA-256 is not that in "
-                f"{self.sidecar.name}), and {OVERWRITTEN}"
-            )
+    Args:
+        path: the file, which is not as a sidecar says.
+        sidecar: the one that lists it; None if there is none.
+        written: when the sidecar was written, in ns since 1970.
+
+    Raises:
+        ImageError: it is somebody else's, or somebody changed it.
+    """
+    if not is_marked(path):
+        raise ImageError(
+            f"{path}: clpipe did not write this file, or it was changed since, and {OVERWRITTEN}"
+        )
+    # If nobody has touched the file since, the disk has damaged it.
+    if sidecar and os.lstat(path).st_ctime_ns > written and is_whole(path):
+        raise ImageError(
+            f"{path}: was changed since clpipe wrote it (its SHA-256 is not that in "
+            f"{sidecar.name}), and {OVERWRITTEN}"
+        )
 
 
 def _written(path: Path) -> int:
@@ -166,7 +167,7 @@ def found_in(
 ) -> Found:
     """Whether a sidecar's values are of the same input, the same request and this program.
 
-    Arguments as for :meth:`Existing.found`.
+    Arguments as for :func:`find`.
     """
     if not _same_request(values.get("request"), request) or not _same_input(values, job, verify):
         return Found.NOTHING
@@ -174,51 +175,28 @@ def found_in(
 
 
 def _same_input(values: Mapping[str, Any], job: Job, verify: bool) -> bool:
-    """Whether a sidecar's values are of a job's files.
-
-    An input each of whose files has the same size and time of change is taken for the same; else,
-    and with ``verify``, its SHA-256 decides.
-    """
+    """Return whether a sidecar is of a job's files, see :func:`_is_same`."""
     try:
-        was, now = stamps_in(values), [stamp_of(path) for path in job.paths]
-        if [size for size, _ in was] != [size for size, _ in now]:
-            return False
-        reads = verify and url_of(job.path) is None  # what is behind a URL is told by its stamp
-        if (was != now or reads) and values["sha256"] != _digest_of(job):
-            return False
-        layers = (*values.get("carried", ()), *values.get("depth", ()))
-        return all(_is_same(job, each, verify) for each in layers)
-    except (KeyError, TypeError):  # the sidecar is damaged
+        return all(_is_same(path, was, verify) for path, was in inputs_in(values, job.paths))
+    except (KeyError, TypeError, ValueError):  # the sidecar is damaged, or of more files
         return False
 
 
-def stamps_in(values: Mapping[str, Any]) -> list[tuple[int, int]]:
-    """The size and the time of change of each file of the input, as a sidecar's values say them.
+def _is_same(path: Path, was: Mapping[str, Any], verify: bool) -> bool:
+    """Return whether an input file is what a sidecar says of it.
 
-    Raises:
-        KeyError, TypeError: the values are damaged.
-    """
-    if "subframes" in values:
-        return [(each["size"], each["modified"]) for each in values["subframes"]]
-    return [(values["input_size"], values["input_modified"])]
-
-
-def _digest_of(job: Job) -> str | None:
-    """The SHA-256 of a job's input; None where it cannot be read."""
-    found = digests(map(str, job.paths))
-    return joint_digest(list(found.values())) if len(found) == len(set(job.paths)) else None
-
-
-def _is_same(job: Job, carried: Mapping[str, Any], verify: bool) -> bool:
-    """Whether the file of a carried layer is what a sidecar says of it.
+    A file with the same size and time of change counts as the same, and a URL always by these.
+    Otherwise, and with ``verify``, the SHA-256 decides.
 
     Raises:
         KeyError, TypeError: the sidecar is damaged.
     """
-    file = job.path.parent / carried["file"]
-    if (carried["size"], carried["modified"]) == stamp_of(file) and not verify:
+    size, modified = stamp_of(path)
+    if size != was["size"]:
+        return False
+    if modified == was["modified"] and not (verify and url_of(path) is None):
         return True
-    return carried["sha256"] in digests([str(file)]).values()
+    return was["sha256"] in digests([str(path)]).values()
 
 
 def _same_request(one: Any, other: Mapping[str, Any]) -> bool:
@@ -249,3 +227,31 @@ def is_marked(path: Path) -> bool:
     except OSError:
         return False
     return MARK.search(ends) is not None or not ends.strip(b"\0")
+
+
+def pictures_without_input(plan: OutputPlan, jobs: Sequence[Job], inputs: Sequence[str]) -> int:
+    """Return how many pictures of the output folder are of inputs that were removed or renamed.
+
+    An input counts only if it was in a folder that is an input now, or next to an input: names in
+    sidecars are relative to the folder in which that run was started.
+
+    Args:
+        plan: of the run.
+        jobs: all of it.
+        inputs: as the user gave them.
+    """
+    own = {plan.path(job, SIDECAR, each) for job in jobs for each in plan.renditions_of(job)}
+    beside = {Path(text) for text in {os.path.dirname(job.input) for job in jobs}}
+    below = [Path(text) for text in inputs if os.path.isdir(text)]
+    count = 0
+    for path in sidecar_files(plan.folder):
+        if path in own:
+            continue
+        try:
+            render = (values_at(path) or {}).get("input")
+        except SidecarError:
+            continue
+        if isinstance(render, str) and not os.path.lexists(render):
+            was = Path(render)
+            count += was.parent in beside or any(was.is_relative_to(each) for each in below)
+    return count

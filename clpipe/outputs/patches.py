@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
@@ -58,7 +58,7 @@ class Patch:
 def first_place(pattern: str, orientation: int, size: int) -> tuple[int, int] | None:
     """The first column and row of a patch that has the pattern when it is turned.
 
-    None where there is none. ``pattern`` is as :func:`pattern_of` gives it.
+    None where there is none. ``pattern`` is a Bayer pattern, such as "RGGB", or rows of letters.
 
     So a mosaic keeps its pattern, and no pixel is interpolated or thrown away: the CFA-preserving
     augmentation of Liu et al., "Learning Raw Image Denoising with Bayer Pattern Unification and
@@ -78,95 +78,6 @@ def first_place(pattern: str, orientation: int, size: int) -> tuple[int, int] | 
             if (turned[:rows, :columns] == cell).all():
                 return x, y
     return None
-
-
-@dataclass(frozen=True)
-class Cutting:
-    """How patches are cut from the pictures of one size and CFA pattern.
-
-    Each begins so that, turned, it has the pattern of the camera.
-
-    Args:
-        size: of the sides of a patch, in px.
-        width, height: of the picture, at least as large.
-        pattern: of its mosaic, as :func:`pattern_of` gives it.
-        augment: whether patches are flipped and turned.
-    """
-
-    size: int
-    width: int
-    height: int
-    pattern: str
-    augment: bool
-
-    def drawn(self, numbers: Sequence[int], owner: str) -> list[Patch]:
-        """Patches at random places, by their numbers.
-
-        ``owner`` is what they belong to, see :func:`~clpipe.chain.drawing.uniforms`.
-        """
-        draws = self._draws(numbers, owner, ("turn", "left", "top"))
-        patches = []
-        for u_turn, u_left, u_top in draws:
-            orientation = self._orientation(u_turn)
-            (x, y), (down, across) = self._first(orientation), self._period
-            left = x + across * int(u_left * ((self.width - self.size - x) // across + 1))
-            top = y + down * int(u_top * ((self.height - self.size - y) // down + 1))
-            patches.append(Patch(left, top, self.size, orientation))
-        return patches
-
-    @property
-    def count(self) -> int:
-        """How many patches side by side cover a picture, but for a last odd column and row."""
-        return self._columns * -(-self.height // self.size)
-
-    def in_grid(self, numbers: Sequence[int], owner: str) -> list[Patch]:
-        """Patches side by side, by their numbers, row by row; the last end where the picture does.
-
-        Patches move by less than a period of the pattern where it wants that. ``owner`` as for
-        :meth:`drawn`.
-        """
-        patches = []
-        for number, (u_turn,) in zip(numbers, self._draws(numbers, owner, ("turn",)), strict=True):
-            row, column = divmod(number, self._columns)
-            orientation = self._orientation(u_turn)
-            (x, y), (down, across) = self._first(orientation), self._period
-            left = min(column * self.size, self.width - self.size)
-            top = min(row * self.size, self.height - self.size)
-            left, top = max(left - (left - x) % across, x), max(top - (top - y) % down, y)
-            patches.append(Patch(left, top, self.size, orientation))
-        return patches
-
-    @staticmethod
-    def _draws(
-        numbers: Sequence[int], owner: str, names: Sequence[str]
-    ) -> Iterator[tuple[float, ...]]:
-        """Numbers from 0 to 1 for each patch, by its number and their names."""
-        drawn = uniforms(owner, [f"{number}.{name}" for number in numbers for name in names])
-        return (tuple(drawn[f"{number}.{name}"] for name in names) for number in numbers)
-
-    @property
-    def _columns(self) -> int:
-        return -(-self.width // self.size)
-
-    def _orientation(self, number: float) -> int:
-        """The orientation of a number from 0 to 1, of those for which there is a place."""
-        if not self.augment:
-            return 1
-        spare = self.width - self.size, self.height - self.size
-        places = {turn: first_place(self.pattern, turn, self.size) for turn in FLIPS}
-        fits = [
-            turn for turn, place in places.items() if place and all(np.less_equal(place, spare))
-        ]
-        return fits[int(number * len(fits))]
-
-    def _first(self, orientation: int) -> tuple[int, int]:
-        place = first_place(self.pattern, orientation, self.size)
-        assert place  # or the orientation would not be taken
-        return place
-
-    @property
-    def _period(self) -> tuple[int, int]:
-        return parse_array(self.pattern).period
 
 
 @dataclass(frozen=True)
@@ -194,8 +105,13 @@ class Patches:
                 or_grid = ", or 'grid'" if name == "per_image" else ""
                 raise RequestError(f"found {name} {number!r}; expected 1 or more{or_grid}")
 
-    def cutting(self, chain: Chain, width: int, height: int) -> Cutting:
-        """How they are cut of the picture that a chain makes of an image of a size.
+    @property
+    def least(self) -> int:
+        """How many there are of any picture."""
+        return 1 if self.per_image == "grid" else self.per_image
+
+    def cutting(self, chain: Chain, width: int, height: int) -> "Cutting":
+        """Return how they are cut from the picture that a chain makes of an image of a size.
 
         Raises:
             ImageError: it is smaller than a patch.
@@ -206,20 +122,80 @@ class Patches:
                 f"its picture has {width}x{height} pixels, and patches are to have "
                 f"{self.size}x{self.size}; make them smaller, or leave the image out"
             )
-        return Cutting(self.size, width, height, pattern_of(chain), self.augment)
+        return Cutting(self, width, height, chain.filters.pattern, chain.seed)
+
+
+@dataclass(frozen=True)
+class Cutting:
+    """How patches are cut from the pictures of one size and CFA pattern.
+
+    Each begins so that, turned, it has the pattern of the camera.
+
+    Args:
+        patches: which.
+        width, height: of the picture, at least as large as a patch.
+        pattern: of its mosaic, such as "RGGB", or rows of letters.
+        seed: of the draws.
+    """
+
+    patches: Patches
+    width: int
+    height: int
+    pattern: str
+    seed: int
 
     @property
-    def least(self) -> int:
-        """How many there are of any picture."""
-        return 1 if self.per_image == "grid" else self.per_image
+    def count(self) -> int:
+        """How many there are. A grid covers the picture, except for a last odd column and row."""
+        size, count = self.patches.size, self.patches.per_image
+        return -(-self.width // size) * -(-self.height // size) if count == "grid" else count
 
-    def cut(
-        self, cutting: Cutting, numbers: Sequence[int], chain: Chain, key: str, epoch: int = 0
-    ) -> list[Patch]:
-        """Patches, by their numbers, as they are for a chain's seed and an image's key."""
-        owner = f"patch:{chain.seed}:{key}:{epoch}"
-        cut = cutting.in_grid if self.per_image == "grid" else cutting.drawn
-        return cut(numbers, owner)
+    def cut(self, numbers: Sequence[int], key: str, epoch: int = 0) -> list[Patch]:
+        """Return patches by their numbers: at random places, or side by side, row by row.
+
+        The last patches of a row or column end where the picture does. The pattern may move any
+        patch of a grid by less than its period.
+
+        Args:
+            numbers: of the patches.
+            key: of the image.
+            epoch: of a training.
+        """
+        size, is_grid = self.patches.size, self.patches.per_image == "grid"
+        names = ("turn",) if is_grid else ("turn", "left", "top")
+        drawn = uniforms(
+            f"patch:{self.seed}:{key}:{epoch}",
+            [f"{number}.{name}" for number in numbers for name in names],
+        )
+        last_left, last_top = self.width - size, self.height - size
+        down, across = parse_array(self.pattern).period
+        patches = []
+        for number in numbers:
+            orientation = self._orientation(drawn[f"{number}.turn"])
+            place = first_place(self.pattern, orientation, size)
+            assert place  # or the orientation would not be taken
+            x, y = place
+            if is_grid:
+                row, column = divmod(number, -(-self.width // size))
+                left, top = min(column * size, last_left), min(row * size, last_top)
+                left, top = max(left - (left - x) % across, x), max(top - (top - y) % down, y)
+            else:
+                left = x + across * int(drawn[f"{number}.left"] * ((last_left - x) // across + 1))
+                top = y + down * int(drawn[f"{number}.top"] * ((last_top - y) // down + 1))
+            patches.append(Patch(left, top, size, orientation))
+        return patches
+
+    def _orientation(self, number: float) -> int:
+        """Return the orientation of a number from 0 to 1, of those for which there is a place."""
+        size = self.patches.size
+        if not self.patches.augment:
+            return 1
+        spare = self.width - size, self.height - size
+        places = {turn: first_place(self.pattern, turn, size) for turn in FLIPS}
+        fits = [
+            turn for turn, place in places.items() if place and all(np.less_equal(place, spare))
+        ]
+        return fits[int(number * len(fits))]
 
 
 def patch_name(number: int | None) -> str:
@@ -242,20 +218,14 @@ def without_patch(name: str) -> str:
     return re.sub(r"_\d{4,}$", "", name)
 
 
-def pattern_of(chain: Chain) -> str:
-    """The filter array of a chain's raw: a Bayer pattern, such as "RGGB", or rows of letters."""
-    return chain.filters.pattern
-
-
 def every_patch(patches: Patches, chain: Chain, width: int, height: int, key: str) -> list[Patch]:
-    """All patches of the picture that a chain makes of an image of a size.
+    """Return all patches of the picture that a chain makes of an image of a size.
 
     Raises:
         ImageError: it is smaller than a patch.
     """
     cutting = patches.cutting(chain, width, height)
-    count = cutting.count if patches.per_image == "grid" else patches.per_image
-    return patches.cut(cutting, range(count), chain, key)
+    return cutting.cut(range(cutting.count), key)
 
 
 def variance_steps(chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
@@ -299,7 +269,7 @@ def facts_of(chain: Chain) -> dict[str, Any]:
     except RequestError:  # there is no raw
         return facts
     return facts | {
-        "cfa": pattern_of(chain),
+        "cfa": chain.filters.pattern,
         "black_level": float(raw.black_level),
         "white_level": float(raw.white_level),
         "gains": np.array([raw.array.gains[0], 1, raw.array.gains[1]], np.float32),

@@ -1,6 +1,5 @@
 """The pictures of an output folder with their cameras, as its sidecars say them."""
 
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,12 +7,11 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from clpipe.base.reading import read_bytes
 from clpipe.chain.formats import DNG, ending_of
 from clpipe.chain.render_camera import Matrix, Vector
 from clpipe.chain.rendition import BASELINES, NOISY, PICTURES, Rendition, Role
-from clpipe.outputs.carried import png_ending
-from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, values_in
+from clpipe.outputs.carried import carried_files
+from clpipe.outputs.sidecar import SIDECAR, SidecarError, outputs_in, sidecar_files, values_at
 from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
 
 # What is trained on is of one kind: noisy pictures lie in the folder itself, others below.
@@ -64,38 +62,30 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
         left_out: gets the names of those whose camera is not known, by the reason.
 
     """
-    for place, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        for name in names:
-            path = Path(place, name)
-            if not name.endswith(f".{SIDECAR}") or name.startswith("."):
+    for path in sidecar_files(folder):
+        shown = path.relative_to(folder).as_posix()
+        try:
+            values = values_at(path)
+            role = values and Rendition.from_record(values).role
+            file = values and picture_of(path, values) if role in MODELS else None
+            if not values or not role or not file:
                 continue
-            shown = path.relative_to(folder).as_posix()
-            try:
-                values = values_in(read_bytes(path), path)
-                role = values and Rendition.from_record(values).role
-                file = values and picture_of(path, values) if role in MODELS else None
-                if not values or not role or not file:
-                    continue
-                shown = file.relative_to(folder).as_posix()
-                if values["intrinsics"] is None:
-                    left_out["no known intrinsics, so in none of the files"].append(shown)
-                    continue
-                camera = CAMERA.validate_python(values["intrinsics"])
-                pose = values["pose"]
-                r_and_t = pose and POSE.validate_python((pose["R"], pose["t"]))
-                depth = _depth_of(path, values)
-                below = depth.relative_to(folder).as_posix() if depth else ""
-                told = *_light_and_motion(values), str(values["name"]), below
-                yield Photograph(shown, role, simplest(camera), r_and_t, *told)
-            except SidecarError:
-                left_out[f"{CHANGED}, so not used; the same clpipe run makes it again"].append(
-                    shown
-                )
-            except OSError:  # nor does a run take it for a sidecar
+            shown = file.relative_to(folder).as_posix()
+            if values["intrinsics"] is None:
+                left_out["no known intrinsics, so in none of the files"].append(shown)
                 continue
-            except (KeyError, TypeError, ValueError):
-                left_out["a sidecar that is damaged or of another version"].append(shown)
+            camera = CAMERA.validate_python(values["intrinsics"])
+            pose = values["pose"]
+            r_and_t = pose and POSE.validate_python((pose["R"], pose["t"]))
+            layers, files = values.get("carried", ()), carried_files(values)
+            depths = [files.get(each["layer"]) for each in layers if each["kind"] == "depth"]
+            depth = next((Path(shown).with_name(name).as_posix() for name in depths if name), "")
+            told = *_light_and_motion(values), str(values["name"]), depth
+            yield Photograph(shown, role, simplest(camera), r_and_t, *told)
+        except SidecarError:
+            left_out[f"{CHANGED}, so not used; the same clpipe run makes it again"].append(shown)
+        except (KeyError, TypeError, ValueError):
+            left_out["a sidecar that is damaged or of another version"].append(shown)
 
 
 def _light_and_motion(
@@ -128,20 +118,6 @@ def picture_of(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
         return None
     file = sidecar.with_name(f"{sidecar.name.removesuffix(SIDECAR)}{ending_of(formats[0])}")
     return file if file.name in outputs_in(values) and file.exists() else None
-
-
-def _depth_of(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
-    """The PNG of a picture's depth; None where there is none.
-
-    Raises:
-        KeyError, TypeError: the values are damaged.
-    """
-    stem = Path(values["name"]).name
-    for layer in values.get("carried", ()):
-        name = f"{stem}.{png_ending(layer['layer'])}"
-        if layer["kind"] == "depth" and name in outputs_in(values):
-            return sidecar.with_name(name)
-    return None
 
 
 def simplest(camera: Intrinsics) -> Intrinsics:

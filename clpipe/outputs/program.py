@@ -1,23 +1,29 @@
-"""Which program makes the pictures: a digest of all that decides their pixels, besides the request.
+"""What a picture's pixels depend on besides the request: the program, its libraries, the device.
 
-The version does not tell: people install from a checkout. So sidecars have this digest, and what
-another program has made is not taken for this one's.
+The version alone does not identify a program, because people install from a checkout. So sidecars
+contain a digest of it, by which a run recognizes pictures that another program made.
 """
 
 import hashlib
 import json
 import os
+import platform
 from collections.abc import Iterator
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import clpipe
+from clpipe.base.about import full_version
 from clpipe.engine.cache_folder import cache_folder
+from clpipe.engine.device import Device
 from clpipe.engine.sources import kernel_folder
 from clpipe.engine.store import Store
 from clpipe.images.write import versions
+from clpipe.outputs.sidecar import Constant
 
 # The rooms in which nothing decides a pixel: they ask for pictures, or look at finished ones.
 WITHOUT_PIXELS = ("analysis", "commands", "dataset", "explorer", "reports", "scenes")
@@ -70,3 +76,27 @@ def _files(folder: Path) -> Iterator[Path]:
             if name != "__pycache__" and not (at_top and name in WITHOUT_PIXELS)
         ]
         yield from (Path(place, name) for name in names if not name.endswith(IGNORED))
+
+
+def device_record(device: Device | None) -> dict[str, Any]:
+    """Return what a sidecar says of a device, as JSON values; None is NumPy."""
+    return {
+        "name": device.info.name if device else "numpy",
+        "platform": device.info.platform if device else "numpy",
+        "version": device.info.version if device else all_versions()["numpy"],
+        "driver": device.info.driver if device else "",
+        "lanes": device.info.lanes if device else 0,
+        "target": device.info.target.name if device else "",
+    }
+
+
+@cache
+def all_versions() -> dict[str, str]:
+    """Return the versions of all that a picture's bytes may depend on, by name."""
+    return Constant(
+        clpipe=full_version(),
+        python=platform.python_version(),
+        numpy=version("numpy"),
+        pyopencl=version("pyopencl"),
+        **versions(),
+    )

@@ -1,4 +1,4 @@
-"""Recipes: how each rendition of an image is made, with which chain and which noise."""
+"""Which pictures are made of an image, and how: with which chain and which noise."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -23,7 +23,7 @@ from clpipe.chain.rendition import (
 )
 from clpipe.chain.settings import overlay
 from clpipe.chain.truth import noisy_mosaic, picture_without_noise, signal_and_noise
-from clpipe.outputs.spread import Spread
+from clpipe.outputs.baseline_noise import Spread
 from clpipe.stage import StageRole
 
 
@@ -61,81 +61,67 @@ class Recipe:
         return replace(self.chain, steps=(*self.chain.steps[:-1], *self.noise))
 
 
-@dataclass(frozen=True)
-class RenditionPlan:
-    """Which renditions are made of each image.
+@lru_cache(maxsize=64)
+def renditions(
+    frames: int | None = None,
+    truths: tuple[str, ...] = (),
+    bracket: tuple[float, ...] = (),
+    baselines: tuple[str, ...] = (),
+) -> tuple[Rendition, ...]:
+    """Return the renditions that are made of an image, exposure by exposure.
 
     Args:
-        frames: how many frames; None is one picture. A burst has the truth of its development, too.
+        frames: how many frames; None is one picture. A burst also has the truth of its development.
         truths: which of :data:`clpipe.chain.rendition.TRUTHS`.
-        bracket: what is added to the exposure's EV, for each exposure; () is the exposure alone.
-        baselines: which of :data:`clpipe.chain.rendition.BASELINES`; they bring the truths that are
-            pictures along.
+        bracket: what is added to the exposure's EV, for each exposure; () is one exposure.
+        baselines: which of :data:`clpipe.chain.rendition.BASELINES`. With any of them, the truths
+            that are pictures are made too.
+
+    >>> [each.suffix for each in renditions(2)]
+    ['.frame0', '.frame1', '.truth']
+    >>> [each.suffix for each in renditions(None, ("mosaic",), (-2, 0))]
+    ['.ev-2', '.ev-2.truth_mosaic', '.ev+0', '.ev+0.truth_mosaic']
     """
+    asked = {NOISY, *truths, *baselines, *((DEVELOPMENT,) if frames else ())}
+    asked |= {*PICTURES} if baselines else set()
+    return tuple(
+        Rendition(role, ev, frame, frames)
+        for ev in bracket or (None,)
+        for role in (NOISY, *TRUTHS, *BASELINES)
+        if role in asked
+        for frame in (range(frames) if frames and role == NOISY else (None,))
+    )
 
-    frames: int | None = None
-    truths: tuple[str, ...] = ()
-    bracket: tuple[float, ...] = ()
-    baselines: tuple[str, ...] = ()
 
-    def renditions(self) -> tuple[Rendition, ...]:
-        """The renditions of an image, exposure by exposure.
+def recipes(asked: Iterable[Rendition], chain: Chain, key: str) -> list[Recipe]:
+    """Return how each rendition of an image is made.
 
-        >>> [each.suffix for each in RenditionPlan(2).renditions()]
-        ['.frame0', '.frame1', '.truth']
-        >>> [each.suffix for each in RenditionPlan(None, ("mosaic",), (-2, 0)).renditions()]
-        ['.ev-2', '.ev-2.truth_mosaic', '.ev+0', '.ev+0.truth_mosaic']
-        """
-        return tuple(
-            Rendition(role, ev, frame, self.frames)
-            for ev in self.bracket or (None,)
-            for role in self._roles()
-            for frame in (range(self.frames) if self.frames and role == NOISY else (None,))
-        )
+    The first frame equals the picture without a burst, and an exposure at 0 EV the picture without
+    a bracket.
 
-    def _roles(self) -> list[Role]:
-        truths = (*self.truths, *([DEVELOPMENT] if self.frames else []))
-        if self.baselines:
-            truths += PICTURES
-        asked = {NOISY, *truths, *self.baselines}
-        return [role for role in (NOISY, *TRUTHS, *BASELINES) if role in asked]
+    Args:
+        asked: the renditions. A baseline comes after the pictures that it is measured on.
+        chain: of the noisy picture.
+        key: of the image.
 
-    def needed(self, renditions: Iterable[Rendition]) -> set[Rendition]:
-        """Renditions, with those that a baseline among them is measured on."""
-        needed = set(renditions)
-        for each in tuple(needed):
-            if each.role in BASELINES:
-                needed |= {*measured_on(each)}
-        return needed
-
-    def recipes(self, chain: Chain, key: str) -> list[Recipe]:
-        """How each of :meth:`renditions` is made of an image.
-
-        The first frame is the same picture as that without a burst, and an exposure at 0 EV as that
-        without a bracket.
-
-        Args:
-            chain: of the noisy picture.
-            key: of the image.
-
-        Raises:
-            RequestError: the chain has no such truth, or no such exposure.
-        """
-        recipes: list[Recipe] = []
-        spreads: dict[float | None, Spread] = {}  # baselines of one exposure share theirs
-        for each in self.renditions():
-            own = chain if each.ev is None else exposed(chain, each.ev)
-            own_key = of_bracket(key, each.ev or 0.0)
-            recipe = Recipe(each, *chain_and_noise(each.role, own), own_key)
-            if each.role in BASELINES:
-                spread = Spread(measured_on(each), matching_of(own), own.settings.output)
-                recipe = replace(recipe, spread=spreads.setdefault(each.ev, spread))
-            recipes.append(recipe)
-        return recipes
+    Raises:
+        RequestError: the chain has no such truth, or no such exposure.
+    """
+    found: list[Recipe] = []
+    spreads: dict[float | None, Spread] = {}  # baselines of one exposure share theirs
+    for each in asked:
+        own = chain if each.ev is None else exposed(chain, each.ev)
+        own_key = of_bracket(key, each.ev or 0.0)
+        recipe = Recipe(each, *chain_and_noise(each.role, own), own_key)
+        if each.role in BASELINES:
+            spread = Spread(measured_on(each), matching_of(own), own.settings.output)
+            recipe = replace(recipe, spread=spreads.setdefault(each.ev, spread))
+        found.append(recipe)
+    return found
 
 
 def measured_on(baseline: Rendition) -> tuple[Rendition, Rendition, Rendition]:
-    """What a baseline is measured on: the noisy picture, and its truths that are pictures."""
+    """Return what a baseline is measured on: the noisy picture and the truths that are pictures."""
     return baseline.beside(NOISY), baseline.beside(DEVELOPMENT), baseline.beside(CLEAN)
 
 

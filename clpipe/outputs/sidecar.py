@@ -1,203 +1,242 @@
-"""The sidecar: everything that is needed to make a picture again, and to see that it is done."""
+"""Sidecar files: JSON that contains its own digest, so that edits are noticed.
 
-import platform
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from functools import cache, lru_cache
-from importlib.metadata import version
+All sidecars are written by :func:`sealed` and read by :func:`values_in`. The digest protects
+against accidents and edits, not against forgery. :mod:`clpipe.outputs.record` says what is in them.
+"""
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.about import __version__, full_version
-from clpipe.base.files import Stored
-from clpipe.chain.chain import Chain
-from clpipe.chain.photometry import photometry_of
-from clpipe.chain.render_camera import POSE
-from clpipe.engine.device import Device
-from clpipe.engine.runner import Result
-from clpipe.images.read import SourceImage
-from clpipe.images.tags import FLIPS, orientation_of
-from clpipe.images.write import versions
-from clpipe.inputs.carry import Aovs
-from clpipe.inputs.find import Job
-from clpipe.inputs.raw import RawImage
-from clpipe.outputs.motion import motion_records
-from clpipe.outputs.patches import Patch, facts_of
-from clpipe.outputs.program import program_digest
-from clpipe.outputs.recipes import Recipe
-from clpipe.outputs.sealed import OWN, Constant, sealed
-from clpipe.reference.intrinsics import Intrinsics
+from pydantic_core import from_json
 
-FACTS, PATCHES = "facts", "patches"  # keys of a sidecar of patches
+from clpipe.base.errors import ImageError
+from clpipe.base.files import keep_names, write_whole
+from clpipe.base.reading import parse_json, read_bytes
 
-SAID = ("image_key", "noise_key", "iso", "noise")  # keys of a sidecar that its patches have, too
+SIDECAR = "json"  # the ending of its name
+
+OWN = "clpipe"  # the first key of every sidecar
+
+SEAL = "sidecar_sha256"  # the last one: the SHA-256 of all lines before its own
+
+BEGINNING = b'{\n  "%b": ' % OWN.encode()
+
+# Either end of a sidecar, so that one that was cut off or edited is known for one still.
+_BEGINNING = re.compile(rb'\s*\{\s*"%b"\s*:' % OWN.encode())
+_END = re.compile(rb'"%b"\s*:' % SEAL.encode())
 
 
-def intrinsics_of(chain: Chain, source: SourceImage) -> Intrinsics | None:
-    """The intrinsics of a render's or a photograph's picture; None where they are not known.
+class SidecarError(ImageError):
+    """A sidecar is not as clpipe wrote it: it was edited, cut off or damaged."""
 
-    A photograph's are those of the picture turned upright. They are not of a raw, whose lens is not
-    known, and not of an image that enters in the midst of a chain, which may have gone through a
-    lens already.
+    def __init__(self, name: Path | str) -> None:
+        super().__init__(
+            f"{name}: was changed since clpipe wrote it (its {SEAL} does not fit), so it is not "
+            "used; the same clpipe run makes it again, and takes other settings as options or in a "
+            "configuration"
+        )
 
-    Raises:
-        RequestError: what is said of the render contradicts a lens of the chain.
+
+def sealed(record: Mapping[str, Any]) -> bytes:
+    r"""A sidecar's bytes: its values, and the digest of what is before that.
+
+    ``head -n -2 NAME.json | sha256sum`` computes it.
+
+    >>> sealed({"a": 1})[:28]
+    b'{\n  "a": 1,\n  "sidecar_sha25'
     """
-    if isinstance(source, RawImage) or chain.steps[0].name != chain.names[0]:
-        return None
-    height, width = source.pixels.shape[:2]
-    *_, is_transposed = FLIPS[orientation_of(source.attributes)]
-    if is_transposed:
-        width, height = height, width
-    return chain.intrinsics(width, height, source.shot)
+    head = json_text(record).removesuffix("\n}\n").encode() + b",\n"
+    return head + _seal_of(head)
 
 
-def subframe_records(
-    source: SourceImage, stamps: Sequence[tuple[int, int]]
-) -> list[dict[str, Any]]:
-    """The files that an exposure is the mean of, relative to the folder of the first."""
-    return [
-        {"file": name, "size": size, "modified": modified, "sha256": digest}
-        for (name, digest), (size, modified) in zip(source.subframes, stamps, strict=True)
-    ]
-
-
-def sidecar(
-    job: Job,
-    request: Mapping[str, Any],
-    stamps: Sequence[tuple[int, int]],
-    recipe: Recipe,
-    device: Device | None,
-    source: SourceImage,
-    result: Result,
-    outputs: Mapping[Path, Stored],
-    clipped: float | None,
-    carried: Aovs | None = None,
-    patches: Sequence[Patch] = (),
-) -> dict[str, Any]:
-    """Everything that is needed to make the files of a rendition again, as JSON values.
+def values_in(data: bytes, name: Path | str) -> dict[str, Any] | None:
+    """Return the values of a sidecar that is as clpipe wrote it. Only the key :data:`OWN` is sure.
 
     Args:
-        job: the image.
-        request: the record of the request for the image.
-        stamps: the size and the time of change of each file of the input, before it was read.
-        recipe: of the picture.
-        device: where it was made; None is NumPy.
-        source: the image, as it was loaded.
-        result: what was made of it.
-        outputs: the files.
-        clipped: the share of clipped pixels, 0 to 1; None where the image has no upper end.
-        carried: layers that were written beside it.
-        patches: that were written in place of the picture.
+        data: the bytes of a file.
+        name: of the file, for the message.
+
+    Returns:
+        None if the file is empty, or is not a sidecar of clpipe's.
+
+    Raises:
+        SidecarError: it was edited, cut off or damaged.
     """
-    chain, rendition = recipe.whole, recipe.rendition
-    facts = source.facts if isinstance(source, RawImage) else None
-    noise = chain.noise if not facts or chain.is_noisy else None
-    width, height = chain.size(*source.pixels.shape[1::-1])
-    intrinsics = intrinsics_of(chain, source)
+    end = data.rfind(b'  "%b": "' % SEAL.encode())
+    if end > 0 and data[end:] == _seal_of(data[:end]):
+        try:
+            # pydantic's parser takes a third of the time of json's. It rejects the escapes by which
+            # json writes file names that are not UTF-8.
+            values = parse_json(data) if b"\\ud" in data else from_json(data)
+        except ValueError:
+            values = None
+        if isinstance(values, dict) and OWN in values:
+            return values
+    if is_sidecar(data):
+        raise SidecarError(name)
+    return None
+
+
+def is_sidecar(data: bytes) -> bool:
+    """Whether the bytes of a file are a sidecar, or what became of one."""
+    is_cut = BEGINNING.startswith(data.rstrip(b"\0") or b"-")
+    return is_cut or bool(_BEGINNING.match(data) or _END.search(data))
+
+
+def read_sidecar(path: Path) -> dict[str, Any]:
+    """Return the values of a sidecar, see :func:`values_in`.
+
+    Raises:
+        FileNotFoundError: it is missing, or is empty, as a loss of power may leave it.
+        SidecarError: it was edited, cut off or damaged.
+        ImageError: it cannot be read, or clpipe did not write it.
+    """
+    try:
+        data = read_bytes(path)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+    if not data.strip(b"\0"):
+        raise FileNotFoundError(path)
+    values = values_in(data, path)
+    if values is None:
+        raise ImageError(
+            f"{path}: clpipe did not write this file, and would overwrite it with its sidecar; "
+            "move it, choose another output folder, or say --redo all"
+        )
+    return values
+
+
+def sidecar_files(folder: Path) -> Iterator[Path]:
+    """Yield the files below a folder that may be sidecars, sorted, without hidden ones."""
+    for place, folders, names in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in sorted(names):
+            if name.endswith(f".{SIDECAR}") and not name.startswith("."):
+                yield Path(place, name)
+
+
+def values_at(path: Path) -> dict[str, Any] | None:
+    """Return the values of a file that may be a sidecar; None if it is not, or cannot be read.
+
+    Raises:
+        SidecarError: it was edited, cut off or damaged.
+    """
+    try:
+        return values_in(read_bytes(path), path)
+    except OSError:
+        return None
+
+
+def write_sidecar(path: Path, record: Mapping[str, Any]) -> None:
+    """Write the sidecar of a picture, whose files are all there.
+
+    Raises:
+        ImageError: it cannot be written.
+    """
+    write_whole(path, sealed(record))
+    keep_names(path.parent)
+
+
+def remove_sidecar(path: Path) -> None:
+    """Remove a sidecar where there is one: its pictures are about to be written.
+
+    Raises:
+        ImageError: it cannot be removed.
+    """
+    try:
+        path.unlink()
+        keep_names(path.parent, at_once=True)
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be removed: {error.strerror}") from None
+
+
+def outputs_in(values: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """The files that a sidecar's values list: the size and the SHA-256 of each, by its name.
+
+    What is no name beside the sidecar, or says no size and SHA-256, is left out.
+    """
+    listed = values.get("outputs")
     return {
-        OWN: __version__,
-        "input": job.input,
-        "input_size": stamps[0][0],
-        "input_modified": stamps[0][1],
-        "sha256": source.sha256,
-        **({"subframes": subframe_records(source, stamps)} if source.subframes else {}),
-        **({"panorama": source.panorama.record} if source.panorama else {}),
-        "layer": source.layer,
-        "part": source.part,
-        "name": job.stem,
-        "picture": rendition.suffix,
-        **asdict(rendition),
-        "image_key": recipe.key,
-        "noise_key": recipe.noise_key,
-        "seed": chain.seed,
-        "width": width,
-        "height": height,
-        "camera": chain.camera.name,
-        "iso": chain.iso,
-        **({"lens": lens.name} if (lens := chain.optics.calibration) else {}),
-        "output": chain.settings.output.model_dump()
-        | chain.settings.render.with_defaults(source.shot).model_dump(exclude=POSE),
-        "intrinsics": intrinsics.record() if intrinsics else None,
-        "pose": chain.settings.render.pose,
-        **motion_records(chain, source),
-        "photometry": photometry_of(chain, result.estimates),
-        "noise": noise.record() if noise else None,
-        "starts_on": chain.source.label,
-        **({"raw": asdict(facts)} if facts else {}),
-        "stages": [
-            each | {"estimates": result.estimates[each["name"]]}
-            if each["name"] in result.estimates
-            else each
-            for each in stage_records(chain)
-        ],
-        **(patch_records(chain, patches) if patches else {}),
-        "clipped": clipped if clipped is None else round(clipped, 4),
-        "outputs": [
-            {"name": path.name, "size": file.size, "sha256": file.sha256}
-            for path, file in outputs.items()
-        ],
-        **({"carried": [layer.record for layer in carried.layers]} if carried else {}),
-        **({"depth": [source.depth.record]} if source.depth else {}),
-        **({"overscan": source.margins._asdict()} if source.margins else {}),
-        "warnings": list(source.warnings),
-        "device": device_record(device),
-        "program": program_digest(),
-        "versions": all_versions(),
-        "request": request,
+        each["name"]: each
+        for each in (listed if isinstance(listed, list) else ())
+        if isinstance(each, dict) and {"name", "size", "sha256"} <= each.keys()
+        if isinstance(each["name"], str) and os.path.basename(each["name"]) == each["name"] != ""
+        if "\0" not in each["name"]
     }
 
 
-def patch_records(chain: Chain, patches: Sequence[Patch]) -> dict[str, Any]:
-    """What a sidecar says of patches, as JSON values: of the raw of all, and where each is."""
-    facts = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in facts_of(chain).items()}
-    places = [{"place": [patch.left, patch.top], "turn": patch.orientation} for patch in patches]
-    return {FACTS: facts, PATCHES: places}
+def inputs_in(
+    values: Mapping[str, Any], paths: Sequence[Path]
+) -> list[tuple[Path, Mapping[str, Any]]]:
+    """Return the files that a picture was made of: those of its image and of its layers.
 
+    Each comes with what the sidecar says of it: its size, time of change and SHA-256.
 
-def patch_text(values: Mapping[str, Any], number: int) -> bytes:
-    """What is said of one patch, by its number, in the sidecar's values: a sidecar of its own.
+    Args:
+        values: of the sidecar.
+        paths: the files of the image.
 
     Raises:
-        KeyError, TypeError, IndexError: the values are damaged.
+        KeyError, TypeError, ValueError: the values are damaged, or of more or fewer files.
     """
-    said = {key: values[key] for key in SAID}
-    return sealed({OWN: values[OWN], **said, **values[FACTS], **values[PATCHES][number]})
-
-
-@lru_cache(maxsize=8)
-def stage_records(chain: Chain) -> list[dict[str, Any]]:
-    """What a sidecar says of the steps of a chain, as JSON values; cached, as images share it."""
+    one = {"size": values["input_size"], "modified": values["input_modified"]}
+    layers = (*values.get("carried", ()), *values.get("depth", ()))
     return [
-        Constant(
-            name=step.name,
-            stage=step.stage.name,
-            method=step.method.method,
-            parameters=step.method.model_dump(),
-        )
-        for step in chain.steps
+        *zip(paths, values.get("subframes", [one | {"sha256": values["sha256"]}]), strict=True),
+        *((paths[0].parent / each["file"], each) for each in layers),
     ]
 
 
-def device_record(device: Device | None) -> dict[str, Any]:
-    """What a sidecar says of a device, as JSON values; None is NumPy."""
-    return {
-        "name": device.info.name if device else "numpy",
-        "platform": device.info.platform if device else "numpy",
-        "version": device.info.version if device else all_versions()["numpy"],
-        "driver": device.info.driver if device else "",
-        "lanes": device.info.lanes if device else 0,
-        "target": device.info.target.name if device else "",
+class Constant(dict[str, Any]):
+    """A part of many records, which never changes: its JSON is made once.
+
+    >>> Constant(a=1).text
+    '{"a": 1}'
+    """
+
+    @cached_property
+    def text(self) -> str:
+        """Its JSON."""
+        return json.dumps(self)
+
+
+def _text_of(value: Any) -> str:
+    return value.text if isinstance(value, Constant) else json.dumps(value)
+
+
+def json_text(record: Mapping[str, Any]) -> str:
+    """JSON with a line for each key, and for each object of a list.
+
+    >>> print(json_text({"a": 1, "b": [{"c": 2}, {"d": [3, 4]}]}), end="")
+    {
+      "a": 1,
+      "b": [
+        {"c": 2},
+        {"d": [3, 4]}
+      ]
     }
+    """
+    lines = []
+    for key, value in record.items():
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            each = ",\n".join(f"    {_text_of(one)}" for one in value)
+            text = f"[\n{each}\n  ]"
+        else:
+            text = _text_of(value)
+        lines.append(f"  {json.dumps(key)}: {text}")
+    return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
-@cache
-def all_versions() -> dict[str, str]:
-    """The versions of all that a picture's bytes may depend on, by name."""
-    return Constant(
-        clpipe=full_version(),
-        python=platform.python_version(),
-        numpy=version("numpy"),
-        pyopencl=version("pyopencl"),
-        **versions(),
-    )
+def _seal_of(head: bytes) -> bytes:
+    """The last two lines of a sidecar, by those before."""
+    return f'  "{SEAL}": "{hashlib.sha256(head).hexdigest()}"\n}}\n'.encode()

@@ -8,7 +8,7 @@ from typing import Any
 
 from clpipe.base.about import __version__
 from clpipe.outputs.photographs import Photograph, lens_record
-from clpipe.outputs.sealed import json_text
+from clpipe.outputs.sidecar import json_text
 from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE
 from clpipe.reference.pose import to_opengl, to_quaternion
 

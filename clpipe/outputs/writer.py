@@ -1,13 +1,17 @@
-"""Writes the pictures of a run, as :mod:`clpipe.outputs.planned` has them."""
+"""Writes the pictures of a run, as :mod:`clpipe.outputs.plan` has them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from pathlib import Path
+
+import numpy as np
 
 from clpipe.base.errors import ImageError, OutputError
 from clpipe.base.files import Stored, keep_names
+from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, Step
-from clpipe.chain.formats import DNG, FORMATS, NPY, ending_of
+from clpipe.chain.formats import DNG, FORMATS, NPY, Format, ending_of
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.dng import write_dng
@@ -20,33 +24,26 @@ from clpipe.inputs.kept import attributes_of
 from clpipe.outputs.carried import write_carried
 from clpipe.outputs.folder import RESUMABLE, write_problem
 from clpipe.outputs.negative import negative_of
-from clpipe.outputs.parts import parts_of, samples, typed
-from clpipe.outputs.patches import Patch
-from clpipe.outputs.planned import PlannedOutputs
+from clpipe.outputs.patches import Patch, variance_at
+from clpipe.outputs.plan import OutputPlan, results_of
 from clpipe.outputs.recipes import Recipe
-from clpipe.outputs.results import results_of
-from clpipe.outputs.sealed import SIDECAR, remove_sidecar
 from clpipe.outputs.shot import kept_tags, shown_tags, tags_of
-from clpipe.reference.geometry import NO_MARGINS
+from clpipe.outputs.sidecar import SIDECAR, remove_sidecar
+from clpipe.reference.curve import to_16_bit
+from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.stage import Kind
 
 
 @dataclass(frozen=True)
-class OutputWriter(PlannedOutputs):
+class OutputWriter(OutputPlan):
     """Writes the pictures of a request to a folder."""
 
     def runner(self, recipe: Recipe, device: Device | None) -> Runner:
         """A runner that makes all of a rendition that is written, and nothing else."""
         formats, keep = self.formats_of(recipe.rendition), self.keep_of(recipe.rendition)
-        results = results_of(recipe.chain, formats, keep)
-        if self.request.baselines:
-            results = results._replace(final=True)  # to measure its noise
-        return Runner(recipe.chain, device, *results)
-
-    def _kept_steps(self, recipe: Recipe) -> list[str]:
-        """The steps of a rendition's chain whose image is written, too."""
-        keep = self.keep_of(recipe.rendition)
-        return [step.name for step in recipe.chain.steps if step.name in keep]
+        steps, encode, final = results_of(recipe.chain, formats, keep)
+        final |= bool(self.request.baselines)  # to measure its noise
+        return Runner(recipe.chain, device, steps, encode, final)
 
     def check_size(self, source: SourceImage, chain: Chain) -> None:
         """See that what a chain makes of an image fits into the formats.
@@ -105,17 +102,18 @@ class OutputWriter(PlannedOutputs):
             OutputError: the output folder has gone.
         """
         self._make_folder_of(job)
-        # A new picture beside an old sidecar would look like one that somebody has changed.
+        # A new picture next to an old sidecar would look like one that somebody has changed.
         remove_sidecar(self.path(job, SIDECAR, recipe.rendition))
         outputs: dict[Path, Stored] = {}
-        for number, part in parts_of(recipe, result, patches):
+        for number, patch in numbered(patches):
+            part = part_of(result, recipe, number, patch)
             outputs |= self._write(job, recipe, source, part, number)
-        if carried:
-            own: list[tuple[int | None, Aovs]]
-            own = [(n, carried.changed(patch.cut_out)) for n, patch in enumerate(patches)]
-            for number, layers in own or [(None, carried)]:
-                for layer, path in self._carried_files(job, recipe.rendition, number).items():
-                    outputs[path] = write_carried(path, layers, layer)
+        for number, patch in numbered(patches) if carried else ():
+            assert carried
+            layers = carried.changed(patch.cut_out) if patch else carried
+            for layer, ending in self.carried_endings(recipe.rendition).items():
+                path = self.path(job, ending, patch=number)
+                outputs[path] = write_carried(path, layers, layer)
         return outputs
 
     def _write(
@@ -130,55 +128,47 @@ class OutputWriter(PlannedOutputs):
             source.attributes, Tags(camera.make, camera.model, chain.iso)
         )
         tags = tags_of(chain, source, tags, result.estimates)
-        if patch is not None:  # which has not the width of the sensor
+        if patch is not None:  # which does not have the width of the sensor
             tags = replace(tags, sensor_width=None)
         orientation = self.picture_orientation(source, chain) if patch is None else 1
+
+        def write_floats(
+            path: Path, image: Floats, step: Step, turn: int, half: bool, margins: Margins
+        ) -> Stored:
+            image, kind = upright(image, turn), step.stage.writes
+            if path.suffix == f".{NPY}":
+                return write_npy(path, typed(image, kind, _white(step)))
+            attributes = attributes_of(step, chain, recipe.key, rendition.frame)
+            attributes |= kept_tags(chain, step, source, tags)
+            attributes |= {"orientation": "1"} if turn != 1 else {}
+            return write_exr(path, image, kind.channels, attributes, half, margins)
+
         outputs: dict[Path, Stored] = {}
-        whose = recipe.key, rendition.frame
-        for step in (chain.step_named(name) for name in self._kept_steps(recipe)):
+        keep = self.keep_of(rendition)
+        for step in (step for step in chain.steps if step.name in keep):
             path = self.path(job, f"{step.name}.{self.kept_format}", rendition, patch)
-            if self.kept_format == NPY:
-                outputs[path] = write_npy(
-                    path, typed(result.kept[step.name], step.stage.writes, _white(step))
-                )
-                continue
-            carried_tags = kept_tags(chain, step, source, tags)
-            attributes = attributes_of(step, chain, *whose) | carried_tags
-            channels = step.stage.writes.channels
-            beyond = NO_MARGINS if step.method.geometry() else step.method.margins
-            outputs[path] = write_exr(
-                path, result.kept[step.name], channels, attributes, margins=beyond
-            )
+            margins = NO_MARGINS if step.method.geometry() else step.method.margins
+            outputs[path] = write_floats(path, result.kept[step.name], step, 1, False, margins)
         for format_ in self.formats_of(rendition):
-            path = self.path(job, ending_of(format_), rendition, patch)
-            if recipe.noise and format_ != NPY:
-                assert result.final is not None
-                attributes = variance_attributes(recipe)
-                outputs[path] = write_exr(path, result.final, ("Y",), attributes)
-            elif format_ == NPY:
-                assert result.final is not None
-                image = upright(result.final, orientation)
-                outputs[path] = write_npy(path, typed(image, chain.result, _white(chain.steps[-1])))
-            elif format_ == DNG:
-                negative = negative_of(chain)
+            ending, final = ending_of(format_), result.final
+            path = self.path(job, ending, rendition, patch)
+            if format_ == DNG:
+                negative, tags_of_raw = negative_of(chain), tags
                 raw = result.kept[negative.step] if negative.step else source.pixels
                 if negative.step:
                     tags_of_raw = shown_tags(chain.through([negative.step]), source, tags)
-                else:
-                    tags_of_raw = tags
                 outputs[path] = write_dng(path, raw, negative, tags_of_raw, source_orientation)
-            elif FORMATS[format_].ending == "exr":
-                assert result.final is not None
-                carried_tags = kept_tags(chain, chain.steps[-1], source, tags)
-                attributes = attributes_of(chain.steps[-1], chain, *whose) | carried_tags
-                if orientation != 1:
-                    attributes |= {"orientation": "1"}
-                half = FORMATS[format_].bits == 16
-                image = upright(result.final, orientation)
-                outputs[path] = write_exr(path, image, chain.result.channels, attributes, half)
-            else:
+            elif ending not in (NPY, "exr"):
                 pixels = upright(samples(result, FORMATS[format_]), orientation)
                 outputs[path] = write_display(path, pixels, shown_tags(chain, source, tags))
+            elif recipe.noise and format_ != NPY:
+                assert final is not None
+                outputs[path] = write_exr(path, final, ("Y",), variance_attributes(recipe))
+            else:
+                assert final is not None
+                half = FORMATS[format_].bits == 16
+                last = chain.steps[-1], orientation, half, NO_MARGINS
+                outputs[path] = write_floats(path, final, *last)
         return outputs
 
     def _make_folder_of(self, job: Job) -> None:
@@ -211,3 +201,54 @@ def variance_attributes(recipe: Recipe) -> dict[str, str]:
     """The attributes of a variance map; by their kind it can enter no chain."""
     own = attributes_of(recipe.noise[-1], recipe.whole, recipe.key, recipe.rendition.frame)
     return {**own, "stage": "variance", "kind": "variance"}
+
+
+def numbered(patches: Sequence[Patch]) -> list[tuple[int, Patch]] | list[tuple[None, None]]:
+    """Return the patches that are written with their numbers; all of a picture is one without."""
+    return [*enumerate(patches)] or [(None, None)]
+
+
+def part_of(result: Result, recipe: Recipe, number: int | None, patch: Patch | None) -> Result:
+    """Return what is written of a result: all of it, or a patch, turned, by its number.
+
+    The last image of a variance map becomes the variance.
+    """
+    if number is not None:
+        result = mapped(result, itemgetter(number))
+    if recipe.noise:
+        assert result.final is not None
+        result = replace(result, final=variance_at(recipe.noise, result.final, patch))
+    return mapped(result, patch.turned) if patch else result
+
+
+def mapped(result: Result, change: Callable[[Array], Array]) -> Result:
+    """Return a result whose images are changed."""
+    return Result(
+        None if result.final is None else change(result.final),
+        None if result.encoded is None else change(result.encoded),
+        {name: change(image) for name, image in result.kept.items()},
+        result.estimates,
+    )
+
+
+def samples(result: Result, format_: Format) -> Array:
+    """Return the last image in the type of a format for display: uint8, uint16 or float32."""
+    if format_.bits == 8:
+        assert result.encoded is not None
+        return result.encoded
+    assert result.final is not None
+    return result.final if format_.floats else to_16_bit(result.final)
+
+
+def typed(image: Floats, kind: Kind, white_level: float | None = None) -> Array:
+    """Return an image in the type of ``.npy``: uint16 DN, float16 display values, else float32.
+
+    DN with a white level of more than 16 bits are uint32.
+
+    >>> typed(np.array([[511.0, 7e4]]), Kind.RAW)
+    array([[  511, 65535]], dtype=uint16)
+    """
+    if kind is Kind.RAW:
+        dtype = np.uint16 if white_level is None or white_level <= 65535 else np.uint32
+        return np.clip(np.rint(image), 0, np.iinfo(dtype).max).astype(dtype)
+    return image.astype(np.float16 if kind is Kind.DISPLAY else np.float32, copy=False)

@@ -4,7 +4,7 @@ Places are counted in pixels from the image's upper left corner, so that the cen
 pixel is at (0.5, 0.5), as COLMAP counts; OpenCV's first centre is (0, 0).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -215,8 +215,11 @@ class Crop:
         return x + self.left, y + self.top
 
     def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
-        """See :meth:`Geometry.intrinsics`; those of patches are not told."""
-        return None
+        """See :meth:`Geometry.intrinsics`."""
+        if before is None:
+            return None
+        cx, cy = before.cx - self.left, before.cy - self.top
+        return replace(before, width=self.width, height=self.height, cx=cx, cy=cy)
 
 
 RESIDUAL = 1e-6  # px, in the image that a geometry gets

@@ -10,12 +10,12 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.base.errors import RequestError
-from clpipe.base.reading import TEXT_BYTES, parse_json, read_bytes
+from clpipe.base.reading import TEXT_BYTES, read_bytes
 from clpipe.batch.run_log import read_log
 from clpipe.batch.tars import DAMAGED
 from clpipe.chain.keys import KEYS as SINGLE
 from clpipe.chain.rendition import Rendition
-from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, values_in
+from clpipe.outputs.sidecar import SIDECAR, SidecarError, outputs_in, values_in
 
 TAR = ".tar"
 # What is kept of sidecars, of which there may be hundreds of thousands.
@@ -24,7 +24,6 @@ KEYS = (
     "warnings",
 )
 ALIKE = ("device", "versions")  # which most of them share
-STAGES, STAGES_END = b'\n  "stages": [\n', b"\n  ],\n"  # as json_text writes them
 LOGS = "run*.jsonl"
 
 
@@ -118,42 +117,16 @@ class Run:
     def __post_init__(self) -> None:
         self._by_image: dict[str, dict[Rendition, Made]] = {}
         self._alike: dict[str, Any] = {}
-        self._steps: dict[bytes, Any] = {}
-
-    def parsed(self, sidecar: bytes) -> Any:
-        """The values of a sidecar, as clpipe lays it out.
-
-        Most lines of stages are those of other sidecars, too: a line is parsed once, and is one
-        object.
-
-        Raises:
-            ValueError: it is no JSON of an object.
-        """
-        head, _, rest = sidecar.partition(STAGES)
-        lines, end, tail = rest.partition(STAGES_END)
-        if not end:
-            return parse_json(sidecar)
-        values = parse_json(head + b"\n" + tail)
-        if not isinstance(values, dict):
-            raise ValueError("it is no object")
-        values["stages"] = [self._step(line) for line in lines.split(b",\n")]
-        return values
-
-    def _step(self, line: bytes) -> Any:
-        if line not in self._steps:
-            self._steps[line] = parse_json(line)
-        return self._steps[line]
 
     def slim(self, record: Mapping[str, Any]) -> dict[str, Any]:
-        """What is kept of a sidecar; machines that are alike become one object."""
+        """Return what is kept of a sidecar. Machines and steps that are alike become one object."""
         steps = record.get("stages")
         steps = steps if isinstance(steps, list) else []
+        asked, one = asked_in(record.get("request")), self._alike.setdefault
         kept = {key: record.get(key) for key in KEYS}
-        for key in ALIKE:
-            kept[key] = self._alike.setdefault(repr(record.get(key)), record.get(key))
-        asked = asked_in(record.get("request"))
-        kept["asked"] = self._alike.setdefault(repr(sorted(asked)), asked)
-        kept["stages"] = [step for step in steps if isinstance(step, dict)]
+        kept |= {key: one(repr(record.get(key)), record.get(key)) for key in ALIKE}
+        kept["asked"] = one(repr(sorted(asked)), asked)
+        kept["stages"] = [one(repr(step), step) for step in steps if isinstance(step, dict)]
         return kept
 
     def add(self, made: Made) -> None:
@@ -277,7 +250,7 @@ def _made(
         beside: the files of its folder by their names.
     """
     try:
-        record = values_in(data, _joined(below, name), run.parsed)
+        record = values_in(data, _joined(below, name))
     except SidecarError as error:
         run.problems.append(str(error))
         return

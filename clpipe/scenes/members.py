@@ -4,16 +4,16 @@ import logging
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from clpipe.chain.rendition import NOISY, Rendition
-from clpipe.outputs.carried import png_ending
-from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, read_sidecar
+from clpipe.outputs.carried import carried_files
+from clpipe.outputs.sidecar import SidecarError, outputs_in, sidecar_files, values_at
 
-PICTURE, CARRIED = "picture", "carried"
+PICTURE = "picture"
 SERIES = re.compile(r"(?:[^/]+/)?iso[0-9.e+]+(?=/)|")  # the folder of a camera and an ISO
 SPLITS = {3: "val", 7: "test"}  # of eight views
 
@@ -87,12 +87,12 @@ def members_of(folder: Path, renders: str) -> list[Member]:
         renders: the name of its folder that has no pictures.
     """
     found: dict[str, dict[str, tuple[Path, Mapping[str, Any]]]] = defaultdict(dict)
-    for path in _sidecars(folder, renders):
-        try:
-            values = read_sidecar(path)
-            found[str(values["name"])][str(values["picture"])] = path, values
-        except FileNotFoundError:
+    for path in sidecar_files(folder):
+        if path.parts[len(folder.parts)] == renders:
             continue
+        try:
+            if values := values_at(path):
+                found[str(values["name"])][str(values["picture"])] = path, values
         except (SidecarError, *DAMAGED):
             log.warning("%s; the card goes without it", SidecarError(path))
     members = []
@@ -104,22 +104,6 @@ def members_of(folder: Path, renders: str) -> list[Member]:
             path = next(path for path, _ in renditions.values())
             log.warning("%s; the card goes without it", SidecarError(path))
     return sorted(members, key=lambda each: (each.view, each.folder))
-
-
-def _sidecars(folder: Path, renders: str) -> Iterator[Path]:
-    for place, folders, names in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        if Path(place) == folder and renders in folders:
-            folders.remove(renders)
-        yield from (
-            Path(place, name)
-            for name in sorted(names)
-            if name.endswith(f".{SIDECAR}") and not name.startswith(".") and _is_of_picture(name)
-        )
-
-
-def _is_of_picture(name: str) -> bool:
-    return name not in ("dataset.json", "cameras.json", "transforms.json", "run.json")
 
 
 def _member(
@@ -136,20 +120,14 @@ def _member(
     files: dict[str, str] = {}
     noisy: Mapping[str, Any] | None = None
     for suffix, (path, values) in sorted(renditions.items()):
-        first, *others = outputs_in(values)
+        first, *_ = outputs_in(values)
         place = path.parent.relative_to(folder)
         if not (path.parent / first).exists():
             continue
         if Rendition.from_record(values).role == NOISY and noisy is None:
             noisy = values
         files[suffix.removeprefix(".") or PICTURE] = (place / first).as_posix()
-        stem = Path(name).name
-        for each in others:
-            if each == f"{stem}.{CARRIED}.exr":
-                files[CARRIED] = (place / each).as_posix()
-        for layer in values.get("carried", ()):
-            if (png := f"{stem}.{png_ending(layer['layer'])}") in others:
-                files[str(layer["layer"])] = (place / png).as_posix()
+        files |= {k: (place / file).as_posix() for k, file in carried_files(values).items()}
     if noisy is None:
         return None
     own = SERIES.match(name)

@@ -95,7 +95,7 @@ def ways(suffix: str) -> tuple[Callable[[Path], object], ...]:
     from clpipe.inputs.loader import ImageLoader
     from clpipe.inputs.manifest import check_rows, read_manifest
     from clpipe.inputs.poses import with_views
-    from clpipe.outputs.sealed import read_sidecar
+    from clpipe.outputs.sidecar import read_sidecar
 
     def entering(**options: object) -> Callable[[Path], object]:
         loader = ImageLoader(Request.from_options(max_pixels=MAX_PIXELS, **options))

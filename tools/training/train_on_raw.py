@@ -30,7 +30,6 @@ from torch import Tensor
 import clpipe
 from clpipe.dataset.arrays import packed
 from clpipe.images.read import ReadOptions, read_source
-from clpipe.outputs.patches import pattern_of
 from clpipe.stage import Kind
 from clpipe.torch import RawNoise
 from tools.training.figures import NOISY, scores, table
@@ -53,7 +52,7 @@ def clean_raws(paths: Sequence[Path], camera: str) -> list[Tensor]:
     pipeline = clpipe.Pipeline(
         camera=camera, iso=1600, until="normalize", skip=["noise"], quantize={"bits": 16}
     )
-    pattern = pattern_of(pipeline.chain)
+    pattern = pipeline.chain.filters.pattern
     found = []
     for path in paths:
         pixels = read_source(path, Kind.RGB, ReadOptions()).pixels.astype(np.float32)

@@ -1,6 +1,6 @@
-"""Where the noise of a picture is looked at: flat places, all of it, and that after averaging 2x2.
+"""Where the noise of a picture is measured: in flat areas, everywhere, or after averaging 2x2.
 
-The constants are choices; tests/test_statistics.py shows what they select.
+The constants are choices. tests/test_statistics.py shows what they select.
 """
 
 import numpy as np

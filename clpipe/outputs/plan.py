@@ -1,7 +1,7 @@
-"""Which files a run makes of an image: renditions, formats and names; what cannot be is refused."""
+"""Which files a run makes of an image: their renditions, formats and names."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,35 +22,53 @@ from clpipe.chain.request import ResolvedRequest
 from clpipe.inputs.companions import CARRIED
 from clpipe.inputs.find import Job
 from clpipe.outputs.carried import png_ending
-from clpipe.outputs.existing import Existing
 from clpipe.outputs.negative import dng_of
 from clpipe.outputs.patches import Patches, patch_name, variance_steps
-from clpipe.outputs.recipes import RenditionPlan
-from clpipe.outputs.sealed import SIDECAR
+from clpipe.outputs.recipes import measured_on, recipes, renditions
+from clpipe.outputs.sidecar import SIDECAR
 from clpipe.stage import Kind
 
 
-class Endings(NamedTuple):
-    """What is behind a job's stem in the names of a rendition's files.
+class RenditionFiles(NamedTuple):
+    """The files of a rendition.
 
     Args:
-        sidecar: in that of the sidecar.
-        pictures: in those that every such rendition has.
-        others: in those of further files that may be written.
+        sidecar: its sidecar.
+        pictures: the files that every such rendition has.
+        others: files that it may have. An image of a step before ``start_at`` is never written.
     """
 
-    sidecar: str
-    pictures: tuple[str, ...]
-    others: tuple[str, ...]
+    sidecar: Path
+    pictures: Sequence[Path]
+    others: Sequence[Path] = ()
 
-    @property
-    def every(self) -> tuple[str, ...]:
-        """All of them."""
-        return (self.sidecar, *self.pictures, *self.others)
+
+def results_of(
+    chain: Chain, formats: Sequence[str], keep: Sequence[str]
+) -> tuple[tuple[str, ...], bool, bool]:
+    """Return the results that files need of a chain, so that nothing else is computed.
+
+    Args:
+        chain: the chain.
+        formats: of the last image, and of the raw.
+        keep: names of steps; those that the chain does not have are ignored.
+
+    Returns:
+        The steps whose images are needed, and whether the last image is needed in 8 bits and in
+        floats.
+
+    Raises:
+        RequestError: a DNG is needed, and the chain has no raw for one.
+    """
+    last = [FORMATS[name].bits for name in formats if name != DNG]
+    steps = [step.name for step in chain.steps if step.name in keep]
+    if DNG in formats and (raw := dng_of(chain).step):
+        steps.append(raw)
+    return tuple(dict.fromkeys(steps)), 8 in last, any(bits > 8 for bits in last)
 
 
 def ending_behind(ending: str, rendition: Rendition, patch: int | None = None) -> str:
-    """All that is behind a job's stem in the name of a file.
+    """Return all that follows a job's stem in the name of a file.
 
     >>> ending_behind("jpg", Rendition("clean"), 3)
     '_0003.truth_clean.jpg'
@@ -59,7 +77,7 @@ def ending_behind(ending: str, rendition: Rendition, patch: int | None = None) -
 
 
 @dataclass(frozen=True)
-class PlannedOutputs:
+class OutputPlan:
     """The files that a request makes in a folder.
 
     Args:
@@ -75,16 +93,24 @@ class PlannedOutputs:
         """The formats of the last image, and of the raw."""
         return self.request.formats
 
-    def plan_of(self, job: Job) -> RenditionPlan:
-        """Which renditions are made of a job's image."""
-        frames = self.request.frames if job.frames is None else job.frames
-        asked = self.request.truths, self.request.bracket, self.request.baselines
-        return RenditionPlan(frames, *asked)
+    def _every(self, frames: int | None) -> tuple[Rendition, ...]:
+        """Return the renditions that are made of an image with that many frames."""
+        asked = self.request
+        frames = asked.frames if frames is None else frames
+        return renditions(frames, asked.truths, asked.bracket, asked.baselines)
 
     def renditions_of(self, job: Job) -> tuple[Rendition, ...]:
-        """The renditions that are made of a job's image."""
-        planned = self.plan_of(job).renditions()
-        return tuple(each for each in planned if job.renditions is None or each in job.renditions)
+        """Return the renditions that are made of a job's image."""
+        every = self._every(job.frames)
+        return every if job.renditions is None else tuple(e for e in every if e in job.renditions)
+
+    def needed(self, job: Job, missing: Iterable[Rendition]) -> tuple[Rendition, ...]:
+        """Return the renditions to make, in order: missing ones, and what they are measured on."""
+        needed = set(missing)
+        for each in tuple(needed):
+            if each.role in BASELINES:
+                needed |= {*measured_on(each)}
+        return tuple(each for each in self._every(job.frames) if each in needed)
 
     def formats_of(self, rendition: Rendition) -> tuple[str, ...]:
         """The formats of a rendition."""
@@ -128,15 +154,8 @@ class PlannedOutputs:
         is_first = rendition.is_first and rendition.ev in (None, *self.request.bracket[:1])
         return bool(self.request.carry) and is_first
 
-    def _carried_files(
-        self, job: Job, rendition: Rendition, patch: int | None = None
-    ) -> dict[str, Path]:
-        """The files of carried layers: that of all, "", and the PNGs of some by their names."""
-        endings = self._carried_endings(rendition).items()
-        return {name: self.path(job, ending, patch=patch) for name, ending in endings}
-
-    def _carried_endings(self, rendition: Rendition) -> dict[str, str]:
-        """The endings of :meth:`_carried_files`."""
+    def carried_endings(self, rendition: Rendition) -> dict[str, str]:
+        """Return the endings of the EXR of all carried layers, "", and of the PNGs by layer."""
         if not self.carries(rendition):
             return {}
         depths = [each.name for each in self.request.aov_specs() if each.png]
@@ -155,9 +174,9 @@ class PlannedOutputs:
                 "end it with normalize or a later stage, or use --format dng, npy or exr"
             )
         if DNG in self.formats:
-            dng_of(chain)  # refuses a chain without a raw
-        for plan in {self.plan_of(job) for job in jobs}:
-            plan.recipes(chain, "")  # refuses a chain that has no such truth
+            dng_of(chain)  # rejects a chain without a raw
+        for frames in {job.frames for job in jobs}:
+            recipes(self._every(frames), chain, "")  # rejects a chain that has no such truth
         if self.patches:
             self._check_patches(chain)
         endings: dict[str, str] = {}
@@ -188,7 +207,7 @@ class PlannedOutputs:
                 "--patch and --truth out"
             )
         if VARIANCE in self.request.truths:
-            variance_steps(chain)  # refuses steps that mix the noise of neighbours
+            variance_steps(chain)  # rejects steps that mix the noise of neighbours
 
     def _check_paths(self, jobs: Sequence[Job]) -> None:
         """See that no file that may be written is an input or the file of another job.
@@ -202,7 +221,9 @@ class PlannedOutputs:
         makers: dict[str, Job] = {}
         for job in jobs:
             for rendition in self.renditions_of(job):
-                for path in (self.name(job, ending) for ending in self._endings(rendition).every):
+                sidecar, pictures, others = self._endings(rendition)
+                for ending in (sidecar, *pictures, *others):
+                    path = self.name(job, ending)
                     if inside and os.path.realpath(path) in inside:
                         raise RequestError(
                             f"{path} is an input and would be overwritten; "
@@ -225,34 +246,30 @@ class PlannedOutputs:
         """The name of a job's file; ``ending`` is all that is behind the job's stem."""
         return f"{self.folder}/{job.stem}{ending}"
 
-    def existing(self, job: Job, rendition: Rendition) -> Existing:
-        """The files of a rendition. A kept image of a step before ``start_at`` is
-        never written, so kept images need not be there. Of a grid of patches, whose number follows
-        from the image, the first is named.
-        """
-        endings = self._endings(rendition)
-        pictures, others = (
-            [Path(self.name(job, ending)) for ending in own]
-            for own in (endings.pictures, endings.others)
+    def files(self, job: Job, rendition: Rendition) -> RenditionFiles:
+        """Return the files of a rendition. Of a grid of patches, only the first patch is known."""
+        sidecar, pictures, others = self._endings(rendition)
+        return RenditionFiles(
+            Path(self.name(job, sidecar)),
+            [Path(self.name(job, ending)) for ending in pictures],
+            [Path(self.name(job, ending)) for ending in others],
         )
-        return Existing(Path(self.name(job, endings.sidecar)), pictures, others)
 
-    def _endings(self, rendition: Rendition) -> Endings:
-        """What is behind a job's stem in the names of a rendition's files."""
+    def _endings(self, rendition: Rendition) -> tuple[str, list[str], list[str]]:
+        """Return what follows a job's stem in the names of :meth:`files`."""
         if found := self._known_endings.get(rendition):
             return found
         numbers = range(self.patches.least) if self.patches else (None,)
         formats = [ending_of(format_) for format_ in self.formats_of(rendition)]
-        kept = [f"{step}.{self.kept_format}" for step in self.keep_of(rendition)]
+        carried = self.carried_endings(rendition).values()
         pictures = [ending_behind(each, rendition, n) for n in numbers for each in formats]
-        for n in numbers:
-            carried = self._carried_endings(rendition).values()
-            pictures += [ending_behind(each, FIRST, n) for each in carried]
+        pictures += [ending_behind(each, FIRST, n) for n in numbers for each in carried]
+        kept = [f"{step}.{self.kept_format}" for step in self.keep_of(rendition)]
         others = [ending_behind(each, rendition, n) for n in numbers for each in kept]
-        found = Endings(ending_behind(SIDECAR, rendition), tuple(pictures), tuple(others))
+        found = ending_behind(SIDECAR, rendition), pictures, others
         self._known_endings[rendition] = found
         return found
 
     @cached_property
-    def _known_endings(self) -> dict[Rendition, Endings]:
+    def _known_endings(self) -> dict[Rendition, tuple[str, list[str], list[str]]]:
         return {}

@@ -1,7 +1,7 @@
-"""How strong the noise of a baseline is: as strong as that of a picture that is made before it.
+"""The strength of a baseline's noise, which matches that of a noisy picture made before it.
 
-Variance is matched in each channel, as the finished pictures have it: what is cut off below black
-and above white counts as it does there.
+The variance of each channel is matched in the finished pictures, where values are clipped at black
+and at white.
 """
 
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from clpipe.base.types import Array, Doubles, Floats, Mask
 from clpipe.chain.rendition import IID, Rendition
 from clpipe.images.encoding import Encoding
 from clpipe.images.jpeg import JpegEncoding, through_jpeg
-from clpipe.outputs.places import FLAT, HALVED, covariance, halved, select_flat
+from clpipe.outputs.noise_areas import FLAT, HALVED, covariance, halved, select_flat
 from clpipe.reference.curve import to_8_bit
 from clpipe.stage import run_reference
 from clpipe.stages.picture_noise import CHANNELS, IidGaussian, IntensityDependent, NoNoise

@@ -1,0 +1,176 @@
+"""What a sidecar says of a picture: all that is needed to make it again."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from clpipe.base.about import __version__
+from clpipe.base.files import Stored
+from clpipe.chain.chain import Chain
+from clpipe.chain.photometry import photometry_of
+from clpipe.chain.render_camera import POSE
+from clpipe.engine.device import Device
+from clpipe.engine.runner import Result
+from clpipe.images.read import SourceImage
+from clpipe.images.tags import FLIPS, orientation_of
+from clpipe.inputs.carry import Aovs
+from clpipe.inputs.find import Job
+from clpipe.inputs.raw import RawImage
+from clpipe.outputs.motion import motion_records
+from clpipe.outputs.patches import Patch, facts_of
+from clpipe.outputs.program import all_versions, device_record, program_digest
+from clpipe.outputs.recipes import Recipe
+from clpipe.outputs.sidecar import OWN, Constant, sealed
+from clpipe.reference.intrinsics import Intrinsics
+
+FACTS, PATCHES = "facts", "patches"  # keys of a sidecar of patches
+
+SAID = ("image_key", "noise_key", "iso", "noise")  # keys of a sidecar that its patches have, too
+
+
+def intrinsics_of(chain: Chain, source: SourceImage) -> Intrinsics | None:
+    """The intrinsics of a render's or a photograph's picture; None where they are not known.
+
+    A photograph's are those of the picture turned upright. They are not of a raw, whose lens is not
+    known, and not of an image that enters in the midst of a chain, which may have gone through a
+    lens already.
+
+    Raises:
+        RequestError: what is said of the render contradicts a lens of the chain.
+    """
+    if isinstance(source, RawImage) or chain.steps[0].name != chain.names[0]:
+        return None
+    height, width = source.pixels.shape[:2]
+    *_, is_transposed = FLIPS[orientation_of(source.attributes)]
+    if is_transposed:
+        width, height = height, width
+    return chain.intrinsics(width, height, source.shot)
+
+
+def subframe_records(
+    source: SourceImage, stamps: Sequence[tuple[int, int]]
+) -> list[dict[str, Any]]:
+    """The files that an exposure is the mean of, relative to the folder of the first."""
+    return [
+        {"file": name, "size": size, "modified": modified, "sha256": digest}
+        for (name, digest), (size, modified) in zip(source.subframes, stamps, strict=True)
+    ]
+
+
+def picture_record(
+    job: Job,
+    request: Mapping[str, Any],
+    stamps: Sequence[tuple[int, int]],
+    recipe: Recipe,
+    device: Device | None,
+    source: SourceImage,
+    result: Result,
+    outputs: Mapping[Path, Stored],
+    clipped: float | None,
+    carried: Aovs | None = None,
+    patches: Sequence[Patch] = (),
+) -> dict[str, Any]:
+    """Return all that is needed to make the files of a rendition again, as JSON values.
+
+    Args:
+        job: the image.
+        request: the record of the request for the image.
+        stamps: the size and the time of change of each file of the input, before it was read.
+        recipe: of the picture.
+        device: where it was made; None is NumPy.
+        source: the image, as it was loaded.
+        result: what was made of it.
+        outputs: the files.
+        clipped: the share of clipped pixels, 0 to 1; None where the image has no upper end.
+        carried: layers that were written beside it.
+        patches: that were written in place of the picture.
+    """
+    chain, rendition = recipe.whole, recipe.rendition
+    facts = source.facts if isinstance(source, RawImage) else None
+    noise = chain.noise if not facts or chain.is_noisy else None
+    width, height = chain.size(*source.pixels.shape[1::-1])
+    intrinsics = intrinsics_of(chain, source)
+    return {
+        OWN: __version__,
+        "input": job.input,
+        "input_size": stamps[0][0],
+        "input_modified": stamps[0][1],
+        "sha256": source.sha256,
+        **({"subframes": subframe_records(source, stamps)} if source.subframes else {}),
+        **({"panorama": source.panorama.record} if source.panorama else {}),
+        "layer": source.layer,
+        "part": source.part,
+        "name": job.stem,
+        "picture": rendition.suffix,
+        **asdict(rendition),
+        "image_key": recipe.key,
+        "noise_key": recipe.noise_key,
+        "seed": chain.seed,
+        "width": width,
+        "height": height,
+        "camera": chain.camera.name,
+        "iso": chain.iso,
+        **({"lens": lens.name} if (lens := chain.optics.calibration) else {}),
+        "output": chain.settings.output.model_dump()
+        | chain.settings.render.with_defaults(source.shot).model_dump(exclude=POSE),
+        "intrinsics": intrinsics.record() if intrinsics else None,
+        "pose": chain.settings.render.pose,
+        **motion_records(chain, source),
+        "photometry": photometry_of(chain, result.estimates),
+        "noise": noise.record() if noise else None,
+        "starts_on": chain.source.label,
+        **({"raw": asdict(facts)} if facts else {}),
+        "stages": [
+            each | {"estimates": result.estimates[each["name"]]}
+            if each["name"] in result.estimates
+            else each
+            for each in stage_records(chain)
+        ],
+        **(patch_records(chain, patches) if patches else {}),
+        "clipped": clipped if clipped is None else round(clipped, 4),
+        "outputs": [
+            {"name": path.name, "size": file.size, "sha256": file.sha256}
+            for path, file in outputs.items()
+        ],
+        **({"carried": [layer.record for layer in carried.layers]} if carried else {}),
+        **({"depth": [source.depth.record]} if source.depth else {}),
+        **({"overscan": source.margins._asdict()} if source.margins else {}),
+        "warnings": list(source.warnings),
+        "device": device_record(device),
+        "program": program_digest(),
+        "versions": all_versions(),
+        "request": request,
+    }
+
+
+def patch_records(chain: Chain, patches: Sequence[Patch]) -> dict[str, Any]:
+    """What a sidecar says of patches, as JSON values: of the raw of all, and where each is."""
+    facts = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in facts_of(chain).items()}
+    places = [{"place": [patch.left, patch.top], "turn": patch.orientation} for patch in patches]
+    return {FACTS: facts, PATCHES: places}
+
+
+def patch_text(values: Mapping[str, Any], number: int) -> bytes:
+    """What is said of one patch, by its number, in the sidecar's values: a sidecar of its own.
+
+    Raises:
+        KeyError, TypeError, IndexError: the values are damaged.
+    """
+    said = {key: values[key] for key in SAID}
+    return sealed({OWN: values[OWN], **said, **values[FACTS], **values[PATCHES][number]})
+
+
+@lru_cache(maxsize=8)
+def stage_records(chain: Chain) -> list[dict[str, Any]]:
+    """What a sidecar says of the steps of a chain, as JSON values; cached, as images share it."""
+    return [
+        Constant(
+            name=step.name,
+            stage=step.stage.name,
+            method=step.method.method,
+            parameters=step.method.model_dump(),
+        )
+        for step in chain.steps
+    ]
