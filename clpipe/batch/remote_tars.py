@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.about import full_version
-from clpipe.base.buckets import fetched, listed, read_url, upload, url_of
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import discard, sha256_of, write_whole
+from clpipe.base.urls import fetched, listed, read_url, upload, url_of
 from clpipe.batch.outcome import FAILED
 from clpipe.batch.tars import NUMBERED, Tar
 from clpipe.chain.request import ResolvedRequest
@@ -45,7 +45,7 @@ class RemoteTars:
         self._redo = redo
         url = url_of(tars[0].folder)
         assert url
-        below = [each.removeprefix(f"{url}/") for each in listed(url, may_be_missing=True)]
+        below = [each.removeprefix(f"{url}/") for each in listed(url)]
         self._there = {name for name in below if "/" not in name}
         self._keys = {tar.name: self._key(tar) for tar in tars}  # of inputs as they are now
         for name in sorted(self._there):

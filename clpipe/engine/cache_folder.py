@@ -12,8 +12,8 @@ from pathlib import Path
 
 import platformdirs
 
+from clpipe.base.process_folder import ROOM, process_folder
 from clpipe.base.system import writable_by_others
-from clpipe.engine.process_folder import ROOM, process_folder
 
 VARIABLE = "CLPIPE_CACHE_DIR"  # names another folder
 log = logging.getLogger(__name__)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError
-from clpipe.engine.process_folder import process_folder
+from clpipe.base.process_folder import process_folder
 
 PACKAGE, LIBRARY = "intel-opencl-rt", "libintelocl.so"
 # With any of these a user says where platforms are; the first is what we set.
