@@ -9,7 +9,7 @@ import OpenEXR
 import pytest
 
 from clpipe.base.errors import ImageError
-from clpipe.images import read
+from clpipe.images import samples
 from clpipe.images.exr_header import read_header
 from clpipe.images.openexr import open_exr, read_channels
 from clpipe.images.pixels import BLOCK, HALF_MAX, clip_to_half, make_finite
@@ -60,9 +60,9 @@ def decoded(monkeypatch):
             used.append(pixels is not None)
             return pixels
 
-        monkeypatch.setattr(read, "read_channels", counted)
+        monkeypatch.setattr(samples, "read_channels", counted)
         first = outcome(path, **options)
-        monkeypatch.setattr(read, "read_channels", lambda *_: None)
+        monkeypatch.setattr(samples, "read_channels", lambda *_: None)
         assert first == outcome(path, **options)
         return any(used), first
 
@@ -199,7 +199,7 @@ def test_standard_output_is_that_of_the_other_threads(tmp_path, capsys):
 def test_the_digest_of_a_large_file_is_the_same(tmp_path, monkeypatch):
     path = save(tmp_path / "a.exr", {"RGB": light()})
     digest = read_image(path).sha256
-    monkeypatch.setattr(read, "LARGE_FILE", 0)
+    monkeypatch.setattr(samples, "LARGE_FILE", 0)
     assert read_image(path).sha256 == digest
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(ImageError, match="damaged"):

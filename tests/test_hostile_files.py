@@ -28,7 +28,8 @@ from clpipe.chain.registry import load_stage_file
 from clpipe.chain.settings import settings_from
 from clpipe.images.dump import parse_dump, read_dump
 from clpipe.images.raw import EXIF_BYTES, MOST_READS, read_exif, read_facts
-from clpipe.images.read import ReadOptions, holds_mosaic, read_source
+from clpipe.images.read import ReadOptions, read_source
+from clpipe.images.samples import holds_mosaic
 from clpipe.inputs.manifest import read_manifest
 from clpipe.stage import Kind
 from tests.conftest import ROOT

@@ -9,7 +9,8 @@ from PIL import Image, ImageCms
 from clpipe.base.errors import ImageError
 from clpipe.images.layers import picture_channels
 from clpipe.images.pixels import display_window
-from clpipe.images.read import holds_mosaic, read_finished, read_image
+from clpipe.images.read import read_finished, read_image
+from clpipe.images.samples import holds_mosaic
 from clpipe.images.tags import Tags, exif
 from clpipe.images.write import write_display, write_exr
 from tests.conftest import file_limit

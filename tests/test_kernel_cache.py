@@ -11,10 +11,10 @@ from types import SimpleNamespace
 import pyopencl as cl
 import pytest
 
-from clpipe.base import system
+from clpipe.base import process_folder, system
 from clpipe.base.errors import DeviceError
 from clpipe.base.memory import Left
-from clpipe.engine import builders, cache_folder, process_folder
+from clpipe.engine import builders, cache_folder
 from clpipe.engine.builders import BinaryBuilder, PoclBuilder
 from clpipe.engine.store import Store
 from tests.test_programs import DEVELOP, python
@@ -224,7 +224,7 @@ def test_folders_that_are_made_are_the_users_alone(tmp_path):
 
 
 FOLDER_OF_A_PROCESS = (
-    "from clpipe.engine.process_folder import process_folder; print(process_folder(), flush=True)"
+    "from clpipe.base.process_folder import process_folder; print(process_folder(), flush=True)"
 )
 needs_locks = pytest.mark.skipif(not system.fcntl, reason="needs file locks (Linux or macOS)")
 
@@ -268,7 +268,7 @@ def test_a_new_folder_that_another_process_removes_is_made_again(tmp_path, monke
 
 FORK = """
 import os, sys
-from clpipe.engine.process_folder import process_folder
+from clpipe.base.process_folder import process_folder
 parents = process_folder()
 reader, writer = os.pipe()
 child = os.fork()

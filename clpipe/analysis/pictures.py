@@ -10,7 +10,8 @@ from clpipe.base.types import Floats, Mask
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings
 from clpipe.images.raw import RAW_SUFFIXES
-from clpipe.images.read import holds_mosaic, photograph_facts, read_finished, read_image
+from clpipe.images.read import read_finished, read_image
+from clpipe.images.samples import holds_mosaic, photograph_facts
 from clpipe.inputs.kept import embedded_settings
 from clpipe.stage import Context, Kind
 

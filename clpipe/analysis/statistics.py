@@ -47,6 +47,12 @@ class Channel:
     whole_curve: NoiseCurve | None = None  # of every pixel
     size: int = 0  # samples, those that do not count, too
 
+    @property
+    def right(self) -> float:
+        """The correlation of noise with that of the next pixel to the right."""
+        middle = len(self.autocorrelation) // 2
+        return float(self.autocorrelation[middle, middle + 1])
+
 
 def tails(standard: Floats, mask: Mask) -> Tails:
     """The distribution of standardised noise over the pixels that count."""

@@ -30,7 +30,7 @@ from clpipe.analysis.spatial import LAGS
 from clpipe.base.text import one_line
 
 NEUTRAL = INK["mosaic"]
-PAGE_COLOURS = resources.files("clpipe.analysis") / "colours.css"  # of the pages
+PAGE_FILES = resources.files("clpipe.analysis") / "page"  # what reports and explorer share
 PAGE = "#010203"  # stands for the page's colour until the drawing is text
 COLOURS = ("#1f8a8a", "#d9822b", "#7a5bb5", "#c8102e")
 LONG = 18  # characters of a name beside a bar

@@ -6,14 +6,14 @@ from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
-from clpipe.base.buckets import stamp_of_url, url_of
 from clpipe.base.files import sha256_of
+from clpipe.base.urls import stamp_of_url, url_of
 
 
 def stamp_of(path: Path) -> tuple[int, int]:
     """The size of a file in bytes and its time of change in ns; zeros where it has no status.
 
-    Of one that stands for a URL, see :func:`clpipe.base.buckets.stamp_of_url`.
+    Of one that stands for a URL, see :func:`clpipe.base.urls.stamp_of_url`.
     """
     try:
         info = path.stat()

@@ -8,6 +8,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
 from clpipe.base.text import one_of, several
 from clpipe.base.types import plain
+from clpipe.base.urls import path_of
 from clpipe.base.validation import typed
 from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
@@ -18,7 +19,6 @@ from clpipe.chain.request import Moments, Request
 from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS
 from clpipe.inputs.find import parse_shard
 from clpipe.inputs.series import Series, check_isos
-from clpipe.inputs.spool import path_of
 from clpipe.outputs.existing import Redo
 from clpipe.outputs.patches import Patches
 

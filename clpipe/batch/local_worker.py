@@ -18,12 +18,12 @@ from typing import Any, NoReturn
 
 from clpipe.base.errors import ClpipeError
 from clpipe.base.files import discard, remove_temporary_files
+from clpipe.base.process_folder import process_folder
 from clpipe.base.system import stay_on
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.spec import RunSpec
 from clpipe.batch.threads import Batch, Jobs
 from clpipe.engine.device import Device, open_devices
-from clpipe.engine.process_folder import process_folder
 
 SOON = 0.005  # s for which outcomes are collected into one message
 

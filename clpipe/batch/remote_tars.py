@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.about import full_version
-from clpipe.base.buckets import fetched, listed, read_url, upload, url_of
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import discard, sha256_of, write_whole
+from clpipe.base.urls import fetched, listed, read_url, upload, url_of
 from clpipe.batch.outcome import FAILED, SKIPPED, Outcome
 from clpipe.batch.sinks import Executor
 from clpipe.batch.tar_sink import Packer, Tars
@@ -48,7 +48,7 @@ class RemoteTars(Tars):
         self._request = json.dumps(writer.request.record(), sort_keys=True, default=str)
         url = url_of(tars[0].folder)
         assert url
-        below = [each.removeprefix(f"{url}/") for each in listed(url, may_be_missing=True)]
+        below = [each.removeprefix(f"{url}/") for each in listed(url)]
         self._there = {name for name in below if "/" not in name}
         self._keys = {tar.name: self._key(tar) for tar in tars}  # of the present inputs
         for name in sorted(self._there):

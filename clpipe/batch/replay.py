@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.about import __version__
-from clpipe.base.buckets import fetch, is_url, url_of
 from clpipe.base.digests import digests
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.urls import fetch, path_of
 from clpipe.chain.registry import code_files
 from clpipe.chain.rendition import BASELINES, TRUTHS, Rendition
 from clpipe.chain.request import Request
 from clpipe.inputs.find import Job
 from clpipe.inputs.manifest import check_output_name
-from clpipe.inputs.spool import place_of_url
 from clpipe.outputs.sidecar import SidecarError, inputs_in, outputs_in, read_sidecar
 
 CODE = (".py", ".cl")  # the endings of files that are run
@@ -176,11 +175,7 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
         truths=(rendition.role,) if rendition.role in TRUTHS else (),
         baselines=(rendition.role,) if rendition.role in BASELINES else (),
     )
-    said = str(values["input"])
-    path = inputs[0] if inputs else Path(said)
-    if not inputs and is_url(said):
-        path = place_of_url(said)
-        fetch(path)
+    path = inputs[0] if inputs else fetch(path_of(str(values["input"])))
     others = tuple(path.parent / str(each["file"]) for each in values.get("subframes", ())[1:])
     job = Job(
         path,
@@ -189,7 +184,6 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
         values=request.image,
         renditions=(rendition,),
         subframes=others,
-        written=url_of(path) or "",
     )
     return Replay(request, job, surroundings_in(values), digests_in(values))
 

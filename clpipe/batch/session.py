@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from clpipe.base.about import full_version
-from clpipe.base.buckets import upload, url_of
 from clpipe.base.errors import OutputError, RequestError
 from clpipe.base.files import check_folder, discard
 from clpipe.base.processors import available_processors
+from clpipe.base.urls import upload, url_of
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.processes import Processes, usual_processes
 from clpipe.batch.remote_tars import RemoteTars

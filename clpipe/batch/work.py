@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, TypeVar
 
-from clpipe.base.buckets import fetched
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import DeviceError, ImageError, NoPictureError, OutputError, RequestError
 from clpipe.base.files import FileGroup, deferred_files
 from clpipe.base.types import Array
+from clpipe.base.urls import fetched
 from clpipe.batch.job_state import JobState
 from clpipe.batch.memory_budget import host_bytes
 from clpipe.batch.outcome import LEFT_OUT, SKIPPED, Span

@@ -73,37 +73,57 @@ def signal_and_noise(chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
 
 
 def variance_of(noise: Sequence[Step], signal: Floats) -> Floats:
-    """The variance of the noise in each pixel of a mosaic, (height, width), in signal squared.
+    """Return the variance of the noise in each pixel of a mosaic, in signal squared.
 
-    The noisy mosaic varies about the clean one by this much, over images and over cameras. Noise
-    that is fixed to a sensor (PRNU, DSNU, columns) is a part of it, because the clean mosaic is
-    that of an ideal sensor. Each stage gives its own share; the default chain has
+    The noisy mosaic varies about the clean one by this much, over images and over cameras. The
+    clean mosaic is that of an ideal sensor, so fixed patterns (PRNU, DSNU, columns) are noise too.
 
-        a*y + b + (prnu*y)^2 + dsnu^2 + row^2 + column^2 + 1/(12 range^2)
+    Derivation: a stage reads x + n, where x is the clean image and n has the mean 0 and the
+    variance v. It draws its own noise independently of n, so the variance that it writes is the
+    mean variance of its own noise plus the variance of its mean (law of total variance):
 
-    with y the clean signal that the noise falls on, neither rounded nor cut at black, but at most
-    white, that of the last of several readouts, where the ADC follows. ``a*y + b`` is that of Foi
-    et al. (IEEE TIP 2008, eq. 2), with Poisson noise and with heavy-tailed read noise, too.
-    ``range`` is the white level above black in DN; rounding has the variance 1/12 DN^2. Clipping
-    (at 0 DN, at white, in a full well) removes noise, which is not modelled; hot and dead pixels,
-    and the rounding of the clean mosaic, are left out.
+    ==========================================  ====================
+    what the stage does, k of variance 1        variance it writes
+    ==========================================  ====================
+    adds noise of the variance w(x) = a x + b   v + w(x)
+    multiplies by a gain g                      g^2 v
+    multiplies each pixel by 1 + s k            (1 + s^2) v + s^2 x^2
+    rounds to whole DN                          v + 1/12, in DN^2
+    ==========================================  ====================
+
+    The first row is exact for any n, because w is linear in x and the mean of n is 0. Each stage's
+    ``variance`` applies its row. This function starts with v = 0, applies the stages in order, and
+    runs each one without its noise to get the next x. With white at ``range`` DN above black, the
+    rows of the default chain give (Foi et al., IEEE TIP 2008, eq. 2, for the first two terms)
+
+        a y + b + (prnu y)^2 + dsnu^2 + row^2 + column^2 + 1/(12 range^2)
+
+    y is the clean signal that enters the first of them. It is not rounded or cut at black. The ADC
+    writes white for everything brighter, so y is at most white. This limit applies only if no stage
+    changes the scale before the ADC. Clipping at 0 DN, at white and in a full well would reduce the
+    variance, which is not modelled. Hot and dead pixels, and the rounding of the clean mosaic, do
+    not count.
 
     Args:
         noise: the steps from the first that adds noise to the last one of the mosaic.
         signal: the clean image that enters the first of them, (height, width[, channel]).
 
+    Returns:
+        float32, (height, width).
+
     Raises:
         RequestError: a step does not know its variance.
     """
-    analogue = list(takewhile(lambda step: step.stage.writes is not Kind.RAW, noise))
-    if len(analogue) < len(noise) and all(s.adds_noise or not s.passes for s in analogue):
-        signal = np.minimum(signal, np.float32(noise[len(analogue)].context.full_scale))
+    before_adc = list(takewhile(lambda step: step.stage.writes is not Kind.RAW, noise))
+    keeps_scale = all(step.adds_noise or not step.passes for step in before_adc)
+    if keeps_scale and len(before_adc) < len(noise):
+        signal = np.minimum(signal, np.float32(noise[len(before_adc)].context.full_scale))
     last = max(i for i, step in enumerate(noise) if step.adds_noise)
     variance: Floats = np.zeros((), np.float32)
     for i, step in enumerate(noise):
         with user_code_errors(f"stage {step.name}", step.stage.folder):
             after = step.method.variance(variance, signal, step.context)
-            # Behind the last noise no variance depends on the signal.
+            # After the last noise no variance depends on the signal.
             clean = step.method.without_noise() if i < last else None
             if clean and clean.passes():
                 signal = clean.reference(signal, ReferenceContext(step.context, {}, {}))

@@ -14,12 +14,11 @@ from typing import Any, TypeVar
 import click
 from click.core import ParameterSource
 
-from clpipe.base.buckets import is_url
 from clpipe.base.errors import MissingError, RequestError
 from clpipe.base.memory import parse_size
 from clpipe.base.reading import check_input
+from clpipe.base.urls import is_url, path_of
 from clpipe.images.dump import TYPES
-from clpipe.inputs.spool import place_of_url
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -216,7 +215,7 @@ class OutputPath(click.Path):
             raise RequestError("--output: it is empty; name what to write to")
         if is_url(value) and ctx:
             if ctx.info_name == "run":
-                return place_of_url(value)
+                return path_of(value)
             raise RequestError(f"--output: found {value}; only clpipe run writes behind URLs")
         return super().convert(value, param, ctx)
 

@@ -12,8 +12,8 @@ import click
 from rich.console import Console
 from rich.text import Text
 
-from clpipe.base.buckets import url_of
 from clpipe.base.text import duration, one_line
+from clpipe.base.urls import url_of
 from clpipe.batch.interrupt import interruptible
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
 from clpipe.batch.session import Run

@@ -9,10 +9,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from clpipe.base.buckets import fetch, is_glob, is_url, listed, place_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import several
+from clpipe.base.urls import fetched, is_glob, is_url, listed, path_of
 from clpipe.dataset.dataset import Dataset
 from clpipe.dataset.developer import Sample
 from clpipe.torch.iterable import IterableDataset, worker
@@ -103,14 +103,10 @@ def _unpack(tar: str, folder: Path) -> None:
     Raises:
         ImageError: it cannot be read.
     """
-    path = Path(tar)
     folder.mkdir()
-    if is_url(tar):
-        path = place_of(tar, folder.with_suffix(".url"))
-        fetch(path)
     into = folder / PurePosixPath(tar).name.removesuffix(".tar")
     try:
-        with tarfile.open(path) as file:
+        with fetched([path_of(tar)]) as (path,), tarfile.open(path) as file:
             for member in file:
                 inside = PurePosixPath(member.name)
                 if not member.isfile() or inside.is_absolute() or ".." in inside.parts:
@@ -123,5 +119,3 @@ def _unpack(tar: str, folder: Path) -> None:
                     shutil.copyfileobj(content, written)
     except (tarfile.TarError, OSError, EOFError) as error:
         raise ImageError(f"{tar}: cannot be read as a tar: {error}") from None
-    finally:
-        shutil.rmtree(folder.with_suffix(".url"), ignore_errors=True)

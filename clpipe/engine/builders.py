@@ -20,7 +20,7 @@ from typing import Any
 from clpipe.base.errors import DeviceError, ImageError
 from clpipe.base.files import passing_files, write_new
 from clpipe.base.memory import in_words, memory_left
-from clpipe.engine.process_folder import ROOM, has_room
+from clpipe.base.process_folder import ROOM, has_room
 from clpipe.engine.store import Store
 
 COMPILER = 112 << 20  # bytes of memory; measured: 86 to 105 MiB for the default chain

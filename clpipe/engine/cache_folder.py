@@ -1,6 +1,15 @@
-"""Folders in which compiled programs are kept between processes, by us and the libraries below.
+"""Where compiled programs are kept: by clpipe, by PoCL and by pyopencl.
 
-What is kept is run, so it is a folder that nobody but this user may write to.
+=========  =====================  ==================================================
+who        variable               folder
+=========  =====================  ==================================================
+clpipe     ``CLPIPE_CACHE_DIR``   the user's cache folder for clpipe, if not set
+PoCL       ``POCL_CACHE_DIR``     in the folder of this process, always
+pyopencl   ``XDG_CACHE_HOME``     the user's; that of this process if it is unusable
+=========  =====================  ==================================================
+
+:func:`prepare_environment` sets the last two variables. clpipe runs the programs that it keeps, so
+it uses its folder only if nobody but this user may write to it.
 """
 
 import logging
@@ -12,8 +21,8 @@ from pathlib import Path
 
 import platformdirs
 
+from clpipe.base.process_folder import ROOM, process_folder
 from clpipe.base.system import writable_by_others
-from clpipe.engine.process_folder import ROOM, process_folder
 
 VARIABLE = "CLPIPE_CACHE_DIR"  # names another folder
 log = logging.getLogger(__name__)
@@ -39,17 +48,20 @@ def user_folder(name: str | None = None) -> Path | None:
     return None
 
 
-@cache
-def lasting_folder() -> Path | None:
-    """The folder that ``CLPIPE_CACHE_DIR`` names, else the user's cache folder for clpipe."""
+# Read when this module is loaded, because prepare_environment changes XDG_CACHE_HOME later.
+OWN_FOLDER = user_folder("clpipe")
+
+
+def wanted_folder() -> Path | None:
+    """Return the folder that ``CLPIPE_CACHE_DIR`` names, or the user's cache folder for clpipe."""
     named = os.environ.get(VARIABLE)
-    return Path(named) if named else user_folder("clpipe")
+    return Path(named) if named else OWN_FOLDER
 
 
 @cache
 def cache_folder() -> Path | None:
-    """The lasting folder, where it can be used and is the user's alone; None where not."""
-    folder = lasting_folder()
+    """Return the folder for kernels, or None if it is unusable or others may write to it."""
+    folder = wanted_folder()
     return folder.resolve() if folder and is_usable(folder) and is_private(folder) else None
 
 
@@ -69,25 +81,24 @@ def is_private(folder: Path) -> bool:
 
 
 def later_runs() -> str:
-    """Where later runs find what is compiled now, in words."""
+    """Return in words where later runs find what is compiled now."""
     if folder := cache_folder():
         return f"later runs find them in {folder}"
-    return f"later runs do so again, because they cannot be kept in {lasting_folder() or 'a home'}"
+    return f"later runs do so again, because they cannot be kept in {wanted_folder() or 'a home'}"
 
 
 def pocl_folder() -> Path | None:
-    """The folder that PoCL compiles in; None where there is none."""
+    """Return the folder that PoCL compiles in, or None if there is none."""
     folder = process_folder()
     return folder / "pocl" if folder else None
 
 
 def prepare_environment() -> None:
-    """Have the libraries below keep their caches where they can; before OpenCL is first used.
+    """Tell PoCL and pyopencl where to keep their caches. Call this before pyopencl is loaded.
 
-    PoCL believes all that it finds, so it gets a folder of this process alone, whatever the
-    variable says. pyopencl fails to start where its cache folder cannot be used.
+    PoCL trusts every file that it finds, so it gets a folder that only this process uses, whatever
+    the variable says. pyopencl fails to start if its cache folder is unusable.
     """
-    lasting_folder()  # remembers the user's folder, before XDG_CACHE_HOME changes below
     if folder := pocl_folder():
         os.environ["POCL_CACHE_DIR"] = str(folder)
     if not is_usable(user_folder()) and (folder := process_folder()):

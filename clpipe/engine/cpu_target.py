@@ -1,17 +1,14 @@
-"""The CPU that the PoCL of pip compiles for: by its features, not by the name that LLVM gives.
+"""Chooses the CPU that the PoCL of pip compiles for, by the features of the processor.
 
-PoCL up to 4 asks LLVM for the name of the CPU and compiles for that. LLVM 14, of 2022, which is
-within pip's PoCL 3.0, calls an AMD Zen 5 "generic", for which nothing compiles (PoCL's issue 1049).
-It takes a Zen 4 for a Zen 3 without AVX-512, and recent Intel CPUs for an Atom without AVX; and it
-goes by family and model where a hypervisor masks features, so that the first launch ends in SIGILL.
-PoCL 5 and later choose one of seven targets by features. This module does the same for pip's.
+PoCL up to 4 compiles for the CPU name that LLVM reports. LLVM 14, in pip's PoCL 3.0, calls an AMD
+Zen 5 "generic", for which nothing compiles, takes others for CPUs without AVX-512 or AVX, and
+ignores features that a hypervisor masks, so that launches end in SIGILL (PoCL's issue 1049).
 
-There is no option for it, so it is set where PoCL keeps it: the device record (what a cl_device_id
-points to) has a pointer to the name, behind one to the target triple. Both texts are also in the
-device's version, so the place can be proven: it is used only where two adjacent pointers to just
-these texts are found, once. That is so in pip's PoCL 3.0. Everything else is left as it is. The
-record is read and written through /proc/self/mem, where a bad address is an error, not a crash.
-PoCL's cache of programs tells targets apart, since their macros differ.
+It acts only for a PoCL below 5 on x86-64 Linux whose name for the CPU has other features than the
+processor. It then replaces the pointer to that name in PoCL's device record, which no option can
+change. It does so only where two adjacent pointers to the target triple and to the name, both known
+from the device's version, are found exactly once. It uses /proc/self/mem, where a wrong address is
+an error, not a crash. To switch it off, set ``CLPIPE_CPU_TARGET=driver``.
 """
 
 import ctypes
@@ -29,6 +26,7 @@ from clpipe.base.errors import DeviceError
 from clpipe.base.text import one_of
 
 VARIABLE = "CLPIPE_CPU_TARGET"  # forces a target, for tests and support
+DRIVERS = "driver"  # its value that leaves the driver's choice
 
 _AVX2 = frozenset({"avx2", "fma", "f16c", "bmi1", "bmi2", "abm", "cx16", "popcnt"})
 _AVX512 = frozenset({"avx512f", "avx512bw", "avx512dq", "avx512cd", "avx512vl"})
@@ -182,14 +180,14 @@ def _usable() -> frozenset[str] | None:
 
 
 def forced_target() -> str | None:
-    """The target that :data:`VARIABLE` names; None where it is not set.
+    """Return the target that :data:`VARIABLE` names, or :data:`DRIVERS`; None if it is not set.
 
     Raises:
         DeviceError: there is no such target.
     """
     name = os.environ.get(VARIABLE) or None
-    if name and name not in TARGETS:
-        raise DeviceError(f"{VARIABLE}: {one_of('target', name, list(TARGETS))}")
+    if name and name not in (*TARGETS, DRIVERS):
+        raise DeviceError(f"{VARIABLE}: {one_of('target', name, (*TARGETS, DRIVERS))}")
     return name
 
 
@@ -223,6 +221,8 @@ def candidates(platform: Any, device: Any) -> list[Target]:
     features = cpu_features()
     if features is None or not _chooses_by_name(platform.version) or _place(device) is None:
         return [Target(own, f"PoCL's choice{f'; {VARIABLE} cannot change it' if forced else ''}")]
+    if forced == DRIVERS:
+        return [Target(own, f"PoCL's choice, as {VARIABLE} says")]
     if forced:
         return [Target(forced, f"{VARIABLE} names it")]
     target = target_for(features)

@@ -11,7 +11,7 @@ from clpipe.base.extras import installing
 from clpipe.base.memory import available_memory, check_addresses
 from clpipe.base.system import processors
 from clpipe.base.text import one_of
-from clpipe.engine.cache_folder import pocl_problem, prepare_environment
+from clpipe.engine.cache_folder import pocl_problem
 from clpipe.engine.cpu_target import VARIABLE as TARGET_VARIABLE
 from clpipe.engine.cpu_target import Target, candidates, compile_for, forced_target
 from clpipe.engine.hardware import Hardware, hardware_of
@@ -93,7 +93,6 @@ def find_devices(again: bool = False) -> list[DeviceInfo]:
         )
     check_addresses(ADDRESSES + OF_THREAD * processors(), "an OpenCL runtime")
     _process = os.getpid()
-    prepare_environment()
     forced_target()
     known = verdicts(again)
     if known.listing:

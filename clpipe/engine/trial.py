@@ -14,11 +14,10 @@ import numpy as np
 
 from clpipe.base.errors import DeviceError
 from clpipe.base.types import Floats
-from clpipe.engine.cache_folder import prepare_environment
 from clpipe.engine.cpu_target import candidates, compile_for
 from clpipe.engine.runtimes import attempt, is_tried, lanes_for, platform_id, type_of
 from clpipe.engine.sources import files_text
-from clpipe.engine.vendors import platforms
+from clpipe.engine.vendors import loaded, platforms
 from clpipe.reference.math import square_root
 from clpipe.reference.random import Stream, normal_of, philox
 
@@ -99,8 +98,7 @@ def try_all(known: dict[str, Any]) -> None:
     def say(**values: Any) -> None:
         os.write(report, json.dumps(values).encode() + b"\n")
 
-    import pyopencl as cl
-
+    cl = loaded()
     say(at="list")
     for platform in platforms(known["hidden"]):
         if platform_id(platform) in known["platforms"]:
@@ -137,7 +135,6 @@ def try_all(known: dict[str, Any]) -> None:
 def main() -> None:
     """Read what is known from the standard input, and try the rest."""
     known = json.load(sys.stdin)
-    prepare_environment()
     try:
         try_all(known)
     except DeviceError as error:

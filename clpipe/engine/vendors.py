@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError
-from clpipe.engine.process_folder import process_folder
+from clpipe.base.process_folder import process_folder
+from clpipe.engine.cache_folder import prepare_environment
 
 PACKAGE, LIBRARY = "intel-opencl-rt", "libintelocl.so"
 # With any of these a user says where platforms are; the first is what we set.
@@ -46,14 +47,26 @@ def icd_files() -> list[tuple[Path, str]]:
     return found
 
 
+def loaded() -> Any:
+    """Return pyopencl. Every use of OpenCL starts here, in an environment that suits it.
+
+    Raises:
+        DeviceError: it cannot be loaded.
+    """
+    prepare_environment()
+    try:
+        import pyopencl as cl
+    except (ImportError, OSError) as error:
+        raise DeviceError(f"pyopencl cannot be loaded: {error}") from None
+    return cl
+
+
 def installed_drivers() -> list[str]:
     """The runtimes that can be hidden from the loader: paths of .icd files, and :data:`BUNDLED`.
 
     Where the user said where platforms are, by one of :data:`VARIABLES`, the .icd files stay.
     """
-    import pyopencl as cl
-
-    bundled = [BUNDLED] if any(Path(cl.__file__).parent.glob(".libs/*.icd")) else []
+    bundled = [BUNDLED] if any(Path(loaded().__file__).parent.glob(".libs/*.icd")) else []
     named = any(name in os.environ for name in VARIABLES)
     return bundled if named else [*bundled, *(str(path) for path, _ in icd_files())]
 
@@ -69,10 +82,7 @@ def platforms(hidden: Collection[str] = ()) -> list[Any]:
     Raises:
         DeviceError: pyopencl cannot be loaded, or the platforms cannot be listed.
     """
-    try:
-        import pyopencl as cl
-    except (ImportError, OSError) as error:
-        raise DeviceError(f"pyopencl cannot be loaded: {error}") from None
+    cl = loaded()
     try:
         with drivers_visible(hidden):
             return list(cl.get_platforms())

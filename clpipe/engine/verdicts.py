@@ -17,9 +17,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from clpipe.base.process_folder import process_folder
 from clpipe.engine.cache_folder import cache_folder
 from clpipe.engine.cpu_target import VARIABLE, Target, candidates, cpu_text
-from clpipe.engine.process_folder import process_folder
 from clpipe.engine.runtimes import attempt
 from clpipe.engine.sources import LIBRARY, kernel_folder
 from clpipe.engine.store import Store

@@ -20,7 +20,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Mount, Route
 
-from clpipe.analysis.svg import PAGE_COLOURS, noise_svg
+from clpipe.analysis.svg import PAGE_FILES, noise_svg
 from clpipe.base.errors import ClpipeError, KeyedError, RequestError
 from clpipe.base.reading import parse_json
 from clpipe.base.types import Array
@@ -176,7 +176,7 @@ def page_files() -> dict[str, Callable[[Request], Response]]:
         "/" if file.name == PAGE else f"/{file.name}": file_answer(
             file.read_bytes(), TYPES[Path(file.name).suffix]
         )
-        for file in (*folder.iterdir(), PAGE_COLOURS)
+        for file in (*PAGE_FILES.iterdir(), *folder.iterdir())
     }
 
 

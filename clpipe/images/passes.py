@@ -14,7 +14,7 @@ from clpipe.images.kinds import kind_named
 from clpipe.images.layers import MOST_PARTS, full_name
 from clpipe.images.openimageio import open_image
 from clpipe.images.pixels import check_size
-from clpipe.images.read import read_samples
+from clpipe.images.samples import read_samples
 from clpipe.images.statements import statements
 from clpipe.reference.carried import LayerKind
 

@@ -10,7 +10,8 @@ from PIL import Image
 
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
-from clpipe.images.read import holds_mosaic, read_image
+from clpipe.images.read import read_image
+from clpipe.images.samples import holds_mosaic
 from clpipe.reference.curve import to_8_bit
 from clpipe.reference.transfer import srgb_curve
 from clpipe.stage import Kind

@@ -1,31 +1,20 @@
 """Reading images: renders and kept images as linear light, mosaics, finished pictures."""
 
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
 
 from clpipe.base.cpu_time import CpuTimer
-from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError
-from clpipe.base.files import sha256_of
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.images.attributes import own_attributes, photograph_attributes, shot_attributes
 from clpipe.images.colour import SRGB, to_linear_srgb
-from clpipe.images.layers import (
-    MOST_PARTS,
-    PictureLocation,
-    find_picture,
-    mosaic_channel,
-    picture_channels,
-)
+from clpipe.images.layers import find_picture, picture_channels
 from clpipe.images.luminance_chroma import read_luminance_chroma
-from clpipe.images.openexr import read_channels
-from clpipe.images.openimageio import SubsampledError, damage_text, open_image, read_with_pillow
+from clpipe.images.openimageio import SubsampledError, open_image
 from clpipe.images.pixels import (
     HALF_MAX,
     USUAL_MAX_PIXELS,
@@ -36,6 +25,7 @@ from clpipe.images.pixels import (
     make_finite,
     margins_of,
 )
+from clpipe.images.samples import digest_of, read_part, read_samples, with_digest
 from clpipe.images.statements import Statements, over_black, statements
 from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import NO_MARGINS, Margins
@@ -46,8 +36,6 @@ from clpipe.stage import Kind
 RENDER_SUFFIXES = (".exr", ".hdr", ".pfm", ".tif", ".tiff")
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".bmp", ".tga", ".webp")
 WHOLE = (oiio.UINT8, oiio.UINT16, oiio.UINT32, oiio.INT8, oiio.INT16, oiio.INT32)
-LARGE_FILE = 4 << 20  # bytes; to start a thread takes as long as the SHA-256 of a small one
-READ_AT_ONCE = 8  # channels; those of a picture may lie hundreds apart
 
 
 @dataclass(frozen=True)
@@ -81,21 +69,6 @@ class SourceImage:
     part: int = 0
 
 
-@dataclass(frozen=True)
-class _Decoded:
-    """The samples of a picture, (height, width[, channel]), and what the header says of them."""
-
-    pixels: Array
-    sha256: str
-    layer: str
-    attributes: Mapping[str, str]
-    shot: Mapping[str, float]
-    stated: Statements
-    margins: Margins
-    envmap: str = ""
-    part: int = 0
-
-
 def read_image(
     path: Path,
     mosaic: bool = False,
@@ -126,12 +99,12 @@ def read_image(
             names the file and the reason.
     """
     try:
-        decoded = _decode(path, mosaic, layer, max_pixels, overscan)
+        image, stated = _decode(path, mosaic, layer, max_pixels, overscan)
     except SubsampledError:
         if mosaic or layer is not None:
             raise
-        decoded = _decode_luminance_chroma(path, max_pixels, overscan)
-    pixels, stated = decoded.pixels, decoded.stated
+        image, stated = _decode_luminance_chroma(path, max_pixels, overscan)
+    pixels = image.pixels
     warnings = list(stated.warnings_with("linear"))
     if count := make_finite(pixels):
         were = "sample was" if count == 1 else "samples were"
@@ -145,17 +118,7 @@ def read_image(
     # Beyond half it is so bright that nothing is lost, and no stage's squares overflow.
     if not mosaic and pixels.dtype == np.float32 and (beyond := clip_to_half(pixels)):
         warnings.append(f"{beyond} samples beyond {HALF_MAX:g}, the range of half, were clipped")
-    return SourceImage(
-        pixels,
-        decoded.sha256,
-        decoded.layer,
-        tuple(warnings),
-        decoded.attributes,
-        decoded.shot,
-        margins=decoded.margins,
-        envmap=decoded.envmap,
-        part=decoded.part,
-    )
+    return replace(image, pixels=pixels, warnings=tuple(warnings))
 
 
 GREY = "it holds luminance alone; the picture is grey"
@@ -234,13 +197,10 @@ def _read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
 class _Encoded:
     """A picture in whole numbers: RGB, (height, width, 3), and alpha, both in 0..1 as stored."""
 
-    pixels: Floats
+    image: SourceImage
     alpha: Floats | None
-    sha256: str
     stated: Statements
     is_grey: bool
-    attributes: Mapping[str, str]
-    shot: Mapping[str, float]
 
 
 @CpuTimer("decode")
@@ -265,15 +225,11 @@ def _read_encoded(path: Path, max_pixels: int) -> _Encoded | None:
         rgb = samples[..., : len(channels)]
         rgb = 1 - rgb if stated.is_inverted else rgb
         attributes, shot = photograph_attributes(spec)
-        return _Encoded(
-            np.repeat(rgb, 3, axis=-1) if len(channels) == 1 else np.ascontiguousarray(rgb),
-            np.ascontiguousarray(samples[..., -1]) if has_alpha else None,
-            _digest(path),
-            stated,
-            len(channels) == 1,
-            attributes,
-            shot,
-        )
+        is_grey = len(channels) == 1
+        pixels = np.repeat(rgb, 3, axis=-1) if is_grey else np.ascontiguousarray(rgb)
+        alpha = np.ascontiguousarray(samples[..., -1]) if has_alpha else None
+        image = SourceImage(pixels, digest_of(path), "", (), attributes, shot)
+        return _Encoded(image, alpha, stated, is_grey)
 
 
 def _as_light(path: Path, encoded: _Encoded, transfer: str) -> SourceImage:
@@ -285,7 +241,8 @@ def _as_light(path: Path, encoded: _Encoded, transfer: str) -> SourceImage:
     Raises:
         ImageError: the colours that the file states are impossible.
     """
-    pixels, alpha, stated = encoded.pixels, encoded.alpha, encoded.stated
+    image, alpha, stated = encoded.image, encoded.alpha, encoded.stated
+    pixels = image.pixels
     if alpha is not None and stated.is_associated:
         opaque = np.where(alpha > 0, alpha, np.float32(1))[..., np.newaxis]
         pixels = np.minimum(pixels / opaque, 1)
@@ -295,10 +252,8 @@ def _as_light(path: Path, encoded: _Encoded, transfer: str) -> SourceImage:
     if alpha is not None:
         light = over_black(light, alpha)
     warnings = (*stated.warnings_with(transfer), *said, *([GREY] if encoded.is_grey else []))
-    attributes = {**encoded.attributes, "orientation": "1"}
-    return SourceImage(
-        stated.upright(light), encoded.sha256, "", warnings, attributes, encoded.shot
-    )
+    attributes = {**image.attributes, "orientation": "1"}
+    return replace(image, pixels=stated.upright(light), warnings=warnings, attributes=attributes)
 
 
 def read_finished(
@@ -327,58 +282,16 @@ def read_finished(
         warnings.append("its primaries are not those of sRGB; its colours are read as sRGB")
     if encoded.alpha is not None and encoded.alpha.min() < 1:
         warnings.append("its alpha channel is not used")
-    return SourceImage(
-        *(encoded.pixels, encoded.sha256, "", tuple(warnings), encoded.attributes, encoded.shot)
-    )
-
-
-def read_whole_numbers(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> Array:
-    """The first channel of a picture, (height, width), uint8 or uint16, as the file has it.
-
-    Raises:
-        ImageError: the file cannot be read, holds other samples, or is too large.
-    """
-    with open_image(path) as file:
-        spec = file.spec()
-        if spec.format.basetype not in (oiio.UINT8, oiio.UINT16):
-            raise ImageError(
-                f"{path}: has samples of type {spec.format}, but whole numbers of 8 or 16 bits are "
-                "expected"
-            )
-        check_size(path, spec.width, spec.height, max_pixels)
-        return read_samples(path, file, 0, (0,), spec.format.basetype)[..., 0]
-
-
-def photograph_facts(path: Path) -> tuple[float | None, int]:
-    """The ISO in the EXIF of a finished picture, None where it does not say it, and its bits.
-
-    Raises:
-        ImageError: the file is missing, empty, damaged or not an image.
-    """
-    with open_image(path) as file:
-        iso = file.spec().getattribute("Exif:PhotographicSensitivity")
-        bits = 8 * file.spec().format.size()
-    return float(iso) if isinstance(iso, int) and iso > 0 else None, bits
-
-
-def holds_mosaic(path: Path) -> bool:
-    """Whether a file has no red, green and blue, but one channel that may be a mosaic.
-
-    Raises:
-        ImageError: the file is missing, empty, damaged or not an image.
-    """
-    with open_image(path) as file:
-        parts: list[list[str]] = []
-        while len(parts) < MOST_PARTS and file.seek_subimage(len(parts), 0):
-            parts.append(list(file.spec().channelnames))
-    return not any(map(picture_channels, parts)) and any(map(mosaic_channel, parts))
+    return replace(encoded.image, warnings=tuple(warnings))
 
 
 @CpuTimer("decode")
 def _decode(
     path: Path, mosaic: bool, layer: str | None, max_pixels: int, overscan: bool
-) -> _Decoded:
-    """The picture of a file that OpenImageIO reads; arguments and errors as :func:`read_image`.
+) -> tuple[SourceImage, Statements]:
+    """Return the picture of a file that OpenImageIO reads, not converted, and its header's facts.
+
+    Arguments and errors are those of :func:`read_image`.
 
     Raises:
         SubsampledError: the channels differ in size.
@@ -390,8 +303,8 @@ def _decode(
         x, y = spec.x - spec.full_x, spec.y - spec.full_y
         margins = margins_of(x, y, data, display) if overscan else NO_MARGINS
         stated = statements(path, file, location.xyz)
-        pixels, digest = _with_digest(
-            path, lambda: _read_part(path, file, location, mosaic, max_pixels, margins)
+        pixels, digest = with_digest(
+            path, lambda: read_part(path, file, location, mosaic, max_pixels, margins)
         )
         if not mosaic:
             pixels = stated.light(pixels)
@@ -399,22 +312,20 @@ def _decode(
                 alpha = read_samples(path, file, location.part, [stated.alpha], oiio.FLOAT)
                 pixels = over_black(pixels, alpha[..., 0])
             pixels = stated.upright(pixels)
-        return _Decoded(
-            pixels,
-            digest,
-            location.layer,
-            own_attributes(spec),
-            shot_attributes(spec),
-            stated,
-            margins,
-            str(spec.getattribute("textureformat") or ""),
-            location.part,
+        image = SourceImage(
+            *(pixels, digest, location.layer, (), own_attributes(spec), shot_attributes(spec)),
+            margins=margins,
+            envmap=str(spec.getattribute("textureformat") or ""),
+            part=location.part,
         )
+        return image, stated
 
 
 @CpuTimer("decode")
-def _decode_luminance_chroma(path: Path, max_pixels: int, overscan: bool) -> _Decoded:
-    """The picture of a file whose chroma is subsampled."""
+def _decode_luminance_chroma(
+    path: Path, max_pixels: int, overscan: bool
+) -> tuple[SourceImage, Statements]:
+    """Return the picture of a file whose chroma is subsampled; see :func:`_decode`."""
     window = read_luminance_chroma(path, max_pixels)
     data, display = window.pixels.shape[1::-1], (window.width, window.height)
     margins = margins_of(window.x, window.y, data, display) if overscan else NO_MARGINS
@@ -424,32 +335,7 @@ def _decode_luminance_chroma(path: Path, max_pixels: int, overscan: bool) -> _De
     pixels = display_window(window.pixels, *place, width, height)
     header = window.attributes
     stated = Statements(header.get("chromaticities"), header.get("adoptedNeutral"))
-    return _Decoded(pixels, _digest(path), "", {}, {}, stated, margins)
-
-
-def _with_digest(path: Path, read: Callable[[], Array]) -> tuple[Array, str]:
-    """What is read of a file, and the file's SHA-256, computed meanwhile if it takes long.
-
-    Raises:
-        ImageError: one of them cannot be had.
-    """
-    if stamp_of(path)[0] < LARGE_FILE:
-        return read(), _digest(path)
-    with ThreadPoolExecutor(1) as beside:
-        digest = beside.submit(_digest, path)
-        return read(), digest.result()
-
-
-def _digest(path: Path) -> str:
-    """The SHA-256 of a file.
-
-    Raises:
-        ImageError: it cannot be read any more.
-    """
-    try:
-        return sha256_of(path)[0]
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+    return SourceImage(pixels, digest_of(path), "", (), {}, margins=margins), stated
 
 
 def _srgb_matrix(path: Path, stated: Statements) -> Array | None:
@@ -465,74 +351,3 @@ def _srgb_matrix(path: Path, stated: Statements) -> Array | None:
         return to_linear_srgb(chromaticities, stated.neutral)
     except ImageError as error:
         raise ImageError(f"{path}: {error}") from None
-
-
-def _read_part(
-    path: Path,
-    file: Any,
-    location: PictureLocation,
-    mosaic: bool,
-    max_pixels: int,
-    margins: Margins,
-) -> Array:
-    """Three channels of one part, or one, in its display window with margins: (height, width[, 3]).
-
-    Raises:
-        ImageError: the samples are not linear float (those of a mosaic may be whole numbers), too
-            many, or damaged.
-    """
-    spec, channels = file.spec(), location.channels
-    formats = spec.channelformats or [spec.format] * spec.nchannels
-    types = {formats[i].basetype for i in channels}
-    whole = mosaic and types <= {oiio.UINT16, oiio.UINT32}
-    if not whole and not types <= {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}:
-        raise ImageError(
-            f"{path}: this {file.format_name().upper()} file has samples of type {spec.format}, "
-            "but linear light in floats is expected",
-            "For a render, add --transfer srgb or linear (in Python, transfer='srgb'). For a "
-            "photograph, use -c unprocess (config='unprocess')",
-        )
-    width, height = margins.around(spec.full_width, spec.full_height)
-    check_size(path, width, height, max_pixels)
-    check_size(path, spec.width, spec.height, max_pixels)
-    # Whole numbers are read as they are: as float, OpenImageIO would scale them to 0..1.
-    type_ = types.pop() if whole else oiio.HALF if types == {oiio.HALF} else oiio.FLOAT
-    pixels = None
-    if file.format_name() == "openexr" and not whole:
-        names = [spec.channelnames[i] for i in channels]
-        pixels = read_channels(path, names, (spec.height, spec.width))
-    if pixels is None:
-        pixels = read_samples(path, file, location.part, channels, type_)
-    if whole:
-        pixels = pixels.astype(np.float32)
-    place = spec.x - spec.full_x + margins.left, spec.y - spec.full_y + margins.top
-    if (*place, spec.width, spec.height) != (0, 0, width, height):
-        pixels = display_window(pixels, *place, width, height)
-    return pixels if len(channels) > 1 else np.ascontiguousarray(pixels[..., 0])
-
-
-def read_samples(path: Path, file: Any, part: int, channels: Sequence[int], type_: Any) -> Array:
-    """Channels of a part's data window, (rows, columns, channel), as samples of a type.
-
-    Raises:
-        ImageError: the part is damaged, or a volume.
-    """
-    spec = file.spec()
-    if spec.depth > 1:
-        raise ImageError(
-            f"{path}: a volume of {spec.depth} images, not a picture. Write each of them as a file"
-        )
-    first, last = min(channels), max(channels) + 1
-    if last - first > READ_AT_ONCE:
-        planes = [read_samples(path, file, part, [i], type_) for i in channels]
-        return np.concatenate(planes, axis=-1)
-    data = file.read_image(part, 0, first, last, type_)
-    problem = file.geterror()
-    if data is None or problem:
-        data = read_with_pillow(path, spec, part, type_)
-        if data is None:
-            raise ImageError(f"{path}: {damage_text(problem)}")
-        data = data[..., first:last]
-    pixels = np.asarray(data).reshape(spec.height, spec.width, last - first)
-    order = [i - first for i in channels]
-    return pixels if order == list(range(last - first)) else pixels[..., order]

@@ -9,7 +9,7 @@ from clpipe.base.errors import ImageError
 from clpipe.images.openimageio import BEGINNINGS, open_image
 from clpipe.images.pixels import USUAL_MAX_PIXELS
 from clpipe.images.raw import check_raw
-from clpipe.images.read import read_samples
+from clpipe.images.samples import read_samples
 
 NPY = b"\x93NUMPY"
 

@@ -11,16 +11,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
-from clpipe.base.buckets import check_url, is_glob, is_url, listed, url_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_input
 from clpipe.base.text import printable, whole_number
+from clpipe.base.urls import is_glob, is_url, listed, path_of, url_of
 from clpipe.chain.rendition import Rendition
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import PICTURE_SUFFIXES, RENDER_SUFFIXES
 from clpipe.inputs.companions import owner_of
 from clpipe.inputs.manifest import MANIFEST_SUFFIXES, read_manifest
-from clpipe.inputs.spool import path_of, place_of_url
 
 T = TypeVar("T")
 
@@ -103,7 +102,7 @@ class Job:
     @property
     def input(self) -> str:
         """The path as it is stored and printed."""
-        return self.written or str(self.path)
+        return self.written or self.shown
 
     @cached_property
     def stem(self) -> str:
@@ -156,10 +155,7 @@ def find_jobs(
             jobs += [Job(p, p.relative_to(path).as_posix(), listed=False) for p in files]
         elif path.suffix.lower() in MANIFEST_SUFFIXES:
             jobs += [
-                Job(
-                    *(row.path, row.key, row.name, True, row.values, row.frames, row.place),
-                    written=url_of(row.path) or "",
-                )
+                Job(row.path, row.key, row.name, True, row.values, row.frames, row.place)
                 for row in read_manifest(path)
             ]
         elif glob.has_magic(text) and not os.path.exists(text):
@@ -221,8 +217,7 @@ def _jobs_behind(url: str, endings: Sequence[str], excluded: Exclusion) -> list[
     """
     is_pattern = is_glob(url)
     if not is_pattern and Path(url).suffix.lower() in endings:  # one that is missing fails alone
-        check_url(url)
-        return [Job(place_of_url(url), url.rpartition("/")[2], written=url)]
+        return [Job(path_of(url), url.rpartition("/")[2])]
     root = url.rstrip("/")
     jobs = []
     for each in listed(url):
@@ -233,11 +228,11 @@ def _jobs_behind(url: str, endings: Sequence[str], excluded: Exclusion) -> list[
         if (is_below and (hidden or suffix not in endings)) or key in excluded:
             continue
         try:
-            path = place_of_url(each)
+            path = path_of(each)
         except RequestError as error:
             log.warning("%s; it is left out", error)
             continue
-        jobs.append(Job(path, key, listed=not is_below, written=each))
+        jobs.append(Job(path, key, listed=not is_below))
     if not jobs:
         raise RequestError(f"{url}: no image is there (looked for {', '.join(endings[:6])} ...)")
     return jobs

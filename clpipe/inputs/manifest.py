@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
-from clpipe.base.buckets import beside, fetch, is_url
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import check_exists, read_bytes
 from clpipe.base.text import one_of
+from clpipe.base.urls import fetch, is_url, joined
 from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import TABLES, check_type
@@ -20,7 +20,6 @@ from clpipe.chain.paths import from_folder
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import toml_value, value_text
-from clpipe.inputs.spool import place_of_url
 from clpipe.inputs.tables import OWN, PLAIN, TEXTS, csv_records, json_records
 
 MANIFEST_SUFFIXES = (".csv", ".jsonl")
@@ -272,12 +271,8 @@ def _row(
             values[column] = value.split()
         elif column in PLAIN:
             values[column] = value
-    if url := path if is_url(path) else beside(folder, path):
-        own = place_of_url(url)
-        key = name or (own.name if is_url(path) else key_of(folder, own))
-    else:
-        own = folder / path
-        key = name or key_of(folder, own)
+    own = joined(folder, path)
+    key = name or (own.name if is_url(path) else key_of(folder, own))
     values = from_folder(folder, values)
     return Row(own, key, name, alike.setdefault(repr(values), values), frames, place)
 

@@ -10,11 +10,11 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.buckets import url_of
 from clpipe.base.digests import digests, stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.base.system import open_plain
+from clpipe.base.urls import url_of
 from clpipe.images.whole import is_whole
 from clpipe.inputs.find import Job
 from clpipe.outputs.plan import OutputPlan, RenditionFiles

@@ -11,6 +11,7 @@ from clpipe.analysis.intensity import VarianceLaw
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import WHOLE, load_picture
 from clpipe.analysis.report import NoiseReport
+from clpipe.analysis.statistics import Channel
 from clpipe.analysis.svg import law_svg, noise_svg
 from clpipe.base.errors import ClpipeError
 from clpipe.chain.rendition import DEVELOPMENT, MOSAIC
@@ -55,16 +56,18 @@ class Law:
 
 @dataclass(frozen=True)
 class Noise:
-    """The noise of one picture, drawn."""
+    """The noise of one picture, measured and drawn."""
 
     name: str
     against: str
     iso: float
+    report: NoiseReport
     svg: str
-    sigma: str
-    left: float  # share of luma's variance that averaging 2x2 leaves
-    correlation: float  # of luma, one pixel to the right
-    at_edges: float  # of luma, over flat places
+
+    @property
+    def channels(self) -> Mapping[str, Channel]:
+        """The noise of each channel, by its name."""
+        return {one.name: one for one in self.report.channels}
 
 
 def measured(files: Sequence[Blob]) -> NoiseReport:
@@ -106,21 +109,8 @@ def noises(run: Run, pictures: Sequence[Made], problems: list[str], most: int) -
         except ClpipeError as error:
             problems.append(f"{made.name}: its noise cannot be measured: {error}")
             continue
-        by_name = {one.name: one for one in report.channels}
-        luma = by_name["Y"]
-        middle = luma.autocorrelation.shape[0] // 2
-        found.append(
-            Noise(
-                made.name,
-                pair[1].name,
-                number(made.value("iso")),
-                noise_svg(report),
-                ", ".join(f"{name} {by_name[name].sigma * 255:.2f}" for name in "RGB"),
-                luma.energy_left,
-                float(luma.autocorrelation[middle, middle + 1]),
-                report.at_edges,
-            )
-        )
+        iso = number(made.value("iso"))
+        found.append(Noise(made.name, pair[1].name, iso, report, noise_svg(report)))
     return found
 
 

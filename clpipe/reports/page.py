@@ -10,7 +10,7 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from clpipe.analysis.svg import PAGE_COLOURS, bars_svg, histogram_svg, lines_svg, shares_svg
+from clpipe.analysis.svg import PAGE_FILES, bars_svg, histogram_svg, lines_svg, shares_svg
 from clpipe.base.about import __version__
 from clpipe.base.text import duration, one_line
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, STEPS
@@ -133,9 +133,15 @@ def html(runs: Sequence[Run], tell: Callable[[str], None] = lambda _: None) -> s
         laws=judged,
         law_drawings=law_drawings,
         limit=f"{LIMIT:g}",
-        style=PAGE_COLOURS.read_text() + (TEMPLATES / "report.css").read_text(),
-        script=(TEMPLATES / "report.js").read_text(),
+        style=shared_and_own("css"),
+        script=shared_and_own("js"),
     )
+
+
+def shared_and_own(kind: str) -> str:
+    """Return the styles ("css") or scripts ("js"): those of all pages, then those of reports."""
+    own = (TEMPLATES / f"report.{kind}").read_text("utf-8")
+    return (PAGE_FILES / f"page.{kind}").read_text("utf-8") + own
 
 
 def visible(value: Any) -> Any:

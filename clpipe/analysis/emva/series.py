@@ -21,7 +21,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import read_text
 from clpipe.base.text import one_line, whole_number
 from clpipe.base.types import Array
-from clpipe.images.read import read_whole_numbers
+from clpipe.images.samples import read_whole_numbers
 
 NAME = "EMVA1288_Data.txt"
 RELEASE = "3.1"

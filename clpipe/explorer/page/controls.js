@@ -2,12 +2,6 @@
 
 // Controls. Each is made once from what the server declares; then only its value changes.
 
-const made = (tag, properties = {}, ...children) => {
-  const element = Object.assign(document.createElement(tag), properties);
-  element.append(...children);
-  return element;
-};
-
 const typeOf = (schema) => (schema.anyOf || [schema]).find((each) => each.type !== "null") || schema;
 
 const limitsOf = (schema, value) => {

@@ -104,12 +104,8 @@ const tell = (facts, shown) => {
       `; ${step}: ${Object.entries(found).map(([name, value]) => `${name} ${value.toPrecision(4)}`).join(", ")}`).join("") +
     facts.warnings.map((warning) => `; warning: ${warning}`).join("");
   byId("launches").replaceChildren(...facts.launches.map((launch) => {
-    const row = document.createElement("tr");
-    const [name, time] = [document.createElement("td"), document.createElement("td")];
-    name.textContent = launch.name;
-    time.textContent = launch.ms === null ? "not run again" : launch.ms.toFixed(2);
-    row.append(name, time);
-    return row;
+    const time = launch.ms === null ? "not run again" : launch.ms.toFixed(2);
+    return made("tr", {}, made("td", { textContent: launch.name }), made("td", { textContent: time }));
   }));
 };
 
@@ -263,12 +259,6 @@ byId("link").addEventListener("click", tried(async () => {
   say("Link", `${done ? "It is copied, and" : "It"} shows this view as long as this program runs; behind “#” it has the settings.`, address);
 }));
 byId("say-copy").addEventListener("click", () => toClipboard(byId("say-command").textContent));
-
-byId("theme").addEventListener("click", () => {
-  const root = document.documentElement;
-  const own = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
-  root.dataset.theme = (root.dataset.theme || own) === "dark" ? "light" : "dark";
-});
 
 byId("image").addEventListener("change", () => {
   state.image = Number(byId("image").value);

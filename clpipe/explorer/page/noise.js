@@ -28,13 +28,11 @@ const measure = async () => {
     const scale = kind === "display" ? 255 : 1;
     byId("noise-table").hidden = false;
     byId("noise-table").tBodies[0].replaceChildren(...Object.entries(channels).map(([name, channel]) => {
-      const row = document.createElement("tr");
       const table = channel.autocorrelation;
       const middle = (table.length - 1) / 2;
       const figures = [channel.sigma * scale, table[middle][middle + 1], channel.energy_left_2x2, channel.excess_kurtosis];
       const cells = [name, ...figures.map((value) => value === null ? "-" : Number(value.toPrecision(4)))];
-      row.append(...cells.map((text) => Object.assign(document.createElement("td"), { textContent: text })));
-      return row;
+      return made("tr", {}, ...cells.map((text) => made("td", { textContent: text })));
     }));
     const drawn = new DOMParser().parseFromString(answer.svg, "image/svg+xml").documentElement;
     drawn.setAttribute("xmlns", "http://www.w3.org/2000/svg");

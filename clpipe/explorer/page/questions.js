@@ -3,7 +3,6 @@
 // The page holds one thing: a configuration, as nested values. The server develops whatever is
 // asked of it and remembers no settings, so that pages do not disturb each other.
 
-const byId = (id) => document.getElementById(id);
 const copy = (value) => JSON.parse(JSON.stringify(value));
 const same = (one, two) => JSON.stringify(one) === JSON.stringify(two);
 

@@ -1,13 +1,4 @@
-"use strict";
-
-const byId = (id) => document.getElementById(id);
 const held = (id) => (byId(id) ? JSON.parse(byId(id).textContent) : []);
-
-byId("theme").addEventListener("click", () => {
-  const root = document.documentElement;
-  const own = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
-  root.dataset.theme = (root.dataset.theme || own) === "dark" ? "light" : "dark";
-});
 
 // The contact sheet: filters, and pages of what they leave.
 
@@ -31,23 +22,14 @@ const filtered = () => {
     entry.name.toLowerCase().includes(name.toLowerCase()));
 };
 
-const made = (tag, className, text) => {
-  const element = document.createElement(tag);
-  element.className = className;
-  element.textContent = text;
-  return element;
-};
-
 const listItem = (entry) => {
-  const item = made("li", entry.odd.length ? "odd" : "", "");
-  const picture = entry.image ? made("img", "", "") : made("span", "none", "no picture");
-  if (entry.image) {
-    picture.src = entry.image;
-    picture.alt = entry.name;
-  }
+  const picture = entry.image
+    ? made("img", { src: entry.image, alt: entry.name })
+    : made("span", { className: "none", textContent: "no picture" });
   const about = [`ISO ${entry.iso}, ${(entry.clipped * 100).toFixed(1)} % clipped`, ...entry.odd];
-  item.append(picture, made("span", "name", entry.name), made("span", "about", about.join("; ")));
-  return item;
+  return made("li", { className: entry.odd.length ? "odd" : "" }, picture,
+    made("span", { className: "name", textContent: entry.name }),
+    made("span", { className: "about", textContent: about.join("; ") }));
 };
 
 const drawSheet = () => {
@@ -77,7 +59,7 @@ if (large.length) {
     "look-image", "look-left", "look-right", "look-place"].map(byId);
   const canvases = [...loupes.querySelectorAll("canvas")];
   const closest = canvases.at(-1);
-  const here = made("span", "here", "");
+  const here = made("span", { className: "here" });
   const sides = { left: { select: left, picture: over }, right: { select: right, picture: under } };
   const shown = () => large[image.value];
   let at = [0, 0]; // the middle of the crops, px of the picture
@@ -175,7 +157,7 @@ if (large.length) {
     const times = Math.max(Math.floor(SMALLEST / wide), 1);
     slider.style.width = `${times * wide}px`;
     slider.classList.toggle("enlarged", times > 1);
-    marks.replaceChildren(here, ...(by > 1 ? places : []).map((each) => outline(made("span", "", ""), each)));
+    marks.replaceChildren(here, ...(by > 1 ? places : []).map((each) => outline(made("span"), each)));
     for (const facts of document.querySelectorAll(".look-facts")) {
       facts.hidden = facts.dataset.number !== image.value;
     }

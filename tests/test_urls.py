@@ -14,10 +14,10 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 import clpipe as package
-from clpipe.base import buckets
+from clpipe.base import urls
 from clpipe.base.errors import OutputError, RequestError
+from clpipe.base.process_folder import process_folder
 from clpipe.batch.run_log import read_log
-from clpipe.engine.process_folder import process_folder
 from tests.conftest import contents, written
 
 RUN = ("--iso", 3200, "--device", "numpy", "--skip", "noise")
@@ -76,8 +76,8 @@ class Flaky(MemoryFileSystem):
 @pytest.fixture
 def bucket(write_exr, clpipe, monkeypatch):
     """Seven renders in a bucket, and here."""
-    monkeypatch.setattr(buckets, "FIRST_WAIT", 0.0)
-    monkeypatch.setattr(buckets, "TRIES", 30)
+    monkeypatch.setattr(urls, "FIRST_WAIT", 0.0)
+    monkeypatch.setattr(urls, "TRIES", 30)
     fsspec.register_implementation("flaky", Flaky, clobber=True)
     system = fsspec.filesystem("flaky")
     Flaky.store.clear()
@@ -146,8 +146,30 @@ def test_files_globs_and_manifests_behind_urls(bucket, clpipe):
     assert found["d"] == ["in/x0/r0.jpg", "r3.jpg"]
 
 
+def test_listings_are_urls(bucket):
+    assert urls.listed("flaky://b/renders/notes.txt") == ["flaky://b/renders/notes.txt"]
+    assert urls.listed("flaky://b/renders/x1/") == [
+        f"flaky://b/renders/x1/r{n}.exr" for n in (1, 3, 5)
+    ]
+    assert urls.listed("flaky://*/renders/*/r0.exr") == ["flaky://b/renders/x0/r0.exr"]
+    assert urls.listed("flaky://b/r*") == []  # folders are no files
+    assert urls.listed("flaky://none/x") == []
+
+
+def test_tars_behind_urls_are_streamed(bucket, clpipe):
+    with tarfile.open("a.tar", "w") as tar:
+        tar.add("in/x0/r0.exr", "r0.exr")
+    bucket.put_file("a.tar", "/b/tars/a.tar")
+    options = {"device": "numpy", "iso": 3200}
+    here = [sample["image"] for sample in package.StreamingDataset("a.tar", **options)]
+    for name in ("flaky://b/tars/a.tar", "flaky://b/tars/*.tar"):
+        streamed = list(package.StreamingDataset(name, **options))
+        assert [sample["key"] for sample in streamed] == ["a/r0.exr"]
+        assert np.array_equal(streamed[0]["image"], here[0])
+
+
 def test_what_is_wrong_with_a_url_is_said(bucket, clpipe, monkeypatch):
-    monkeypatch.setattr(buckets, "TRIES", 2)
+    monkeypatch.setattr(urls, "TRIES", 2)
 
     def told(*arguments, status):
         text = clpipe("run", *arguments, *RUN, status=status).stderr
@@ -199,7 +221,7 @@ def test_tars_behind_a_url_are_those_of_a_folder(bucket, clpipe, rate):
 @pytest.mark.slow
 def test_a_run_that_was_cut_off_goes_on(bucket, clpipe, monkeypatch):
     command = ("run", "in", "-o", "flaky://b/set", "--webdataset", 3, *RUN)
-    monkeypatch.setattr(buckets, "TRIES", 1)
+    monkeypatch.setattr(urls, "TRIES", 1)
     Flaky.forbidden = "000001.tar"
     told = clpipe(*command, status=1).stderr
     assert "flaky://b/set/000001.tar: cannot be written: the token has expired" in told
@@ -254,7 +276,7 @@ def test_from_python(bucket, monkeypatch):
     assert sorted(tars(bucket)) == ["000000.tar", "000001.tar"]
     with pytest.raises(RequestError, match="say --webdataset N"):
         package.run("in", "flaky://b/set")
-    monkeypatch.setattr(buckets, "TRIES", 1)
+    monkeypatch.setattr(urls, "TRIES", 1)
     Flaky.forbidden = "000000.index"
     with pytest.raises(OutputError, match="the token has expired"):
         list(package.run("in", "flaky://b/other", device="numpy", webdataset=4))
@@ -286,7 +308,7 @@ def test_manifests_behind_urls_do_not_lead_out_of_their_bucket(bucket, clpipe, t
 
 
 def test_a_listing_that_fails_is_no_empty_bucket(bucket, clpipe, monkeypatch):
-    monkeypatch.setattr(buckets, "TRIES", 1)
+    monkeypatch.setattr(urls, "TRIES", 1)
     bucket.pipe_file("/b/set/000000.tar", b"somebody's")
 
     def refused(self, path, *arguments, **more):

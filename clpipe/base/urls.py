@@ -1,0 +1,295 @@
+"""Files behind URLs, through fsspec: ``s3://``, ``https://`` and every other scheme that it knows.
+
+The rest of clpipe handles paths only. A URL is represented by a path in this process's folder for
+temporary files, which contains :data:`SPOOL` and then the URL's parts. :func:`path_of` makes that
+path, :func:`url_of` reads the URL from it, in any process, and :func:`fetched` puts the file there.
+
+fsspec finds the credentials: those of the environment, and of its own configuration.
+"""
+
+import contextlib
+import hashlib
+import os
+import posixpath
+import random
+import re
+import secrets
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from clpipe.base.errors import ClpipeError, ImageError, OutputError, RequestError
+from clpipe.base.extras import require
+from clpipe.base.process_folder import process_folder
+from clpipe.base.text import one_line
+
+T = TypeVar("T")
+
+SPOOL = "clpipe-spool"
+
+_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://(.+)")
+
+TRIES = 6
+FIRST_WAIT = 0.25  # s; doubled each time
+
+# What file systems call a file's checksum or its time of change. The first that is present counts.
+CHANGES = ["ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime"]
+CHANGES += ["updated", "modified", "created"]
+
+# Errors that another try does not help.
+FINAL = (FileNotFoundError, PermissionError, IsADirectoryError, NotImplementedError)
+
+
+def is_url(text: str) -> bool:
+    """Return whether a text is a URL.
+
+    >>> is_url("s3://renders/a.exr"), is_url("C:/renders"), is_url("a.exr")
+    (True, False, False)
+    """
+    return _URL.fullmatch(text) is not None
+
+
+def is_glob(url: str) -> bool:
+    """Return whether a URL is a pattern. A "?" does not make it one: it starts a query."""
+    return any(letter in url for letter in "*[")
+
+
+def path_of(text: str) -> Path:
+    """Return the path that a text names, or the path that represents it if it is a URL.
+
+    Raises:
+        RequestError: fsspec or a package that it needs is missing, it does not know the scheme, no
+            path can represent the URL, or there is no folder for temporary files.
+    """
+    if not is_url(text):
+        return Path(text)
+    _check_scheme(text)
+    folder = process_folder()
+    if folder is None:
+        raise RequestError(f"{text}: there is no folder for temporary files with room (TMPDIR)")
+    return _place(text, folder)
+
+
+def url_of(path: Path) -> str | None:
+    """Return the URL that a path represents; None for a file of this machine.
+
+    >>> url_of(Path("/tmp/x/clpipe-spool/s3/bucket/a/b.exr")), url_of(Path("/tmp/b.exr"))
+    ('s3://bucket/a/b.exr', None)
+    """
+    if SPOOL not in str(path):
+        return None
+    parts = path.parts
+    scheme, *rest = parts[parts.index(SPOOL) + 1 :] if SPOOL in parts else ("",)
+    return f"{scheme}://{'/'.join(rest)}" if rest and ".." not in rest else None
+
+
+def joined(folder: Path, text: str) -> Path:
+    """Return the path that a text names: a URL, or a path relative to a folder.
+
+    Raises:
+        RequestError: the folder represents a URL, and the path leads out of its bucket; or as for
+            :func:`path_of`.
+    """
+    url = url_of(folder)
+    if is_url(text) or url is None:
+        return path_of(text) if is_url(text) else folder / text
+    scheme, _, rest = url.partition("://")
+    bucket = rest.split("/")[0]
+    inside = posixpath.normpath(posixpath.join(rest, text))
+    if inside.split("/")[0] != bucket:
+        raise RequestError(f"path: found {text}, which leads out of {scheme}://{bucket}")
+    return path_of(f"{scheme}://{inside}")
+
+
+def listed(url: str) -> list[str]:
+    """Return the URLs of all files below one, at any depth, or of those that a glob matches.
+
+    The URL of a file returns itself. fsspec remembers the listing, so that stamps cost nothing.
+
+    Returns:
+        The URLs, sorted. There may be none.
+
+    Raises:
+        RequestError: it cannot be listed.
+    """
+    fixed = re.split(r"[*[]", url)[0].rpartition("/")[0] if is_glob(url) else url.rstrip("/")
+
+    def work(system: Any, path: str) -> list[str]:
+        system.invalidate_cache()
+        root = path.removesuffix(url[len(fixed) :]).rstrip("/")
+        found: Iterable[str] = ()
+        with contextlib.suppress(FileNotFoundError):
+            if is_glob(url):
+                infos = system.glob(path, detail=True)
+                found = [name for name, info in infos.items() if info["type"] != "directory"]
+            else:
+                found = system.find(path)
+        # The scheme stays that of the URL, because a file system may have several.
+        return sorted(f"{fixed}{name[len(root) :]}" for name in found)
+
+    return _retried(url, work, RequestError, "listed")
+
+
+def stamp_of_url(url: str) -> tuple[int, int]:
+    """Return a file's size in bytes, and a number that changes with it; zeros if it is missing."""
+    with contextlib.suppress(ClpipeError):
+        return _retried(url, lambda system, path: _stamp(system.info(path)), ImageError, "read")
+    return 0, 0
+
+
+@contextlib.contextmanager
+def fetched(paths: Iterable[Path]) -> Iterator[list[Path]]:
+    """Fetch the files of paths that represent URLs, each into a folder of its own.
+
+    Yields:
+        The paths of the copies, which also represent the URLs; paths of other files stay the same.
+
+    Raises:
+        ImageError: one cannot be fetched.
+    """
+    with contextlib.ExitStack() as stack:
+        found: list[Path] = []
+        for path in paths:
+            found.append(path)
+            if (url := url_of(path)) and not path.exists():
+                folder = tempfile.TemporaryDirectory(
+                    prefix="fetched-", dir=process_folder(), ignore_cleanup_errors=True
+                )
+                found[-1] = _place(url, Path(stack.enter_context(folder)))
+                _fetch(url, found[-1], ImageError)
+        yield found
+
+
+def fetch(path: Path) -> Path:
+    """Fetch the file of a path that represents a URL. It stays there until this process ends.
+
+    Returns:
+        The path.
+
+    Raises:
+        RequestError: it cannot be fetched.
+    """
+    if url := url_of(path):
+        _fetch(url, path, RequestError)
+    return path
+
+
+def upload(path: Path, url: str) -> None:
+    """Write a file to a URL, whole or not at all.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+
+    def work(system: Any, remote: str) -> None:
+        system.put_file(str(path), remote)
+        system.invalidate_cache()
+        if (size := system.info(remote).get("size")) != path.stat().st_size:
+            raise OSError(f"{size} of {path.stat().st_size} bytes are there")
+
+    _retried(url, work, OutputError, "written")
+
+
+def read_url(url: str) -> bytes | None:
+    """Return the bytes of a small file; None if it is missing.
+
+    Raises:
+        OutputError: it cannot be read.
+    """
+
+    def work(system: Any, path: str) -> bytes | None:
+        with contextlib.suppress(FileNotFoundError):
+            return bytes(system.cat_file(path))
+        return None
+
+    return _retried(url, work, OutputError, "read")
+
+
+def _check_scheme(url: str) -> None:
+    """See that fsspec knows a URL's scheme. No server is asked.
+
+    Raises:
+        RequestError: it does not, or a package is missing; the message names the package.
+    """
+    require(f"{url}:", "fsspec")
+    from fsspec import get_filesystem_class
+
+    try:
+        get_filesystem_class(url.partition("://")[0])
+    except (ImportError, ValueError) as error:
+        raise RequestError(f"{url}: {one_line(str(error))}") from None
+
+
+def _place(url: str, folder: Path) -> Path:
+    """Return the path that represents a URL, below a folder for temporary files.
+
+    Raises:
+        RequestError: no path can.
+
+    >>> str(_place("s3://bucket/a/b.exr", Path("/tmp/x")))
+    '/tmp/x/clpipe-spool/s3/bucket/a/b.exr'
+    """
+    scheme, _, rest = url.partition("://")
+    parts = rest.split("/")
+    has_drive = os.name == "nt" and ":" in rest
+    if {"..", "."} & {*parts} or "" in parts[:-1] or "\\" in url or has_drive:
+        raise RequestError(f"{url}: expected a URL without '..', '.', backslashes and empty parts")
+    return folder / SPOOL / scheme / rest
+
+
+def _fetch(url: str, path: Path, fails: type[ClpipeError]) -> None:
+    """Copy a file to this machine, whole or not at all, with its stamp as size and time of change.
+
+    Raises:
+        ClpipeError: it cannot be fetched. The error has the given type.
+    """
+    part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")  # others may fetch it too
+
+    def work(system: Any, remote: str) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        info = system.info(remote)
+        size, modified = _stamp(info)
+        system.get_file(remote, str(part))
+        if info.get("size") is not None and part.stat().st_size != size:
+            raise OSError(f"{part.stat().st_size} of {size} bytes came")
+        os.utime(part, ns=(modified, modified))
+        part.replace(path)
+
+    try:
+        _retried(url, work, fails, "read")
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _stamp(info: Mapping[str, Any]) -> tuple[int, int]:
+    """Return the size, and a number made of what shows that a file changed."""
+    said = next((str(v) for name in CHANGES if (v := info.get(name)) is not None), "")
+    number = int.from_bytes(hashlib.sha256(said.encode()).digest()[:7]) if said else 0
+    return int(info.get("size") or 0), number // 100 * 100  # as a file's time, of which NTFS keeps
+
+
+def _retried(url: str, work: Callable[[Any, str], T], fails: type[ClpipeError], what: str) -> T:
+    """Return what a function returns for a URL's file system and the path in it.
+
+    It is called again after errors that may pass.
+
+    Raises:
+        RequestError: as for :func:`_check_scheme`.
+        ClpipeError: it failed. The error has the given type, and says what could not be done.
+    """
+    _check_scheme(url)
+    from fsspec.core import url_to_fs
+
+    wait = FIRST_WAIT
+    for left in reversed(range(TRIES)):
+        try:
+            return work(*url_to_fs(url))
+        except Exception as error:
+            if not left or isinstance(error, FINAL):
+                reason = one_line(str(error) or type(error).__name__)
+                raise fails(f"{url}: cannot be {what}: {reason}") from None
+            time.sleep(wait * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
+            wait *= 2
+    raise AssertionError

@@ -1,0 +1,165 @@
+"""Reads samples and single facts from image files, and computes digests of the files."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+
+from clpipe.base.digests import stamp_of
+from clpipe.base.errors import ImageError
+from clpipe.base.files import sha256_of
+from clpipe.base.types import Array
+from clpipe.images.layers import MOST_PARTS, PictureLocation, mosaic_channel, picture_channels
+from clpipe.images.openexr import read_channels
+from clpipe.images.openimageio import damage_text, open_image, read_with_pillow
+from clpipe.images.pixels import USUAL_MAX_PIXELS, check_size, display_window
+from clpipe.reference.geometry import Margins
+
+LARGE_FILE = 4 << 20  # bytes; to start a thread takes as long as the SHA-256 of a small one
+READ_AT_ONCE = 8  # channels; those of a picture may lie hundreds apart
+
+
+def read_samples(path: Path, file: Any, part: int, channels: Sequence[int], type_: Any) -> Array:
+    """Return channels of a part's data window, (rows, columns, channel), in the given type.
+
+    Raises:
+        ImageError: the part is damaged, or a volume.
+    """
+    spec = file.spec()
+    if spec.depth > 1:
+        raise ImageError(
+            f"{path}: a volume of {spec.depth} images, not a picture. Write each of them as a file"
+        )
+    first, last = min(channels), max(channels) + 1
+    if last - first > READ_AT_ONCE:
+        planes = [read_samples(path, file, part, [i], type_) for i in channels]
+        return np.concatenate(planes, axis=-1)
+    data = file.read_image(part, 0, first, last, type_)
+    problem = file.geterror()
+    if data is None or problem:
+        data = read_with_pillow(path, spec, part, type_)
+        if data is None:
+            raise ImageError(f"{path}: {damage_text(problem)}")
+        data = data[..., first:last]
+    pixels = np.asarray(data).reshape(spec.height, spec.width, last - first)
+    order = [i - first for i in channels]
+    return pixels if order == list(range(last - first)) else pixels[..., order]
+
+
+def read_part(
+    path: Path,
+    file: Any,
+    location: PictureLocation,
+    mosaic: bool,
+    max_pixels: int,
+    margins: Margins,
+) -> Array:
+    """Return one or three channels of a part in its display window with margins.
+
+    Returns:
+        float16 or float32, (height, width[, 3]).
+
+    Raises:
+        ImageError: the samples are damaged, too many, or not linear float. A mosaic may also have
+            whole numbers.
+    """
+    spec, channels = file.spec(), location.channels
+    formats = spec.channelformats or [spec.format] * spec.nchannels
+    types = {formats[i].basetype for i in channels}
+    whole = mosaic and types <= {oiio.UINT16, oiio.UINT32}
+    if not whole and not types <= {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}:
+        raise ImageError(
+            f"{path}: this {file.format_name().upper()} file has samples of type {spec.format}, "
+            "but linear light in floats is expected",
+            "For a render, add --transfer srgb or linear (in Python, transfer='srgb'). For a "
+            "photograph, use -c unprocess (config='unprocess')",
+        )
+    width, height = margins.around(spec.full_width, spec.full_height)
+    check_size(path, width, height, max_pixels)
+    check_size(path, spec.width, spec.height, max_pixels)
+    # Whole numbers are read as they are: as float, OpenImageIO would scale them to 0..1.
+    type_ = types.pop() if whole else oiio.HALF if types == {oiio.HALF} else oiio.FLOAT
+    pixels = None
+    if file.format_name() == "openexr" and not whole:
+        names = [spec.channelnames[i] for i in channels]
+        pixels = read_channels(path, names, (spec.height, spec.width))
+    if pixels is None:
+        pixels = read_samples(path, file, location.part, channels, type_)
+    if whole:
+        pixels = pixels.astype(np.float32)
+    place = spec.x - spec.full_x + margins.left, spec.y - spec.full_y + margins.top
+    if (*place, spec.width, spec.height) != (0, 0, width, height):
+        pixels = display_window(pixels, *place, width, height)
+    return pixels if len(channels) > 1 else np.ascontiguousarray(pixels[..., 0])
+
+
+def read_whole_numbers(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> Array:
+    """Return the first channel of a picture as it is stored: (height, width), uint8 or uint16.
+
+    Raises:
+        ImageError: the file cannot be read, holds other samples, or is too large.
+    """
+    with open_image(path) as file:
+        spec = file.spec()
+        if spec.format.basetype not in (oiio.UINT8, oiio.UINT16):
+            raise ImageError(
+                f"{path}: has samples of type {spec.format}, but whole numbers of 8 or 16 bits are "
+                "expected"
+            )
+        check_size(path, spec.width, spec.height, max_pixels)
+        return read_samples(path, file, 0, (0,), spec.format.basetype)[..., 0]
+
+
+def photograph_facts(path: Path) -> tuple[float | None, int]:
+    """Return the ISO in a finished picture's EXIF, or None if it has none, and the bits a sample.
+
+    Raises:
+        ImageError: the file is missing, empty, damaged or not an image.
+    """
+    with open_image(path) as file:
+        iso = file.spec().getattribute("Exif:PhotographicSensitivity")
+        bits = 8 * file.spec().format.size()
+    return float(iso) if isinstance(iso, int) and iso > 0 else None, bits
+
+
+def holds_mosaic(path: Path) -> bool:
+    """Return whether a file has no red, green and blue, but one channel that may be a mosaic.
+
+    Raises:
+        ImageError: the file is missing, empty, damaged or not an image.
+    """
+    with open_image(path) as file:
+        parts: list[list[str]] = []
+        while len(parts) < MOST_PARTS and file.seek_subimage(len(parts), 0):
+            parts.append(list(file.spec().channelnames))
+    return not any(map(picture_channels, parts)) and any(map(mosaic_channel, parts))
+
+
+def with_digest(path: Path, read: Callable[[], Array]) -> tuple[Array, str]:
+    """Return what a function reads from a file, and the file's SHA-256.
+
+    The digest of a large file is computed at the same time, in another thread.
+
+    Raises:
+        ImageError: the file cannot be read.
+    """
+    if stamp_of(path)[0] < LARGE_FILE:
+        return read(), digest_of(path)
+    with ThreadPoolExecutor(1) as beside:
+        digest = beside.submit(digest_of, path)
+        return read(), digest.result()
+
+
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 of a file.
+
+    Raises:
+        ImageError: it cannot be read.
+    """
+    try:
+        return sha256_of(path)[0]
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
