@@ -111,6 +111,7 @@ class Run:
         echo: gets each line of the log, too.
 
     Attributes:
+        images: which images the run is about.
         jobs: the images of the run's part; there may be none.
         summary: counts of what became of them so far.
         notes: what is to be said of the output folder, once the run has ended.
@@ -134,7 +135,7 @@ class Run:
         check_processes(where, dask, images.per_tar)
         self.where = where
         self.notes: list[str] = []
-        self._images = images
+        self.images = images
         self._dask = dask
         self._arguments = arguments
         self._echo = echo
@@ -182,7 +183,7 @@ class Run:
         """
         if not self.jobs:
             return
-        images, where = self._images, self.where
+        images, where = self.images, self.where
         start = {"arguments": list(self._arguments), "images": len(self.jobs)}
         with ExitStack() as stack:
             batch = self._running = stack.enter_context(self._batch(jobs))
@@ -209,7 +210,7 @@ class Run:
 
     def _send_log(self, url: str) -> None:
         """Put the log beside the tars, under a name that no other run has."""
-        path = self.where.output / log_name(self._images.shard)
+        path = self.where.output / log_name(self.images.shard)
         if path.exists():
             began = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
             try:
@@ -263,8 +264,8 @@ class Run:
 
             for folder in folders:
                 self.notes += write_camera_files(folder).lines(folder)
-        if self._images.is_whole and (
-            count := pictures_without_input(self.writer, self.jobs, self._images.inputs)
+        if self.images.is_whole and (
+            count := pictures_without_input(self.writer, self.jobs, self.images.inputs)
         ):
             pictures, are = ("picture", "is") if count == 1 else ("pictures", "are")
             self.notes.append(
