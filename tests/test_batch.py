@@ -716,7 +716,7 @@ def test_a_sidecar_that_somebody_edited(clpipe, renders):
 def test_a_replay_says_that_the_bytes_are_the_same(clpipe, renders):
     clpipe("run", renders(1), *RUN)
     for _ in ("made", "there already"):
-        stderr = clpipe("replay", "out/r000.json", "-o", "b").stderr
+        stderr = clpipe("replay", "out/r000.json", "-o", "b", "--memory", "1G").stderr
         assert "b/r000.jpg: the same bytes" in stderr
     assert clpipe("run", "out/r000.jpg", "-o", "c", "-c", "unprocess").exit_code == 0
 

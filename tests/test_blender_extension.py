@@ -100,7 +100,7 @@ def test_command_is_one_of_the_command_line(settings, tmp_path):
     context = run.make_context("run", arguments[arguments.index("run") + 1 :])
     told = ParameterSource.COMMANDLINE
     given = {n for n in context.params if context.get_parameter_source(n) is told}
-    assert given == {"inputs", "output", "config", "cameras", "isos", "seed", "formats", "quiet"}
+    assert given == {"inputs", "output", "config", "camera", "iso", "seed", "format", "quiet"}
     assert context.params["inputs"] == tuple(str(render.path) for render in renders)
 
 

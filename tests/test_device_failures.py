@@ -150,7 +150,9 @@ def test_kernels_that_fail_in_a_batch_change_no_byte(device, write_exr, tmp_path
     for i in range(12):
         pixels = np.random.default_rng(i).random((20, 30, 3)).astype(np.float32)
         write_exr(f"in/{i:02}.exr", pixels)
-    loader = ImageLoader(Request.from_options(stages="exposure,gamma", formats=("png",)))
+    loader = ImageLoader(
+        Request.from_options(values={"stages": ["exposure", "gamma"]}, formats=("png",))
+    )
     jobs = find_jobs([str(tmp_path / "in")], tmp_path)
 
     def made(name):

@@ -14,6 +14,7 @@ from PIL import Image
 from clpipe.base.errors import ClpipeError, ImageError, KeyedError, RequestError
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings, overlay
+from clpipe.commands.chain_options import settings_in
 from clpipe.commands.main import main
 from clpipe.engine.device import open_device
 from clpipe.images.write import write_exr as write
@@ -98,15 +99,11 @@ def test_options_are_the_same_settings(two_renders):
     text = ["run", str(two_renders), "-o", "out", *options]
     context = main.get_command(None, "run").make_context("run", text[1:])
     params = context.params
-    own = {"iso": 6400, "seed": 3, "noise_key": "it's", "lens": "a b"}
-    assert params["isos"] == "6400"
-    assert {k: params[k] for k in ("seed", "noise_key", "lens")} == {
-        k: own[k] for k in ("seed", "noise_key", "lens")
-    }
-    assert params["stages"] == "mosaic,demosaic"
-    given = Request.from_options(
-        iso=6400.0, seed=3, skip=params["skip"], assignments=params["assignments"]
-    )
+    others = {"noise_key": "it's", "lens": "a b", "stages": ["mosaic", "demosaic"]}
+    assert {key: params.pop(key) for key in others} == others
+    settings = settings_in(params)
+    assert settings.pop("iso") == "6400"
+    given = Request.from_options(values={"iso": 6400.0, **settings})
     assert given.settings() == overlay(Settings(), NOISY)
 
 
@@ -268,7 +265,7 @@ def test_every_lens_in_the_list_is_one():
 
 
 def test_a_page_may_switch_on_what_the_command_line_skipped(two_renders):
-    explorer = explorer_of(two_renders, skip=["sharpen"], device="numpy")
+    explorer = explorer_of(two_renders, values={"skip": ["sharpen"]}, device="numpy")
     assert explorer.initial == {"skip": ["sharpen"]}
     on = explorer.develop(0, {}, View()).facts["steps"]
     assert {step["name"]: step["on"] for step in on}["sharpen"]
@@ -297,7 +294,7 @@ def test_files_that_were_named_may_be_used(two_renders, tmp_path):
     profile = tmp_path / "own.toml"
     built_in = ROOT / "clpipe/camera/profiles/sony-a7r2.toml"
     profile.write_text(built_in.read_text("utf-8"), "utf-8")
-    explorer = explorer_of(two_renders, camera=str(profile), device="numpy")
+    explorer = explorer_of(two_renders, values={"camera": str(profile)}, device="numpy")
     assert explorer.cameras == (str(profile),)
     explorer.develop(0, {"camera": str(profile)}, View())
     assert f'camera = "{profile}"' in exported(explorer, 0, explorer.initial)["config"]

@@ -144,7 +144,7 @@ LONG = "9" * 4400  # more digits than int() takes
         (parse_frames, f"1-{LONG}", "each from 0 to 1048574"),
         (parse_frames, "0-99999999999", "each from 0 to 1048574"),
         (parse_resolution, f"{LONG}x9", "expected WIDTHxHEIGHT"),
-        (patch_count, LONG, "expected 1 to 9999, or grid"),
+        (patch_count, LONG, "expected a whole number from 1 to 9999, or grid"),
         (
             lambda text: choose_places((text,), np.zeros((9, 9, 3), np.float32)),
             f"0,0,9x{LONG}",

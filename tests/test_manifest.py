@@ -261,9 +261,9 @@ def test_a_manifest_that_is_not_there(tmp_path):
     [
         ("iso\nhigh", "row 2: iso: found 'high', but it is a number"),
         ("iso\nNaN", "row 2: iso: found 'NaN', but it is a number"),
-        ("iso\nnan", "row 2: iso: found nan, but camera sony-a7r2"),
+        ("iso\nnan", "row 2: iso: found nan, but it is a number up to"),
         ("iso\n50", "row 2: iso: found 50, but camera sony-a7r2 goes from 100 to 25600"),
-        ("iso\n1" + "0" * 400, "row 2: iso: found 10+, but it is at most"),
+        ("iso\n1" + "0" * 400, "row 2: iso: found 10+, but it is a number up to"),
         ("iso\n" + "1" * 5000, "row 2: iso: found '1+.*1', but it is a number"),
         ("iso\n" + "[" * 5000, "row 2: iso: found .*but it is a number"),
         ("seed\n1.5", "row 2: seed: found 1.5, but it is a whole number"),
@@ -300,8 +300,9 @@ def test_what_is_wrong_in_several_rows(manifest):
 def test_a_row_leaves_out_stages_and_noise(manifest):
     rows = manifest('path,skip\na,denoise noise\nb,"[""denoise""]"\nc,picture_noise\nd,\n')
     rows += manifest('{"path": "e", "skip": ["noise"]}', "frames.jsonl")
-    loud = ("picture_noise.method=iid_gaussian", "picture_noise.sigma=[0.1, 0.1, 0.1]")
-    request = Request.from_options(assignments=[*loud, "prnu.sigma=0.01"], skip=["sharpen"])
+    loud = {"method": "iid_gaussian", "sigma": [0.1, 0.1, 0.1]}
+    values = {"picture_noise": loud, "prnu": {"sigma": 0.01}, "skip": ["sharpen"]}
+    request = Request.from_options(values=values)
     check_rows(rows, request.settings())
     chains = [request.for_image(row.key, row.values).chain() for row in rows]
     assert all(chain.settings.skip[0] == "sharpen" for chain in chains)
@@ -323,22 +324,22 @@ def test_a_row_completes_and_replaces_what_options_set(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # what a row names is found beside the manifest, not here
     (tmp_path / "rows").mkdir()
     (tmp_path / "noise.json").rename(tmp_path / "rows" / "noise.json")
-    method = "picture_noise.method=iid_gaussian"
 
-    def sigma(cells, *assignments):
+    def sigma(cells, **values):
         header, cell = cells
         (tmp_path / "rows" / "a.csv").write_text(f"path,{header}\na.exr,{cell}\n")
         [row] = read_manifest(tmp_path / "rows" / "a.csv")
-        request = Request.from_options(assignments=[method, *assignments])
+        noise = {"method": "iid_gaussian", **values}
+        request = Request.from_options(values={"picture_noise": noise})
         check_rows([row], request.settings())
         chain = request.for_image(row.key, row.values).chain()
         return chain.step_named("picture_noise").method.sigma
 
     measured = ("picture_noise.measured", "noise.json")
     assert sigma(measured) == (0.02, 0.02, 0.02)
-    assert sigma(measured, "picture_noise.sigma=0.1") == (0.02, 0.02, 0.02)
+    assert sigma(measured, sigma=0.1) == (0.02, 0.02, 0.02)
     own = ("picture_noise.sigma", "0.3")
-    assert sigma(own, "picture_noise.measured=rows/noise.json") == (0.3, 0.3, 0.3)
+    assert sigma(own, measured="rows/noise.json") == (0.3, 0.3, 0.3)
     with pytest.raises(RequestError, match="picture_noise: needs sigma, or measured"):
         sigma(("iso", "400"))
 

@@ -18,8 +18,7 @@ from tests.conftest import reseal
 
 OPTIONS = {
     "config": "paper",
-    "iso": 800.0,
-    "assignments": ["exposure.ev=0.5"],
+    "values": {"iso": 800.0, "exposure": {"ev": 0.5}},
     "until": "demosaic",
     "keep": ("mosaic",),
     "formats": ("exr",),
@@ -55,7 +54,13 @@ def test_a_record_makes_the_same_request_but_for_which_pictures_are_made():
 
 @pytest.mark.parametrize(
     "change",
-    [{"config": None}, {"iso": 100.0}, {"keep": ()}, {"formats": ("png",)}, {"transfer": None}],
+    [
+        {"config": None},
+        {"values": {"iso": 100.0}},
+        {"keep": ()},
+        {"formats": ("png",)},
+        {"transfer": None},
+    ],
 )
 def test_records_differ_where_bytes_do(change):
     records = [Request.from_options(**{**OPTIONS, **c}).record() for c in ({}, change)]
@@ -105,7 +110,7 @@ def test_outputs_that_are_left_open_follow_from_the_chain():
 
 def test_what_an_image_carries_stands_below_configuration_and_options():
     carried = settings_from({"iso": 400, "exposure": {"ev": 3}, "gamma": {"method": "srgb"}})
-    request = Request.from_options(iso=800.0, values={"exposure": {"ev": 1}})
+    request = Request.from_options(values={"iso": 800.0, "exposure": {"ev": 1}})
     settings = request.for_image("a", {"seed": 9}).settings(carried)
     assert (settings.iso, settings.seed) == (800, 9)
     assert settings.parameters == {"exposure": {"ev": 1}, "gamma": {"method": "srgb"}}
@@ -115,9 +120,8 @@ def test_a_request_and_its_loader_can_be_sent_with_a_stage_file(tmp_path, monkey
     monkeypatch.setattr("clpipe.chain.registry._from_files", {})
     file = tmp_path / "sent.py"
     file.write_text(STAGE_FILE.format(mark=str(tmp_path / "ran"), name="sent"))
-    request = Request.from_options(
-        stage_files=[file], stages="exposure,sent", assignments=["sent.method=nothing"]
-    )
+    values = {"stages": ["exposure", "sent"], "sent": {"method": "nothing"}}
+    request = Request.from_options(stage_files=[file], values=values)
     loader = ImageLoader(request)
     assert [s.name for s in loader.chain.steps] == ["exposure", "sent"]
     sent = pickle.loads(pickle.dumps(loader))
@@ -134,8 +138,8 @@ def test_a_run_validates_the_parameters_of_a_step_once(monkeypatch):
         return validate(cls, values, **options)
 
     monkeypatch.setattr(Method, "model_validate", classmethod(counted))
-    options = {"assignments": ["exposure.ev=0.5", "denoise.luma_size=3"], "config": "paper"}
-    request = Request.from_options(**options)
+    values = {"exposure": {"ev": 0.5}, "denoise": {"luma_size": 3}}
+    request = Request.from_options(config="paper", values=values)
     loader = ImageLoader(request)
     jobs = [Job(Path("a.exr"), "a"), Job(Path("b.exr"), "b", values={"iso": 800})]
     loader.check(jobs)

@@ -58,6 +58,7 @@ def test_several_of_one_alone_name_no_folder_for_the_other(clpipe, renders, tmp_
         (["--iso", "100,x"], "--iso: found '100,x'; expected numbers above 0"),
         (["--iso", "100,-5"], "expected numbers above 0, such as 100,800,3200"),
         (["--iso", "100,1e2"], "--iso: found '100,1e2', with 100 twice; give it once"),
+        (["--iso", "9", "--set", "iso.choice=[9]"], "--set iso.choice=[9]: found --iso as well"),
         (["--iso", "100,1e7"], "found 1e+07, but camera sony-a7r2 goes from 100 to 25600"),
         (["--camera", "sony-a7r2", "--camera", "ILCE-7RM2"], "found sony-a7r2 twice"),
         (["--camera", "sony-a7r2", "--camera", "nikon-f"], "nikon-f"),

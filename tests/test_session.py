@@ -45,19 +45,20 @@ def test_nothing_is_written_before_a_run_is_iterated(renders):
 
 def test_what_cannot_be_is_refused_at_once(renders):
     for options, message in (
-        ({"iso": [100, 100]}, "--iso: found 100, 100, with 100 twice"),
+        ({"iso": [100, 100]}, r"--iso: found \[100, 100\], with 100 twice"),
         ({"truth": "cleen"}, r"unknown truth 'cleen' \(did you mean 'clean'"),
-        ({"patch": 0}, "patch"),
-        ({"frames": 0}, "found frames 0; expected 1 to 100000"),
-        ({"frames": 10**9}, "found frames 1000000000; expected 1 to 100000"),
-        ({"jobs": -1}, "found jobs -1; expected 1 to 1024"),
-        ({"webdataset": 0}, "found webdataset 0; expected 1 to"),
-        ({"max_pixels": 0}, "found max_pixels 0; expected 1 to"),
-        ({"memory": 0}, "found memory 0; expected bytes"),
+        ({"patch": 0}, "found patch 0; expected a whole number from 1"),
+        ({"patch": package.Patches(8, 10**4)}, "found patches_per_image 10000; expected a whole"),
+        ({"frames": 0}, "found frames 0; expected a whole number from 1 to 100000"),
+        ({"frames": 10**9}, "found frames 1000000000; expected a whole number from 1 to 100000"),
+        ({"jobs": -1}, "found jobs -1; expected a whole number from 1 to 1024"),
+        ({"webdataset": 0}, "found webdataset 0; expected a whole number from 1 to"),
+        ({"max_pixels": 0}, "found max_pixels 0; expected a whole number from 1 to"),
+        ({"memory": 0}, "--memory: found '0'; expected a size"),
         ({"format": "gif"}, "unknown format 'gif'"),
         ({"transfer": "x"}, "found transfer 'x'; expected 'srgb', 'linear' or None"),
-        ({"bracket": [1, 1]}, r"--bracket: found '1,1', with \+1 EV twice"),
-        ({"bracket": [float("nan")]}, "--bracket: found 'nan'; expected EVs"),
+        ({"bracket": [1, 1]}, r"--bracket: found \[1, 1\], with \+1 EV twice"),
+        ({"bracket": [float("nan")]}, r"--bracket: found \[nan\]; expected EVs"),
         ({"redo": "some"}, "found redo 'some'"),
         ({"frames": "2"}, "found frames '2'; expected a whole number or None"),
         (
@@ -68,7 +69,7 @@ def test_what_cannot_be_is_refused_at_once(renders):
     ):
         with pytest.raises(RequestError, match=message):
             package.run("in", "out", **{**DEVICE, **options})
-    with pytest.raises(RequestError, match="output: it is empty; name a folder"):
+    with pytest.raises(RequestError, match="output: it is empty; name a directory"):
         package.run("in", "", **DEVICE)
     with pytest.raises(RequestError, match="the name of a picture"):
         package.run("in", "out.jpg", **DEVICE)
@@ -102,11 +103,12 @@ def test_one_image_fails_alone(renders):
 
 
 def test_a_draw_of_the_iso_and_what_there_is_to_say_behind_a_run(renders):
-    made = package.run("in", "out", iso={"choice": [100, 200]}, **DEVICE)
+    drawn = {"camera": {"choice": ["canon-5d2"]}, "iso": {"choice": [100, 200]}}
+    made = package.run("in", "out", **drawn, **DEVICE)
     list(made)
     assert {json.loads(p.read_text())["iso"] for p in Path("out").glob("*.json")} <= {100, 200}
     assert made.notes == []
     Path("in/a.exr").unlink()
-    made = package.run("in", "out", iso={"choice": [100, 200]}, **DEVICE)
+    made = package.run("in", "out", **drawn, **DEVICE)
     list(made)
     assert made.notes == ["1 picture in out is of inputs that are not there any more"]

@@ -209,7 +209,7 @@ def test_small_images_of_a_run_share_launches(
         write_exr(tmp_path / f"in/r{number}.exr", pixels)
     asked = {"a burst and its truth": {"frames": 3, "truth": ("clean",)}}
     asked["patches"] = {"patch": 16, "patches_per_image": 2}
-    request = Request.from_options(formats=("png",), iso=3200, **asked.get(what, {}))
+    request = Request.from_options(formats=("png",), values={"iso": 3200}, **asked.get(what, {}))
 
     def made(name):
         (tmp_path / name).mkdir()

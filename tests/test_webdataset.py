@@ -431,8 +431,11 @@ def test_the_variance_of_patches(clpipe, renders):
     ("options", "message"),
     [
         (("--patch", 12, "--format", "dng"), "--patch: dng holds whole images"),
-        (("--patch", 12, "--patches-per-image", "grit"), "found 'grit'; expected 1 to 9999, or"),
-        (("--augment",), "--augment: it is about patches; say --patch SIZE"),
+        (
+            ("--patch", 12, "--patches-per-image", "grit"),
+            "found 'grit'; expected a whole number from 1 to 9999, or grid",
+        ),
+        (("--augment",), "--augment: it needs patches; add --patch SIZE"),
     ],
 )
 def test_patches_that_cannot_be(clpipe, renders, options, message):

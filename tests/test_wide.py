@@ -436,7 +436,7 @@ def test_a_dataset_of_faces_that_exist(write, clpipe):
     assert "`Depth` (depth): along the axis of view" in readme
     assert "`Depth.Distance` (depth): the distance from the camera" in readme
     other = (*chosen[:-2], "--set", "projection.method=double_sphere")
-    assert "leave one out" in clpipe("dataset", "in", "-o", "n", *other, status=2).output
+    assert "use only one of them" in clpipe("dataset", "in", "-o", "n", *other, status=2).output
     record = json.loads(Path("set/iso100/one.json").read_text())
     turns = [view["rotation"] for view in record["panorama"]["views"]]
     assert turns == [np.array(turn).tolist() for turn in CUBE.values()]

@@ -1,35 +1,40 @@
 """The Python API of batches: what ``clpipe run`` does, as a function."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
-from clpipe.base.text import one_of, several
+from clpipe.base.text import several
 from clpipe.base.types import plain
 from clpipe.base.urls import path_of
 from clpipe.base.validation import typed
 from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
-from clpipe.chain.formats import EVERY_FORMAT, format_named
-from clpipe.chain.identity import MAX_FRAMES
+from clpipe.chain.formats import format_named
+from clpipe.chain.options import OPTIONS, PER_IMAGE, Moments, RedoName, Transfer, check_option
 from clpipe.chain.rendition import parse_bracket
-from clpipe.chain.request import Moments, Request
-from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS
+from clpipe.chain.request import Request
 from clpipe.inputs.find import parse_shard
-from clpipe.inputs.series import Series, check_isos
+from clpipe.inputs.series import split_series
 from clpipe.outputs.existing import Redo
 from clpipe.outputs.patches import Patches
 
-# The most that may be asked for; the least is 1.
-MOST = {
-    "frames": MAX_FRAMES,
-    "jobs": 1024,
-    "processes": 1024,
-    "webdataset": 10**6,
-    "max_pixels": MAX_PIXELS,
+# What becomes of values before a run has them.
+CONVERT: dict[str, Callable[[Any], Any]] = {
+    "output": lambda output: path_of(str(output)),
+    "format": lambda names: tuple(map(format_named, names)),
+    "bracket": parse_bracket,
+    "poses": Path,
+    "redo": Redo,
+    "shard": parse_shard,
+    "memory": lambda size: parse_size(str(size)),
+    "trace": Path,
 }
+# Options that fields of Request, Images and Where have other names for.
+FIELDS = {"format": "formats", "webdataset": "per_tar", "device": "devices", "jobs": "threads"}
 
 Texts = str | Path | Sequence[str | Path]  # one, or several
 
@@ -40,7 +45,7 @@ def run(
     output: str | Path,
     config: Texts | None = None,
     *,
-    camera: Texts | None = None,
+    camera: Texts | Mapping[str, Any] | None = None,
     iso: float | Sequence[float] | Mapping[str, Any] | None = None,
     start_at: str | None = None,
     until: str | None = None,
@@ -49,18 +54,18 @@ def run(
     keep: Texts | None = None,
     carry: Texts | None = None,
     truth: Texts | None = None,
-    truth_at: Moments = "middle",
+    truth_at: Moments | None = None,
     frames: int | None = None,
     bracket: Sequence[float] | None = None,
     patch: int | Patches | None = None,
     exclude: Texts | None = None,
     poses: str | Path | None = None,
     layer: str | None = None,
-    transfer: Literal["srgb", "linear"] | None = None,
-    max_pixels: int = USUAL_MAX_PIXELS,
-    redo: Literal["missing", "old", "damaged", "all"] = "old",
+    transfer: Transfer | None = None,
+    max_pixels: int | None = None,
+    redo: RedoName | None = None,
     webdataset: int | None = None,
-    shard: str = "1/1",
+    shard: str | None = None,
     device: str | int | Sequence[str | int] | None = None,
     memory: int | str | None = None,
     jobs: int | None = None,
@@ -71,6 +76,9 @@ def run(
 ) -> Run:
     """Put images through a chain and write the results, like ``clpipe run``.
 
+    Where several values are allowed, one will do. ``camera`` and ``iso`` may also be draws, such as
+    ``{"log_uniform": [100, 6400]}``. ``patch`` may also be ``Patches(128, per_image=4)``.
+
     >>> import clpipe
     >>> made = clpipe.run("renders/", "out", iso=1600, truth="clean")  # doctest: +SKIP
     >>> for outcome in made:  # doctest: +SKIP
@@ -79,44 +87,75 @@ def run(
     {'done': 24, 'skipped': 0, 'left out': 0, 'failed': 0}
 
     Args:
-        inputs: files, folders, globs, URLs and manifests; one, or several.
-        output: the output directory or its URL. It is created if it does not exist.
-        config: a built-in configuration or a TOML file. If you name several, each overrides those
-            before it. None is the default configuration.
-        camera: the name of a profile or its TOML file. With several, each camera's pictures go to
-            a directory of their own.
-        iso: the ISO, or a draw such as ``{"log_uniform": [100, 6400]}``. With several numbers,
-            each ISO's pictures go to a directory of their own.
-        start_at: the first step to run. Inputs are then images of the kind that this step reads.
-        until: the last step to run.
-        stage_files: Python files that define further stages.
-        format: formats of the pictures, such as "png" or "exr". None is JPEG.
-        keep: steps whose image is also written, or "all".
-        carry: layers that are warped with the picture, such as "Depth".
-        truth: ground truths and baselines to write next to each picture: "development", "clean",
+        inputs: files, directories, globs, URLs and manifests (.csv, .jsonl).
+        output: the output directory. It is created if it does not exist.
+        config: a built-in configuration or a TOML file. The built-in ones are brooks2019,
+            canon-5d2-jpeg, canon-5d3-jpeg, default, nikon-d800-jpeg, paper, syb3r, training,
+            unprocess. If you name several, each overrides those before it, and one with stages
+            replaces their development.
+        camera: a built-in camera, by name or model, or a profile (.toml). With several, each
+            camera's pictures go to OUT/CAMERA. None is sony-a7r2.
+        iso: the ISO. Noise and denoising depend on it. With several, each ISO's pictures go to a
+            directory such as OUT/iso800. None is 100.
+        start_at: the first stage to run. Inputs are then images of the kind that it reads, such as
+            kept images or mosaics.
+        until: the last stage to run.
+        stage_files: a Python file that defines further stages.
+        format: the format of the pictures, or dng for the raw that quantize makes. npy holds
+            float16, and DN as uint16; it also makes the images of ``keep`` .npy. The choices are
+            "jpg", "png", "png16", "tif", "tif16", "tif32", "exr", "exr16", "npy", "dng". None is
+            jpg; exr, or npy for patches, if ``until`` ends the chain earlier.
+        keep: a stage whose image is also written, or all. It is a float EXR.
+        carry: a layer to warp with the picture. It has depth, normals, flow or object numbers, in
+            the image's own file or in one next to it, and is written to OUT/NAME.carried.exr. KIND
+            is needed if the name does not say it: depth, label, normal, flow, colour or png. png is
+            depth in metres or object numbers, and also writes a PNG with 16 bits,
+            OUT/NAME.LAYER.png, with depth in millimetres. FILE is the path from the image's
+            directory, as in 'Depth=../depth/{name}.exr'. None is {name}_LAYER.exr or similar.
+        truth: write next to each picture the same picture without noise (development), without
+            noise and denoising (clean), the mosaic without noise (mosaic), the variance of the
+            mosaic's noise (variance), or the clean picture with independent noise of the same
+            strength, equal everywhere (iid) or by intensity (intensity). iid and intensity also
+            write the truths from which they are made. The choices are "development", "clean",
             "mosaic", "variance", "iid", "intensity".
-        truth_at: the moment of an exposure of several files whose pose and layers go with the
-            picture: "start", "middle", "end", or "all".
-        frames: the number of frames of a burst. Each frame has its own noise. None is one picture.
-        bracket: one exposure per value, in EV relative to ``exposure.ev``.
-        patch: the side of square patches in px, which are written instead of pictures, or
-            ``Patches(128, per_image=4, augment=True)``.
-        exclude: patterns of files that are skipped in directories and globs.
-        poses: a file with the camera and pose of each render, such as ``transforms.json``.
-        layer: the layer or part of an EXR that is the picture. None lets clpipe choose.
-        transfer: the transfer curve of renders in integers: "srgb" or "linear".
-        max_pixels: larger images are rejected before memory is allocated.
-        redo: which existing pictures to make again: "missing", "old" (also those of another
-            version or request), "damaged" (also damaged files, which reads every file), or "all".
-        webdataset: the number of images per tar. None writes files, no tars.
-        shard: the part of the images to make, such as "2/8", for job arrays.
-        device: an index or part of a name from ``clpipe devices``, or "numpy"; one, or several.
-            None is the first GPU and all GPUs like it, else the CPU.
-        memory: the memory of a device that clpipe may use, in bytes or such as "2G".
-        jobs: the number of threads that decode, and of those that encode.
-        processes: the number of processes that share the work.
-        dask: the address of a Dask scheduler, whose workers do the work.
-        trace: a JSON file for a timeline of the run, for Perfetto or chrome://tracing.
+        truth_at: the moment of an exposure of several files (shutter.subframes) whose pose and
+            layers go with the picture. all has the layers of its start and end as well. The choices
+            are "start", "middle", "end", "all". None is middle.
+        frames: the number of frames of a burst. Each frame has its own noise, and the burst its
+            ground truth.
+        bracket: the exposures of a bracket in EV, which are added to exposure.ev. Each exposure has
+            its own noise, frames and ground truth.
+        patch: the side of square patches in px. They are written instead of pictures, as
+            OUT/NAME_0000.jpg and so on. A patch has the same values as the picture there. Images of
+            ``keep`` are .npy.
+        exclude: a pattern of files and directories to skip. In directories and globs, it matches
+            names and paths relative to the input directory.
+        poses: a file with the camera and pose of each render. This is a cameras.json, a
+            transforms.json (NeRF, nerfstudio), or a directory with COLMAP's text model. The cameras
+            and poses of the pictures are written to OUT/cameras.json, OUT/transforms.json and
+            OUT/sparse/0, see clpipe poses.
+        layer: the layer or part of an EXR that is the picture.
+        transfer: the transfer curve of renders with integer samples (PNG, TIFF and others). The
+            choices are "srgb", "linear".
+        max_pixels: the most pixels of an image. Larger images are rejected before memory is
+            allocated. None is 200000000.
+        redo: make again pictures that are missing or whose request has changed (missing), also
+            those of another version of clpipe (old), also damaged ones (damaged), or all, even if
+            other programs wrote the files (all). To find damaged ones, all files are read. The
+            choices are "missing", "old", "damaged", "all". None is old.
+        webdataset: the number of images per tar for WebDataset, OUT/000000.tar and so on.
+        shard: the part of the images to make, such as 2/8, for job arrays.
+        device: an index or part of a name from 'clpipe devices', or numpy. None is the first GPU
+            and all GPUs like it, else the CPU.
+        memory: the memory of a device that clpipe may use, such as 2G. Larger images are processed
+            in tiles. None is what is free.
+        jobs: the number of threads that decode, and of threads that encode. None is one per
+            processor.
+        processes: the number of processes that share the work. Each has a part of the processors
+            and devices. None is as many as the number and size of the images justify.
+        dask: the address of a Dask scheduler, such as tcp://HOST:8786, whose workers do the work.
+            They must see the same files.
+        trace: a file for a timeline of the run, for Perfetto or chrome://tracing.
         **settings: any value of a configuration file, which overrides ``config``:
             ``seed=1``, ``denoise={"method": "mean"}``.
 
@@ -128,69 +167,50 @@ def run(
         RequestError: a name or value is not allowed, an input does not exist, or a result would
             overwrite an input. If one image fails, its outcome says so, and the run continues.
     """
-    numbers = {
-        "frames": frames,
-        "jobs": jobs,
-        "processes": processes,
-        "webdataset": webdataset,
-        "max_pixels": max_pixels,
-    }
-    for name, number in numbers.items():
-        if number is not None and not 1 <= number <= MOST[name]:
-            raise RequestError(f"found {name} {number}; expected 1 to {MOST[name]}")
-    if not str(output):
-        raise RequestError("output: it is empty; name a folder")
-    formats = tuple(map(format_named, several(format)))
-    for each in formats:
-        if each not in EVERY_FORMAT:
-            raise RequestError(one_of("format", each, EVERY_FORMAT))
-    if isinstance(memory, int) and memory < 1:
-        raise RequestError(f"found memory {memory}; expected bytes, or a size such as 8G")
-    isos: Sequence[float] = ()
-    if iso is not None and not isinstance(iso, Mapping):
-        isos = (iso,) if isinstance(iso, int | float) else iso
-    series = Series(several(camera), check_isos(isos))
-    patches = Patches(patch) if isinstance(patch, int) else patch
-    values = plain(settings)
-    if isinstance(iso, Mapping):
-        values["iso"] = plain(iso)
-    request = Request.from_options(
-        config=config,
-        camera=series.camera,
-        iso=series.iso,
-        stage_files=[Path(file) for file in several(stage_files)],
-        values=values,
-        start_at=start_at,
-        until=until,
-        formats=formats,
-        keep=several(keep),
-        carry=several(carry),
-        truth=several(truth),
-        truth_at=truth_at,
-        frames=frames,
-        bracket=parse_bracket(",".join(map(str, bracket))) if bracket else (),
-        patch=patches.size if patches else None,
-        patches_per_image=patches.per_image if patches else 0,
-        augment=bool(patches and patches.augment),
-        layer=layer,
-        transfer=transfer,
-        max_pixels=max_pixels,
-    )
-    images = Images(
-        several(inputs),
-        several(exclude),
-        None if poses is None else Path(poses),
-        series,
-        parse_shard(shard),
-        webdataset,
-    )
-    where = Where(
-        path_of(str(output)),
-        several(device),
-        parse_size(memory) if isinstance(memory, str) else memory,
-        jobs,
-        Redo(redo),
-        None if trace is None else Path(trace),
-        processes,
-    )
-    return Run(request, images, where, dask)
+    options = dict(locals())
+    if isinstance(patch, Patches):
+        options["patch"], options["augment"] = patch.size, patch.augment
+        options["patches_per_image"] = patch.per_image
+    return run_of(options, options.pop("settings"))
+
+
+def run_of(
+    options: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    arguments: Sequence[str] = (),
+    echo: Callable[[bytes], None] | None = None,
+) -> Run:
+    """The run that options describe. :func:`run` and the command ``clpipe run`` both call this.
+
+    Args:
+        options: values by the names of :data:`OPTIONS`, as :func:`run` takes them. An ISO and a
+            bracket may be texts with commas. None is an option that is not set.
+        settings: values of a configuration file, nested.
+        arguments, echo: as for :class:`Run`.
+
+    Raises:
+        RequestError: as for :func:`run`.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    if not str(given["output"]):
+        raise RequestError("output: it is empty; name a directory")
+    own = {name: given.pop(name) for name in ("camera", "iso") if name in given}
+    series, values = split_series(plain({**settings, **own}))
+    for name, value in given.items():
+        listed = several(value) if OPTIONS[name].type_ is list else value
+        given[name] = CONVERT[name](listed) if name in CONVERT else listed
+        check_option(name, given[name])
+    if "patch" in given:
+        given.setdefault("patches_per_image", PER_IMAGE)
+    elif lost := [name for name in ("patches_per_image", "augment") if given.get(name)]:
+        raise RequestError(f"--{lost[0].replace('_', '-')}: it needs patches; add --patch SIZE")
+    dask = given.pop("dask", None)
+    given = {FIELDS.get(name, name): value for name, value in given.items()}
+    where = Where(**_fields_of(Where, given))
+    images = Images(**_fields_of(Images, given), series=series)
+    return Run(Request.from_options(values=values, **given), images, where, dask, arguments, echo)
+
+
+def _fields_of(class_: type[Where | Images], values: dict[str, Any]) -> dict[str, Any]:
+    """Take the fields of a class from values."""
+    return {each.name: values.pop(each.name) for each in fields(class_) if each.name in values}

@@ -106,6 +106,7 @@ class Run:
         echo: also called with each line of the log.
 
     Attributes:
+        images: the images of the run.
         jobs: the images of this part of the run; may be empty.
         summary: counts of outcomes so far.
         notes: remarks about the output directory, complete when the run has ended.
@@ -129,7 +130,7 @@ class Run:
         check_processes(where, dask, images.per_tar)
         self.where = where
         self.notes: list[str] = []
-        self._images = images
+        self.images = images
         self._dask = dask
         self._arguments = arguments
         self._echo = echo
@@ -177,7 +178,7 @@ class Run:
         """
         if not self.jobs:
             return
-        images, where = self._images, self.where
+        images, where = self.images, self.where
         start = {"arguments": list(self._arguments), "images": len(self.jobs)}
         with ExitStack() as stack:
             sink = self.sink()
@@ -205,7 +206,7 @@ class Run:
 
     def _send_log(self, url: str) -> None:
         """Upload the log next to the tars, under a unique name."""
-        path = self.where.output / log_name(self._images.shard)
+        path = self.where.output / log_name(self.images.shard)
         if path.exists():
             began = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
             try:
@@ -250,8 +251,8 @@ class Run:
 
             for folder in folders:
                 self.notes += write_camera_files(folder).lines(folder)
-        if self._images.is_whole and (
-            count := pictures_without_input(self.writer, self.jobs, self._images.inputs)
+        if self.images.is_whole and (
+            count := pictures_without_input(self.writer, self.jobs, self.images.inputs)
         ):
             pictures, are = ("picture", "is") if count == 1 else ("pictures", "are")
             self.notes.append(

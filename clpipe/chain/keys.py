@@ -1,10 +1,15 @@
-"""The keys of a configuration that stand in no table, and the types of their values."""
+"""Keys: what a user may set by name, each with its type, range and help; those of a configuration.
+
+The options of a run have the same form, see :mod:`clpipe.chain.options`.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from clpipe.base.errors import KeyedError
+from clpipe.camera.profile import DEFAULT_CAMERA
+from clpipe.images.dump import TYPES
 
 CODE = "stage_files"  # the key that only a configuration file may have
 
@@ -14,53 +19,120 @@ TABLES = (OUTPUT, RENDER)
 NOISE = "noise"  # under "skip": the noise of every stage
 
 MAX_STAGES = 256  # of a chain; an image can carry one
+DEFAULT_ISO = 100.0
+
+WORDS = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
 
 
 class Key(NamedTuple):
-    """A key of a configuration.
+    """A value that a user may set by name: a key of a configuration, or an option of a run.
 
     Args:
-        name: the key.
-        type_: of its value, :class:`list` for a list of texts.
-        is_drawn: whether a draw may stand in place of its value.
-        text: one sentence about it, for help.
-        unit: of its value.
-        most: the largest number that it may be.
-        above: what a number must be larger than; None is any.
+        name: its name in configurations and in Python. A command has the option ``--name``.
+        type_: the type of the value. :class:`list` is a list of texts.
+        text: sentences for help and documentation. Brief help shows the start of the first one.
+        metavar: what the help of a command writes in place of the value.
+        usual: the default in words; "" if there is none.
+        choices: the texts that are allowed; () is any text.
+        unit: the unit of the value.
+        above: the value must be larger than this number.
+        most: the largest number that is allowed.
+        is_drawn: whether a draw is allowed in place of the value.
     """
 
     name: str
     type_: type
-    is_drawn: bool = False
-    text: str = ""
+    text: str
+    metavar: str | None = None
+    usual: str = ""
+    choices: Sequence[str] = ()
     unit: str = ""
+    above: float = -math.inf
     most: float = math.inf
-    above: float | None = None
+    is_drawn: bool = False
+
+    @property
+    def allowed(self) -> str:
+        """The type and the range in words.
+
+        >>> Key("jobs", int, "", above=0, most=8).allowed, Key("iso", float, "", most=900).allowed
+        ('a whole number from 1 to 8', 'a number up to 900')
+        """
+        is_counted = self.type_ is int and self.above > -math.inf
+        least = f" from {self.above + 1:g}" if is_counted else f" above {self.above:g}"
+        most = f"{'' if is_counted else ' up'} to {self.most}"
+        return WORDS[self.type_] + least * (self.above > -math.inf) + most * (self.most < math.inf)
+
+    def allows(self, value: Any) -> bool:
+        """Whether a value has the type and is in the range. Lists and choices are not checked."""
+        if self.type_ is list:
+            return True
+        types: Any = (int, float) if self.type_ is float else self.type_
+        if not isinstance(value, types) or isinstance(value, bool) is not (self.type_ is bool):
+            return False
+        return isinstance(value, str) or self.above < value <= self.most
 
 
 def _of_lens(name: str, text: str, unit: str = "") -> Key:
     """What a lens is set to."""
-    return Key(name, float, is_drawn=True, text=text, unit=unit, most=1e6, above=0.0)
+    return Key(name, float, text, unit=unit, above=0, most=10**6, is_drawn=True)
 
 
-LENS_TEXT = "A lens of lensfun's database: its distortion, lateral colour and vignetting."
-NOISE_KEY_TEXT = (
-    "Share the noise with all images that have this key, whatever their ISO; without it, each "
-    "image and ISO has noise of its own."
-)
 _ALL = (
-    Key("camera", str, is_drawn=True),
-    Key("iso", float, is_drawn=True, most=1e9),
-    Key("lens", str, is_drawn=True, text=LENS_TEXT),
-    _of_lens("focal_length", "The lens's focal length.", "mm"),
-    _of_lens("aperture", "The lens's f-number; without it, a lens by name does not vignette."),
-    _of_lens("focus_distance", "Where the lens is focused; without it, far away.", "m"),
-    Key("seed", int, text="The seed of the noise."),
-    Key("noise_key", str, text=NOISE_KEY_TEXT),
-    Key("dump", str),
-    Key("stages", list),
-    Key("skip", list),
-    Key(CODE, list),
+    Key(
+        "camera",
+        str,
+        "A built-in camera, by name or model, or a profile (.toml).",
+        "NAME|FILE",
+        DEFAULT_CAMERA,
+        is_drawn=True,
+    ),
+    Key(
+        "iso",
+        float,
+        "The ISO. Noise and denoising depend on it.",
+        usual=f"{DEFAULT_ISO:g}",
+        most=10**9,
+        is_drawn=True,
+    ),
+    Key(
+        "lens",
+        str,
+        "A lens in lensfun's database. It has distortion, lateral colour and vignetting.",
+        "NAME",
+        "none",
+        is_drawn=True,
+    ),
+    _of_lens("focal_length", "The focal length of the lens.", "mm"),
+    _of_lens(
+        "aperture",
+        "The f-number of the lens. Without it, a lens from lensfun's database has no vignetting.",
+    ),
+    _of_lens("focus_distance", "The distance at which the lens is focused; far by default.", "m"),
+    Key("seed", int, "The seed of the noise.", usual="0"),
+    Key(
+        "noise_key",
+        str,
+        "Images with the same key have the same noise, at any ISO. Without a key, each image and "
+        "ISO has its own noise.",
+        "TEXT",
+    ),
+    Key(
+        "dump",
+        str,
+        "The width, height and sample type of headerless dumps (.raw), such as "
+        f"1920x1080:uint16le. The types are {', '.join(TYPES)}.",
+        "WxH:TYPE",
+    ),
+    Key("stages", list, "The stages to run, in order, in place of the default chain.", "A,B,C"),
+    Key(
+        "skip",
+        list,
+        f"A stage to skip, or '{NOISE}'. This skips the noise of all stages; denoising stays as "
+        "strong as the ISO requires.",
+        "STAGE",
+    ),
+    Key(CODE, list, "A Python file that defines further stages.", "FILE.py"),
 )
 KEYS = {key.name: key for key in _ALL}
 
@@ -68,23 +140,13 @@ LENS = ("lens", "focal_length", "aperture", "focus_distance")  # how a lens is n
 
 
 def check_type(key: str, value: Any) -> None:
-    """See that the value of a key is of the key's type, and in its range.
+    """Check that the value of a key has the key's type and is in its range.
 
     Raises:
         KeyedError: it is not.
     """
-    known = KEYS.get(key)
-    if not known or known.type_ is list:
-        return
-    kind = {float: "a number", int: "a whole number", str: "text"}[known.type_]
-    types: Any = (int, float) if known.type_ is float else known.type_
-    if not isinstance(value, types) or isinstance(value, bool):
-        raise KeyedError(key, f"{key}: found {value!r}, but it is {kind}")
-    if known.above is not None and not known.above < value < known.most:
-        allowed = f"above {known.above:g} and below {known.most:g}"
-        raise KeyedError(key, f"{key}: found {value!r}, but it is {allowed}")
-    if known.type_ is float and value > known.most:
-        raise KeyedError(key, f"{key}: found {value!r}, but it is at most {known.most:g}")
+    if (known := KEYS.get(key)) and not known.allows(value):
+        raise KeyedError(key, f"{key}: found {value!r}, but it is {known.allowed}")
 
 
 def names_in(values: Mapping[str, Any], key: str, what: str) -> tuple[str, ...]:

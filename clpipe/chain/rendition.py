@@ -5,7 +5,7 @@ all of these at each of its exposures.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any, Literal, get_args
@@ -97,23 +97,24 @@ def _adapter() -> TypeAdapter[Rendition]:
 FIRST = Rendition()
 
 
-def parse_bracket(text: str) -> tuple[float, ...]:
-    """The exposures of a bracket, from EVs with commas between.
+def parse_bracket(evs: str | Sequence[float]) -> tuple[float, ...]:
+    """The exposures of a bracket, from EVs or a text with commas between them.
 
     >>> parse_bracket("-2, 0, +2")
     (-2.0, 0.0, 2.0)
 
     Raises:
-        RequestError: one is no number, or is there twice.
+        RequestError: one is not a number, or occurs twice.
     """
     try:
         # As their names say them, so that a replay has the same ones.
-        bracket = tuple(float(f"{float(part):g}") + 0.0 for part in text.split(","))
+        items = evs.split(",") if isinstance(evs, str) else evs
+        bracket = tuple(float(f"{float(item):g}") + 0.0 for item in items)
     except ValueError:
         bracket = (math.nan,)
     if not all(math.isfinite(ev) and "e" not in f"{ev:g}" for ev in bracket):
-        raise RequestError(f"--bracket: found {text!r}; expected EVs, such as -2,0,2")
+        raise RequestError(f"--bracket: found {evs!r}; expected EVs, such as -2,0,2")
     for ev in bracket:
         if bracket.count(ev) > 1:
-            raise RequestError(f"--bracket: found {text!r}, with {ev:+g} EV twice; give it once")
+            raise RequestError(f"--bracket: found {evs!r}, with {ev:+g} EV twice; give it once")
     return bracket

@@ -3,10 +3,11 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, ValidationError
 
 from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.digests import digests
@@ -14,95 +15,41 @@ from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of, several
 from clpipe.base.tracing import altered
 from clpipe.base.validation import first_fault
-from clpipe.chain.assignments import parse_assignment
 from clpipe.chain.carry import AovSpec, parse_carry
 from clpipe.chain.chain import Chain
 from clpipe.chain.files import load_configs
 from clpipe.chain.formats import EVERY_FORMAT, NPY
 from clpipe.chain.keys import KEYS, TABLES
 from clpipe.chain.making import make_chain
+from clpipe.chain.options import MOST_PATCHES, Moments
 from clpipe.chain.registry import code_files, load_stage_file
-from clpipe.chain.rendition import BASELINES, MOSAIC, TRUTHS
+from clpipe.chain.rendition import BASELINES, MOSAIC
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.truth import noisy_mosaic
 from clpipe.stage import Kind
 
 DEFAULTS = Settings()
 
-MOST_PATCHES = 9999  # of an image; the names of their files have four digits
-
-
-Moments = Literal["start", "middle", "end", "all"]
-MOMENTS: tuple[Moments, ...] = get_args(Moments)
-
-
-class Recorded(BaseModel):
-    """The part of a request that decides about a picture's bytes, as a sidecar stores it.
-
-    The rest decides which pictures are made, or whether.
-    """
-
-    model_config = ConfigDict(strict=True)
-
-    config: dict[str, Any] | None
-    options: dict[str, Any]
-    image: dict[str, Any]
-    start_at: str | None
-    until: str | None
-    stage_files: list[str]
-    image_name: str
-    layer: str | None
-    transfer: str | None
-    formats: list[str]
-    keep: list[str]
-    patch: Annotated[int, Field(gt=0)] | None
-    patches_per_image: Annotated[int, Field(ge=0, le=MOST_PATCHES)] | Literal["grid"]
-    augment: bool
-    carry: list[str]
-    truth_at: Moments = "middle"
-
-    @model_validator(mode="after")
-    def _has_patches(self) -> "Recorded":
-        if (self.patch is None) != (self.patches_per_image == 0):
-            raise ValueError("patch and patches_per_image contradict each other")
-        return self
-
-
-RECORDED = tuple(Recorded.model_fields)
-
 MADE = 8  # settings that a request, and those that it is replaced by, keep
 
 
 @dataclass(frozen=True)
-class Request:
-    """A request: plain values for all that is asked for, so that it can be stored and sent.
+class Recorded:
+    """The part of a request that decides about a picture's bytes, as a sidecar stores it.
+
+    The rest of a request decides which pictures are made, or whether they are.
 
     Args:
-        config: the values of a configuration, nested as in its file; None where none is named.
-        options: values over those of the configuration.
-        image: values of one image over both, from its row in a manifest.
-        start_at: the first step to run; None is the first of the chain.
-        until: the last step to run; None is the last of the chain.
-        stage_files: Python files that define further stages; settings load them.
-        image_name: the image that draws belong to; "" is none in particular.
-        layer: of an EXR, which is the picture; None chooses.
-        transfer: the transfer curve of renders in whole numbers; None refuses these.
-        max_pixels: larger files are refused; None is the reader's own limit.
-        formats: of the last image; () follows from the chain, see :meth:`with_outputs`.
-        keep: steps whose image is written too, or "all".
-        truth_at: of an exposure of several files, whose pose and layers go with the picture.
-        frames: how many frames of each image; None is one picture instead of a burst.
-        truths: which of :data:`clpipe.chain.rendition.TRUTHS` are written beside each picture.
-        carry: layers that go along with each picture, as :func:`clpipe.chain.carry.parse_carry`
-            reads them.
-        bracket: what is added to the exposure's EV, for each exposure that is made of each image;
-            () is one exposure.
-        baselines: which of :data:`clpipe.chain.rendition.BASELINES` are made beside each picture.
-        patch: the sides of patches in px, which are written in place of pictures; None is pictures.
-        patches_per_image: how many of each picture, at random places, or "grid"; 0 without patches.
-        augment: whether patches are flipped and turned.
-        made: the settings that were made of ``config`` and ``options``; requests that are replaced
-            by others share them.
+        config: the values of a configuration, nested as in its file; None if none is named.
+        options: values that override those of the configuration.
+        image: values of one image that override both, from its row in a manifest.
+        stage_files: Python files that define further stages; :meth:`Request.settings` loads them.
+        image_name: the image that draws belong to; "" if it is no particular image.
+        formats: the formats of the last image; () follows from the chain, see
+            :meth:`Request.with_outputs`.
+        patches_per_image: 0 without patches.
+
+    The other fields are options, see :data:`clpipe.chain.options.OPTIONS`.
     """
 
     config: Mapping[str, Any] | None = None
@@ -114,18 +61,36 @@ class Request:
     image_name: str = ""
     layer: str | None = None
     transfer: str | None = None
-    max_pixels: int | None = None
     formats: tuple[str, ...] = ()
     keep: tuple[str, ...] = ()
+    patch: Annotated[int, Field(gt=0)] | None = None
+    patches_per_image: Annotated[int, Field(ge=0, le=MOST_PATCHES)] | Literal["grid"] = 0
+    augment: bool = False
     carry: tuple[str, ...] = ()
     truth_at: Moments = "middle"
+
+
+RECORDED = tuple(each.name for each in fields(Recorded))
+
+
+@dataclass(frozen=True)
+class Request(Recorded):
+    """A request: plain values for all that is asked for, so that it can be stored and sent.
+
+    Args:
+        truths: which of :data:`clpipe.chain.rendition.TRUTHS` are written next to each picture.
+        baselines: which of :data:`clpipe.chain.rendition.BASELINES` are made next to each picture.
+        made: the settings that were made of ``config`` and ``options``; requests that are replaced
+            by others share them.
+
+    The other fields are those of :class:`Recorded`, and options.
+    """
+
+    max_pixels: int | None = None
     frames: int | None = None
     truths: tuple[str, ...] = ()
     bracket: tuple[float, ...] = ()
     baselines: tuple[str, ...] = ()
-    patch: int | None = None
-    patches_per_image: int | Literal["grid"] = 0
-    augment: bool = False
     made: BoundedCache[Settings] = field(
         default_factory=lambda: BoundedCache(MADE), compare=False, repr=False
     )
@@ -135,71 +100,40 @@ class Request:
         cls,
         *,
         config: str | Path | Sequence[str | Path] | None = None,
-        camera: str | None = None,
-        iso: float | None = None,
-        lens: str | None = None,
-        focal_length: float | None = None,
-        aperture: float | None = None,
-        focus_distance: float | None = None,
-        seed: int | None = None,
-        noise_key: str | None = None,
-        assignments: Sequence[str] = (),
-        stages: str | None = None,
-        skip: Sequence[str] = (),
-        stage_files: Sequence[Path] = (),
-        dump: str | None = None,
         values: Mapping[str, Any] | None = None,
+        stage_files: Sequence[str | Path] = (),
         truth: Sequence[str] = (),
-        **fields_: Any,
+        **others: Any,
     ) -> "Request":
-        """The request of command-line options; None and () are options that are not set.
+        """The request of options. None is an option that is not set.
 
         Args:
-            config: the name of a built-in configuration, or of a TOML file; of several, each lies
-                over those before it.
-            camera, iso, seed, noise_key, skip, dump: settings.
-            lens, focal_length, aperture, focus_distance: settings.
-            assignments: texts of the form ``stage.parameter=value``.
-            stages: names, separated by commas.
-            stage_files: as for the class.
-            values: further settings, nested.
-            truth: truths and baselines that are written beside each picture.
-            **fields_: further fields of the class.
+            config: built-in configurations or TOML files. Each overrides those before it.
+            values: settings that override the configuration, nested as in its file.
+            stage_files: Python files that define further stages; they are loaded.
+            truth: truths and baselines to write next to each picture.
+            **others: further fields of the class.
 
         Raises:
             RequestError: a name or value that is not allowed.
         """
-        for name in truth:
-            if name not in (*TRUTHS, *BASELINES):
-                raise RequestError(f"--truth: {one_of('truth', name, (*TRUTHS, *BASELINES))}")
         for file in stage_files:
-            load_stage_file(file)
-        plain = {"camera": camera, "iso": iso, "seed": seed, "noise_key": noise_key, "dump": dump}
-        plain |= {"lens": lens, "focal_length": focal_length, "aperture": aperture}
-        plain |= {"focus_distance": focus_distance}
-        options: dict[str, Any] = {k: v for k, v in plain.items() if v is not None}
-        if stages is not None:
-            options["stages"] = [s.strip() for s in stages.split(",") if s.strip()]
-        if skip:
-            options["skip"] = list(skip)
-        for text in assignments:
-            stage, parameter, value = parse_assignment(text)
-            options.setdefault(stage, {})[parameter] = value
+            load_stage_file(Path(file))
         configuration = load_configs(several(config)) if config else None
-        code = (*(configuration.stage_files if configuration else ()), *stage_files)
+        code = (*(configuration.stage_files if configuration else ()), *map(Path, stage_files))
         request = cls(
-            configuration.values if configuration else None,
-            {**options, **(values or {})},
+            config=configuration.values if configuration else None,
+            options=values or {},
             stage_files=tuple(dict.fromkeys(str(file.resolve()) for file in code)),
             truths=tuple(each for each in truth if each not in BASELINES),
             baselines=tuple(each for each in truth if each in BASELINES),
-            **fields_,
+            **{name: value for name, value in others.items() if value is not None},
         )
         if configuration:
             # They are validated already.
             request.made.get(Identity(request.config), lambda: configuration.settings)
         request.settings()
-        request.aov_specs()  # refuses what is wrong
+        request.aov_specs()  # rejects wrong texts
         return request
 
     @classmethod
@@ -209,17 +143,22 @@ class Request:
         Raises:
             RequestError: the record is not of that form.
         """
+        damaged = "the request in it is damaged: "
+        known = {name: record[name] for name in RECORDED if name in record}
+        for name in RECORDED:
+            if name not in known and name != "truth_at":  # which older sidecars lack
+                raise RequestError(f"{damaged}{name}: it is missing")
         try:
-            values = dict(Recorded.model_validate(record))
+            found = _recorded().validate_json(json.dumps(known), strict=True)
         except ValidationError as error:
             fault = first_fault(error)
-            text = f"{fault.key}: {fault.text}".removeprefix(": ")
-            raise RequestError(f"the request in it is damaged: {text}") from None
-        if not set(values["formats"]) <= set(EVERY_FORMAT):
-            raise RequestError(f"found formats {', '.join(values['formats'])}")
-        lists = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
-        request = cls(**{**values, **lists})
-        request.aov_specs()  # refuses what is wrong
+            raise RequestError(damaged + f"{fault.key}: {fault.text}".removeprefix(": ")) from None
+        if (found.patch is None) != (found.patches_per_image == 0):
+            raise RequestError(f"{damaged}patch and patches_per_image contradict each other")
+        if not set(found.formats) <= set(EVERY_FORMAT):
+            raise RequestError(f"found formats {', '.join(found.formats)}")
+        request = cls(**vars(found))
+        request.aov_specs()  # rejects wrong texts
         return request
 
     def for_image(self, name: str, values: Mapping[str, Any]) -> Self:
@@ -334,6 +273,11 @@ class Request:
         if not self.options:
             return configured
         return self.made.get((config, options), lambda: overlay(configured, self.options))
+
+
+@cache
+def _recorded() -> TypeAdapter[Recorded]:
+    return TypeAdapter(Recorded)
 
 
 @dataclass(frozen=True)

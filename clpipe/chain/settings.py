@@ -19,7 +19,17 @@ from clpipe.base.tracing import altered
 from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_name, load_camera
 from clpipe.chain.drawing import draw_of, extremes_of, values_of
 from clpipe.chain.draws import TINY, Choice, Draw, Limits, limits_of
-from clpipe.chain.keys import CODE, KEYS, LENS, MAX_STAGES, NOISE, TABLES, check_type, names_in
+from clpipe.chain.keys import (
+    CODE,
+    DEFAULT_ISO,
+    KEYS,
+    LENS,
+    MAX_STAGES,
+    NOISE,
+    TABLES,
+    check_type,
+    names_in,
+)
 from clpipe.chain.methods import (
     TABLE_MODELS,
     base_name,
@@ -50,7 +60,7 @@ class Settings:
     """
 
     camera: str = DEFAULT_CAMERA
-    iso: float = 100.0
+    iso: float = DEFAULT_ISO
     lens: str = ""  # a name in lensfun's database
     focal_length: float | None = None  # mm
     aperture: float | None = None  # f-number

@@ -10,11 +10,10 @@ from clpipe.base.processors import available_processors
 from clpipe.base.text import whole_number
 from clpipe.batch.bench import CPU_STEPS, BatchSpeed, bench_batch, loads
 from clpipe.chain.methods import base_name, stage_named
-from clpipe.chain.request import Request
-from clpipe.commands.chain_options import chain_options
+from clpipe.commands.chain_options import chain_options, device_option, request_of
 from clpipe.commands.completion import methods_of
 from clpipe.commands.machine import ask_for_report, machine_record
-from clpipe.commands.options import Command, device_option, json_option
+from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.bench import bench as run_bench
 from clpipe.engine.bench import bench_methods
@@ -70,7 +69,7 @@ def bench(
             f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 6000x4000, "
             f"at most {MAX_PIXELS} pixels"
         )
-    request = Request.from_options(**options)
+    request = request_of(options)
     settings = request.settings()
     if request.start_at is None and (names := settings.step_names):
         reads = stage_named("--stages", base_name(names[0])).reads

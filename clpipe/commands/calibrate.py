@@ -12,14 +12,9 @@ from clpipe.analysis.emva.figures import Figures
 from clpipe.analysis.emva.files import measure_series, write_emva_profile
 from clpipe.base.errors import RequestError
 from clpipe.camera.text import check_profile_name
-from clpipe.commands.options import (
-    EXISTING,
-    Command,
-    dump_option,
-    json_option,
-    options_set,
-    output_option,
-)
+from clpipe.chain.keys import KEYS
+from clpipe.commands.chain_options import option
+from clpipe.commands.options import EXISTING, Command, json_option, options_set, output_option
 from clpipe.commands.printing import show, show_json
 from clpipe.images.dump import parse_dump
 from clpipe.reference.cfa import PATTERNS, Pattern
@@ -56,7 +51,7 @@ WITH_EMVA = ("emva", "output", "iso", "as_json")  # what goes with --emva
     type=click.FloatRange(0, min_open=True),
     help="The ISO of all frames, in place of what the files say.",
 )
-@dump_option
+@option(KEYS["dump"])
 @json_option
 def calibrate(
     inputs: tuple[str, ...],

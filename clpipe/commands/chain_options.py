@@ -1,217 +1,25 @@
-"""Options that say which chain to run, and what of it to write."""
+"""Options that set keys: those of a configuration, and those of a run.
 
+Their names, types, ranges, choices and texts are in :mod:`clpipe.chain.keys` and
+:mod:`clpipe.chain.options`.
+"""
+
+import math
 from collections.abc import Callable
 from typing import Any
 
 import click
 
 from clpipe.base.errors import RequestError
+from clpipe.base.memory import parse_size
 from clpipe.base.text import whole_number
-from clpipe.chain.files import built_in_configs
-from clpipe.chain.formats import EVERY_FORMAT, format_named
-from clpipe.chain.keys import KEYS
-from clpipe.chain.request import DEFAULTS, MOMENTS, MOST_PATCHES
-from clpipe.commands.completion import (
-    cameras,
-    configs,
-    parameters,
-    stage_lists,
-    steps,
-    steps_or_all,
-)
-from clpipe.commands.options import stage_file_option
-from clpipe.outputs.patches import PER_IMAGE
-from clpipe.reference.carried import RESAMPLING
-
-
-def about(key: str) -> str:
-    """What the value of a key is, with its unit."""
-    text, unit = KEYS[key].text, KEYS[key].unit
-    return f"{text} In {unit}." if unit else text
-
-
-camera_option = click.option(
-    "--camera",
-    metavar="NAME|FILE",
-    shell_complete=cameras,
-    help=f"A built-in camera, by name or model, or a profile (.toml). [default: {DEFAULTS.camera}]",
-)
-
-iso_option = click.option(
-    "--iso",
-    type=float,
-    help=f"The ISO; noise and denoising follow from it. [default: {DEFAULTS.iso:g}]",
-)
-
-config_option = click.option(
-    "-c",
-    "--config",
-    multiple=True,
-    metavar="NAME|FILE",
-    shell_complete=configs,
-    help="A configuration, or several: "
-    f"{', '.join(built_in_configs())}, or a TOML file. Each lies over those before "
-    "it: of one with stages, the development goes behind their raw.",
-)
-
-set_option = click.option(
-    "--set",
-    "assignments",
-    multiple=True,
-    metavar="STAGE.PARAM=VALUE",
-    shell_complete=parameters,
-    help="Set a parameter; may be repeated. STAGE.method=NAME chooses a method; "
-    "'{uniform=[1, 2]}' as the value draws one for each image.",
-)
-
-_SERIES_OPTIONS = (
-    click.option(
-        "--camera",
-        "cameras",
-        multiple=True,
-        metavar="NAME|FILE",
-        shell_complete=cameras,
-        help="A built-in camera, by name or model, or a profile (.toml); several go to folders of "
-        f"their own, OUT/CAMERA/NAME.jpg. [default: {DEFAULTS.camera}]",
-    ),
-    click.option(
-        "--iso",
-        "isos",
-        metavar="ISO,ISO,...",
-        help="The ISO; noise and denoising follow from it. Several go to folders of their own, "
-        f"OUT/iso800/NAME.jpg. [default: {DEFAULTS.iso:g}]",
-    ),
-)
-
-_CHAIN_OPTIONS = (
-    click.option(
-        "--lens",
-        metavar="NAME",
-        help=f"{about('lens')} [default: none]",
-    ),
-    click.option("--focal-length", type=float, help=about("focal_length")),
-    click.option("--aperture", type=float, help=about("aperture")),
-    click.option("--focus-distance", type=float, help=about("focus_distance")),
-    click.option("--seed", type=int, help=f"{about('seed')} [default: {DEFAULTS.seed}]"),
-    click.option("--noise-key", metavar="TEXT", help=about("noise_key")),
-    set_option,
-    click.option(
-        "--stages",
-        metavar="A,B,C",
-        shell_complete=stage_lists,
-        help="The stages to run, in order, in place of the default chain.",
-    ),
-    click.option(
-        "--skip",
-        multiple=True,
-        metavar="STAGE",
-        shell_complete=steps,
-        help="Leave a stage out, or 'noise': that of all stages, while denoising and the rest stay "
-        "as at that ISO; may be repeated.",
-    ),
-    click.option(
-        "--start-at",
-        metavar="STAGE",
-        shell_complete=steps,
-        help="The first stage to run, on kept images or mosaics.",
-    ),
-    click.option("--until", metavar="STAGE", shell_complete=steps, help="The last stage to run."),
-    stage_file_option,
-)
-
-
-def chain_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The options that say which chain to run."""
-    return _with(function, config_option, camera_option, iso_option, *_CHAIN_OPTIONS)
-
-
-def series_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The options that say which chains to run, of several cameras and ISOs."""
-    return _with(function, config_option, *_SERIES_OPTIONS, *_CHAIN_OPTIONS)
-
-
-def _with(function: Callable[..., Any], *options: Callable[..., Any]) -> Callable[..., Any]:
-    for option in reversed(options):
-        function = option(function)
-    return function
-
-
-keep_option = click.option(
-    "--keep",
-    multiple=True,
-    metavar="STAGE|all",
-    shell_complete=steps_or_all,
-    help="Write the image of a stage, too; as float EXR. May be repeated.",
-)
-
-_PATCH_OPTIONS = (
-    click.option(
-        "--patch",
-        type=click.IntRange(1),
-        metavar="SIZE",
-        help="Write patches of SIZE px a side in place of pictures: OUT/NAME_0000.jpg and so on, "
-        "with the bits that the picture has there. Images of --keep are .npy.",
-    ),
-    click.option(
-        "--patches-per-image",
-        callback=lambda _context, _option, text: None if text is None else patch_count(text),
-        metavar="N|grid",
-        help="How many, at random places, or all side by side that cover the picture. "
-        f"[default: {PER_IMAGE}]",
-    ),
-    click.option(
-        "--augment",
-        is_flag=True,
-        help="Flip patches and turn them by 90 degrees, at random; the CFA pattern stays.",
-    ),
-)
-
-
-def patch_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The options that say which patches are written."""
-    return _with(function, *_PATCH_OPTIONS)
-
-
-def patch_count(text: str) -> int | str:
-    """How many patches of an image: a number, or "grid".
-
-    Raises:
-        RequestError: it is neither.
-    """
-    if text == "grid":
-        return text
-    if 0 < (count := whole_number(text)) <= MOST_PATCHES:
-        return count
-    raise RequestError(
-        f"--patches-per-image: found {text!r}; expected 1 to {MOST_PATCHES}, or grid"
-    )
-
-
-carry_option = click.option(
-    "--carry",
-    multiple=True,
-    metavar="NAME[:KIND][=FILE]",
-    help="Move a layer as the picture's pixels are moved. It goes to OUT/NAME.carried.exr: "
-    "depth, normals, flow, object numbers, of the image's own file or of one beside it. KIND is "
-    f"{', '.join(RESAMPLING)}, where its name does not say it, or png: depth in metres, which goes "
-    "to OUT/NAME.LAYER.png, too, with 16 bits, in millimetres, or object numbers. FILE is where it "
-    "is, as '../depth/{name}.exr', from the image's folder. [default: {name}_LAYER.exr or alike] "
-    "May be repeated.",
-)
-
-TRUTHS_HELP = (
-    "Write next to each picture the same without noise (development), without noise and denoising "
-    "(clean), the mosaic without noise (mosaic), the variance of the mosaic's noise (variance)"
-)
-
-truth_at_option = click.option(
-    "--truth-at",
-    type=click.Choice(MOMENTS),
-    default="middle",
-    show_default=True,
-    help="Of an exposure of several files (shutter.subframes), whose pose and carried layers go "
-    "with the picture; all has the layers of its start and end, too.",
-)
+from clpipe.chain.assignments import parse_assignment
+from clpipe.chain.formats import format_named
+from clpipe.chain.keys import CODE, KEYS, Key
+from clpipe.chain.options import DEVICE, OPTIONS
+from clpipe.chain.request import Request
+from clpipe.commands.completion import COMPLETIONS, parameters
+from clpipe.commands.options import EXISTING, F, output_option
 
 
 class FormatName(click.Choice[str]):
@@ -221,12 +29,112 @@ class FormatName(click.Choice[str]):
         return super().convert(format_named(value), param, ctx)
 
 
-format_option = click.option(
-    "--format",
-    "formats",
+def patch_count(text: str) -> int | str:
+    """How many patches of an image: a number, or "grid".
+
+    Raises:
+        RequestError: it is neither.
+    """
+    key, count = OPTIONS["patches_per_image"], whole_number(text)
+    if text != "grid" and not key.allows(count):
+        raise RequestError(f"--patches-per-image: found {text!r}; expected {key.allowed}, or grid")
+    return text if text == "grid" else count
+
+
+# Keys whose options are not written --name, and those with types of their own.
+FLAGS = {"config": ("-c", "--config"), CODE: ("--stage-file",)}
+TYPES: dict[str, Any] = {
+    "stages": lambda text: [name.strip() for name in text.split(",") if name.strip()],
+    "format": FormatName(OPTIONS["format"].choices),
+    "patches_per_image": patch_count,
+    "memory": parse_size,
+    "poses": EXISTING,
+    CODE: EXISTING,
+}
+
+
+def option(key: Key, parameter: str = "", **others: Any) -> Callable[[F], F]:
+    """The option of a command that sets a key.
+
+    Args:
+        key: what it sets; type, range, choices and help follow from it.
+        parameter: the parameter of the command's function, if it is not the name of the key.
+        **others: arguments of :func:`click.option` that replace those of the key.
+    """
+    type_: Any = {int: int, float: float}.get(key.type_)
+    if key.choices:
+        type_ = click.Choice(key.choices, case_sensitive=False)
+    elif key.type_ is int and key.above > -math.inf:
+        type_ = click.IntRange(int(key.above) + 1, None if key.most == math.inf else int(key.most))
+    multiple = key.type_ is list and key.name != "stages"
+    texts = [key.text, f"In {key.unit}." * bool(key.unit), "May be repeated." * multiple]
+    attributes: dict[str, Any] = {
+        "type": TYPES.get(key.name, type_),
+        "metavar": key.metavar,
+        "multiple": multiple,
+        "shell_complete": COMPLETIONS.get(key.name),
+        "help": " ".join(filter(None, [*texts, f"[default: {key.usual}]" * bool(key.usual)])),
+    }
+    if key.type_ is bool:
+        attributes["is_flag"] = True
+    flags = FLAGS.get(key.name, (f"--{key.name.replace('_', '-')}",))
+    return click.option(*flags, parameter or key.name, **{**attributes, **others})
+
+
+def options(*keys: Key | str) -> Callable[[F], F]:
+    """The options of a command that set keys; those of a run by their names."""
+
+    def decorated(function: F) -> F:
+        for key in reversed(keys):
+            function = option(OPTIONS[key] if isinstance(key, str) else key)(function)
+        return function
+
+    return decorated
+
+
+set_option = click.option(
+    "--set",
+    "assignments",
     multiple=True,
-    type=FormatName(EVERY_FORMAT),
-    help="The format of the last image, or dng for the raw that quantize makes; may be repeated. "
-    "npy holds float16, DN as uint16, and makes those of --keep .npy, too. "
-    "[default: jpg; exr, or npy of patches, where --until ends the chain earlier]",
+    metavar="STAGE.PARAM=VALUE",
+    shell_complete=parameters,
+    help="Set a parameter. STAGE.method=NAME chooses a method; '{uniform=[1, 2]}' as the value "
+    "draws one for each image. May be repeated.",
 )
+out_option = output_option("OUT", OPTIONS["output"].text)
+device_option = option(DEVICE, "selector")
+
+# Settings that chains have options for, besides the camera and the ISO.
+SETTINGS = tuple(key for name, key in KEYS.items() if name not in ("camera", "iso", "dump", CODE))
+
+
+def chain_options(function: F) -> F:
+    """The options that say which chain to run; :func:`request_of` makes a request of them."""
+    own = options("config", KEYS["camera"], KEYS["iso"], *SETTINGS, "start_at", "until", CODE)
+    return own(set_option(function))
+
+
+def settings_in(options: dict[str, Any]) -> dict[str, Any]:
+    """Take the settings from the options of a command, nested as in a configuration.
+
+    Raises:
+        RequestError: an assignment is wrong, or is about a value that has an option as well.
+    """
+    own = {key: options.pop(key) for key in KEYS if key in options and key != CODE}
+    settings = {key: value for key, value in own.items() if value not in (None, ())}
+    assigned: dict[str, dict[str, Any]] = {}
+    for text in options.pop("assignments", ()):
+        stage, parameter, value = parse_assignment(text)
+        if stage in settings:
+            raise RequestError(f"--set {text}: found --{stage} as well; use only one of them")
+        assigned.setdefault(stage, {})[parameter] = value
+    return {**settings, **assigned}
+
+
+def request_of(options: dict[str, Any]) -> Request:
+    """The request that a command's options describe, which are all of them that are left.
+
+    Raises:
+        RequestError: a name or value is not allowed.
+    """
+    return Request.from_options(values=settings_in(options), **options)

@@ -6,11 +6,13 @@ from pathlib import Path
 import click
 
 from clpipe.base.errors import RequestError
+from clpipe.chain.keys import CODE
 from clpipe.chain.methods import stage_named
 from clpipe.chain.registry import load_stage_file
+from clpipe.commands.chain_options import device_option, options
 from clpipe.commands.completion import steps
 from clpipe.commands.machine import ask_for_report, machine_record
-from clpipe.commands.options import Command, device_option, json_option, stage_file_option
+from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.check import SIZES, Check, check_all
 from clpipe.engine.device import open_device
@@ -20,7 +22,7 @@ from clpipe.engine.device import open_device
 @click.argument("names", nargs=-1, metavar="[STAGE]...", shell_complete=steps)
 @device_option
 @click.option("--small", is_flag=True, help="Compare tiny images only, for slow devices.")
-@stage_file_option
+@options(CODE)
 @json_option
 def check(
     names: tuple[str, ...],

@@ -100,3 +100,15 @@ def _names(names: Iterable[str], text: str) -> list[CompletionItem]:
 def _file(text: str) -> list[CompletionItem]:
     """The item that lets the shell complete names of files."""
     return [CompletionItem(text, type="file")]
+
+
+# By the names of options.
+COMPLETIONS = {
+    "camera": cameras,
+    "config": configs,
+    "stages": stage_lists,
+    "skip": steps,
+    "start_at": steps,
+    "until": steps,
+    "keep": steps_or_all,
+}

@@ -15,16 +15,22 @@ from clpipe.base.files import check_folder
 from clpipe.batch.run_log import Summary
 from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
+from clpipe.chain.keys import CODE
+from clpipe.chain.options import OPTIONS, TRUTH
 from clpipe.chain.panorama import projection_of
 from clpipe.chain.registry import stage_in
-from clpipe.chain.rendition import CLEAN, TRUTHS
 from clpipe.chain.request import Request
-from clpipe.commands.chain_options import TRUTHS_HELP, carry_option, format_option, series_options
-from clpipe.commands.input_options import poses_option
+from clpipe.commands.chain_options import (
+    SETTINGS,
+    device_option,
+    option,
+    options,
+    set_option,
+    settings_in,
+)
 from clpipe.commands.options import (
     EXISTING,
     GroupedCommand,
-    device_option,
     json_lines_option,
     options_set,
     output_option,
@@ -32,7 +38,7 @@ from clpipe.commands.options import (
 )
 from clpipe.commands.progress import Reporter, follow, print_line
 from clpipe.inputs.around import wide_of
-from clpipe.inputs.series import Series, parse_isos
+from clpipe.inputs.series import Series, split_series
 from clpipe.reference.panorama import CUBE
 from clpipe.reference.projection import seen_faces
 from clpipe.reference.wide import MODELS
@@ -66,21 +72,20 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
 @click.option(
     "--box",
     metavar="X,Y,Z,X,Y,Z",
-    callback=lambda _context, _option, text: None if text is None else parse_box(text),
+    type=parse_box,
     help="Two corners of the box of --path random. [default: half as wide as the way to what the "
     "camera looks at]",
 )
 @click.option(
     "--frames",
     metavar="A-B",
-    callback=lambda _context, _option, text: None if text is None else parse_frames(text),
+    type=parse_frames,
     help="Render these frames of the scene, by its own camera: 1-24, or 1,5,9.",
 )
-@poses_option
 @click.option(
     "--resolution",
     metavar="WxH",
-    callback=lambda _context, _option, text: None if text is None else parse_resolution(text),
+    type=parse_resolution,
     help="Of the renders. [default: the scene's]",
 )
 @click.option(
@@ -108,15 +113,10 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
     help="An installed Blender, 4.2 or newer, or a Python that has the package bpy. [default: this "
     "Python]",
 )
-@series_options
-@click.option(
-    "--truth",
-    multiple=True,
-    default=(CLEAN,),
-    show_default=True,
-    type=click.Choice(TRUTHS),
-    help=f"{TRUTHS_HELP}. May be repeated.",
-)
+@options("config", "camera", "iso", *SETTINGS, "start_at", "until", CODE, "carry", "poses")
+@set_option
+@option(TRUTH, default=(TRUTH.usual,))
+@option(OPTIONS["format"], "formats")
 @click.option(
     "--licence",
     metavar="TEXT",
@@ -129,23 +129,18 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
     help="Render faces of a cube, and look at them through a wide lens of that model, whose "
     "coefficients are those of --set projection.fx=300 and so on.",
 )
-@carry_option
-@format_option
 @device_option
 @quiet_option
 @json_lines_option
 def dataset(
     source: Path,
     output: Path,
-    cameras: tuple[str, ...],
-    isos: str | None,
     poses: Path | None,
     selector: str | None,
     lens_model: str | None,
-    assignments: tuple[str, ...],
     quiet: bool,
     json_lines: bool,
-    **options: Any,
+    **chosen: Any,
 ) -> None:
     """Make a dataset of a Blender scene, or of a folder of renders that exist.
 
@@ -163,19 +158,20 @@ def dataset(
     clpipe dataset renders/ -o set --iso 100,800 --camera sony-a7r2 --camera canon-5d2
     """
     check_folder(output)
-    series = Series(cameras, parse_isos(isos) if isos is not None else (), always=True)
-    said = {name: options.pop(name) for name in ("licence", "author")}
-    rendering = {name: options.pop(name) for name in RENDER_OPTIONS}
+    said = {name: chosen.pop(name) for name in ("licence", "author")}
+    rendering = {name: chosen.pop(name) for name in RENDER_OPTIONS}
+    settings = settings_in(chosen)
     if lens_model:
-        method = f"{stage_in(StageRole.VIEW).name}.method="
-        if others := [each for each in assignments if each.startswith(method)]:
+        stage = stage_in(StageRole.VIEW).name
+        view = settings.setdefault(stage, {})
+        if "method" in view:
             raise RequestError(
-                f"--lens-model: found {lens_model}, but --set {others[0]}; leave one out"
+                f"--lens-model: found {lens_model}, but --set {stage}.method={view['method']}; use "
+                "only one of them"
             )
-        assignments = (f"{stage_in(StageRole.VIEW).name}.method={lens_model}", *assignments)
-    request = Request.from_options(
-        camera=series.camera, iso=series.iso, assignments=assignments, **options
-    )
+        view["method"] = lens_model
+    series, values = split_series(settings, always=True)
+    request = Request.from_options(values=values, **chosen)
     if not series.isos and "iso" not in request.settings().draws:
         series = replace(series, isos=(request.settings().iso,))
     series.jobs((), request.settings())  # refuses what is wrong before anything is rendered
@@ -261,9 +257,9 @@ def refuse_rendering() -> None:
     Raises:
         RequestError: one is.
     """
-    for name, option in options_set().items():
+    for name, flag in options_set().items():
         if name in RENDER_OPTIONS:
-            raise RequestError(f"{option}: it is for a .blend, not for renders that exist")
+            raise RequestError(f"{flag}: it is for a .blend, not for renders that exist")
 
 
 def develop(

@@ -9,8 +9,9 @@ from clpipe.analysis.emva.simulation import SeriesSize, simulate
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
 from clpipe.base.text import whole_number
-from clpipe.commands.completion import cameras
-from clpipe.commands.options import Command, device_option, json_option, output_option
+from clpipe.chain.keys import KEYS
+from clpipe.commands.chain_options import device_option, option
+from clpipe.commands.options import Command, json_option, output_option
 from clpipe.commands.printing import show_json
 from clpipe.commands.progress import told
 from clpipe.engine.device import open_device
@@ -19,14 +20,8 @@ USUAL = SeriesSize()
 
 
 @click.command("emva", cls=Command)
-@click.option(
-    "--camera",
-    required=True,
-    metavar="NAME|FILE",
-    shell_complete=cameras,
-    help="A built-in camera, by name or model, or a profile (.toml).",
-)
-@click.option("--iso", type=float, help="[default: the camera's lowest]")
+@option(KEYS["camera"]._replace(usual=""), required=True)
+@option(KEYS["iso"]._replace(text="The ISO.", usual="the camera's lowest"))
 @output_option("DIR", "The folder of the series; it is made where it is missing.")
 @click.option(
     "--size",
@@ -49,7 +44,7 @@ USUAL = SeriesSize()
     type=click.IntRange(3, 10_000),
     help="Frames at half the saturation, and as many dark ones, for DSNU and PRNU.",
 )
-@click.option("--seed", default=0, show_default=True, help="Of the noise.")
+@option(KEYS["seed"], default=0)
 @device_option
 @json_option
 def emva(

@@ -8,10 +8,9 @@ import click
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.extras import require
-from clpipe.chain.request import Request
-from clpipe.commands.chain_options import chain_options
-from clpipe.commands.input_options import layer_option, max_pixels_option, transfer_option
-from clpipe.commands.options import Command, device_option, dump_option, json_option
+from clpipe.chain.keys import KEYS
+from clpipe.commands.chain_options import chain_options, device_option, options, request_of
+from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show_json
 from clpipe.engine.device import open_device
 from clpipe.inputs.find import find_jobs
@@ -22,10 +21,7 @@ from clpipe.inputs.loader import ImageLoader
 @click.command("explore", cls=Command)
 @click.argument("inputs", nargs=-1, required=True, metavar="RENDER...")
 @chain_options
-@dump_option
-@transfer_option
-@layer_option
-@max_pixels_option
+@options(KEYS["dump"], "transfer", "layer", "max_pixels")
 @device_option
 @json_option
 @click.option(
@@ -39,7 +35,7 @@ def explore(
     selector: str | None,
     as_json: bool,
     port: int | None,
-    **options: Any,
+    **chosen: Any,
 ) -> None:
     """Try a camera on renders: a page on this machine, developed live as settings change.
 
@@ -56,7 +52,7 @@ def explore(
     from clpipe.explorer.explorer import Explorer
     from clpipe.explorer.server import Server
 
-    request = Request.from_options(**options)
+    request = request_of(chosen)
     loader = ImageLoader(request)
     jobs = loader.exposures(find_jobs(inputs, Path(os.devnull), loader.endings()))
     loader.first_chain(jobs)  # a wrong request is refused here

@@ -16,11 +16,12 @@ from clpipe.analysis.matching.search import Candidate, StoppedError, Watch
 from clpipe.base.extras import require
 from clpipe.base.text import duration
 from clpipe.batch.interrupt import INTERRUPTED, interruptible
+from clpipe.chain.keys import KEYS
 from clpipe.chain.settings import Settings
 from clpipe.chain.toml import value_text
-from clpipe.commands.chain_options import camera_option
+from clpipe.commands.chain_options import device_option, option
 from clpipe.commands.notices import NOTICES
-from clpipe.commands.options import Command, device_option, json_option, output_option
+from clpipe.commands.options import Command, json_option, output_option
 from clpipe.commands.printing import Rows, number, show, show_json
 from clpipe.commands.progress import EVERY
 
@@ -96,11 +97,12 @@ class Follower(Watch):
     help="The mean of many pictures of each FRAME's scene, in the same order; a file or a quoted "
     "glob; may be repeated. [default: the FRAMEs are a burst of one scene]",
 )
-@camera_option
-@click.option(
-    "--iso",
-    type=float,
-    help="The ISO at which the raw noise is the camera's. [default: the strength is found, too]",
+@option(KEYS["camera"])
+@option(
+    KEYS["iso"]._replace(
+        text="The ISO at which the raw noise is the camera's.",
+        usual="the search finds the strength",
+    )
 )
 @click.option(
     "--plot",

@@ -9,21 +9,9 @@ import click
 from clpipe.analysis.metering import check_request, exposures, to_meter, write_exposures
 from clpipe.base.errors import RequestError
 from clpipe.base.text import printable
-from clpipe.chain.request import Request
-from clpipe.commands.chain_options import config_option, set_option
-from clpipe.commands.input_options import (
-    exclude_option,
-    layer_option,
-    max_pixels_option,
-    transfer_option,
-)
-from clpipe.commands.options import (
-    Command,
-    device_option,
-    json_option,
-    output_option,
-    stage_file_option,
-)
+from clpipe.chain.keys import CODE
+from clpipe.commands.chain_options import device_option, options, request_of, set_option
+from clpipe.commands.options import Command, json_option, output_option
 from clpipe.commands.printing import show_json
 from clpipe.engine.device import open_device
 from clpipe.inputs.find import find_jobs
@@ -42,13 +30,8 @@ from clpipe.inputs.loader import ImageLoader
     help="The time constant of the smoothing, after which 1/e of a change of light is left to make "
     "up for; 0 is none.",
 )
-@config_option
+@options("config", CODE, "transfer", "layer", "max_pixels", "exclude")
 @set_option
-@stage_file_option
-@transfer_option
-@layer_option
-@max_pixels_option
-@exclude_option
 @device_option
 @json_option
 def meter(
@@ -59,7 +42,7 @@ def meter(
     exclude: tuple[str, ...],
     selector: str | None,
     as_json: bool,
-    **options: Any,
+    **chosen: Any,
 ) -> None:
     """Meter the frames of a sequence, and write their exposures as a manifest for clpipe run.
 
@@ -76,7 +59,7 @@ def meter(
     if any(os.path.realpath(each) == os.path.realpath(output) for each in frames):
         raise RequestError(f"--output: {output} is an input; choose another name")
     metering = ("exposure.method=auto", *assignments)
-    request = Request.from_options(assignments=metering, until="exposure", **options)
+    request = request_of({"assignments": metering, "until": "exposure", **chosen})
     loader = ImageLoader(request)
     jobs = to_meter(
         loader.exposures(find_jobs(frames, Path(os.devnull), loader.endings(), exclude))

@@ -1,6 +1,6 @@
 """The class of all commands, and options that several share.
 
-Options that need the stages are in chain_options.
+The options that set keys are in chain_options.
 """
 
 import logging
@@ -15,10 +15,8 @@ import click
 from click.core import ParameterSource
 
 from clpipe.base.errors import MissingError, RequestError
-from clpipe.base.memory import parse_size
 from clpipe.base.reading import check_input
-from clpipe.base.urls import is_url, path_of
-from clpipe.images.dump import TYPES
+from clpipe.base.urls import is_url
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -168,16 +166,9 @@ json_lines_option = click.option(
     help="Print the lines of the log on stdout, for programs: the start, each image, the end.",
 )
 
-device_option = click.option(
-    "--device",
-    "selector",
-    metavar="SEL",
-    help="An index or a part of a name from 'clpipe devices', or numpy.",
-)
-
 
 class ExistingPath(click.Path):
-    """A file or folder that is read."""
+    """A file or directory that is read."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if not (ctx and ctx.resilient_parsing):
@@ -187,27 +178,11 @@ class ExistingPath(click.Path):
 
 EXISTING = ExistingPath(path_type=Path)
 
-stage_file_option = click.option(
-    "--stage-file",
-    "stage_files",
-    multiple=True,
-    type=EXISTING,
-    metavar="FILE.py",
-    help="Load a stage of your own; may be repeated.",
-)
-
-dump_option = click.option(
-    "--dump",
-    metavar="WxH:TYPE",
-    help="Width, height and type of the samples of headerless dumps (.raw), such as "
-    f"1920x1080:uint16le. TYPE is {', '.join(TYPES)}.",
-)
-
 
 class OutputPath(click.Path):
-    """A file or folder to write to; "" is refused, which would else be the working directory.
+    """A file or directory to write to; "" is rejected, because it would be the working directory.
 
-    What lies behind a URL is for ``clpipe run`` alone.
+    Only ``clpipe run`` writes to a URL.
     """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
@@ -215,7 +190,7 @@ class OutputPath(click.Path):
             raise RequestError("--output: it is empty; name what to write to")
         if is_url(value) and ctx:
             if ctx.info_name == "run":
-                return path_of(value)
+                return value
             raise RequestError(f"--output: found {value}; only clpipe run writes behind URLs")
         return super().convert(value, param, ctx)
 
@@ -234,16 +209,6 @@ def output_option(
         metavar=metavar,
         help=text,
     )
-
-
-out_option = output_option("OUT", "The output folder; it is made where it is missing.")
-
-memory_option = click.option(
-    "--memory",
-    callback=lambda _context, _option, text: None if text is None else parse_size(text),
-    metavar="SIZE",
-    help="Memory of a device, such as 2G; larger images are done in tiles. [default: what is free]",
-)
 
 
 def _hush(_context: click.Context, _option: click.Parameter, is_quiet: bool) -> bool:

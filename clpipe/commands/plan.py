@@ -8,8 +8,8 @@ import click
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
 from clpipe.chain.files import toml_text
-from clpipe.chain.request import Request
-from clpipe.commands.chain_options import chain_options, format_option, keep_option
+from clpipe.chain.options import OPTIONS
+from clpipe.commands.chain_options import chain_options, option, request_of
 from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.codegen import write_kernel
@@ -23,8 +23,8 @@ LANES = 8  # of a CPU, for which sources and bytes are given
 
 @click.command("plan", cls=Command)
 @chain_options
-@keep_option
-@format_option
+@option(OPTIONS["keep"])
+@option(OPTIONS["format"], "formats")
 @json_option
 @click.option("--toml", "as_toml", is_flag=True, help="Print the chain as a configuration.")
 @click.option("--source", metavar="LAUNCH", help="Print the OpenCL source of a launch.")
@@ -37,7 +37,7 @@ def plan(as_json: bool, as_toml: bool, source: str | None, **options: Any) -> No
     """
     if (as_json, as_toml, source is not None).count(True) > 1:
         raise RequestError("plan: --json, --toml and --source each print something else; give one")
-    request = Request.from_options(**options)
+    request = request_of(options)
     if as_toml:
         if request.start_at or request.until:
             raise RequestError(

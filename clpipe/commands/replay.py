@@ -9,17 +9,9 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.batch.replay import replay_of
 from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
-from clpipe.commands.input_options import max_pixels_option
-from clpipe.commands.options import (
-    EXISTING,
-    Command,
-    device_option,
-    json_option,
-    memory_option,
-    out_option,
-    quiet_option,
-    stage_file_option,
-)
+from clpipe.chain.keys import CODE
+from clpipe.commands.chain_options import device_option, options, out_option
+from clpipe.commands.options import EXISTING, Command, json_option, quiet_option
 from clpipe.commands.printing import show_json
 from clpipe.commands.progress import follow
 
@@ -28,10 +20,8 @@ from clpipe.commands.progress import follow
 @click.argument("sidecar", type=EXISTING, metavar="SIDECAR")
 @click.argument("image", required=False, type=EXISTING, metavar="[INPUT]")
 @out_option
-@stage_file_option
 @device_option
-@memory_option
-@max_pixels_option
+@options(CODE, "memory", "max_pixels")
 @quiet_option
 @json_option
 def replay(
@@ -41,7 +31,7 @@ def replay(
     stage_files: tuple[Path, ...],
     selector: str | None,
     memory: int | None,
-    max_pixels: int,
+    max_pixels: int | None,
     quiet: bool,
     as_json: bool,
 ) -> None:

@@ -9,14 +9,15 @@ from pydantic import ValidationError
 
 from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.base.text import one_of
+from clpipe.chain.keys import CODE, KEYS
 from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages, load_stage_file
 from clpipe.chain.request import DEFAULTS
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import value_text
-from clpipe.commands.chain_options import camera_option, iso_option
+from clpipe.commands.chain_options import options, settings_in
 from clpipe.commands.completion import steps
-from clpipe.commands.options import Command, json_option, stage_file_option
+from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import short_text, show, show_json
 from clpipe.stage import Context, Kind, Method, Stage
 
@@ -25,16 +26,13 @@ LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 @click.command("stages", cls=Command)
 @click.argument("name", required=False, shell_complete=steps)
-@camera_option
-@iso_option
-@stage_file_option
+@options(KEYS["camera"], KEYS["iso"], CODE)
 @json_option
 def stages(
     name: str | None,
-    camera: str | None,
-    iso: float | None,
     stage_files: tuple[Path, ...],
     as_json: bool,
+    **values: Any,
 ) -> None:
     """List the stages, or explain the methods and parameters of one.
 
@@ -44,8 +42,7 @@ def stages(
         load_stage_file(file)
     if name is not None and name not in all_stages():
         raise RequestError(one_of("stage", name, all_stages()))
-    values = {"camera": camera, "iso": iso}
-    settings = overlay(DEFAULTS, {k: v for k, v in values.items() if v is not None})
+    settings = overlay(DEFAULTS, settings_in(values))
     chosen = [all_stages()[name]] if name else list(all_stages().values())
     if as_json:
         records = [stage_record(s, context_for(s, settings)) for s in chosen]

@@ -62,12 +62,10 @@ def key_controls() -> dict[str, Any]:
     """
     names = {int: "integer", str: "string", float: "number"}
     controls: dict[str, dict[str, Any]] = {}
-    for key, known in KEYS.items():
-        if known.text:
-            about = {"type": names[known.type_], "text": known.text, "unit": known.unit}
-            controls[key] = {**about, "plain": True}
-        if key in LENS and key != "lens":
-            controls[key]["exclusiveMinimum"] = 0
+    for known in (KEYS[key] for key in (*LENS, "seed", "noise_key")):
+        about = {"type": names[known.type_], "text": known.text, "unit": known.unit}
+        limit = {"exclusiveMinimum": known.above} if known.above == 0 else {}
+        controls[known.name] = {**about, "plain": True, **limit}
     try:
         controls["lens"]["suggested"] = lens_names()
     except KeyedError:

@@ -12,10 +12,10 @@ from clpipe.base.errors import RequestError
 from clpipe.base.reading import check_exists, read_bytes
 from clpipe.base.text import one_of
 from clpipe.base.urls import fetch, is_url, joined
-from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import TABLES, check_type
 from clpipe.chain.methods import TABLE_MODELS, base_name
+from clpipe.chain.options import OPTIONS
 from clpipe.chain.paths import from_folder
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings, overlay
@@ -258,10 +258,8 @@ def _row(
     if os.path.basename(path) in ("", ".", ".."):
         raise RequestError(f"path: found {path!r}, which names no image")
     _check_name(name)
-    if frames is not None and (type(frames) is not int or not 0 < frames <= MAX_FRAMES):
-        raise RequestError(
-            f"frames: found {frames!r}, but it is a whole number from 1 to {MAX_FRAMES}"
-        )
+    if frames is not None and not OPTIONS["frames"].allows(frames):
+        raise RequestError(f"frames: found {frames!r}, but it is {OPTIONS['frames'].allowed}")
     values: dict[str, Any] = {}
     for column, value in record.items():
         step, _, parameter = column.partition(".")

@@ -13,8 +13,8 @@ import numpy as np
 from clpipe.base.errors import RequestError
 from clpipe.chain.keys import RENDER
 from clpipe.chain.methods import make_table
+from clpipe.chain.options import Moments
 from clpipe.chain.render_camera import RenderCamera
-from clpipe.chain.request import Moments
 from clpipe.inputs.find import Job
 from clpipe.inputs.render_cameras import View, read_views
 

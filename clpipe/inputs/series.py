@@ -1,12 +1,13 @@
 """Series: each image with several cameras and ISOs, each in a folder of its own."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import RequestError
+from clpipe.base.text import several
 from clpipe.camera.profile import load_camera
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.settings import Settings, overlay
@@ -28,14 +29,10 @@ class Series:
     always: bool = False
 
     @property
-    def camera(self) -> str | None:
-        """The camera of all images, where there is one, and no folder for it."""
-        return self.cameras[0] if len(self.cameras) == 1 and not self.always else None
-
-    @property
-    def iso(self) -> float | None:
-        """The ISO of all images, where there is one, and no folder for it."""
-        return self.isos[0] if len(self.isos) == 1 and not self.always else None
+    def common(self) -> dict[str, Any]:
+        """The settings of all images: one camera and one ISO that have no directory."""
+        lists = {"camera": self.cameras, "iso": self.isos}
+        return {k: v[0] for k, v in lists.items() if len(v) == 1 and not self.always}
 
     def under(self, output: Path) -> list[Path]:
         """The folders that its pictures go to, the output folder itself where there is no series.
@@ -100,33 +97,51 @@ class Series:
                 yield (folder + name).rstrip("/"), {**camera, **iso}
 
 
-def parse_isos(text: str) -> tuple[float, ...]:
-    """Sensitivities with commas between.
+def split_series(
+    settings: Mapping[str, Any], always: bool = False
+) -> tuple[Series, dict[str, Any]]:
+    """Take the cameras and ISOs from settings: a series, and the settings that all images share.
 
-    >>> parse_isos("100, 3200")
-    (100.0, 3200.0)
+    >>> split_series({"camera": ["a", "b"], "iso": 800, "seed": 1})[1]
+    {'seed': 1, 'iso': 800.0}
+
+    Args:
+        settings: nested values, in which a camera is one name or several, and an ISO is a number,
+            several, or a text such as "100,800". A draw of either stays.
+        always: as for :class:`Series`.
 
     Raises:
-        RequestError: one is no number above 0, or is there twice.
+        RequestError: an ISO is not a number above 0, or occurs twice.
     """
+    own = {
+        key: settings[key]
+        for key in ("camera", "iso")
+        if key in settings and not isinstance(settings[key], Mapping)
+    }
+    isos = check_isos(own["iso"]) if "iso" in own else ()
+    series = Series(several(own.get("camera")), isos, always)
+    others = {key: value for key, value in settings.items() if key not in own}
+    return series, others | series.common
+
+
+def check_isos(isos: float | str | Sequence[float]) -> tuple[float, ...]:
+    """Return one ISO or several as a tuple. A text has commas between them.
+
+    >>> check_isos("100, 3200"), check_isos(100)
+    ((100.0, 3200.0), (100.0,))
+
+    Raises:
+        RequestError: one is not a number above 0, or occurs twice.
+    """
+    found, items = repr(isos), isos.split(",") if isinstance(isos, str) else isos
     try:
-        isos = [float(part) for part in text.split(",")]
+        numbers = tuple(map(float, [items] if isinstance(items, int | float) else items))
     except ValueError:
-        isos = [math.nan]
-    return check_isos(isos, text)
-
-
-def check_isos(isos: Sequence[float], text: str = "") -> tuple[float, ...]:
-    """Sensitivities, as they are; ``text`` is what the user wrote.
-
-    Raises:
-        RequestError: one is no number above 0, or is there twice.
-    """
-    found = repr(text) if text else ", ".join(f"{iso:g}" for iso in isos)
-    if not all(math.isfinite(iso) and iso > 0 for iso in isos):
+        numbers = (math.nan,)
+    if not all(math.isfinite(iso) and iso > 0 for iso in numbers):
         raise RequestError(f"--iso: found {found}; expected numbers above 0, such as 100,800,3200")
-    names = [f"{iso:g}" for iso in isos]
+    names = [f"{iso:g}" for iso in numbers]
     for name in names:
         if names.count(name) > 1:
             raise RequestError(f"--iso: found {found}, with {name} twice; give it once")
-    return tuple(map(float, isos))
+    return numbers

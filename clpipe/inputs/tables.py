@@ -14,7 +14,7 @@ from typing import Any
 
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
-from clpipe.chain.keys import LENS
+from clpipe.chain.keys import CODE, KEYS
 from clpipe.chain.toml import toml_value
 
 Record = Callable[[], dict[str, Any]]  # the values of a row by column, or a RequestError
@@ -23,14 +23,8 @@ TEXTS = ("path", "name")  # columns that are text, whatever they look like
 
 OWN = (*TEXTS, "frames")  # columns that are no settings
 
-PLAIN = (
-    "iso",
-    "camera",
-    *LENS,
-    "seed",
-    "noise_key",
-    "skip",
-)  # columns of settings that stand in no table
+# Columns of settings that stand in no table.
+PLAIN = tuple(key for key in KEYS if key not in (CODE, "dump", "stages"))
 
 
 def csv_records(

@@ -13,14 +13,13 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.drawing import uniforms
+from clpipe.chain.options import PER_IMAGE
 from clpipe.chain.truth import signal_and_noise, variance_of
 from clpipe.engine.extents import Box
 from clpipe.images.tags import FLIPS, upright
 from clpipe.outputs.negative import negative_of
 from clpipe.reference.filter_array import parse_array
 from clpipe.stage import Stencil
-
-PER_IMAGE = 16  # patches, unless another number is asked for
 
 
 @dataclass(frozen=True)

@@ -1,24 +1,32 @@
-"""Write clpipe/chain/keywords.pyi: what Python callers may set, as editors and mypy read it.
+"""Write what editors, type checkers and the documentation read in the source of the Python API.
 
     tools/run pages keywords
 
-A test compares it with the stages, so it is written again when a parameter has changed.
+This is clpipe/chain/keywords.pyi, from the stages, and the arguments in the docstring of
+``clpipe.run``, from the keys of its options. A test compares both with what this tool writes, so
+run it again after you have changed a parameter or an option.
 """
 
+import inspect
+import re
 import subprocess
 import sys
+import textwrap
 from collections.abc import Mapping
 from subprocess import PIPE
 from typing import Any
 
 from pydantic import BaseModel
 
-from clpipe.chain.keys import CODE, KEYS
+from clpipe.batch.api import run
+from clpipe.chain.keys import CODE, KEYS, Key
 from clpipe.chain.methods import TABLE_MODELS
+from clpipe.chain.options import OPTIONS
 from clpipe.chain.registry import all_stages
 from tools import ROOT
 
 PATH = ROOT / "clpipe" / "chain" / "keywords.pyi"
+API = ROOT / "clpipe" / "batch" / "api.py"
 
 START = '''"""Keywords of the Python API: the tables and keys of a configuration, with their types.
 
@@ -87,6 +95,30 @@ def text_of() -> str:
     return subprocess.run(command, input=written, stdout=PIPE, text=True, check=True).stdout
 
 
+def argument_of(key: Key) -> str:
+    """The entry of an option in a docstring."""
+    text = key.text if key.text[1].isupper() else key.text[0].lower() + key.text[1:]
+    listed = ", ".join(f'"{name}"' for name in key.choices)
+    choices = f" The choices are {listed}." if listed else ""
+    usual = f" None is {key.usual}." if key.usual else ""
+    named = re.sub(
+        r"--([a-z-]+)",
+        lambda match: f"``{match[1].replace('-', '_')}``",
+        f"{key.name}: {text}{choices}{usual}",
+    )
+    return textwrap.fill(named, 100, initial_indent=" " * 8, subsequent_indent=" " * 12)
+
+
+def api_text() -> str:
+    """The module of ``clpipe.run`` with the arguments in its docstring."""
+    names = [name for name in inspect.signature(run).parameters if name != "settings"]
+    before, start, rest = API.read_text("utf-8").partition("    Args:\n")
+    _, end, after = rest.partition("        **settings:")
+    arguments = "\n".join(argument_of(OPTIONS[name]) for name in names)
+    return f"{before}{start}{arguments}\n{end}{after}"
+
+
 if __name__ == "__main__":
-    PATH.write_text(text_of(), "utf-8")
-    print(PATH.relative_to(ROOT))
+    for path, text in ((PATH, text_of()), (API, api_text())):
+        path.write_text(text, "utf-8")
+        print(path.relative_to(ROOT))

@@ -51,7 +51,9 @@ def report(page: Any, folder: Path) -> None:
 def explorer(page: Any) -> None:
     """The explorer on a render, at a high ISO."""
     jobs = [Job(RENDER, RENDER.name)]
-    server = Server(Explorer(jobs, Request.from_options(iso=6400), open_device(None)), 0)
+    server = Server(
+        Explorer(jobs, Request.from_options(values={"iso": 6400}), open_device(None)), 0
+    )
     threading.Thread(target=server.run, daemon=True).start()
     page.goto(server.address)
     page.wait_for_timeout(6000)

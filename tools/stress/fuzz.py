@@ -133,7 +133,7 @@ def ways(suffix: str) -> tuple[Callable[[Path], object], ...]:
     by_ending = {
         **dict.fromkeys((".dng", ".nef", ".cr2", ".kdc"), (entering(), frame, noise_model)),
         ".c": (noise_model,),
-        ".raw": (entering(dump="24x16:uint16le"),),
+        ".raw": (entering(values={"dump": "24x16:uint16le"}),),
         ".toml": (
             lambda path: make_chain(load_settings(str(path)).drawn("key")),
             lambda path: load_camera(str(path)),

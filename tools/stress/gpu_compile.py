@@ -222,7 +222,7 @@ def chains() -> Iterator[tuple[str, Chain]]:
         settings = Settings(iso=ISO, stages=until_raw, parameters=parameters)
         yield f"{RAW}{noise}, all noise", make_chain(settings)
     for config in ("default", "paper"):
-        request = Request.from_options(config=config, iso=ISO)
+        request = Request.from_options(config=config, values={"iso": ISO})
         yield f"{RAW}{config}", request.chain().through(["quantize"])
         yield config, request.chain()
     for stage in all_stages().values():

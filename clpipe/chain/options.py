@@ -1,0 +1,260 @@
+"""The options of a run: of each, its name, type, range, choices, default and help.
+
+The options of ``clpipe run``, the checks and documentation of :func:`clpipe.run`, and the options
+that other commands share all follow from these keys.
+"""
+
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from clpipe.base.errors import RequestError
+from clpipe.base.text import one_of
+from clpipe.chain.files import built_in_configs
+from clpipe.chain.formats import EVERY_FORMAT
+from clpipe.chain.identity import MAX_FRAMES
+from clpipe.chain.keys import CODE, KEYS, Key
+from clpipe.chain.rendition import BASELINES, CLEAN, TRUTHS
+from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS
+from clpipe.reference.carried import RESAMPLING
+
+Moments = Literal["start", "middle", "end", "all"]
+Transfer = Literal["srgb", "linear"]
+RedoName = Literal["missing", "old", "damaged", "all"]
+
+MOST_PATCHES = 9999  # of an image; the names of their files have four digits
+PER_IMAGE = 16  # patches, unless another number is asked for
+
+DEVICE = Key(
+    "device",
+    str,
+    "An index or part of a name from 'clpipe devices', or numpy.",
+    "SEL",
+    "the first GPU, else the CPU",
+)
+
+TRUTH = Key(
+    "truth",
+    list,
+    "Write next to each picture the same picture without noise (development), without noise and "
+    "denoising (clean), the mosaic without noise (mosaic), the variance of the mosaic's noise "
+    "(variance).",
+    usual=CLEAN,
+    choices=TRUTHS,
+)
+
+_ALL = (
+    Key("inputs", list, "Files, directories, globs, URLs and manifests (.csv, .jsonl).", "INPUT"),
+    Key("output", Path, "The output directory. It is created if it does not exist.", "OUT"),
+    Key(
+        "config",
+        list,
+        "A built-in configuration or a TOML file. The built-in ones are "
+        f"{', '.join(built_in_configs())}. If you name several, each overrides those before it, "
+        "and one with stages replaces their development.",
+        "NAME|FILE",
+    ),
+    KEYS["camera"]._replace(
+        type_=list,
+        text=f"{KEYS['camera'].text} With several, each camera's pictures go to OUT/CAMERA.",
+    ),
+    KEYS["iso"]._replace(
+        type_=str,
+        text=f"{KEYS['iso'].text} With several, each ISO's pictures go to a directory such as "
+        "OUT/iso800.",
+        metavar="ISO,ISO,...",
+    ),
+    Key(
+        "start_at",
+        str,
+        "The first stage to run. Inputs are then images of the kind that it reads, such as kept "
+        "images or mosaics.",
+        "STAGE",
+    ),
+    Key("until", str, "The last stage to run.", "STAGE"),
+    KEYS[CODE],
+    Key(
+        "format",
+        list,
+        "The format of the pictures, or dng for the raw that quantize makes. npy holds float16, "
+        "and DN as uint16; it also makes the images of --keep .npy.",
+        usual="jpg; exr, or npy for patches, if --until ends the chain earlier",
+        choices=EVERY_FORMAT,
+    ),
+    Key(
+        "keep", list, "A stage whose image is also written, or all. It is a float EXR.", "STAGE|all"
+    ),
+    Key(
+        "carry",
+        list,
+        "A layer to warp with the picture. It has depth, normals, flow or object numbers, in the "
+        "image's own file or in one next to it, and is written to OUT/NAME.carried.exr. "
+        f"KIND is needed if the name does not say it: {', '.join(RESAMPLING)} or png. png is depth "
+        "in metres or object numbers, and also writes a PNG with 16 bits, OUT/NAME.LAYER.png, "
+        "with depth in millimetres. FILE is the path from the image's directory, as in "
+        "'Depth=../depth/{name}.exr'.",
+        "NAME[:KIND][=FILE]",
+        "{name}_LAYER.exr or similar",
+    ),
+    TRUTH._replace(
+        text=f"{TRUTH.text[:-1]}, or the clean picture with independent noise of the same "
+        "strength, equal everywhere (iid) or by intensity (intensity). iid and intensity also "
+        "write the truths from which they are made.",
+        usual="",
+        choices=(*TRUTHS, *BASELINES),
+    ),
+    Key(
+        "truth_at",
+        str,
+        "The moment of an exposure of several files (shutter.subframes) whose pose and layers go "
+        "with the picture. all has the layers of its start and end as well.",
+        usual="middle",
+        choices=get_args(Moments),
+    ),
+    Key(
+        "frames",
+        int,
+        "The number of frames of a burst. Each frame has its own noise, and the burst its ground "
+        "truth.",
+        "N",
+        above=0,
+        most=MAX_FRAMES,
+    ),
+    Key(
+        "bracket",
+        str,
+        "The exposures of a bracket in EV, which are added to exposure.ev. Each exposure has its "
+        "own noise, frames and ground truth.",
+        "EV,EV,...",
+    ),
+    Key(
+        "patch",
+        int,
+        "The side of square patches in px. They are written instead of pictures, as "
+        "OUT/NAME_0000.jpg and so on. A patch has the same values as the picture there. Images of "
+        "--keep are .npy.",
+        "SIZE",
+        above=0,
+    ),
+    Key(
+        "patches_per_image",
+        int,
+        "The number of patches at random places, or grid for adjacent patches that cover the "
+        "picture.",
+        "N|grid",
+        f"{PER_IMAGE}",
+        above=0,
+        most=MOST_PATCHES,
+    ),
+    Key(
+        "augment",
+        bool,
+        "Flip patches and rotate them by multiples of 90 degrees, at random. The CFA pattern "
+        "stays the same.",
+    ),
+    Key(
+        "exclude",
+        list,
+        "A pattern of files and directories to skip. In directories and globs, it matches names "
+        "and paths relative to the input directory.",
+        "GLOB",
+    ),
+    Key(
+        "poses",
+        Path,
+        "A file with the camera and pose of each render. This is a cameras.json, a "
+        "transforms.json (NeRF, nerfstudio), or a directory with COLMAP's text model. The cameras "
+        "and poses of the pictures are written to OUT/cameras.json, OUT/transforms.json and "
+        "OUT/sparse/0, see clpipe poses.",
+        "FILE",
+    ),
+    Key("layer", str, "The layer or part of an EXR that is the picture.", "NAME"),
+    Key(
+        "transfer",
+        str,
+        "The transfer curve of renders with integer samples (PNG, TIFF and others).",
+        choices=get_args(Transfer),
+    ),
+    Key(
+        "max_pixels",
+        int,
+        "The most pixels of an image. Larger images are rejected before memory is allocated.",
+        "N",
+        f"{USUAL_MAX_PIXELS}",
+        above=0,
+        most=MAX_PIXELS,
+    ),
+    Key(
+        "redo",
+        str,
+        "Make again pictures that are missing or whose request has changed (missing), also those "
+        "of another version of clpipe (old), also damaged ones (damaged), or all, even if other "
+        "programs wrote the files (all). To find damaged ones, all files are read.",
+        usual="old",
+        choices=get_args(RedoName),
+    ),
+    Key(
+        "webdataset",
+        int,
+        "The number of images per tar for WebDataset, OUT/000000.tar and so on.",
+        "N",
+        above=0,
+        most=10**6,
+    ),
+    Key("shard", str, "The part of the images to make, such as 2/8, for job arrays.", "I/N"),
+    DEVICE._replace(type_=list, usual="the first GPU and all GPUs like it, else the CPU"),
+    Key(
+        "memory",
+        str,
+        "The memory of a device that clpipe may use, such as 2G. Larger images are processed in "
+        "tiles.",
+        "SIZE",
+        "what is free",
+    ),
+    Key(
+        "jobs",
+        int,
+        "The number of threads that decode, and of threads that encode.",
+        "N",
+        "one per processor",
+        above=0,
+        most=1024,
+    ),
+    Key(
+        "processes",
+        int,
+        "The number of processes that share the work. Each has a part of the processors and "
+        "devices.",
+        "N",
+        "as many as the number and size of the images justify",
+        above=0,
+        most=1024,
+    ),
+    Key(
+        "dask",
+        str,
+        "The address of a Dask scheduler, such as tcp://HOST:8786, whose workers do the work. They "
+        "must see the same files.",
+        "ADDRESS",
+    ),
+    Key(
+        "trace",
+        Path,
+        "A file for a timeline of the run, for Perfetto or chrome://tracing.",
+        "FILE.json",
+    ),
+)
+OPTIONS = {key.name: key for key in _ALL}
+
+
+def check_option(name: str, value: Any) -> None:
+    """Check that a value, which has the type of an option, is in its range or one of its choices.
+
+    Raises:
+        RequestError: it is not.
+    """
+    key = OPTIONS[name]
+    if key.type_ is int and isinstance(value, int) and not key.allows(value):
+        raise RequestError(f"found {name} {value}; expected {key.allowed}")
+    for each in value if key.choices and key.type_ is list else ():
+        if each not in key.choices:
+            raise RequestError(one_of(name, each, key.choices))
