@@ -118,13 +118,13 @@ def run(
             strength, equal everywhere (iid) or by intensity (intensity). iid and intensity also
             write the truths from which they are made. The choices are "development", "clean",
             "mosaic", "variance", "iid", "intensity".
-        truth_at: the moment of an exposure of several files (shutter.subframes) whose pose and
-            layers go with the picture. all has the layers of its start and end as well. The choices
-            are "start", "middle", "end", "all". None is middle.
+        truth_at: the moment of an exposure of several files whose pose and layers go with the
+            picture. all has the layers of its start and end as well. The choices are "start",
+            "middle", "end", "all". None is middle.
         frames: the number of frames of a burst. Each frame has its own noise, and the burst its
             ground truth.
-        bracket: the exposures of a bracket in EV, which are added to exposure.ev. Each exposure has
-            its own noise, frames and ground truth.
+        bracket: the exposures of a bracket, in EV relative to the exposure that is set. Each
+            exposure has its own noise, frames and ground truth.
         patch: the side of square patches in px. They are written instead of pictures, as
             OUT/NAME_0000.jpg and so on. A patch has the same values as the picture there. Images of
             ``keep`` are .npy.

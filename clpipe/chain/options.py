@@ -105,8 +105,8 @@ _ALL = (
     Key(
         "truth_at",
         str,
-        "The moment of an exposure of several files (shutter.subframes) whose pose and layers go "
-        "with the picture. all has the layers of its start and end as well.",
+        "The moment of an exposure of several files whose pose and layers go with the picture. all "
+        "has the layers of its start and end as well.",
         usual="middle",
         choices=get_args(Moments),
     ),
@@ -122,8 +122,8 @@ _ALL = (
     Key(
         "bracket",
         str,
-        "The exposures of a bracket in EV, which are added to exposure.ev. Each exposure has its "
-        "own noise, frames and ground truth.",
+        "The exposures of a bracket, in EV relative to the exposure that is set. Each exposure has "
+        "its own noise, frames and ground truth.",
         "EV,EV,...",
     ),
     Key(
