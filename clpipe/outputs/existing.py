@@ -39,7 +39,7 @@ MARK = re.compile(rb"clpipe \d+\.\d|clpipe:\w")
 
 
 class Found(Enum):
-    """What lies there of a rendition."""
+    """What exists of a rendition."""
 
     NOTHING = "nothing that fits, or is whole"
     OLD = "all, but made by another program"
@@ -47,15 +47,15 @@ class Found(Enum):
 
 
 class Redo(Enum):
-    """Which of the pictures that are there already are made again: each has those before it, too.
+    """Which existing pictures are made again. Each choice includes those before it.
 
-    What is missing, or was asked for in another way, is always made.
+    Pictures that are missing, or were made by another request, are always made.
     """
 
-    MISSING = "missing"  # no others
+    MISSING = "missing"  # none
     OLD = "old"  # those that another program made
-    DAMAGED = "damaged"  # those that are damaged, which is found by reading everything
-    ALL = "all"  # all, also files that clpipe did not write
+    DAMAGED = "damaged"  # damaged ones, which are found by reading all files
+    ALL = "all"  # all, even if clpipe did not write the files
 
     @property
     def verifies(self) -> bool:
@@ -63,7 +63,7 @@ class Redo(Enum):
         return self is Redo.DAMAGED
 
     def keeps(self, found: Found) -> bool:
-        """Whether what was found stays."""
+        """Return whether a rendition is kept."""
         return found is Found.DONE or (found is Found.OLD and self is Redo.MISSING)
 
 
@@ -154,7 +154,7 @@ def _check_own(path: Path, sidecar: Path | None, written: int) -> None:
 
 
 def _written(path: Path) -> int:
-    """When a sidecar was written, in ns since 1970; 0 where that lies in the future."""
+    """Return when a sidecar was written, in ns since 1970; 0 if that is in the future."""
     try:
         modified = path.stat().st_mtime_ns
     except OSError:
@@ -165,7 +165,7 @@ def _written(path: Path) -> int:
 def found_in(
     values: Mapping[str, Any], job: Job, request: Mapping[str, Any], verify: bool = False
 ) -> Found:
-    """Whether a sidecar's values are of the same input, the same request and this program.
+    """Return whether a sidecar's values are of the same input, the same request and this program.
 
     Arguments as for :func:`find`.
     """
@@ -200,7 +200,7 @@ def _is_same(path: Path, was: Mapping[str, Any], verify: bool) -> bool:
 
 
 def _same_request(one: Any, other: Mapping[str, Any]) -> bool:
-    """Whether records of requests are equal, with files compared by content and not by name."""
+    """Return whether records of requests are equal. Files are compared by content, not by name."""
     if one == other:
         return True
     if not isinstance(one, dict) or not (other["files"] and one.get("files")):
@@ -215,7 +215,7 @@ def _same_request(one: Any, other: Mapping[str, Any]) -> bool:
 
 
 def is_marked(path: Path) -> bool:
-    """Whether a file is clpipe's work by its tags, or is what a loss of power may leave of one."""
+    """Return whether a file has clpipe's tags, or only zeros, which a loss of power may leave."""
     try:
         with open(open_plain(path, os.O_RDONLY), "rb") as file:
             status = os.fstat(file.fileno())

@@ -113,7 +113,7 @@ class OutputPlan:
         return tuple(each for each in self._every(job.frames) if each in needed)
 
     def formats_of(self, rendition: Rendition) -> tuple[str, ...]:
-        """The formats of a rendition."""
+        """Return the formats of a rendition."""
         if rendition.role in BASELINES:  # it has no raw
             return tuple(format_ for format_ in self.formats if format_ != DNG)
         return (self.kept_format,) if rendition.role in FLOAT_MOSAICS else self.formats
@@ -132,7 +132,7 @@ class OutputPlan:
         return Patches(request.patch, request.patches_per_image, request.augment)
 
     def keep_of(self, rendition: Rendition) -> tuple[str, ...]:
-        """The steps whose image is written beside a rendition, where it has them."""
+        """Return the steps whose images are written next to a rendition that has them."""
         if rendition.role in (*FLOAT_MOSAICS, *BASELINES):
             return ()
         if rendition.role in PICTURES:
@@ -140,17 +140,12 @@ class OutputPlan:
         return self.request.keep
 
     def record_of(self, request: Mapping[str, Any], rendition: Rendition) -> dict[str, Any]:
-        """The record of a request as far as it is about one rendition.
-
-        Args:
-            request: the record for its image.
-            rendition: which it is.
-        """
+        """Return the part of an image's request record that is about one rendition."""
         record = {**request, "keep": list(self.keep_of(rendition))}
         return record if self.carries(rendition) else record | {"carry": []}
 
     def carries(self, rendition: Rendition) -> bool:
-        """Whether layers go along with a rendition: they do with an image's first."""
+        """Return whether layers are carried with a rendition, which is the first of its image."""
         is_first = rendition.is_first and rendition.ev in (None, *self.request.bracket[:1])
         return bool(self.request.carry) and is_first
 
@@ -162,7 +157,7 @@ class OutputPlan:
         return {"": f"{CARRIED}.exr", **{name: png_ending(name) for name in depths}}
 
     def check(self, chain: Chain, jobs: Sequence[Job]) -> None:
-        """See that the formats can hold the results, and that no file is written twice.
+        """Check that the formats can hold the results, and that no file is written twice.
 
         Raises:
             RequestError: they cannot, or a result would overwrite an input or another result.
@@ -190,7 +185,7 @@ class OutputPlan:
         self._check_paths(jobs)
 
     def _check_patches(self, chain: Chain) -> None:
-        """See that patches of a chain's pictures can be written.
+        """Check that patches of a chain's pictures can be written.
 
         Raises:
             RequestError: they cannot.
@@ -210,7 +205,7 @@ class OutputPlan:
             variance_steps(chain)  # rejects steps that mix the noise of neighbours
 
     def _check_paths(self, jobs: Sequence[Job]) -> None:
-        """See that no file that may be written is an input or the file of another job.
+        """Check that no file that may be written is an input or the file of another job.
 
         Raises:
             RequestError: one is.
@@ -239,11 +234,11 @@ class OutputPlan:
     def path(
         self, job: Job, ending: str, rendition: Rendition = FIRST, patch: int | None = None
     ) -> Path:
-        """The file of a job with an ending; ``patch`` is the number of a patch of the rendition."""
+        """Return a file of a job by its ending. ``patch`` is the number of a patch."""
         return Path(self.name(job, ending_behind(ending, rendition, patch)))
 
     def name(self, job: Job, ending: str) -> str:
-        """The name of a job's file; ``ending`` is all that is behind the job's stem."""
+        """Return the name of a job's file. ``ending`` is all that follows the job's stem."""
         return f"{self.folder}/{job.stem}{ending}"
 
     def files(self, job: Job, rendition: Rendition) -> RenditionFiles:

@@ -37,8 +37,8 @@ class Recipe:
         noise: for a variance map, the steps whose noise has this variance in the chain's last
             image, see :func:`clpipe.chain.truth.variance_of`; else ().
         key: the key of the image.
-        spread: what its noise is measured on, of a baseline; the chain has it when that is known.
-        estimates: what was found about its noise, of a baseline.
+        spread: measures the noise of a baseline. The chain has that noise when it is known.
+        estimates: what was found about the noise of a baseline.
     """
 
     rendition: Rendition
@@ -50,7 +50,7 @@ class Recipe:
 
     @property
     def noise_key(self) -> str:
-        """What its noise is made of."""
+        """The key of its noise."""
         return noise_key(self.chain.settings, self.key, self.rendition.frame)
 
     @property
@@ -127,7 +127,7 @@ def measured_on(baseline: Rendition) -> tuple[Rendition, Rendition, Rendition]:
 
 @lru_cache(maxsize=64)  # as chain_and_noise
 def exposed(chain: Chain, ev: float) -> Chain:
-    """A chain that is exposed by so many EV more, and with noise of its own.
+    """Return a chain that is exposed by so many EV more, with noise of its own.
 
     Raises:
         RequestError: it has no such step, or the sum is not allowed.
@@ -157,7 +157,7 @@ def exposed(chain: Chain, ev: float) -> Chain:
 
 @lru_cache(maxsize=64)  # most images of a run share one chain, and plans are cached per chain
 def chain_and_noise(role: Role, chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
-    """The chain of a rendition, and the noise of a variance map, see :class:`Recipe`.
+    """Return the chain of a rendition, and the noise of a variance map, see :class:`Recipe`.
 
     Args:
         role: of the rendition.

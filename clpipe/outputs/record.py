@@ -31,14 +31,13 @@ SAID = ("image_key", "noise_key", "iso", "noise")  # keys of a sidecar that its 
 
 
 def intrinsics_of(chain: Chain, source: SourceImage) -> Intrinsics | None:
-    """The intrinsics of a render's or a photograph's picture; None where they are not known.
+    """Return the intrinsics of the picture of a render or a photograph; None if not known.
 
-    A photograph's are those of the picture turned upright. They are not of a raw, whose lens is not
-    known, and not of an image that enters in the midst of a chain, which may have gone through a
-    lens already.
+    The picture of a photograph is turned upright. The lens of a raw is not known. An image that
+    enters after the first step may have passed a lens already.
 
     Raises:
-        RequestError: what is said of the render contradicts a lens of the chain.
+        RequestError: the render's own values contradict a lens of the chain.
     """
     if isinstance(source, RawImage) or chain.steps[0].name != chain.names[0]:
         return None
@@ -52,7 +51,7 @@ def intrinsics_of(chain: Chain, source: SourceImage) -> Intrinsics | None:
 def subframe_records(
     source: SourceImage, stamps: Sequence[tuple[int, int]]
 ) -> list[dict[str, Any]]:
-    """The files that an exposure is the mean of, relative to the folder of the first."""
+    """Return the files that an exposure is the mean of, relative to the folder of the first."""
     return [
         {"file": name, "size": size, "modified": modified, "sha256": digest}
         for (name, digest), (size, modified) in zip(source.subframes, stamps, strict=True)
@@ -83,8 +82,8 @@ def picture_record(
         source: the image, as it was loaded.
         result: what was made of it.
         outputs: the files.
-        clipped: the share of clipped pixels, 0 to 1; None where the image has no upper end.
-        carried: layers that were written beside it.
+        clipped: the share of clipped pixels, 0 to 1; None if the image has no upper end.
+        carried: layers that were written next to it.
         patches: that were written in place of the picture.
     """
     chain, rendition = recipe.whole, recipe.rendition
@@ -146,14 +145,14 @@ def picture_record(
 
 
 def patch_records(chain: Chain, patches: Sequence[Patch]) -> dict[str, Any]:
-    """What a sidecar says of patches, as JSON values: of the raw of all, and where each is."""
+    """Return what a sidecar says of patches, as JSON values: of their raw, and where each is."""
     facts = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in facts_of(chain).items()}
     places = [{"place": [patch.left, patch.top], "turn": patch.orientation} for patch in patches]
     return {FACTS: facts, PATCHES: places}
 
 
 def patch_text(values: Mapping[str, Any], number: int) -> bytes:
-    """What is said of one patch, by its number, in the sidecar's values: a sidecar of its own.
+    """Return a sidecar of one patch, by its number, from the values of all patches.
 
     Raises:
         KeyError, TypeError, IndexError: the values are damaged.
@@ -164,7 +163,7 @@ def patch_text(values: Mapping[str, Any], number: int) -> bytes:
 
 @lru_cache(maxsize=8)
 def stage_records(chain: Chain) -> list[dict[str, Any]]:
-    """What a sidecar says of the steps of a chain, as JSON values; cached, as images share it."""
+    """Return what a sidecar says of the steps of a chain, as JSON values, which images share."""
     return [
         Constant(
             name=step.name,

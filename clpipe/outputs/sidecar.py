@@ -27,13 +27,16 @@ SEAL = "sidecar_sha256"  # the last one: the SHA-256 of all lines before its own
 
 BEGINNING = b'{\n  "%b": ' % OWN.encode()
 
-# Either end of a sidecar, so that one that was cut off or edited is known for one still.
+# Either end of a sidecar, by which one that was cut off or edited is still recognized.
 _BEGINNING = re.compile(rb'\s*\{\s*"%b"\s*:' % OWN.encode())
 _END = re.compile(rb'"%b"\s*:' % SEAL.encode())
 
 
+to_json = json.JSONEncoder().encode  # which json.dumps calls, after a look at its options
+
+
 class SidecarError(ImageError):
-    """A sidecar is not as clpipe wrote it: it was edited, cut off or damaged."""
+    """A sidecar was edited, cut off or damaged after clpipe wrote it."""
 
     def __init__(self, name: Path | str) -> None:
         super().__init__(
@@ -44,9 +47,9 @@ class SidecarError(ImageError):
 
 
 def sealed(record: Mapping[str, Any]) -> bytes:
-    r"""A sidecar's bytes: its values, and the digest of what is before that.
+    r"""Return a sidecar's bytes: its values, then the digest of all lines before.
 
-    ``head -n -2 NAME.json | sha256sum`` computes it.
+    ``head -n -2 NAME.json | sha256sum`` computes that digest.
 
     >>> sealed({"a": 1})[:28]
     b'{\n  "a": 1,\n  "sidecar_sha25'
@@ -84,7 +87,7 @@ def values_in(data: bytes, name: Path | str) -> dict[str, Any] | None:
 
 
 def is_sidecar(data: bytes) -> bool:
-    """Whether the bytes of a file are a sidecar, or what became of one."""
+    """Return whether the bytes of a file are a sidecar, or the remains of one."""
     is_cut = BEGINNING.startswith(data.rstrip(b"\0") or b"-")
     return is_cut or bool(_BEGINNING.match(data) or _END.search(data))
 
@@ -93,7 +96,7 @@ def read_sidecar(path: Path) -> dict[str, Any]:
     """Return the values of a sidecar, see :func:`values_in`.
 
     Raises:
-        FileNotFoundError: it is missing, or is empty, as a loss of power may leave it.
+        FileNotFoundError: it is missing, or empty after a loss of power.
         SidecarError: it was edited, cut off or damaged.
         ImageError: it cannot be read, or clpipe did not write it.
     """
@@ -136,7 +139,7 @@ def values_at(path: Path) -> dict[str, Any] | None:
 
 
 def write_sidecar(path: Path, record: Mapping[str, Any]) -> None:
-    """Write the sidecar of a picture, whose files are all there.
+    """Write the sidecar of a picture whose files have been written.
 
     Raises:
         ImageError: it cannot be written.
@@ -146,7 +149,7 @@ def write_sidecar(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def remove_sidecar(path: Path) -> None:
-    """Remove a sidecar where there is one: its pictures are about to be written.
+    """Remove a sidecar, if there is one, before its pictures are written.
 
     Raises:
         ImageError: it cannot be removed.
@@ -161,9 +164,9 @@ def remove_sidecar(path: Path) -> None:
 
 
 def outputs_in(values: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """The files that a sidecar's values list: the size and the SHA-256 of each, by its name.
+    """Return the files that a sidecar's values list: the size and SHA-256 of each, by its name.
 
-    What is no name beside the sidecar, or says no size and SHA-256, is left out.
+    An entry is ignored if it lacks one of these, or its name is not one of the sidecar's folder.
     """
     listed = values.get("outputs")
     return {
@@ -198,7 +201,7 @@ def inputs_in(
 
 
 class Constant(dict[str, Any]):
-    """A part of many records, which never changes: its JSON is made once.
+    """A part of many records that never changes. Its JSON is made once.
 
     >>> Constant(a=1).text
     '{"a": 1}'
@@ -207,15 +210,15 @@ class Constant(dict[str, Any]):
     @cached_property
     def text(self) -> str:
         """Its JSON."""
-        return json.dumps(self)
+        return to_json(self)
 
 
 def _text_of(value: Any) -> str:
-    return value.text if isinstance(value, Constant) else json.dumps(value)
+    return value.text if isinstance(value, Constant) else to_json(value)
 
 
 def json_text(record: Mapping[str, Any]) -> str:
-    """JSON with a line for each key, and for each object of a list.
+    """Return JSON with a line for each key, and for each object of a list.
 
     >>> print(json_text({"a": 1, "b": [{"c": 2}, {"d": [3, 4]}]}), end="")
     {
@@ -233,10 +236,10 @@ def json_text(record: Mapping[str, Any]) -> str:
             text = f"[\n{each}\n  ]"
         else:
             text = _text_of(value)
-        lines.append(f"  {json.dumps(key)}: {text}")
+        lines.append(f"  {to_json(key)}: {text}")
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 def _seal_of(head: bytes) -> bytes:
-    """The last two lines of a sidecar, by those before."""
+    """Return the last two lines of a sidecar, from those before."""
     return f'  "{SEAL}": "{hashlib.sha256(head).hexdigest()}"\n}}\n'.encode()

@@ -1,4 +1,4 @@
-"""Writes the pictures of a run, as :mod:`clpipe.outputs.plan` has them."""
+"""Writes the files that :mod:`clpipe.outputs.plan` names."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -39,14 +39,14 @@ class OutputWriter(OutputPlan):
     """Writes the pictures of a request to a folder."""
 
     def runner(self, recipe: Recipe, device: Device | None) -> Runner:
-        """A runner that makes all of a rendition that is written, and nothing else."""
+        """Return a runner that makes all of a rendition that is written, and nothing else."""
         formats, keep = self.formats_of(recipe.rendition), self.keep_of(recipe.rendition)
         steps, encode, final = results_of(recipe.chain, formats, keep)
         final |= bool(self.request.baselines)  # to measure its noise
         return Runner(recipe.chain, device, steps, encode, final)
 
     def check_size(self, source: SourceImage, chain: Chain) -> None:
-        """See that what a chain makes of an image fits into the formats.
+        """Check that what a chain makes of an image fits into the formats.
 
         Raises:
             ImageError: it is too large for one.
@@ -56,7 +56,7 @@ class OutputWriter(OutputPlan):
             raise ImageError(f"JPEG holds at most {JPEG_MAX_SIDE} pixels a side; use --format png")
 
     def check_folder(self) -> None:
-        """See that the output folder can still be written to.
+        """Check that the output folder can still be written to.
 
         Raises:
             OutputError: it cannot.
@@ -66,8 +66,9 @@ class OutputWriter(OutputPlan):
 
     @staticmethod
     def picture_orientation(source: SourceImage, chain: Chain) -> int:
-        """EXIF's orientation by which a picture is turned; a mosaic, whose pattern would change, is
-        not turned.
+        """Return EXIF's orientation by which a picture is turned upright.
+
+        A mosaic is not turned, because its pattern would change.
 
         Raises:
             ImageError: the attributes of the source are damaged.
@@ -91,7 +92,7 @@ class OutputWriter(OutputPlan):
             recipe: of the picture.
             source: the image, as it was loaded.
             result: what its :meth:`runner` made of it.
-            carried: layers that are written beside it.
+            carried: layers that are written next to it.
             patches: of which the result is; () is all of the picture.
 
         Returns:
@@ -108,12 +109,12 @@ class OutputWriter(OutputPlan):
         for number, patch in numbered(patches):
             part = part_of(result, recipe, number, patch)
             outputs |= self._write(job, recipe, source, part, number)
-        for number, patch in numbered(patches) if carried else ():
-            assert carried
-            layers = carried.changed(patch.cut_out) if patch else carried
-            for layer, ending in self.carried_endings(recipe.rendition).items():
-                path = self.path(job, ending, patch=number)
-                outputs[path] = write_carried(path, layers, layer)
+        if carried:
+            for number, patch in numbered(patches):
+                layers = carried.changed(patch.cut_out) if patch else carried
+                for layer, ending in self.carried_endings(recipe.rendition).items():
+                    path = self.path(job, ending, patch=number)
+                    outputs[path] = write_carried(path, layers, layer)
         return outputs
 
     def _write(
