@@ -183,7 +183,7 @@ def test_what_is_wrong_with_a_url_is_said(bucket, clpipe, monkeypatch):
     assert "flaky://b/gone.exr: cannot be read: " in text and "1 of 2 images done" in text
     assert "'..'" in told("flaky://b/../x.exr", "-o", "o", status=2)
     text = told("in", "-o", "flaky://b/set", status=2)
-    assert "found flaky://b/set; behind a URL go tars alone: say --webdataset N" in text
+    assert "found flaky://b/set; only tars are written to a URL, so add --webdataset N" in text
     text = clpipe("meter", "in", "-o", "flaky://b/m.csv", status=2).stderr
     assert "only clpipe run writes behind URLs" in text
     Flaky.forbidden = "r3"

@@ -93,10 +93,10 @@ class BatchSpeed:
 def bench_batch(device: Device, request: Request, load: Load) -> BatchSpeed:
     """Time one load: half EXR in, JPEG out, and the CPU time of each step.
 
-    A step's time is that of the clocks of the threads that do it. What the process takes beyond
-    its own threads is the driver's, as kernels and transfers take it on a CPU. It is shared out by
-    how long those last, a kernel on all compute units, a transfer on one. "Python" is what
-    threads take outside of all steps.
+    The time of a step is measured by the clocks of the threads that do it. On a CPU, the driver's
+    threads run kernels and transfers. Their time is the process's time less that of our threads. It
+    is divided between kernels, which take all compute units, and transfers, which take one.
+    "Python" is the time of our threads outside all steps.
 
     The files lie in a temporary folder while it lasts.
     """

@@ -39,7 +39,7 @@ class Outcome:
         megapixels: the size of the image that was read.
         warnings: warnings about the image.
         error: why it failed, or "".
-        reason: what an image that was left out holds instead of a picture, or "".
+        reason: the content of a file that was left out, or "".
         outputs: the files that were written, relative to the output directory.
         began: its begin, in s since 1970.
         spans: the periods of work.

@@ -25,7 +25,7 @@ class Replay:
     """One picture to make again.
 
     Args:
-        request: what the sidecar says was asked for.
+        request: the request in the sidecar.
         job: the image, and the rendition of it.
         made: what the sidecar says of the program, the device and the versions of libraries.
         outputs: the SHA-256 of the files that it lists, by their names.
@@ -67,12 +67,12 @@ def digests_in(values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def short(value: str) -> str:
-    """A digest as far as people tell such apart; other values as they are."""
+    """Shorten a digest for people; return other values unchanged."""
     return value[:12] if re.fullmatch("[0-9a-f]{64}", value) else value
 
 
 def surroundings_in(values: Mapping[str, Any]) -> dict[str, str]:
-    """What the bytes of a picture depend on beside the request, by name, by a sidecar's values.
+    """Return what a picture's bytes depend on besides the request, by name, from a sidecar.
 
     Raises:
         KeyError, TypeError, AttributeError: they are damaged.
@@ -102,12 +102,12 @@ def replay_of(
         path: of the sidecar.
         inputs: where its input is now; none means, where it was.
         max_pixels: as for :class:`~clpipe.chain.request.Request`.
-        stage_files: code that may be run. What a sidecar names is data, and is not.
+        stage_files: code that may be run. Files that only a sidecar names are not run.
 
     Raises:
-        RequestError: it is no sidecar, or one of another version, the input or a file that was used
-            (a camera profile, a curve) is missing or has changed, or it was made with stage files
-            that are not among these.
+        RequestError: it is no sidecar, or one of another version. Or the input or a file that was
+            used (a camera profile, a curve) is missing or has changed. Or it was made with stage
+            files that are not among these.
     """
     if len(inputs) > 1:
         raise RequestError(f"{path}: it has one input; found {len(inputs)}")

@@ -327,7 +327,7 @@ def check_output(folder: Path, per_tar: int | None = None) -> None:
     """
     if (url := url_of(folder)) and not per_tar:
         raise RequestError(
-            f"--output: found {url}; behind a URL go tars alone: say --webdataset N as well"
+            f"--output: found {url}; only tars are written to a URL, so add --webdataset N"
         )
     if folder.suffix.lower() in (*PICTURE_SUFFIXES, ".dng") and not folder.is_dir():
         raise RequestError(

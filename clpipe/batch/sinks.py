@@ -1,4 +1,4 @@
-"""Where results go, and who makes them: what a sink and an executor are.
+"""The interfaces of a run: executors make images, sinks receive them.
 
 There are three executors: :class:`clpipe.batch.threads.Batch` (threads of this process),
 :class:`clpipe.batch.processes.Processes` (processes of this machine) and

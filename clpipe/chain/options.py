@@ -35,8 +35,8 @@ DEVICE = Key(
 TRUTH = Key(
     "truth",
     list,
-    "Write next to each picture the same picture without noise (development), without noise and "
-    "denoising (clean), the mosaic without noise (mosaic), the variance of the mosaic's noise "
+    "Write next to each picture its ground truth: without noise (development), without noise and "
+    "denoising (clean), the mosaic without noise (mosaic), or the variance of the mosaic's noise "
     "(variance).",
     usual=CLEAN,
     choices=TRUTHS,
@@ -96,9 +96,9 @@ _ALL = (
         "{name}_LAYER.exr or similar",
     ),
     TRUTH._replace(
-        text=f"{TRUTH.text[:-1]}, or the clean picture with independent noise of the same "
-        "strength, equal everywhere (iid) or by intensity (intensity). iid and intensity also "
-        "write the truths from which they are made.",
+        text=f"{TRUTH.text} Or write the clean picture with independent noise of the same strength, "
+        "equal everywhere (iid) or by intensity (intensity). These two also write the ground truth "
+        "from which they are made.",
         usual="",
         choices=(*TRUTHS, *BASELINES),
     ),
@@ -186,9 +186,9 @@ _ALL = (
     Key(
         "redo",
         str,
-        "Make again pictures that are missing or whose request has changed (missing), also those "
-        "of another version of clpipe (old), also damaged ones (damaged), or all, even if other "
-        "programs wrote the files (all). To find damaged ones, all files are read.",
+        "Which existing pictures to make again: none (missing), those of another version of clpipe "
+        "(old), also damaged ones (damaged), or all, even files of other programs (all). Pictures "
+        "that are missing or whose request has changed are always made. damaged reads all files.",
         usual="old",
         choices=get_args(RedoName),
     ),
