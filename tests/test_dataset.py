@@ -17,7 +17,7 @@ from PIL import Image
 
 import clpipe as api
 from clpipe.base.errors import DeviceError, ImageError, RequestError
-from clpipe.dataset import dataset as module
+from clpipe.dataset import ahead
 from clpipe.dataset.renders import SharedRenders
 from clpipe.dataset.samples import SampleLoader
 from clpipe.engine.runner import is_planar
@@ -195,7 +195,7 @@ def test_samples_of_a_batch_go_through_together_and_are_the_same(renders, monkey
     in_order = list(samples)
     for number, one in zip(numbers, alone, strict=True):
         same(in_order[number], one)
-    monkeypatch.setattr(module, "MOST_PIXELS", 300)  # two patches
+    monkeypatch.setattr(ahead, "MOST_PIXELS", 300)  # two patches
     sizes.clear()
     for one, two in zip(samples.__getitems__(numbers), alone, strict=True):
         same(one, two)

@@ -36,6 +36,15 @@ SRGB_TO_XYZ = np.array(
 )
 
 Share = Annotated[float, Field(ge=0, le=0.1)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Temperature = Annotated[float, Field(ge=-100, le=150)]  # deg C
+
+# Keys that need another one, and what that is.
+NEEDED = {
+    ("hot_pixel_share", "hot_pixel_level"): "the smallest extra charge of a hot pixel in e-",
+    ("banding_amplitude", "banding_period"): "in rows",
+    ("rts_share", "rts_amplitude"): "the mean distance of two levels in e-",
+}
 
 
 class Camera(BaseModel):
@@ -62,9 +71,7 @@ class Camera(BaseModel):
     full_well: Positive | None = None  # e-; None: the ADC clips first
     tukey_lambda: TukeyLambda | None = None  # of read noise at every ISO; None: Gaussian
     prnu: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # standard deviation over mean
-    crosstalk: Annotated[float, Field(ge=0, le=0.1)] = (
-        0.0  # share of a pixel's charge, to each side
-    )
+    crosstalk: Share = 0.0  # of a pixel's charge, to each side
     dsnu: NotNegative = 0.0  # e-
     hot_pixel_share: Share = 0.0
     hot_pixel_level: NotNegative = 0.0  # e-, the smallest extra charge of a hot pixel
@@ -72,13 +79,9 @@ class Camera(BaseModel):
     rts_share: Share = 0.0  # of pixels with random telegraph noise
     rts_amplitude: NotNegative = 0.0  # e-, the mean distance of their two levels
     dark_current: NotNegative = 0.0  # e-/s
-    dark_current_temperature: Annotated[float, Field(ge=-100, le=150)] = (
-        20.0  # deg C, it holds there
-    )
+    dark_current_temperature: Temperature = 20.0  # at which dark_current holds
     dark_current_doubling: Positive | None = None  # K; None: the same at every temperature
-    dark_current_spread: Annotated[float, Field(ge=0, le=1)] = (
-        0.0  # how pixels differ, standard deviation over mean
-    )
+    dark_current_spread: Fraction = 0.0  # how pixels differ, standard deviation over mean
     dark_shading_slope: NotNegative = 0.0  # DN for each ISO, standard deviation over the sensor
     dark_shading_offset: NotNegative = 0.0  # DN, the same of what does not depend on the ISO
     dark_shading_length: Positive = 500.0  # px, over which both change
@@ -107,17 +110,11 @@ class Camera(BaseModel):
             raise ValueError("white_level must be above black_level")
         if self.xyz_to_camera and abs(np.linalg.det(self.xyz_to_camera)) < 1e-6:
             raise ValueError("xyz_to_camera is singular")
-        if self.hot_pixel_share and not self.hot_pixel_level:
-            raise ValueError(
-                "hot_pixel_share needs hot_pixel_level, the smallest extra charge of a hot pixel "
-                "in e-"
-            )
+        for (key, needed), text in NEEDED.items():
+            if getattr(self, key) and not getattr(self, needed):
+                raise ValueError(f"{key} needs {needed}, {text}")
         if self.tukey_lambda is not None and any(s.tukey_lambda for s in self.gain_stages):
             raise ValueError("tukey_lambda is for every ISO, or in gain_stages; found both")
-        if self.banding_amplitude and not self.banding_period:
-            raise ValueError("banding_amplitude needs banding_period, in rows")
-        if self.rts_share and not self.rts_amplitude:
-            raise ValueError("rts_share needs rts_amplitude, the mean distance of two levels in e-")
         low, high = self.iso_range
         if low > high:
             raise ValueError(f"iso_range must ascend; found {low:g} and {high:g}")
@@ -223,9 +220,7 @@ class Camera(BaseModel):
 
     @property
     def pushed_range(self) -> tuple[float, float]:
-        """The ISOs with two stops more, as cameras push their highest one: there is no more gain in
-        the sensor, so the law of :meth:`noise` goes on.
-        """
+        """The range and two stops more, to which cameras push without more gain in the sensor."""
         low, high = self.iso_range
         return low, high * PUSHED
 
@@ -275,8 +270,8 @@ def comparable(name: str) -> str:
 def camera_names() -> dict[str, str]:
     """The built-in cameras by all that they are called, as :func:`comparable` has it."""
     names: dict[str, str] = {}
-    for name, path in built_in_cameras().items():
-        camera = _parse(read_text(path))
+    for name in built_in_cameras():
+        camera = load_camera(name)
         for model in (camera.model, camera.model.removeprefix(camera.make), *camera.aliases):
             names |= {comparable(model): name, comparable(f"{camera.make} {model}"): name}
     return names | {comparable(name): name for name in built_in_cameras()}
@@ -363,12 +358,11 @@ def load_camera(name: str) -> Camera:
         )
     check_exists(path)
     try:
-        text = read_text(path)
+        return parse_camera(read_text(path), str(path))
     except OSError as error:
         raise RequestError(f"{path}: cannot read this camera profile: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise RequestError(f"{path}: not valid TOML: {error}") from None
-    return parse_camera(text, str(path))
 
 
 @cache
@@ -376,23 +370,19 @@ def _built_in(path: Path) -> Camera:
     return parse_camera(read_text(path), str(path))
 
 
+@lru_cache(maxsize=64)  # a batch loads the camera once for each image
 def parse_camera(text: str, source: str) -> Camera:
-    """The camera of a profile's text; ``source`` names it in messages.
+    """Return the camera of a profile's text. ``source`` names it in messages.
 
     Raises:
         RequestError: the text is not a valid profile.
     """
     try:
-        return _parse(text)
+        return Camera.model_validate(parse_toml(text))
     except ValidationError as error:
         raise RequestError(f"{source}: {_reason(error)}") from None
     except ValueError as error:
         raise RequestError(f"{source}: not valid TOML: {error}") from None
-
-
-@lru_cache(maxsize=64)  # a batch loads the camera once for each image
-def _parse(text: str) -> Camera:
-    return Camera.model_validate(parse_toml(text))
 
 
 def _reason(error: ValidationError) -> str:

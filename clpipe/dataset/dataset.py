@@ -3,12 +3,8 @@
 import copy
 import hashlib
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
-from functools import partial
-from itertools import islice
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, Unpack
 
@@ -16,48 +12,21 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.processors import available_processors
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import several
-from clpipe.base.types import Array, plain
+from clpipe.base.types import plain
 from clpipe.base.validation import typed
 from clpipe.chain.rendition import DEVELOPMENT
 from clpipe.chain.request import Request
+from clpipe.dataset.ahead import PATCHES, Size, begun_ahead
 from clpipe.dataset.arrays import ArrayFormat, dtype_named
 from clpipe.dataset.developer import Sample, SampleSpec
 from clpipe.dataset.inputs import cache_size, jobs_of
 from clpipe.dataset.numbering import Numbering
 from clpipe.dataset.samples import SampleBatch, SampleLoader
-from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.outputs.patches import Patches
 
 if TYPE_CHECKING:
     from clpipe.chain.keywords import Keywords
-
-
-PATCHES = 16  # with draws of their own that are begun together, in order
-# Samples are developed together until these are reached: bytes of renders, of which those of a
-# shuffled dataset all differ, and pixels of samples, of which more would only wait in memory.
-MOST_BYTES = 2**27
-MOST_PIXELS = 2**21
-
-
-class Size:
-    """The size of images that are to be developed together, of patches with such sides, in px."""
-
-    def __init__(self, side: int | None) -> None:
-        self._side = side
-        self._sources: set[int] = set()
-        self._pixels = self._bytes = 0
-
-    def add(self, batch: SampleBatch, source: Array) -> bool:
-        """Add samples of an image; whether they are enough now."""
-        is_new = id(source) not in self._sources
-        self._sources.add(id(source))
-        self._bytes += source.nbytes * is_new
-        if self._side:
-            self._pixels += len(batch.numbers) * self._side**2
-        else:
-            self._pixels += source.shape[0] * source.shape[1] * is_new
-        return self._pixels >= MOST_PIXELS or self._bytes >= MOST_BYTES
 
 
 class Dataset(ReadOnly):
@@ -353,57 +322,22 @@ class Dataset(ReadOnly):
             ImageError: an image cannot be read or processed.
             DeviceError: there is no usable device.
         """
-        set_codec_threads(max(available_processors() // self._threads, 1))
-        ahead: deque[tuple[list[SampleBatch], Future[list[Callable[[], list[Sample]]]]]] = deque()
-        decoders = ThreadPoolExecutor(self._threads, "decode")
-        developer = ThreadPoolExecutor(1, "device")
         self._next, self._first = self._first, 0
-        try:
-            together = PATCHES if self._draws_by_patch else 1
-            batches = self._batches(self._next)
-            while some := list(islice(batches, together)):
-                read = [decoders.submit(self._loader.read, batch) for batch in some]
-                ahead.append((some, developer.submit(self._begin_read, some, read)))
-                if len(ahead) > self._threads + 1:
-                    yield from self._counted(*ahead.popleft())
-            while ahead:
-                yield from self._counted(*ahead.popleft())
-        finally:
-            decoders.shutdown(cancel_futures=True)
-            developer.shutdown(cancel_futures=True)
-            self._loader.drain()
-
-    def _begin_read(
-        self, batches: Sequence[SampleBatch], read: Sequence[Future[tuple[LoadedImage, Sample]]]
-    ) -> list[Callable[[], list[Sample]]]:
-        """Begin with batches that are read; what fails together is tried alone, when it is due."""
-        try:
-            return self._loader.begin(
-                [(batch, *own.result()) for batch, own in zip(batches, read, strict=True)]
-            )
-        except ImageError:
-            return [
-                partial(self._alone, batch, own) for batch, own in zip(batches, read, strict=True)
-            ]
-
-    def _alone(self, batch: SampleBatch, read: Future[tuple[LoadedImage, Sample]]) -> list[Sample]:
-        return self._loader.begin([(batch, *read.result())])[0]()
-
-    def _counted(
-        self, batches: Sequence[SampleBatch], begun: Future[list[Callable[[], list[Sample]]]]
-    ) -> Iterator[Sample]:
-        for batch, wait in zip(batches, begun.result(), strict=True):
-            try:
-                samples = wait()
-            except ImageError as error:
-                if not self._skips:
-                    raise
-                warnings.warn(f"skipped: {error}", stacklevel=3)
-                self._next += len(batch.numbers)
-                continue
-            for sample in samples:
-                self._next += 1
-                yield sample
+        together = PATCHES if self._draws_by_patch else 1
+        begun = begun_ahead(self._loader, self._batches(self._next), self._threads, together)
+        with closing(begun):
+            for batch, wait in begun:
+                try:
+                    samples = wait()
+                except ImageError as error:
+                    if not self._skips:
+                        raise
+                    warnings.warn(f"skipped: {error}", stacklevel=2)
+                    self._next += len(batch.numbers)
+                    continue
+                for sample in samples:
+                    self._next += 1
+                    yield sample
 
     def _numbering(self) -> Numbering:
         """How samples are numbered.

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 
@@ -13,14 +12,6 @@ from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, of_structure
 from clpipe.chain.exposures import exposures_of
 from clpipe.chain.registry import user_code_errors
-from clpipe.engine.bindings import (
-    ArgumentValue,
-    Bind,
-    EncodedCurves,
-    ResamplingValue,
-    StreamWord,
-    Value,
-)
 from clpipe.engine.buffers import HostImages, room_for
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
@@ -28,9 +19,9 @@ from clpipe.engine.ir import Plan
 from clpipe.engine.ops import chain_ops
 from clpipe.engine.options import DEFAULTS, RunOptions
 from clpipe.engine.plan import make_plan
+from clpipe.engine.values import binding
 from clpipe.engine.work import Work
-from clpipe.reference.curve import compose, to_8_bit
-from clpipe.reference.random import Stream
+from clpipe.reference.curve import to_8_bit
 from clpipe.stage import Method, NoiseScope, ReferenceContext, Resample
 
 
@@ -267,7 +258,7 @@ class Runner:
         return Work(
             plan,
             image,
-            self.bind(plan, image, noise_key),
+            binding(self.chain, plan, (width, height), noise_key, self._tables),
             room_for(plan, width, height, options.into, options.boxes),
             options,
             partial(self._result, plan, estimates),
@@ -305,31 +296,6 @@ class Runner:
                 f"{self.chain.source.label} with {channels} channel(s)"
             )
 
-    def bind(self, plan: Plan, image: Array, noise_key: str) -> Bind:
-        """What gives the values of the kernels' parameters for an image."""
-        streams: dict[tuple[str, NoiseScope], Stream] = {}
-        sizes = plan.sizes(*image.shape[1::-1])
-        arguments = self._arguments
-
-        def other(value: Value) -> Any:
-            match value:
-                case ResamplingValue(level, name):
-                    return plan.resamplings[level].values(*sizes[level])[name]
-                case EncodedCurves(steps):
-                    return self._composed(steps)
-                case StreamWord(step, scope, word):
-                    if (step, scope) not in streams:
-                        streams[step, scope] = self.chain.stream(step, scope, noise_key)
-                    return getattr(streams[step, scope], word)
-
-        def bind(values: Sequence[Value]) -> list[Any]:
-            return [
-                arguments[each.step][each.name] if type(each) is ArgumentValue else other(each)
-                for each in values
-            ]
-
-        return bind
-
     def _estimates_for(self, width: int, height: int) -> dict[str, dict[str, float]]:
         """Numbers that follow from the size of the steps' images, by step."""
         found = {}
@@ -355,24 +321,6 @@ class Runner:
                 for step, values in output.estimates.items()
             },
         )
-
-    def _composed(self, steps: Sequence[str]) -> Array:
-        """The table of these curves and the conversion to eight bits, all in one."""
-        curves: list[Array] = []
-        for name in steps:
-            table = self._arguments[name]["table"]
-            assert isinstance(table, np.ndarray)
-            curves.append(table)
-        key = tuple(map(Identity, curves))  # of which each is one object for the same parameters
-
-        def composed() -> Array:
-            *first, last = curves
-            table: Array = to_8_bit(last)
-            for curve in reversed(first):
-                table = compose(curve, table)
-            return table
-
-        return self._tables.get(key, composed)
 
     def _run_numpy(self, image: Floats, noise_key: str, boxes: Sequence[Box]) -> Result:
         kept: dict[str, Floats] = {}

@@ -1,0 +1,80 @@
+"""Values of kernel parameters that follow from an image's chain, its size and its noise key."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from clpipe.base.cache import BoundedCache, Identity
+from clpipe.base.types import Array
+from clpipe.chain.chain import Chain
+from clpipe.engine.bindings import (
+    ArgumentValue,
+    Bind,
+    EncodedCurves,
+    ResamplingValue,
+    StreamWord,
+    Value,
+)
+from clpipe.engine.ir import Plan
+from clpipe.reference.curve import compose, to_8_bit
+from clpipe.reference.random import Stream
+from clpipe.stage import NoiseScope
+
+
+def binding(
+    chain: Chain,
+    plan: Plan,
+    size: tuple[int, int],
+    noise_key: str,
+    tables: BoundedCache[Array],
+) -> Bind:
+    """Return a function that returns the values of kernel parameters for one image.
+
+    Args:
+        chain: the image's chain.
+        plan: the chain's plan.
+        size: width and height of the image in px.
+        noise_key: what the noise is made of.
+        tables: composed curves, which several chains may share.
+    """
+    arguments = chain.arguments
+    streams: dict[tuple[str, NoiseScope], Stream] = {}
+    sizes = plan.sizes(*size)
+
+    def other(value: Value) -> Any:
+        match value:
+            case ResamplingValue(level, name):
+                return plan.resamplings[level].values(*sizes[level])[name]
+            case EncodedCurves(steps):
+                return encoding_table([np.asarray(arguments[s]["table"]) for s in steps], tables)
+            case StreamWord(step, scope, word):
+                if (step, scope) not in streams:
+                    streams[step, scope] = chain.stream(step, scope, noise_key)
+                return getattr(streams[step, scope], word)
+
+    def bind(values: Sequence[Value]) -> list[Any]:
+        return [
+            arguments[each.step][each.name] if type(each) is ArgumentValue else other(each)
+            for each in values
+        ]
+
+    return bind
+
+
+def encoding_table(curves: Sequence[Array], tables: BoundedCache[Array]) -> Array:
+    """Return one table for curves in a row and the conversion to eight bits.
+
+    Args:
+        curves: tables, each of which is one object for the same parameters.
+        tables: those that were made before.
+    """
+
+    def composed() -> Array:
+        *first, last = curves
+        table: Array = to_8_bit(last)
+        for curve in reversed(first):
+            table = compose(curve, table)
+        return table
+
+    return tables.get(tuple(map(Identity, curves)), composed)
