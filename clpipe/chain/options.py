@@ -96,9 +96,9 @@ _ALL = (
         "{name}_LAYER.exr or similar",
     ),
     TRUTH._replace(
-        text=f"{TRUTH.text} Or write the clean picture with independent noise of the same strength, "
-        "equal everywhere (iid) or by intensity (intensity). These two also write the ground truth "
-        "from which they are made.",
+        text=f"{TRUTH.text} Or write the clean picture with independent noise of the same "
+        "strength, equal everywhere (iid) or by intensity (intensity). These two also write the "
+        "ground truth from which they are made.",
         usual="",
         choices=(*TRUTHS, *BASELINES),
     ),
