@@ -175,7 +175,7 @@ class Developers:
                     self._orders.put([order])
                 return
             self._fail(error)
-            for order in chain(left, asked, *iter(self._orders.get, None)):
+            for order in chain(left, asked, chain.from_iterable(iter(self._orders.get, None))):
                 order.written.set_exception(error)
         finally:
             if device:
