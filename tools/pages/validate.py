@@ -207,12 +207,13 @@ def finished(config: str, iso: float) -> dict[str, float]:
 def closed_loop(given: argparse.Namespace) -> bool:
     """Print the section of the closed loop; return whether all targets are met."""
     width, height = map(int, given.size.split("x"))
-    good = True
+    missed = []
     print(LOOP.format(frames=FRAMES, width=width, height=height))
     print("| camera | ISO | a, % | in s.e. | b, % | in s.e. | rows, % | columns, % | hot wrong |")
     print("|---|---|---|---|---|---|---|---|---|")
     for name, iso, found in loops(height, width):
-        good &= all(loop.good for loop in found)
+        if not all(loop.good for loop in found):
+            missed.append(f"{name} at ISO {iso}")
         worst = [max((getattr(loop, f.name) for loop in found), key=abs) for f in fields(Loop)]
         a, a_errors, b, b_errors, row, column, hot = worst
         print(
@@ -220,7 +221,9 @@ def closed_loop(given: argparse.Namespace) -> bool:
             f"| {row:+.2%} | {column:+.2%} | {hot} |".replace("%", ""),
             flush=True,
         )
-    return good
+    if missed:
+        print(f"\nRows that miss a target: {', '.join(missed)}.")
+    return not missed
 
 
 def photo_electrons(given: argparse.Namespace) -> bool:
@@ -330,7 +333,7 @@ This page compares simulated noise with its model and with real cameras. `tools/
 comparisons with other programs, see [Quality](quality.md). To measure your own images, see [Measuring and calibrating](measuring.md).
 """
 
-LOOP = """## Known noise is measured correctly
+LOOP = """## Calibration of known noise
 
 The tool simulates {frames} frames of a scene and {frames} dark frames, {width}x{height}, with a camera's noise at an ISO. This noise consists of Poisson
 photo-electrons, read, row and column noise, PRNU, DSNU, hot pixels and rounding to whole DN. Then `clpipe calibrate` receives the levels and the
