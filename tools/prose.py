@@ -41,6 +41,21 @@ CHECKED = (
     "docs/recipes/undistort.md",
     "docs/recipes/views.md",
     "docs/sidecars.md",
+    "tools/pages/quality.py",
+    "CHANGELOG.md",
+    "docs/api.md",
+    "docs/architecture.md",
+    "docs/how_it_works.md",
+    "docs/measuring.md",
+    "docs/noise.md",
+    "docs/paper.md",
+    "docs/performance.md",
+    "docs/quality.md",
+    "docs/reconstruction.md",
+    "docs/sensors.md",
+    "docs/validation.md",
+    "docs/recipes/denoiser.md",
+    "docs/recipes/paper.md",
 )
 
 MOST_WORDS = 30  # in a sentence
