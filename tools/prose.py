@@ -101,7 +101,7 @@ RULES = {
 }
 
 CODE = re.compile(r"``.+?``|`[^`]+`|:\w+:`[^`]+`|\{[^}]*\}|https?://\S+")
-SENTENCE = re.compile(r"(?<=[.!?])\s+(?=[A-Z\"'(])")
+SENTENCE = re.compile(r"(?<=[.!?])\s+(?=[A-Z\"'(]|clpipe\b|code\b)")
 ENTRY = re.compile(r"^\s*(?:[-*]|\d+\.|\w[\w, *`|]*:)\s")  # of a list, or of Args
 ABBREVIATION = re.compile(r"\b(?:e\.g|i\.e|etc|al|eq|sec|vol|Fig|Int|Rev|No|Inst|Math)\.")
 
