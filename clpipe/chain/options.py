@@ -96,8 +96,8 @@ _ALL = (
     ),
     TRUTH._replace(
         text="Write the picture without noise (development), without noise and denoising (clean), "
-        "the clean mosaic (mosaic), its noise variance (variance), or the clean picture with uniform "
-        "(iid) or intensity-dependent (intensity) noise. The noise of iid and intensity is "
+        "the clean mosaic (mosaic), its noise variance (variance), or the clean picture with "
+        "uniform (iid) or intensity-dependent (intensity) noise. The noise of iid and intensity is "
         "independent and as strong as the picture's. These two also write the ground truth from "
         "which they are made.",
         usual="",
