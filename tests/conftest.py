@@ -1,3 +1,4 @@
+import itertools
 import resource
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
+import pyopencl as cl
 import pytest
 from click.testing import CliRunner
 from click.testing import Result as ClickResult
@@ -116,6 +118,31 @@ def file_limit(size: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def fail_launches(monkeypatch: pytest.MonkeyPatch, error: BaseException, *numbers: int) -> None:
+    """Have launches of kernels fail, by their numbers from now on."""
+    launch, count = cl.enqueue_nd_range_kernel, itertools.count()
+
+    def launched(*arguments: Any, **options: Any) -> cl.Event:
+        if next(count) in numbers:
+            raise error
+        return launch(*arguments, **options)
+
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
+
+
+@pytest.fixture
+def launches(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
+    """The global sizes of the launches from now on."""
+    seen, launch = [], cl.enqueue_nd_range_kernel
+
+    def launched(queue: Any, kernel: Any, size: Any, *rest: Any, **options: Any) -> cl.Event:
+        seen.append(tuple(size))
+        return launch(queue, kernel, size, *rest, **options)
+
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
+    return seen
 
 
 @pytest.fixture(scope="session", autouse=True)

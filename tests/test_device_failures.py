@@ -22,6 +22,7 @@ from clpipe.engine.runner import Runner
 from clpipe.inputs.find import find_jobs
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.writer import OutputWriter
+from tests.conftest import fail_launches
 
 IMAGE = np.full((20, 30, 3), 0.5, np.float16)
 
@@ -114,34 +115,14 @@ def test_a_device_that_fails_at_everything_is_given_up(device, monkeypatch):
         Runner(runner.chain, Device(device.info)).compile()
 
 
-def test_a_lack_of_memory_needs_no_new_context(device, monkeypatch):
+@pytest.mark.parametrize(
+    "error", [cl.MemoryError("OUT_OF_RESOURCES"), cl.RuntimeError("INVALID_OPERATION")]
+)
+def test_a_launch_that_fails_once_is_tried_again_in_the_same_context(device, monkeypatch, error):
     runner = runner_on(device)
     expected = runner.run(IMAGE, "k").encoded
-    before, launch, errors = programs_of(device.info), cl.enqueue_nd_range_kernel, [1]
-
-    def launched(*arguments, **options):
-        if errors:
-            errors.pop()
-            raise cl.MemoryError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES")
-        return launch(*arguments, **options)
-
-    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
-    assert np.array_equal(runner.run(IMAGE, "k").encoded, expected)
-    assert programs_of(device.info) is before
-
-
-def test_a_launch_that_fails_once_is_tried_again_in_the_same_context(device, monkeypatch):
-    runner = runner_on(device)
-    expected = runner.run(IMAGE, "k").encoded
-    before, launch = programs_of(device.info), cl.enqueue_nd_range_kernel
-    errors = [cl.RuntimeError("clEnqueueNDRangeKernel failed: INVALID_OPERATION")]
-
-    def launched(*arguments, **options):
-        if errors:
-            raise errors.pop()
-        return launch(*arguments, **options)
-
-    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
+    before = programs_of(device.info)
+    fail_launches(monkeypatch, error, 0)
     assert np.array_equal(runner.run(IMAGE, "k").encoded, expected)
     assert programs_of(device.info) is before
 

@@ -6,12 +6,10 @@ import subprocess
 import sys
 
 import pytest
-from click.testing import CliRunner
 
 from clpipe.chain import registry
 from clpipe.chain.registry import all_stages
-from clpipe.commands.main import main
-from tests.conftest import ROOT, STILL_LIFE
+from tests.conftest import ROOT, STILL_LIFE, cli_output
 from tests.test_contributing import block
 
 PYTHON, OPENCL = block("python"), block("c")
@@ -21,13 +19,7 @@ PYTHON, OPENCL = block("python"), block("c")
 def clpipe(monkeypatch):
     """Run clpipe with no stage file loaded yet."""
     monkeypatch.setattr(registry, "_from_files", {})
-
-    def call(*arguments, status=0):
-        result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
-        assert result.exit_code == status, result.output
-        return result.output
-
-    return call
+    return cli_output
 
 
 @pytest.fixture

@@ -56,19 +56,6 @@ def on(device, request):
     return Device(replace(device.info, type=request.param))
 
 
-@pytest.fixture
-def launches(monkeypatch):
-    """The sizes of launches from now on."""
-    seen, launch = [], cl.enqueue_nd_range_kernel
-
-    def launched(queue, kernel, size, *rest, **options):
-        seen.append(tuple(size))
-        return launch(queue, kernel, size, *rest, **options)
-
-    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
-    return seen
-
-
 @dataclass(frozen=True)
 class Asked:
     """An image that is to go through a runner."""
