@@ -1,6 +1,9 @@
 import itertools
+import os
 import resource
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -16,7 +19,10 @@ from click.testing import CliRunner
 from click.testing import Result as ClickResult
 
 from clpipe.batch.run_log import read_log
+from clpipe.batch.sinks import Folder
+from clpipe.batch.work import ImageWorker
 from clpipe.chain.making import make_chain
+from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
 from clpipe.commands.main import main
 from clpipe.engine import programs
@@ -24,7 +30,10 @@ from clpipe.engine.device import Device
 from clpipe.engine.discovery import choose, find_devices
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.write import write_exr as write_file
+from clpipe.inputs.find import Job, find_jobs
+from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.sidecar import SEAL, sealed
+from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -81,6 +90,32 @@ def cli_output(*arguments: object, status: int = 0) -> str:
     return run_cli(*arguments, status=status).output
 
 
+def run_python(
+    *words: object, cwd: str | Path | None = None, status: int | None = 0, **environment: object
+) -> "subprocess.CompletedProcess[str]":
+    """Run Python in a process of its own that finds this clpipe, and check its status.
+
+    Args:
+        words: what stands behind ``python`` on its command line.
+        cwd: its working directory; this one if not given.
+        status: the exit status that is expected; any if None.
+        environment: variables that it has besides those of this process.
+    """
+    done = subprocess.run(
+        [sys.executable, *map(str, words)],
+        cwd=cwd,
+        env={
+            **os.environ,
+            "PYTHONPATH": str(ROOT),
+            **{k: str(v) for k, v in environment.items()},
+        },
+        capture_output=True,
+        text=True,
+    )
+    assert status in (done.returncode, None), done.stdout[-2000:] + done.stderr
+    return done
+
+
 def noise_report(*sigmas: float, **changes: Any) -> dict[str, Any]:
     """What clpipe measure --json says of a picture whose R, G, B have these sigmas; with changes.
 
@@ -107,6 +142,15 @@ def noise_report(*sigmas: float, **changes: Any) -> dict[str, Any]:
 def reseal(path: Path, values: Mapping[str, Any]) -> None:
     """Write a sidecar with values of one's own and the digest that fits them, as a forger can."""
     path.write_bytes(sealed({key: value for key, value in values.items() if key != SEAL}))
+
+
+def worker_of(folder: Path, out: str = "out", **options: Any) -> tuple[ImageWorker, list[Job]]:
+    """A worker that makes PNGs of the renders in "in" of a folder, and its jobs."""
+    request, made = Request.from_options(formats=("png",), **options), folder / out
+    made.mkdir(exist_ok=True)
+    loader, jobs = ImageLoader(request), find_jobs([str(folder / "in")], made)
+    chain = loader.first_chain(jobs)
+    return ImageWorker(loader, Folder(OutputWriter(made, request.with_outputs(chain))), chain), jobs
 
 
 @contextmanager

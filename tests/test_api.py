@@ -124,7 +124,6 @@ def test_an_image_that_is_none(camera, image, message):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"isoo": 3}, "unknown key 'isoo'"),
         ({"denoise": {"strong": 1}}, "unknown parameter of denoise"),
         ({"config": "papers"}, "unknown configuration 'papers' .*'paper'"),
         ({"keep": ["denoize"]}, "unknown stage in this chain 'denoize'"),

@@ -13,10 +13,11 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
+from clpipe.base.errors import DeviceError
 from clpipe.commands.main import COMMANDS, main
 from clpipe.engine import discovery
 from clpipe.stages import DEFAULT_CHAIN
-from tests.conftest import ROOT, STILL_LIFE, written
+from tests.conftest import ROOT, STILL_LIFE, contents, run_python, written
 
 
 @pytest.fixture
@@ -64,21 +65,9 @@ def test_the_main_job(clpipe, tmp_path):
 
 
 def test_numpy_gives_the_same_picture(clpipe, small, tmp_path):
-    clpipe("run", small, "-o", "a", "--iso", 3200, "--format", "png", "--keep", "quantize")
-    clpipe(
-        "run",
-        small,
-        "-o",
-        "b",
-        "--iso",
-        3200,
-        "--format",
-        "png",
-        "--keep",
-        "quantize",
-        "--device",
-        "numpy",
-    )
+    run = ("run", small, "--iso", 3200, "--format", "png", "--keep", "quantize")
+    clpipe(*run, "-o", "a")
+    clpipe(*run, "-o", "b", "--device", "numpy")
     assert written(tmp_path / "a") == ["small.json", "small.png", "small.quantize.exr"]
     one, two = (read_png(f"{f}/small.png").astype(int) for f in "ab")
     assert np.abs(one - two).max() <= 1
@@ -86,44 +75,19 @@ def test_numpy_gives_the_same_picture(clpipe, small, tmp_path):
     assert json.loads((tmp_path / "b" / "small.json").read_text())["device"]["name"] == "numpy"
 
 
-def test_a_second_run_makes_the_same_bytes(clpipe, small, tmp_path):
+def test_a_second_run_makes_the_same_bytes(clpipe, small):
     for folder in "ab":
-        clpipe(
-            "run",
-            small,
-            "-o",
-            folder,
-            "--iso",
-            3200,
-            "--format",
-            "jpg",
-            "--format",
-            "exr",
-            "--keep",
-            "all",
-        )
-    assert written(tmp_path / "a") == written(tmp_path / "b")
-    assert len(written(tmp_path / "a")) == 3 + len(DEFAULT_CHAIN)
-    for name in written(tmp_path / "a"):
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+        formats = ("--format", "jpg", "--format", "exr", "--keep", "all")
+        clpipe("run", small, "-o", folder, "--iso", 3200, *formats)
+    assert contents("a") == contents("b")
+    assert len(contents("a")) == 3 + len(DEFAULT_CHAIN)
 
 
 @pytest.mark.slow
 def test_float_exr_of_the_last_stage(clpipe, small):
-    clpipe(
-        "run",
-        small,
-        "-o",
-        "out",
-        "--stages",
-        "mosaic,sensor_noise",
-        "--format",
-        "exr",
-        "--set",
-        "sensor_noise.a=0",
-        "--set",
-        "sensor_noise.b=0",
-    )
+    quiet = ("--set", "sensor_noise.a=0", "--set", "sensor_noise.b=0")
+    stages = ("--stages", "mosaic,sensor_noise", *quiet)
+    clpipe("run", small, "-o", "out", "--format", "exr", *stages)
     pixels, spec = read_exr("out/small.exr")
     source, _ = read_exr(small)
     assert spec.channelnames == ("Y",)
@@ -144,20 +108,8 @@ def test_a_configuration_with_options_over_it(clpipe, small, tmp_path):
     (tmp_path / "p.toml").write_text(
         'iso = 200\nskip = ["denoise"]\n[mosaic]\npattern = "GBRG"\n[exposure]\nev = 1\n'
     )
-    clpipe(
-        "run",
-        small,
-        "-o",
-        "out",
-        "-c",
-        "p.toml",
-        "--iso",
-        400,
-        "--set",
-        "exposure.ev=-1",
-        "--skip",
-        "row_noise",
-    )
+    over = ("--iso", 400, "--set", "exposure.ev=-1", "--skip", "row_noise")
+    clpipe("run", small, "-o", "out", "-c", "p.toml", *over)
     sidecar = json.loads((tmp_path / "out" / "small.json").read_text())
     stages = {s["name"]: s["parameters"] for s in sidecar["stages"]}
     assert sidecar["iso"] == 400
@@ -460,40 +412,21 @@ def test_a_chain_printed_as_toml_makes_the_same_picture(clpipe, small, tmp_path)
     assert one == two
 
 
-def python(code, **environment):
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
-    )
-
-
 @pytest.mark.slow
 def test_no_platform_at_all(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "clpipe", "run", STILL_LIFE, "-o", tmp_path / "out"],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "OCL_ICD_VENDORS": str(tmp_path)},
-    )
+    command = ("-m", "clpipe", "run", STILL_LIFE, "-o", tmp_path / "out")
+    done = run_python(*command, status=None, OCL_ICD_VENDORS=tmp_path)
     if "no OpenCL platform was found" not in done.stderr:
         # The pip loader may bring its own PoCL whatever OCL_ICD_VENDORS says.
-        from clpipe.base.errors import DeviceError
-        from clpipe.engine.discovery import choose
-
         with pytest.raises(DeviceError, match="no OpenCL platform was found"):
-            choose(None, [])
+            discovery.choose(None, [])
     else:
         assert done.returncode == 3
 
 
 @pytest.mark.slow
 def test_a_missing_linker_is_said_before_it_aborts_the_process(tmp_path):
-    done = python(
-        "from clpipe.commands.main import main; main(['check', '--small'])", PATH=str(tmp_path)
-    )
-    assert done.returncode == 3
+    done = run_python("-m", "clpipe", "check", "--small", status=3, PATH=tmp_path)
     assert "PoCL needs a linker" in done.stderr
 
 

@@ -1,16 +1,13 @@
 """What the shell completes, and that listing and completing commands stays light."""
 
 import ast
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 from click.shell_completion import ShellComplete
 
 from clpipe.commands.main import COMMANDS, main, summary
 from clpipe.stages import DEFAULT_CHAIN
-from tests.conftest import ROOT
+from tests.conftest import run_python
 
 pytestmark = pytest.mark.slow
 
@@ -91,7 +88,7 @@ HEAVY = ("numpy", "pydantic", "pyopencl", "OpenImageIO", "rich", "scipy", "matpl
 
 # In this order, in one process: each may need what those before it need.
 IMPORTS = {
-    "import clpipe": (),
+    "import clpipe.__main__": (),
     "from clpipe.commands.main import main; main(['--help'], standalone_mode=False)": (),
     "import clpipe.commands.cameras": ("numpy", "pydantic"),
     "import clpipe.commands.stages": ("numpy", "pydantic"),
@@ -105,8 +102,7 @@ IMPORTS = {
 def test_what_is_not_needed_is_not_imported():
     told = f"print('found', [m for m in {HEAVY} if m in sys.modules])"
     program = "\n".join(["import sys", *(line for code in IMPORTS for line in (code, told))])
-    command = [sys.executable, "-c", program]
-    run = subprocess.run(command, cwd=Path(ROOT), capture_output=True, text=True, check=True)
-    found = [line[6:] for line in run.stdout.splitlines() if line.startswith("found ")]
+    lines = run_python("-c", program).stdout.splitlines()
+    found = [line[6:] for line in lines if line.startswith("found ")]
     for (code, allowed), modules in zip(IMPORTS.items(), found, strict=True):
         assert set(ast.literal_eval(modules)) <= set(allowed), code

@@ -136,7 +136,9 @@ def test_only_a_few_are_ahead(dataset, monkeypatch):
         next(samples)
     assert len(read) <= 3 + 2 + 2
     samples.close()
-    assert before.issuperset(threading.enumerate())
+    for thread in {*threading.enumerate()} - before:
+        thread.join(1)  # one that would have announced slow compiling may still be ending
+        assert not thread.is_alive()
 
 
 def test_samples_do_not_share_memory(dataset):

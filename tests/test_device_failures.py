@@ -8,21 +8,15 @@ import pyopencl as cl
 import pytest
 
 from clpipe.base.errors import DeviceError, DeviceFailedError
-from clpipe.batch.sinks import Folder
 from clpipe.batch.threads import Batch
-from clpipe.batch.work import ImageWorker
 from clpipe.chain.making import make_chain
-from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
 from clpipe.engine import programs
 from clpipe.engine.device import Device
 from clpipe.engine.programs import programs_of
 from clpipe.engine.recovery import FAILURES
 from clpipe.engine.runner import Runner
-from clpipe.inputs.find import find_jobs
-from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.writer import OutputWriter
-from tests.conftest import fail_launches
+from tests.conftest import fail_launches, worker_of
 
 IMAGE = np.full((20, 30, 3), 0.5, np.float16)
 
@@ -131,16 +125,9 @@ def test_kernels_that_fail_in_a_batch_change_no_byte(device, write_exr, tmp_path
     for i in range(12):
         pixels = np.random.default_rng(i).random((20, 30, 3)).astype(np.float32)
         write_exr(f"in/{i:02}.exr", pixels)
-    loader = ImageLoader(
-        Request.from_options(values={"stages": ["exposure", "gamma"]}, formats=("png",))
-    )
-    jobs = find_jobs([str(tmp_path / "in")], tmp_path)
 
     def made(name):
-        (tmp_path / name).mkdir()
-        chain = loader.first_chain(jobs)
-        writer = OutputWriter(tmp_path / name, loader.request.with_outputs(chain))
-        worker = ImageWorker(loader, Folder(writer), chain)
+        worker, jobs = worker_of(tmp_path, name, values={"stages": ["exposure", "gamma"]})
         # Both have one context, as two on one device have: what breaks it for one does for both.
         batch = Batch(worker, [Device(device.info), Device(device.info)])
         statuses = [outcome.status for outcome in batch.run(jobs)]

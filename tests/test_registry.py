@@ -2,14 +2,12 @@
 
 import ast
 import re
-import subprocess
-import sys
 
 import pytest
 
 from clpipe.chain import registry
 from clpipe.chain.registry import all_stages
-from tests.conftest import ROOT, STILL_LIFE, cli_output
+from tests.conftest import ROOT, STILL_LIFE, cli_output, run_python
 from tests.test_contributing import block
 
 PYTHON, OPENCL = block("python"), block("c")
@@ -151,10 +149,7 @@ def install(folder, python=PYTHON):
 
 
 def run_with_package(folder, *arguments):
-    program = f"import sys; sys.path[:0] = [{str(folder)!r}, {str(ROOT)!r}]\n"
-    program += "from clpipe.commands.main import main; main()"
-    command = [sys.executable, "-c", program, *arguments]
-    return subprocess.run(command, capture_output=True, text=True)
+    return run_python("-m", "clpipe", *arguments, status=None, PYTHONPATH=f"{folder}:{ROOT}")
 
 
 @pytest.mark.slow
