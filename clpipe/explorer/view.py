@@ -13,7 +13,7 @@ from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain
 from clpipe.engine.runner import Result
 from clpipe.images.preview import encoded_light
-from clpipe.stage import Context, Kind
+from clpipe.stage import Kind
 
 
 @dataclass(frozen=True)
@@ -57,15 +57,9 @@ def shown_of(chain: Chain, result: Result) -> Array:
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
 
-def context_of(chain: Chain) -> Context:
-    """What a chain's steps say of the image that comes out."""
-    last = chain.steps[-1]
-    return last.method.next_context(last.context)
-
-
 def signal_of(image: Floats, chain: Chain) -> Floats:
     """A result in which 0 is black and 1 is white: a raw in signal, others as they are."""
-    context = context_of(chain)
+    context = chain.context_after
     black, white = context.black_level, context.white_level
     if chain.result is not Kind.RAW or black is None or white is None:
         return image
@@ -97,7 +91,7 @@ def cut(image: Array, box: tuple[int, int, int, int]) -> Array:
 
 def part_as_read(name: str, part: Array, chain: Chain) -> Picture:
     """A part of a result as it is measured, as if it had been read from a file."""
-    path, kind, context = Path(name), chain.result, context_of(chain)
+    path, kind, context = Path(name), chain.result, chain.context_after
     if kind is Kind.DISPLAY:
         step = 1 / 255
         pixels = part.astype(np.float32) * np.float32(step)
