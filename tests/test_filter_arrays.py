@@ -144,7 +144,10 @@ def test_a_polarised_array_measures_degree_and_angle(device, method):
 def test_a_polarised_array_has_no_colours():
     with pytest.raises(KeyedError, match=r"mosaic.array: .*polarised.*; skip inverse_color_matrix"):
         on("polarised")
-    with pytest.raises(RequestError, match=r"method=camera: .* polarised, whose channels are no"):
+    with pytest.raises(
+        RequestError,
+        match=r"method=camera needs channels that are colours, and those of mosaic polarised",
+    ):
         on("polarised", skip=["inverse_color_matrix"], color_matrix={"method": "camera"})
     chain = on("polarised", skip=["inverse_color_matrix"])
     assert chain.filters.name == "polarised"
@@ -285,9 +288,13 @@ def test_beyond_an_edge_an_array_goes_on():
         (
             "x-trans",
             {"demosaic": {"method": "gray"}},
-            "one channel, but the mosaic is x-trans; lea",
+            "one channel, but the mosaic is x-trans; rem",
         ),
-        ("GRBG", {"demosaic": {"method": "gray"}}, "of one channel, but the mosaic is GRBG; leave"),
+        (
+            "GRBG",
+            {"demosaic": {"method": "gray"}},
+            "of one channel, but the mosaic is GRBG; remove",
+        ),
         ("q", {}, "unknown filter array 'q'"),
     ],
 )
@@ -615,7 +622,7 @@ def test_the_array_of_a_raw_is_that_of_its_pixels():
 
 @pytest.mark.parametrize("array", ["x-trans", "RGGB"])
 def test_what_has_no_cells(array):
-    with pytest.raises(RequestError, match=f"the mosaic is {array}; binning is for cells of 2x2"):
+    with pytest.raises(RequestError, match=f"the mosaic is {array}; binning needs cells of 2x2"):
         remosaiced(array, "binning")
 
 

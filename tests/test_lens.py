@@ -227,18 +227,21 @@ def test_lensfun_says_the_same(camera, name, setting, size):
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
-        ({"lens": "Cannon EF 24-71mm"}, "knows no 'Cannon EF 24-71mm'; the nearest are Canon EF"),
-        ({"lens": "24-70"}, "'24-70' may be .*, or [0-9]+ more; name one of them in full"),
+        (
+            {"lens": "Cannon EF 24-71mm"},
+            "has no lens 'Cannon EF 24-71mm'; the nearest are Canon EF",
+        ),
+        ({"lens": "24-70"}, "'24-70' may mean .*, or [0-9]+ more; use the full name of one"),
         ({"lens": "Canon EF 24-70mm f/2.8L"}, "is a zoom; set 24 to 70 mm"),
         (
             {"lens": "Canon EF 24-70mm f/2.8L", "focal_length": 85},
-            "focal_length: found 85 mm, but Canon EF 24-70mm f/2.8L USM has 24 to 70 mm",
+            "85 mm is not possible, because Canon EF 24-70mm f/2.8L USM has 24 to 70 mm",
         ),
         (
             {"lens": "Canon EF 24-70mm f/2.8L", "focal_length": 24, "aperture": 1.4},
-            "aperture: found f/1.4, but Canon EF 24-70mm f/2.8L USM has f/2.8 to f/22",
+            "f/1.4 is not possible, because Canon EF 24-70mm f/2.8L USM has f/2.8 to f/22",
         ),
-        ({"lens": "Samyang 8mm f/3.5 Fish-Eye CS"}, "is no rectilinear lens"),
+        ({"lens": "Samyang 8mm f/3.5 Fish-Eye CS"}, "is not rectilinear"),
     ],
 )
 def test_lenses_that_lensfun_does_not_have_or_not_so(setting, said):
@@ -270,7 +273,7 @@ def test_a_lens_by_a_part_of_its_name_is_named(clpipe, write_exr):
     pytest.importorskip("lensfunpy", reason="needs lensfunpy, in the extra lens")
     pytest.importorskip("jinja2", reason="needs jinja2, in the extra report")
     run = ("run", write_exr("a.exr", np.full((20, 30, 3), 0.5)), "--device", "numpy")
-    taken = "warning: lens: 'Canon 50mm' is a part of a name, and Canon EF 50mm f/1.8 is taken"
+    taken = "warning: lens: 'Canon 50mm' is a part of a name, and clpipe uses Canon EF 50mm f/1.8"
     assert taken in clpipe(*run, "-o", "o", "--lens", "Canon 50mm").stderr
     assert json.loads(Path("o/a.json").read_text())["lens"] == "Canon EF 50mm f/1.8"
     clpipe("report", "o")
@@ -318,7 +321,7 @@ def test_what_is_said_without_lensfunpy(clpipe, monkeypatch):
     by_name._loaded.cache_clear()
     monkeypatch.setitem(sys.modules, "lensfunpy", None)
     said = clpipe("plan", "--lens", "any", status=2).stderr
-    assert "lensfunpy, which is not here; pip install lensfunpy" in said
+    assert "lensfunpy, which is not installed; pip install lensfunpy" in said
 
 
 def test_kernels_are_not_refused_for_the_image_that_compiles_them(device):
@@ -330,4 +333,4 @@ def test_kernels_are_not_refused_for_the_image_that_compiles_them(device):
 
 def test_the_table_of_parameters_has_no_message_where_a_focal_length_is_to_be_set(clpipe):
     shown = clpipe("stages", "distortion").stdout
-    assert "the middle" in shown and "set fx (px)" not in " ".join(shown.split())
+    assert "the centre" in shown and "set fx (px)" not in " ".join(shown.split())

@@ -58,4 +58,4 @@ class Gaussian(GaussianNoise):
         return y * (backend.fixed(sensor_normals) * n["sigma"] + 1)
 
 
-STAGE = Stage("prnu", "Make pixels differ in sensitivity.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,))
+STAGE = Stage("prnu", "Vary the sensitivity of pixels.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,))

@@ -1,4 +1,4 @@
-"""What PyTorch's ``DataLoader`` takes as an iterable, where PyTorch is there."""
+"""PyTorch's base class for iterable data sets, or a stand-in without PyTorch."""
 
 from typing import Any
 
@@ -9,13 +9,13 @@ try:
 except ModuleNotFoundError:
 
     class IterableDataset:  # type: ignore[no-redef]
-        """Stands for PyTorch's class where PyTorch is not installed."""
+        """Replaces PyTorch's class if PyTorch is not installed."""
 
     def get_worker_info() -> Any:
-        """Stands for PyTorch's function."""
+        """Replaces PyTorch's function."""
 
 
 def worker() -> tuple[int, int]:
-    """Return the number of this worker of a ``DataLoader``, and how many there are."""
+    """Return the number of this worker of a ``DataLoader``, and the number of workers."""
     info = get_worker_info()
     return (info.id, info.num_workers) if info else (0, 1)
