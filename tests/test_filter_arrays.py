@@ -65,11 +65,11 @@ def mosaic_of(image: np.ndarray, array) -> np.ndarray:
     [
         ("bayer", "unknown filter array 'bayer'; allowed: RGGB, BGGR"),
         ("RG/GX", "'X'; a channel is one of R"),
-        ("RG/G", "rows of one length"),
-        ("RG//GB", "rows of one length"),
+        ("RG/G", "rows of the same length"),
+        ("RG//GB", "rows of the same length"),
         ("/".join(["RGB"] * 9), "at most 8x8"),
         ("R" * 9, "at most 8x8"),
-        ("HR/GB", "polarisers .* do not go with colours"),
+        ("HR/GB", "polarisers .* cannot be combined with colours"),
     ],
 )
 def test_what_is_no_filter_array(text, message):
@@ -315,7 +315,7 @@ def test_a_camera_says_its_array(clpipe, half, tmp_path):
     clpipe("run", half, "-o", "bayer", *own, "--set", "mosaic.pattern=GRBG")
     profile.write_text(text.replace("iso_range", 'filter_array = "RG/G"\niso_range', 1))
     result = clpipe("run", half, "-o", "bad", *own, status=2)
-    assert "rows of one length" in result.stderr
+    assert "rows of the same length" in result.stderr
     assert not Path("bad").exists()
     profile.write_text(text.replace("iso_range", 'filter_array = "GBRG"\niso_range', 1))
     (step,) = Pipeline(camera=str(profile), stages=["mosaic"]).chain.steps

@@ -154,7 +154,7 @@ def test_a_lens_that_folds_the_image_is_refused(clpipe, write_exr):
     fold = ("--set", "distortion.method=brown_conrady", "--set", "distortion.fx=25")
     run = ("run", "a.exr", "-o", "o", "--stages", "distortion", "--device", "numpy")
     said = clpipe(*run, *fold, "--set", "distortion.k1=-0.5", status=1).stderr
-    assert "the distortion turns back at r = 0.8165, 20 px from the principal point" in said
+    assert "The distortion folds at r = 0.8165, 20 px from the principal point" in said
     assert "the corner of 60x40 pixels is at r = 1.442" in said
     said = clpipe(*run, "--set", "distortion.method=fisheye", status=2).stderr
     assert "set fx (px), or focal_length and sensor_width (mm)" in said
@@ -163,7 +163,7 @@ def test_a_lens_that_folds_the_image_is_refused(clpipe, write_exr):
     assert "distortion.fx makes the focal length of this render of 60x40 pixels 25 px" in said
     assert "but distortion.focal_length and distortion.sensor_width 40 px" in said
     lateral = PtLens(vr=1.0, br=-0.9)
-    with pytest.raises(ImageError, match="the lateral colour turns back"):
+    with pytest.raises(ImageError, match="The lateral colour folds"):
         lateral.resampling.grid(60, 40)
     shifted = PtLens(a=0.001, cx=-1e6, fit=True)
     with pytest.raises(ImageError, match="distortion: "):

@@ -22,6 +22,7 @@ CHECKED = (
     "tools/prose.py",
     "clpipe/batch",
     "clpipe/camera",
+    "clpipe/reference",
     "clpipe/stage",
     "clpipe/stages",
     "clpipe/torch",
