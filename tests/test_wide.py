@@ -327,8 +327,9 @@ def test_a_view_has_one_focal_length(write, clpipe):
         write(f"cube/room_{name}.exr", **colours(image))
     lengths = ("--focal-length", 35, "--set", "render.sensor_width=36")
     told = clpipe("run", "cube", "-o", "o", *RUN, *wide, *lengths, status=1).output
-    assert "render's focal length is 93.33 px, but that of a view of 96x96 pixels is 48" in (
-        " ".join(told.split())
+    assert (
+        "render's focal length is 93.33 px, but a view of 96x96 pixels with this angle has 48 px"
+        in (" ".join(told.split()))
     )
 
 
