@@ -1,6 +1,6 @@
-"""A camera's raw noise on PyTorch tensors, inside a training loop, on a CPU or a GPU.
+"""A camera's raw noise on PyTorch's tensors, inside a training loop, on a CPU or a GPU.
 
-It only uses PyTorch: no OpenCL, no files, no processes of its own. It needs the package ``torch``.
+It is PyTorch alone: no OpenCL, no files, no processes of its own. It needs the package ``torch``.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ __all__ = ["RawNoise"]
 
 
 def __getattr__(name: str) -> Any:
-    """Return a public name, which is imported on first use.
+    """What is exported, imported on first use.
 
     Raises:
         ImportError: PyTorch is not installed.

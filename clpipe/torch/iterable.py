@@ -1,4 +1,4 @@
-"""PyTorch's base class for iterable data sets, or a stand-in without PyTorch."""
+"""What PyTorch's ``DataLoader`` takes as an iterable, where PyTorch is there."""
 
 from typing import Any
 
@@ -9,13 +9,13 @@ try:
 except ModuleNotFoundError:
 
     class IterableDataset:  # type: ignore[no-redef]
-        """Replaces PyTorch's class if PyTorch is not installed."""
+        """Stands for PyTorch's class where PyTorch is not installed."""
 
     def get_worker_info() -> Any:
-        """Replaces PyTorch's function."""
+        """Stands for PyTorch's function."""
 
 
 def worker() -> tuple[int, int]:
-    """Return the number of this worker of a ``DataLoader``, and the number of workers."""
+    """Return the number of this worker of a ``DataLoader``, and how many there are."""
     info = get_worker_info()
     return (info.id, info.num_workers) if info else (0, 1)

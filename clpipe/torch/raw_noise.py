@@ -23,36 +23,32 @@ from clpipe.stage import NoiseScope
 from clpipe.torch.table import Drawn, Table
 
 FIRST, LAST = "crosstalk", "normalize"
-DRAWN = 1024  # chains, if something is drawn
-# px, over the height and width of a sample: the part of a sensor that contains the places
-ROOM = 512
+DRAWN = 1024  # chains, where something is drawn
+ROOM = 512  # px, over the height and width of a sample: of a sensor's part that has places
 
 
 class RawNoise(ReadOnly):
-    """Adds a camera's noise to clean raws that are tensors, on their device: CPU or GPU.
+    """Puts a camera's noise into clean raws that are tensors, where these are: CPU or GPU.
 
-    It applies the same stages as :class:`clpipe.RawNoise`, from ``crosstalk`` to ``normalize``.
-    These are sensor noise, the noise of rows, columns and single pixels, clipping and rounding to
-    DN. Every sample has its own noise, and its own camera, ISO and other values if these are drawn.
-    On a CPU, a sample with a key has the same bits as in the chain with that ``noise_key``.
+    It is what :class:`clpipe.RawNoise` does, from ``crosstalk`` to ``normalize``: sensor noise,
+    what a sensor does to rows, columns and single pixels, clipping and rounding to DN. Every sample
+    has noise of its own, with a camera, an ISO and other values of its own where these are drawn.
+    On a CPU a sample that has a key has the bits that the chain gives it for that ``noise_key``.
 
-    It is differentiable in the clean raw. Noise grows with the signal, clipping stops a gradient,
-    and rounding passes it. Poisson noise passes it as well: the derivative of the noise itself is
-    taken as 0.
+    It is differentiable in the clean raw: noise grows with the signal, clipping stops a gradient,
+    and rounding lets it through; so does Poisson noise, whose own derivative is taken as 0.
 
     Args:
-        camera: a name that ``clpipe cameras`` lists, or the TOML file of a profile. ``{"choice":
-            [...]}`` is drawn for each sample.
-        iso: its ISO. ``{"log_uniform": [800, 12800]}`` or another distribution is drawn for each
-            sample.
-        seed: with None, each object has different noise. With a number, the calls of an object give
-            the same noise in the same order.
+        camera: a name that ``clpipe cameras`` lists, or the TOML file of a profile;
+            ``{"choice": [...]}`` is drawn.
+        iso: its ISO; ``{"log_uniform": [800, 12800]}`` or another law is drawn for each sample.
+        seed: None is other noise in each object; with a number, an object's calls give the same
+            noise in the same order.
         config: a built-in configuration or a TOML file, or several.
-        **settings: those of :class:`clpipe.Pipeline`, for example ``sensor_noise={"method":
-            "poisson"}``.
+        **settings: as for :class:`clpipe.Pipeline`, such as ``sensor_noise={"method": "poisson"}``.
 
     Raises:
-        RequestError: a name or value is not allowed, or there is a plug-in stage in between.
+        RequestError: a name or value that is not allowed, or a stage of one's own between the two.
 
     >>> add_noise = RawNoise("sony-a7r2", {"log_uniform": [800, 12800]}, seed=1)
     >>> noisy = add_noise(torch.full((8, 4, 32, 32), 0.2))
@@ -80,59 +76,56 @@ class RawNoise(ReadOnly):
             self._random.manual_seed(seed)
         self._table: Table | None = None
         self._one = lru_cache(maxsize=DRAWN)(self._chain)
-        Table([self._chain("")])  # rejects methods without a counterpart
+        Table([self._chain("")])  # refuses what has no twin
 
     def __repr__(self) -> str:
         return f"RawNoise({self._settings.label})"
 
     def __call__(self, raw: Tensor, keys: Sequence[str] | str | None = None) -> Tensor:
-        """Return raws with noise.
+        """Raws with noise.
 
         Args:
-            raw: linear signal, 0 is black and 1 is white, float32. It is a batch of mosaics with
-                the camera's CFA pattern, (raw, 1, height, width), or of planes, (raw, 4, height /
-                2, width / 2). The planes are R, Gr, Gb and B, where Gr is green in the rows of red.
-                A single raw has no first axis.
-            keys: names of the raws, for reproducible noise; use others in each epoch. The fixed
-                pattern is then that of the sensor's upper left corner. With None, each raw has new
-                noise and a new position on the sensor.
+            raw: linear signal, 0 is black and 1 is white, float32: a batch of mosaics, (raw, 1,
+                height, width), with the camera's CFA pattern, or of their planes R, Gr, Gb, B,
+                (raw, 4, height / 2, width / 2), where Gr is green in the rows of red; or one of
+                them, without the first axis.
+            keys: names of the raws, for noise that can be had again; give them others in each
+                epoch. What is fixed to a sensor is then that of its upper left corner. None is new
+                noise, and a place on the sensor, for each.
 
         Returns:
             The noisy raws, of the same shape, on the same device.
 
         Raises:
-            ImageError: the tensor has another shape or type.
-            RequestError: the number of keys is not the number of raws.
+            ImageError: a tensor of another shape or type.
+            RequestError: as many keys as there are raws are needed.
         """
         if raw.dim() not in (3, 4) or raw.shape[-3] not in (1, 4) or 0 in raw.shape:
             raise ImageError(
-                f"the tensor has the shape {tuple(raw.shape)}; expected mosaics, (raw, 1, "
-                "height, width), or their planes, (raw, 4, height / 2, width / 2), or one of "
-                "these"
+                f"found a tensor of shape {tuple(raw.shape)}; expected mosaics, (raw, 1, height, "
+                "width), or their planes, (raw, 4, height / 2, width / 2), or one of these"
             )
         if raw.dtype != torch.float32:
-            raise ImageError(
-                f"the tensor has the type {raw.dtype}; expected torch.float32, in signal units"
-            )
+            raise ImageError(f"found {raw.dtype}; expected torch.float32, in signal")
         if raw.dim() == 3:
             own = None if keys is None else [keys] if isinstance(keys, str) else keys
             one: Tensor = self(raw[None], own)[0]
             return one
         if keys is not None and (isinstance(keys, str) or len(keys) != len(raw)):
-            raise RequestError(f"keys: expected {len(raw)}, one for each raw; they are {keys!r}")
+            raise RequestError(f"keys: found {keys!r}; expected {len(raw)}, one for each raw")
         drawn = self._drawn(raw, keys)
         table = drawn.table
         order = table.planes[torch.from_numpy(drawn.chains)].to(raw.device)
         mosaics = raw[:, 0] if raw.shape[1] == 1 else _unpacked(raw, order)
         if raw.shape[1] == 1 and bool((table.planes != table.planes[0]).any()):
             raise RequestError(
-                f"{self!r}: the cameras have several CFA patterns; use planes, (raw, 4, ...)"
+                f"{self!r}: the cameras have several CFA patterns; give planes, (raw, 4, ...)"
             )
         noisy = table.noisy(mosaics, drawn)
         return noisy[:, None] if raw.shape[1] == 1 else _packed(noisy, order)
 
     def _drawn(self, raw: Tensor, keys: Sequence[str] | None) -> "Drawn":
-        """Draw cameras, ISOs, keys and positions for raws."""
+        """What is drawn for raws."""
         count, cell = len(raw), 2 if raw.shape[1] == 4 else 1
         size = cell * raw.shape[2], cell * raw.shape[3]
         if keys is None:
@@ -161,26 +154,26 @@ class RawNoise(ReadOnly):
         return Drawn(table, chains, words, [(0, 0)] * count, size)
 
     def _of_all(self) -> "Table":
-        """The chains to draw from; a single one if nothing is drawn."""
+        """The chains that are drawn from: one where nothing is drawn."""
         count = DRAWN if self._settings.draws else 1
         return Table([self._chain(str(number)) for number in range(count)])
 
     def _chain(self, name: str) -> Chain:
-        """Return the chain for a sample's name, on which draws depend, or the only chain."""
+        """The chain of a sample's name, on which draws depend; one where there are none."""
         if not self._settings.draws:
             name = ""
         return make_chain(self._settings.drawn(name), start_at=FIRST, until=LAST)
 
 
 def _unpacked(planes: Tensor, order: Tensor) -> Tensor:
-    """Return the mosaics of planes, (sample, 4, height, width); ``order`` is each site's plane."""
+    """Mosaics of planes, (sample, 4, height, width); ``order`` has each place's plane."""
     each = torch.arange(len(planes), device=planes.device)[:, None]
     mosaics: Tensor = functional.pixel_shuffle(planes[each, order], 2)[:, 0]
     return mosaics
 
 
 def _packed(mosaics: Tensor, order: Tensor) -> Tensor:
-    """Return the planes of mosaics, in the layout of :func:`_unpacked`."""
+    """The planes of mosaics, as :func:`_unpacked` takes them."""
     each = torch.arange(len(mosaics), device=mosaics.device)[:, None]
     places: Tensor = functional.pixel_unshuffle(mosaics[:, None], 2)
     return places[each, order.argsort(1)]
