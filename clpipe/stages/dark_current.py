@@ -166,5 +166,9 @@ def charge_of_sensor(height: int, width: int, stream: Stream) -> Floats:
 
 
 STAGE = Stage(
-    "dark_current", "Add the noise of thermal charge.", Kind.MOSAIC, Kind.MOSAIC, (Thermal,)
+    "dark_current",
+    "Add the shot noise and fixed pattern of thermal charge.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (Thermal,),
 )

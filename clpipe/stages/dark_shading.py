@@ -283,5 +283,9 @@ def between(pixels: int, per_px: np.float32, count: int) -> tuple[Array, Array, 
 
 
 STAGE = Stage(
-    "dark_shading", "Add smooth maps of the sensor.", Kind.MOSAIC, Kind.MOSAIC, (Smooth, File)
+    "dark_shading",
+    "Add smooth dark shading maps of the sensor.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (Smooth, File),
 )

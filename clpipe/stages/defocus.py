@@ -244,4 +244,6 @@ def _depth_in(context: Context) -> Depth:
     return depth
 
 
-STAGE = Stage("defocus", "Blur what is out of focus.", Kind.RGB, Kind.RGB, (InFocus, ThinLens))
+STAGE = Stage(
+    "defocus", "Blur surfaces that are out of focus.", Kind.RGB, Kind.RGB, (InFocus, ThinLens)
+)

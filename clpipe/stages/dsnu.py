@@ -44,4 +44,6 @@ class Gaussian(GaussianNoise):
         return y + backend.fixed(sensor_normals) * n["sigma"]
 
 
-STAGE = Stage("dsnu", "Add a fixed offset to each pixel.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,))
+STAGE = Stage(
+    "dsnu", "Add a fixed offset to each pixel (DSNU).", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,)
+)

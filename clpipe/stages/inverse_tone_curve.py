@@ -114,7 +114,7 @@ class File(tone_curve.File):
 
 STAGE = Stage(
     "inverse_tone_curve",
-    "Undo the contrast of a photograph.",
+    "Undo the tone curve of a photograph.",
     Kind.RGB,
     Kind.RGB,
     (Standard, Neutral, CameraRaw, Linear, File),

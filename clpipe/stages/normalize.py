@@ -182,7 +182,7 @@ def _of_curve(context: Context) -> Method | None:
 
 STAGE = Stage(
     "normalize",
-    "Apply the levels: DN to signal.",
+    "Apply black and white level: DN to signal.",
     Kind.RAW,
     Kind.MOSAIC,
     (Linear, Pwl),

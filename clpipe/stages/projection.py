@@ -63,7 +63,11 @@ class Wide(Method):
         None, "Height of the image.", "px", "that of the whole field of view", ge=1, le=65536
     )
     field_of_view: float = parameter(
-        180.0, "Field of view, through the axis; pixels outside it are black.", "deg", gt=1, le=220
+        180.0,
+        "Field of view, through the axis; pixels outside it are black.",
+        "degrees",
+        gt=1,
+        le=220,
     )
     source: Literal["auto", "map"] = parameter(
         "auto",
@@ -73,7 +77,7 @@ class Wide(Method):
     face_angle: float | None = parameter(
         None,
         "Horizontal field of view of a cube's face, or of a view.",
-        "deg",
+        "degrees",
         "90 for a cube, else from the render's focal length",
         gt=1,
         lt=179,

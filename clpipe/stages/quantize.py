@@ -194,4 +194,6 @@ class Pwl(Linear):
         return np.rint(along_pieces(super().reference(image, given), pieces_of(self._knots)))
 
 
-STAGE = Stage("quantize", "Digitise: signal to DN.", Kind.MOSAIC, Kind.RAW, (Linear, Pwl))
+STAGE = Stage(
+    "quantize", "Digitise with the ADC: signal to DN.", Kind.MOSAIC, Kind.RAW, (Linear, Pwl)
+)

@@ -108,7 +108,7 @@ def levels_of_sensor(height: int, width: int, stream: Stream, share: float) -> F
 
 STAGE = Stage(
     "random_telegraph",
-    "Let some pixels jump between two levels.",
+    "Add random telegraph noise: some pixels jump between two levels.",
     Kind.MOSAIC,
     Kind.MOSAIC,
     (TwoLevels,),

@@ -158,7 +158,7 @@ def table_of(array: FilterArray, pattern: Pattern) -> Floats:
 
 STAGE = Stage(
     "remosaic",
-    "Convert an array of larger cells to a Bayer pattern, like sensors with quad arrays.",
+    "Convert a quad or other filter array to a Bayer pattern.",
     Kind.MOSAIC,
     Kind.MOSAIC,
     (Binning, LinearMmse),

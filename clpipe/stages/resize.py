@@ -80,7 +80,7 @@ class Lanczos3(Filter):
 
 STAGE = Stage(
     "resize",
-    "Reduce the image size, like a camera's small JPEG.",
+    "Reduce the image size.",
     Kind.RGB,
     Kind.RGB,
     (Area, Lanczos3),

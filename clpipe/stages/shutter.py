@@ -262,7 +262,7 @@ def _turn(cycles: float) -> np.uint32:
 
 STAGE = Stage(
     "shutter",
-    "Expose rows one after the other, with flickering light.",
+    "Expose with a rolling shutter and flickering light.",
     Kind.RGB,
     Kind.RGB,
     (Rows,),

@@ -166,7 +166,7 @@ def _reciprocal(x: Floats) -> Floats:
 
 STAGE = Stage(
     "vignetting",
-    "Darken the corners, like a lens.",
+    "Darken the corners of the image, like a lens.",
     Kind.RGB,
     Kind.RGB,
     (VignettingOfLens, NoVignetting, Pa, CosineFourth),

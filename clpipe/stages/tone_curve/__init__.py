@@ -99,7 +99,7 @@ class File(Curve):
 
 STAGE = Stage(
     "tone_curve",
-    "Apply the contrast of a photograph.",
+    "Apply a tone curve with the contrast of a photograph.",
     Kind.RGB,
     Kind.RGB,
     (Standard, Neutral, CameraRaw, Linear, File),

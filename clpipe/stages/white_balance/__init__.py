@@ -7,7 +7,7 @@ from clpipe.stages.white_balance.white_patch import WhitePatch
 
 STAGE = Stage(
     "white_balance",
-    "Multiply red and blue so that white surfaces look white.",
+    "Apply white balance gains to red and blue.",
     Kind.MOSAIC,
     Kind.MOSAIC,
     (AsShot, GrayWorld, WhitePatch, Gains, Unbalanced),
