@@ -60,7 +60,7 @@ def streak(length: float, angle: float) -> Floats:
 class Linear(Method):
     """A straight streak, the same everywhere, from a small rotation of the camera.
 
-    The camera turns evenly about an axis in the image plane. Away from the centre, a real streak
+    The camera rotates evenly about an axis in the image plane. Away from the centre, a real streak
     bends and is longer by 1 / cos^2 of the angle to the optical axis. This method ignores both,
     like SyB3R's "linear blur" (Ley, Hänsch and Hellwich, ICCV Workshops 2017). ``perspective``
     includes them.
@@ -161,9 +161,9 @@ class Linear(Method):
 
 
 class Perspective(InFocalLengths, AboutAxis):
-    """Streaks of a camera that turns, with their perspective at each position of the image.
+    """Streaks of a rotating camera, with their perspective at each position of the image.
 
-    The camera turns evenly about an axis in its image plane, and shows the render unchanged in the
+    The camera rotates evenly about an axis in its image plane. It shows the render unchanged in the
     middle of the exposure. Each pixel is the mean of the light it received, from
     :class:`clpipe.reference.turning.Turning`.
 
@@ -179,7 +179,7 @@ class Perspective(InFocalLengths, AboutAxis):
     method: ClassVar = "perspective"
     kernel: ClassVar = "motion_blur"
     overscan: ClassVar = True
-    summary: ClassVar = "streaks of a turning camera, longer and bent away from the image centre"
+    summary: ClassVar = "streaks of a rotating camera, longer and bent away from the image centre"
     example: ClassVar = {"rotation": 4.0, "angle": 30.0, "fx": 90.0}
     other_examples: ClassVar = ({"fx": None, "focal_length": 40.0, "sensor_width": 20.0},)
 
