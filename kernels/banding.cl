@@ -1,4 +1,5 @@
-// A wave along the columns, of another phase in each frame. Only * and +, so that NumPy gives the same bits.
+// A wave over the rows, with a new phase in each frame. Only * and +, so that NumPy gives the same
+// bits.
 #include "lib/random.h"
 
 INLINE vf wave_of_lines(vu line, stream s, float frequency, float amplitude) {

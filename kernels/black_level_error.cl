@@ -1,4 +1,4 @@
-// Errors of the black level: one for each of the four places of the filter array, in each frame.
+// Errors of the black level: one for each of the four positions of the filter array, in each frame.
 #include "lib/random.h"
 
 INLINE vf errors_of_lines(vu line, stream s, uint column, float even, float odd, float sigma) {

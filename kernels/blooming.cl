@@ -1,4 +1,5 @@
-// Charge above the full well goes on along the column. Only * and +, so that NumPy gives the same bits.
+// Charge above the full well flows along the column. Only * and +, so that NumPy gives the same
+// bits.
 INLINE vf excess_at(image src, int row, float full) {
     return vmax(tap_mosaic(src, 0, row) - full, (vf)(0.0f));
 }

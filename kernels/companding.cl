@@ -1,5 +1,5 @@
-// Companding by a curve of straight pieces: DN to fewer DN, and back. `pieces` has for each piece where it begins,
-// what it begins with, and its slope.
+// Companding by a piecewise linear curve: DN to fewer DN, and back. For each piece, `pieces`
+// contains its start, the value there, and its slope.
 INLINE vf along_pieces(vf x, __global const float *pieces, int count) {
     vf v = pieces[1] + (x - pieces[0]) * pieces[2];
     for (int i = 1; i < count; ++i) {
@@ -10,7 +10,7 @@ INLINE vf along_pieces(vf x, __global const float *pieces, int count) {
     return v;
 }
 
-// After the ADC, whose DN are whole.
+// After the ADC, whose DN are integers.
 INLINE vf compand(vf y, site at, float range, float black_level, float white_level, __global const float *pieces, int count) {
     const vf dn = vmin(vmax(nearest(y * range + black_level), (vf)(0.0f)), (vf)(white_level));
     return nearest(along_pieces(dn, pieces, count));

@@ -1,5 +1,5 @@
-// A weighted mean of the pixels around. Tap k is five numbers: how far it is to the right and down, and
-// its weights for red, green and blue.
+// A weighted mean of surrounding pixels. Tap k is five numbers: its offset to the right and down,
+// and its weights for red, green and blue.
 INLINE rgb convolve(site at, src_image src, __global const float *taps, int count) {
     rgb sum = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
     for (int k = 0; k < count; ++k) {
@@ -12,8 +12,8 @@ INLINE rgb convolve(site at, src_image src, __global const float *taps, int coun
     return sum;
 }
 
-// The same by rows and columns alike, weights[k] being that of the pixels k to either side. Rows of a work
-// item share their sums along rows.
+// The same for equal weights along rows and columns: weights[k] is that of the pixels k to either
+// side. Rows of a work item share their sums along rows.
 INLINE rgb blur(site at, src_image src, int reach, __global const float *weights) {
     rgb sum = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
 #pragma unroll

@@ -1,8 +1,9 @@
-// Charge that heat sets free while the shutter is open, less its mean: each pixel's own, and its shot noise.
+// Thermal charge that accumulates during the exposure, minus its mean: each pixel's own charge, and
+// its shot noise.
 #include "lib/random.h"
 
-// The signal with the pixel's own charge less the mean, and that charge; both in signal. Of pixels it has an
-// exponential distribution, shifted.
+// The signal with the pixel's own charge minus the mean, and that charge, both in signal units.
+// Over the pixels, the charge has a shifted exponential distribution.
 INLINE pair dark_charge(vf y, site at, stream s, float mean, float spread) {
     const vu word = word_at(at, 0, s);
     const vf u = (to_float(signed_bits(word >> (vu)(1u))) + 0.5f) * 4.6566129e-10f;

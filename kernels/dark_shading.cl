@@ -1,5 +1,6 @@
-// Smooth maps that a sensor adds in the dark. Each is a sum of products of a curve over the rows and one over
-// the columns; curves are cubic B-splines of normals. Only * and +, so that NumPy gives the same bits.
+// Smooth maps that a sensor adds in the dark. Each is a sum of products of a curve over the rows
+// and a curve over the columns. The curves are cubic B-splines of normals. Only * and +, so that
+// NumPy gives the same bits.
 #include "lib/random.h"
 
 INLINE vf node(vu place, uint curve, stream s) { return normal_of(philox(place, 0, curve, s).word0); }
@@ -13,7 +14,7 @@ INLINE vf curve_of_lines(vu line, stream s, uint curve, float per_px) {
                    node(first + (vu)(1u), curve, s) * (3.0f * f3 - 6.0f * f2 + 4.0f) +
                    node(first + (vu)(2u), curve, s) * (3.0f * f2 + 3.0f * f - 3.0f * f3 + 1.0f) +
                    node(first + (vu)(3u), curve, s) * f3;
-    return sum * 0.24078f;  // so that its variance is 1: 1 / (6 sqrt(151 / 315))
+    return sum * 0.24078f;  // for the variance 1: 1 / (6 sqrt(151 / 315))
 }
 
 INLINE vf dark_shading(vf y, site at, float slope, float offset, __global const float *rows_0,

@@ -1,5 +1,5 @@
-// A map that was measured, between whose samples light is linear. Only * and +, so that NumPy gives the
-// same bits.
+// A measured map with linear interpolation between its samples. Only * and +, so that NumPy gives
+// the same bits.
 INLINE vf sample_of(__global const float *map, vi row, vi column, int width) {
 #if LANES == 1
     return map[row * width + column];
@@ -12,7 +12,8 @@ INLINE vf sample_of(__global const float *map, vi row, vi column, int width) {
 #endif
 }
 
-// A place on an axis of `count` samples, from its pixel: the sample before it, and the share of the next.
+// A position on an axis of `count` samples, from its pixel: the sample before it, and the share of
+// the next one.
 typedef struct {
     vi first, second;
     vf share;

@@ -1,8 +1,8 @@
-// Light spread over discs, and hidden by what is in front. Tap k is four numbers: how far it is to the right
-// and down, the radius at which a disc's edge is there, and its weight for what is hidden. `radii` has those
-// of all pixels of the whole image, below 0 in front of what is in focus, with `reach` mirrored pixels on
-// every side and a vector more at the right. An image larger than it, as one that kernels are tried on,
-// repeats its last row and vector.
+// Light that is spread over discs, and hidden by nearer surfaces. Tap k is four numbers: its offset
+// to the right and down, the radius of a disc whose edge is there, and its weight for hidden
+// surfaces. `radii` has the radii of all pixels of the whole image, negative if nearer than the
+// focus distance. It has `reach` mirrored pixels on every side and one more vector at the right. An
+// image larger than it, for example in a check of the kernel, repeats its last row and vector.
 typedef struct { rgb light; vf total; } surface;
 
 INLINE void add(surface *to, vf share, rgb c) {

@@ -1,17 +1,18 @@
-// Demosaicing that bounds what it invents by the samples around.
+// Demosaicing that limits interpolated colours by the surrounding samples.
 #include "lib/demosaic.h"
 #include "lib/roots.h"
 
-// Differences of colour reach below black where one colour is dark, and are as large as the light
-// itself where it is bright; in roots both are tame.
+// In linear light, colour differences fall below black where one colour is dark, and are as large
+// as the light where it is bright. In roots, both effects are small.
 INLINE vf to_roots(vf y, site at, float offset) { return root_of(y, offset); }
 
 INLINE vf between(vf v, vf a, vf b) { return vmin(vmax(v, vmin(a, b)), vmax(a, b)); }
 
-// Green as Hamilton and Adams (1997) interpolate it, in both directions; each is kept between its two
-// neighbours, and weighs by the other's squared gradient. `even` is the square of a gradient below
-// which both directions are alike. The result is one plane: R-G at red sites, B-G at blue sites, and 0
-// at green sites. In an image of one row or column, the taps for the missing colour find green sites.
+// Green by the interpolation of Hamilton and Adams (1997), in both directions. Each value is
+// limited to the range of its two neighbours, and is weighted by the other's squared gradient.
+// `even` is the square of a gradient below which both directions count as alike. The result is one
+// plane: R-G at red sites, B-G at blue sites, and 0 at green sites. In an image of one row or
+// column, the taps for the missing colour hit green sites.
 INLINE vf bounded_green(site at, image roots, cfa pattern, float even) {
 #pragma OPENCL FP_CONTRACT ON
     const vf centre = tap_mosaic(roots, 0, 0);
@@ -45,9 +46,9 @@ INLINE vf green_at(image roots, image known, int dx, int dy) {
     return tap_mosaic(roots, dx, dy) - tap_mosaic(known, dx, dy);
 }
 
-// How far red or blue may go: as far as its neighbours do, and beyond them by as much as green here,
-// less and more what noise may do, goes beyond green there. A line narrower than the pattern is an
-// extreme of green, too; where a colour ends green only rises or falls.
+// The bounds of red or blue: those of its neighbours, widened by the difference of green here and
+// green there, plus or minus noise. A line narrower than the pattern is an extreme of green. Where
+// a colour ends, green only rises or falls.
 INLINE bounds with_excess(bounds colour, bounds green, vf here, float noise) {
     const bounds v = {colour.low + vmin(here + noise - green.low, (vf)(0.0f)),
                       colour.high + vmax(here - noise - green.high, (vf)(0.0f))};

@@ -1,5 +1,5 @@
-// Demosaicing for any filter array by linear filters of 7x7 under eight models of images, each trusted where it
-// foretells the samples around.
+// Demosaicing for any filter array by linear 7x7 filters under eight image models, each weighted by
+// how well it predicts the surrounding samples.
 #include "lib/table.h"
 
 #define MODELS 8
@@ -39,7 +39,7 @@ INLINE pair errors_6(site at, src_image src, __global const float *misses, uint 
     return errors_from(at, src, misses, rows, columns, 6);
 }
 
-// The mean over 5x5, and what is not seen.
+// The mean over 5x5, and the colours that were not sampled.
 INLINE pair around(image errors, float unseen) {
     pair sum = {(vf)(0.0f), (vf)(0.0f)};
     UNROLL_ROWS
@@ -61,7 +61,7 @@ INLINE pair trust(pair error, vf least) {
     return v;
 }
 
-// What two models make of a colour, by how much they count.
+// The colours of two models, with their weights.
 INLINE vf weight_of(__global const float *own, uint next, pair count) {
 #pragma OPENCL FP_CONTRACT ON
     return load(own) * count.first + load(own + 3 * next) * count.second;

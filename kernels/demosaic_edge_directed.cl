@@ -4,10 +4,10 @@ enum { HAMILTON_ADAMS, LAROCHE_PRESCOTT, HIBBARD };
 
 // Green from the direction with the smaller gradient; equal gradients take the mean of both. The
 // classifier defines the gradient: the change of green (Hibbard 1995), the second derivative of the
-// site's own colour (Laroche and Prescott 1994), or the sum of both (Hamilton and Adams 1997), who
-// also add a quarter of that derivative to green. The result is one plane: R-G at red sites, B-G at
-// blue sites, and 0 at green sites. In an image of one row or column, the taps for the missing colour
-// find green sites.
+// site's own colour (Laroche and Prescott 1994), or the sum of both (Hamilton and Adams 1997).
+// Hamilton and Adams also add a quarter of that derivative to green. The result is one plane: R-G
+// at red sites, B-G at blue sites, and 0 at green sites. In an image of one row or column, the taps
+// for the missing colour hit green sites.
 INLINE vf green_or_difference(site at, src_image src, cfa pattern, int classifier) {
     const vf centre = src_tap(src, 0, 0);
     const vf west = src_tap(src, -1, 0), east = src_tap(src, 1, 0);

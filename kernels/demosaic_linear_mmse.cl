@@ -1,4 +1,5 @@
-// Linear demosaicing for any filter array: for each place of its period, 7x7 weights of each colour.
+// Linear demosaicing for any filter array: 7x7 weights of each colour for each position of its
+// period.
 #include "lib/table.h"
 
 INLINE rgb linear_mmse(site at, src_image src, __global const float *weights, uint rows, uint columns) {

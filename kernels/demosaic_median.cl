@@ -1,5 +1,6 @@
 // Freeman's demosaicing (US patent 4,724,395, 1988): bilinear, then a median filter on the colour
-// differences. The sensor's samples stay as they are; the missing colours follow from the differences.
+// differences. The sensor's samples do not change, and the missing colours follow from the
+// differences.
 #include "demosaic_bilinear.cl"
 
 INLINE pair bilinear_differences(site at, src_image src, cfa pattern) {

@@ -1,9 +1,9 @@
 // Demosaicing with directional filtering and a posteriori decision (Menon, Andriani and Calvagno
-// 2007), with their refining step, in four passes. "Own" is the colour of a red or blue site, and
+// 2007), with their refinement step, in four passes. "Own" is the colour of a red or blue site, and
 // "other" is blue at a red site and red at a blue site.
 
-// Own minus green, green interpolated along the row and along the column by the same filter that
-// Hamilton and Adams use; 0 at green sites.
+// Own minus green, with green interpolated along the row and along the column by Hamilton and
+// Adams' filter; 0 at green sites.
 INLINE pair directional_differences(site at, src_image src, cfa pattern) {
     const vf centre = src_tap(src, 0, 0);
     const vf green_x = (src_tap(src, -1, 0) + src_tap(src, 1, 0)) * 0.5f +
@@ -17,8 +17,8 @@ INLINE pair directional_differences(site at, src_image src, cfa pattern) {
 }
 
 // Chooses the direction in which differences change less: horizontal ones along five rows, vertical
-// ones along five columns; the row where both are equal. The first plane is the chosen difference, 0 at
-// green sites, and the second is 1 where the row was chosen, else 0.
+// ones along five columns; the row if both are equal. The first plane is the chosen difference, 0
+// at green sites. The second is 1 where the row was chosen, else 0.
 INLINE pair decide(site at, image both) {
 #define CHANGE_X(x0, x1, y) magnitude(tap_pair(both, x0, y).first - tap_pair(both, x1, y).first)
 #define CHANGE_Y(y0, y1, x) magnitude(tap_pair(both, x, y0).second - tap_pair(both, x, y1).second)
@@ -38,8 +38,9 @@ INLINE pair decide(site at, image both) {
     return v;
 }
 
-// Own minus green and own minus other at the two green sites beside a red or blue one, in its chosen
-// direction. A difference at a green site is the mean of those in `known` at the two sites beside it.
+// Own minus green and own minus other at the two green sites next to a red or blue one, in its
+// chosen direction. The difference at a green site is the mean of those in `known` at its two
+// adjacent sites.
 typedef struct { vf own_green1, own_green2, own_other1, own_other2; } beside;
 
 INLINE beside along(image known, vi in_row) {
@@ -60,8 +61,8 @@ INLINE beside along(image known, vi in_row) {
 
 #define THIRD 0.33333334f
 
-// Refining, first half: own minus green as the mean of three along the direction; and a first estimate
-// of own minus other.
+// Refinement, first half: own minus green as the mean of three values along the direction, and a
+// first estimate of own minus other.
 INLINE pair refine(site at, image chosen, cfa pattern) {
     const vf centre = tap_mosaic(chosen, 0, 0);
     const beside b = along(chosen, tap_pair(chosen, 0, 0).second > 0.5f);
@@ -71,8 +72,9 @@ INLINE pair refine(site at, image chosen, cfa pattern) {
     return v;
 }
 
-// Refining, second half: red and blue at green sites by bilinear differences; the other colour at
-// red and blue sites from own minus other as the mean of three along the direction.
+// Refinement, second half: red and blue at green sites from bilinear differences. The other colour
+// at red and blue sites comes from own minus other, as the mean of three values along the
+// direction.
 INLINE rgb interpolate(site at, src_image src, image chosen, image refined, cfa pattern) {
     const vf centre = src_tap(src, 0, 0);
     const pair here = tap_pair(refined, 0, 0);

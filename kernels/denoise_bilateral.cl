@@ -1,12 +1,12 @@
 // Bilateral filter (Tomasi and Manduchi 1998) on luma and chroma, each with its own range sigma.
-// Scales come in as -log2(e) / (2 sigma^2), so that a weight is one power of two.
+// Scales are -log2(e) / (2 sigma^2), so that a weight is one power of two.
 #include "lib/luma_chroma.h"
 
 // A sum of weighted pixels, and of the weights.
 typedef struct { ycbcr pixels; vf luma, chroma; } weighted;
 
-// Contraction to fma is allowed here: it rounds only once, and only the raw has to be the same on every
-// device.
+// Contraction to fma is allowed here: it rounds only once, and only the raw image must be the same
+// on every device.
 INLINE void add_luma(weighted *sum, image planes, vf centre, int dy, int reach, float spatial_scale,
                      float scale) {
 #pragma OPENCL FP_CONTRACT ON
@@ -38,7 +38,7 @@ INLINE void add_chroma(weighted *sum, image planes, ycbcr centre, int dy, int re
     }
 }
 
-// Luma and chroma go through the window one after the other, because both at once need more registers
+// The window is traversed for luma and then for chroma, because both at once need more registers
 // than a CPU has.
 INLINE ycbcr bilateral(site at, image planes, int luma_reach, int chroma_reach,
                        float spatial_scale, float luma_scale, float chroma_scale) {

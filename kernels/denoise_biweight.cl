@@ -1,7 +1,7 @@
 // Means weighted by Tukey's biweight of the difference, on the roots of luma and chroma.
 #include "lib/roots.h"
 
-// In units of the difference that weighs nothing.
+// In units of the difference with weight 0.
 INLINE ycbcr roots_to_luma_chroma(rgb c, site at, float luma_range, float chroma_range) {
     const ycbcr v = rgb_to_ycbcr(c);
     const float luma = 1.0f / luma_range, chroma = 1.0f / chroma_range;
@@ -9,7 +9,7 @@ INLINE ycbcr roots_to_luma_chroma(rgb c, site at, float luma_range, float chroma
     return w;
 }
 
-// As ycbcr_to_rgb, with the units in its factors.
+// ycbcr_to_rgb, with the units included in its factors.
 INLINE rgb luma_chroma_to_light(ycbcr c, site at, float offset, float luma_range, float chroma_range) {
 #pragma OPENCL FP_CONTRACT ON
     const float red = chroma_range * 1.4025246f, blue = chroma_range * 1.7730496f;
@@ -19,9 +19,10 @@ INLINE rgb luma_chroma_to_light(ycbcr c, site at, float offset, float luma_range
     return roots_to_light(v, at, offset);
 }
 
-// Luma from the pixels around, chroma from eight on a ring: `chroma_scale` away along both axes, or one more
-// along one; their own noise demosaicing has made differ from the centre's. `grain` is the share of luma that stays as it is. What
-// is equally far has one weight, which comes last.
+// Luma from adjacent pixels, chroma from eight on a ring: `chroma_scale` away along both axes, or
+// one more along one axis. Demosaicing has made their noise independent of the centre's. `grain` is
+// the share of luma that does not change. Pixels at the same distance share one weight, which is
+// applied last.
 INLINE ycbcr biweight(site at, image planes, float grain, int chroma_scale) {
 #pragma OPENCL FP_CONTRACT ON
     const ycbcr centre = tap_ycbcr(planes, 0, 0), none = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};

@@ -1,7 +1,7 @@
 // Mean of a square window of luma and of chroma, blended with the centre.
 #include "lib/luma_chroma.h"
 
-// Four rows of one plane; the sum along a row of pixels is shared by all windows that hold it.
+// Four rows of one plane; all windows that contain a row of pixels share its sum.
 INLINE void box_of_four(__global const float *plane, uint pitch, int reach, float share, vf *out) {
 #pragma OPENCL FP_CONTRACT ON
     vf sum[4] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};

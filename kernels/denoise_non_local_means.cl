@@ -1,7 +1,8 @@
 // Non-local means (Buades, Coll and Morel 2005) on luma and chroma, patches of 3x3.
 #include "lib/patch.h"
 
-// To units in which the squared differences of two patches add up to their squared distance.
+// Converts to units in which the squared differences of two patches add up to their squared
+// distance.
 INLINE ycbcr to_noise_units(rgb c, site at, float luma_unit, float chroma_unit) {
     const ycbcr p = rgb_to_ycbcr(c);
     const float y = 1.0f / luma_unit, c2 = 1.0f / chroma_unit;
@@ -14,7 +15,8 @@ INLINE rgb from_noise_units(ycbcr c, site at, float luma_unit, float chroma_unit
     return ycbcr_to_rgb(v);
 }
 
-// Squared differences, all planes, of pixels and those dx, dy away, summed over three rows.
+// Squared differences, over all planes, between pixels and those dx, dy away, summed over three
+// rows.
 INLINE void column_distances(image planes, int dx, int dy, float down[4][WITH_MARGIN * LANES]) {
 #pragma OPENCL FP_CONTRACT ON
 #pragma unroll
@@ -36,8 +38,8 @@ INLINE void column_distances(image planes, int dx, int dy, float down[4][WITH_MA
 
 INLINE bool inside(int offset, int reach) { return offset >= -reach && offset <= reach; }
 
-// The loops over the window are not unrolled: one turn is long enough, and all turns would not fit into
-// the instruction cache.
+// The loops over the window are not unrolled: one iteration is long enough, and all of them would
+// not fit into the instruction cache.
 INLINE void non_local_means(site at, image planes, int luma_reach, int chroma_reach,
                             float noise_slope, float noise_offset, float luma_bias,
                             float chroma_bias, float luma_scale, float chroma_scale, ycbcr *out) {

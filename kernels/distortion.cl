@@ -1,15 +1,16 @@
-// A bent image: each pixel of each channel gathered where the lens sees it, with a filter. The map is
-// on a grid whose nodes are `step` px apart, a power of two, `share` its reciprocal: cubic polynomials
-// between four nodes, which have eight numbers each, the ways across and down of red, green and blue.
+// A warped image: each pixel of each channel is gathered with a filter from where the lens sees it.
+// The map is on a grid whose nodes are `step` px apart, a power of two, with `share` its
+// reciprocal. It is interpolated by cubic polynomials between four nodes. Each node has eight
+// numbers, including the offsets across and down of red, green and blue.
 //
-// `r`, `g`, `b` are where the larger image's first pixel would be in each plane. Only * and +, so that
-// NumPy gives the same bits. Rows and lanes beyond an image or a tile are computed too; what they read
-// is moved into it.
+// `r`, `g`, `b` point to where the larger image's first pixel would be in each plane. Only * and +,
+// so that NumPy gives the same bits. Rows and lanes outside an image or a tile are computed as
+// well; their reads are clamped to it.
 #include "lib/gather.h"
 
 typedef float8 node __attribute__((aligned(4)));
 
-// The weights of four nodes at 0, 1, 2 and 3 for a place t among them.
+// The weights of four nodes at 0, 1, 2 and 3 for a position t among them.
 #define LAGRANGE(type, t, w)                                                                         \
     const type t##1 = t - 1.0f, t##2 = t - 2.0f, t##3 = t - 3.0f;                                    \
     const type w[4] = {t##1 * t##2 * t##3 * -0.16666667f, t * t##2 * t##3 * 0.5f,                    \
@@ -20,13 +21,13 @@ INLINE uint first_node(uint place, uint step, uint nodes) {
     return cell == 0 ? 0 : cell - 1 < last ? cell - 1 : last;
 }
 
-// The way from each lane's pixel to the place that it shows, of each field.
+// The offset from each lane's pixel to the position that it shows, for each field.
 INLINE void ways(site at, __global const float *nodes, uint step, float share, uint across, uint down,
                  vf *way) {
     const uint top = first_node(at.y, step, down);
     const float v = (float)(at.y - top * step) * share;
     LAGRANGE(float, v, of_row)
-    for (uint lane = 0; lane < LANES; lane += step) {  // once where a block is in one cell
+    for (uint lane = 0; lane < LANES; lane += step) {  // once if a block is in one cell
         const uint left = first_node(at.x + lane, step, across);
         float8 lines[4];
 #pragma unroll
@@ -58,7 +59,7 @@ INLINE rgb distortion(site at, __global const float *r, __global const float *g,
                       int powers) {
     vf way[6];
     ways(at, nodes, step, share, across, down, way);
-    // A loop, because three copies of what is in it take three times as long to compile.
+    // A loop, because three copies of its body take three times as long to compile.
     __global const float *planes[3] = {r, g, b};
     vf channels[3];
 #pragma unroll 1

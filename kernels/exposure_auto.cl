@@ -1,13 +1,14 @@
 #include "exposure.cl"
-// Auto exposure: a gain that brings the luminance of the image to a target. Places count by a circle
-// around the middle; `share` is the image's shorter side over its diameter, and with 0 all are inside.
-#define METER_STEPS 4096  // of the logarithm to base 2
+// Auto exposure: a gain that brings the luminance of the image to a target. Positions are weighted
+// by a circle around the centre. `share` is the image's shorter side over its diameter, and with 0
+// all positions are inside.
+#define METER_STEPS 4096  // per unit of the logarithm to base 2
 #define METER_BINS 9216   // 36 octaves from 2^-18 on, with 256 bins each
 
 // Linear sRGB (ITU-R BT.709).
 #define LUMINANCE(r, g, b) (0.2126f * (r) + 0.7152f * (g) + 0.0722f * (b))
 
-// Places are counted in half pixels from the middle.
+// Positions are in half pixels from the centre.
 INLINE float half_pixels(uint place, uint size) { return (float)(2 * (int)place + 1 - (int)size); }
 
 // The square of the circle's diameter, times that of the share.
@@ -31,7 +32,7 @@ INLINE int steps_of_one(float level) {
     return lanes[0];
 }
 
-// The end of both ways: the stops from the level that was found to the target, and the gain.
+// The last step of both rules: the stops from the measured level to the target, and the gain.
 INLINE void meter(bool lit, int level, int target, int lowest, int highest, float offset,
                   __global float *estimates) {
     const int wanted = target - level;
@@ -57,7 +58,8 @@ INLINE vi metered_log(rgb c, site at, extent e, uint share, uint inside, uint ou
     return steps_of(light + delta) * weight;
 }
 
-// How many pixels are in the circle, row by row; the circle's edge moves outwards up to the middle.
+// The number of pixels in the circle, row by row; the circle's edge moves outwards up to the
+// middle.
 INLINE ulong count_in_circle(uint share, extent e) {
     ulong count = 0;
     uint left = (e.width + 1) / 2;
@@ -81,7 +83,8 @@ INLINE void meter_log_average(long4 sums, uint share, uint inside, uint outside,
     meter(lit, (int)mean, target, lowest, highest, offset, estimates);
 }
 
-// The bin of a pixel by the upper bits of its luminance; those outside of the circle are counted apart.
+// The bin of a pixel by the upper bits of its luminance; pixels outside the circle are counted
+// separately.
 INLINE int metered_bin(__global const float *red, __global const float *green,
                        __global const float *blue, uint x, uint y, extent e, uint share,
                        uint outside) {
@@ -94,8 +97,8 @@ INLINE int metered_bin(__global const float *red, __global const float *green,
     return is_inside ? bounded : METER_BINS + bounded;
 }
 
-// The middle of the bin that holds the percentile, given in millionths of all weights. Behind the bins
-// stand the sums of each RUN of them.
+// The middle of the bin that contains the percentile, in millionths of all weights. After the bins
+// follow the sums of each RUN of them.
 INLINE void meter_percentile(__global const uint *histogram, uint inside, uint outside,
                              uint millionths, int target, int lowest, int highest, float offset,
                              extent e, __global float *estimates) {

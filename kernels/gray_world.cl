@@ -13,7 +13,7 @@ INLINE void gray_world(long4 sums, cfa pattern, extent e, __global float *estima
     const uint red = pattern.red_x + 2 * pattern.red_y, blue = 3 - red;
     const uint green1 = red ^ 1, green2 = blue ^ 1;
     const float green = (float)(sum[green1] + sum[green2]) / (float)(count[green1] + count[green2]);
-    // A colour without light, or without a site in a tiny picture, gets the gain 1.
+    // A colour without light, or without a site in a tiny image, gets the gain 1.
     const bool green_lit = sum[green1] + sum[green2] > 0;
     estimates[0] = green_lit && sum[red] > 0 ? green / ((float)sum[red] / (float)count[red]) : 1.0f;
     estimates[1] = green_lit && sum[blue] > 0 ? green / ((float)sum[blue] / (float)count[blue]) : 1.0f;

@@ -1,4 +1,4 @@
-// The inverse of a picture style: of the largest colour the root of a quadratic equation.
+// The inverse of a picture style: the root of a quadratic equation for the largest colour.
 #include "lib/style.h"
 
 INLINE rgb inverse_standard(rgb v, site at, float grey, float a, float b, float c, float d, float bright_a,
@@ -9,7 +9,7 @@ INLINE rgb inverse_standard(rgb v, site at, float grey, float a, float b, float 
     const vf quadratic = dark ? a - c * u : bright_a - bright_c * u;
     const vf linear = dark ? b - d * u : bright_b - bright_d * u;
     const vf root = square_root(vmax(linear * linear + 4.0f * quadratic * u, (vf)(0.0f)));
-    // Of the two forms of the root, the one in which nothing cancels.
+    // The form of the root that has no cancellation.
     const vi sum = linear > 0.0f;
     const vf above = sum ? 2.0f * u : root - linear, below = sum ? linear + root : 2.0f * quadratic;
     const vf x = above / vmax(below, (vf)(1e-12f)), high = dark ? x : 1.0f - x;

@@ -1,11 +1,11 @@
-// Non-local means (Buades, Coll and Morel 2005) on the mosaic, patches of 3x3. Offsets in the window
-// are even, so that two patches have the same colours in the same places.
+// Non-local means (Buades, Coll and Morel 2005) on the mosaic, patches of 3x3. Offsets in the
+// window are even, so that two patches have the same colours in the same positions.
 #include "lib/patch.h"
 
-// The first plane is the sample as the sensor saw it. The second, in which patches are compared, is a
-// function of it whose noise has the same variance at all levels (generalized Anscombe transform;
-// Murtagh, Starck and Bijaoui 1995): a difference of two roots, written as a quotient that also holds
-// for a = 0.
+// The first plane is the sensor's sample. Patches are compared in the second plane, a function of
+// the sample whose noise has the same variance at all levels (generalized Anscombe transform;
+// Murtagh, Starck and Bijaoui 1995). It is a difference of two roots, written as a quotient that is
+// also valid for a = 0.
 INLINE pair stabilize(vf y, site at, cfa pattern, float red_inverse, float blue_inverse,
                             float a, float offset, float root_of_offset) {
     const vf signal = y * by_site(at, pattern, (vf)(red_inverse), (vf)(1.0f), (vf)(blue_inverse));
@@ -19,7 +19,7 @@ INLINE vf with_gains(vf y, site at, cfa pattern, float red_gain, float blue_gain
     return y * by_site(at, pattern, (vf)(red_gain), (vf)(1.0f), (vf)(blue_gain));
 }
 
-// Squared differences of samples and those dx, dy away, summed over three rows.
+// Squared differences between samples and those dx, dy away, summed over three rows.
 INLINE void sample_distances(image samples, int dx, int dy, float down[4][WITH_MARGIN * LANES]) {
 #pragma OPENCL FP_CONTRACT ON
 #pragma unroll

@@ -1,10 +1,11 @@
-// The mean of an image over a camera's turn. `turns` has three numbers for each moment: the sine, the
-// cosine and 1 less the cosine of how far the camera has turned. `x`, `y` is the way in which the middle of
-// the picture moves; `middle_x`, `middle_y` is how far it is from the centre of the image's first pixel.
-// Places beyond the image are moved to its edge.
+// The mean of an image over a camera's rotation. `turns` has three numbers for each moment: the
+// sine, the cosine and 1 minus the cosine of the rotation so far. `x`, `y` is the direction in
+// which the image centre moves. `middle_x`, `middle_y` is its distance from the centre of the
+// image's first pixel. Positions outside the image are clamped to its edge.
 #include "lib/gather.h"
 
-// Of a plane where all lanes are as far from their places: `corner` is the pixel before the first one's.
+// One plane, if all lanes have the same offset to their positions; `corner` is the pixel before the
+// first one's.
 INLINE vf side_by_side(__global const float *corner, uint pitch, vf u, vf v) {
     const vf above = (1.0f - u) * load(corner) + u * load(corner + 1);
     const vf below = (1.0f - u) * load(corner + pitch) + u * load(corner + pitch + 1);
@@ -43,7 +44,7 @@ INLINE rgb turned(site at, __global const float *r, __global const float *g, __g
             sum.g += side_by_side(g + corner, from.pitch, u, v);
             sum.b += side_by_side(b + corner, from.pitch, u, v);
         } else {
-            // A loop, because three copies of what is in it take three times as long to compile.
+            // A loop, because three copies of its body take three times as long to compile.
             __global const float *planes[3] = {r, g, b};
             vf channels[3];
 #pragma unroll 1

@@ -1,5 +1,5 @@
-// Gaussian noise, independent in each pixel, whose sigma follows each channel's intensity, by a table of
-// 256 entries for each channel (SyB3R; Ley, Haensch, Hellwich 2016).
+// Gaussian noise, independent in each pixel, with a sigma that follows each channel's intensity by
+// a table of 256 entries per channel (SyB3R; Ley, Haensch, Hellwich 2016).
 #include "lib/correlated.h"
 
 INLINE vf sigma_at(vf v, __global const float *table) {

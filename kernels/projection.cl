@@ -1,6 +1,6 @@
-// A picture through a wide lens: each pixel gathered at the place of an image that it shows, with a filter.
-// `across` and `down` are how far away that is, `pitch` to a row of `lines`; rows and lanes beyond the
-// picture read the last.
+// An image through a wide lens: each pixel is gathered with a filter at the position of the input
+// that it shows. `across` and `down` are the offsets to it, with `pitch` to a row of `lines`. Rows
+// and lanes outside the image read the last ones.
 #include "lib/gather.h"
 
 INLINE rgb projection(site at, __global const float *r, __global const float *g, __global const float *b,
@@ -9,7 +9,7 @@ INLINE rgb projection(site at, __global const float *r, __global const float *g,
     const uint row = at.y < lines ? at.y : lines - 1, last = pitch - LANES;
     const size_t here = (size_t)row * pitch + (at.x < last ? at.x : last);
     const vf right = load(across + here), below = load(down + here);
-    // A loop, because three copies of what is in it take three times as long to compile.
+    // A loop, because three copies of its body take three times as long to compile.
     __global const float *planes[3] = {r, g, b};
     vf channels[3];
 #pragma unroll 1

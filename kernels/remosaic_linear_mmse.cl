@@ -1,4 +1,5 @@
-// From any filter array to a Bayer pattern: for each place of the period, 7x7 weights of the colour that it gets.
+// From any filter array to a Bayer pattern: 7x7 weights of the resulting colour for each position
+// of the period.
 #include "lib/table.h"
 
 INLINE vf remosaic(site at, src_image src, __global const float *weights, uint rows, uint columns) {

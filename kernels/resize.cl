@@ -1,8 +1,8 @@
-// Smaller images: each row, then each column, as a weighted mean of those of the larger image. Which,
-// and their weights, are worked out by the host: line i is made of `count` lines from first[i] on.
+// Smaller images: each row, then each column, is a weighted mean of those of the larger image. The
+// host computes which, and their weights: line i is made of `count` lines from first[i] on.
 //
-// `r`, `g`, `b` are where the larger image's first pixel would be in each plane. Rows and lanes beyond
-// an image or a tile are computed too; what they read is moved into it.
+// `r`, `g`, `b` point to where the larger image's first pixel would be in each plane. Rows and
+// lanes outside an image or a tile are computed as well; their reads are clamped to it.
 INLINE int inside(int first, uint low, uint size, uint count) {
     const int last = (int)(low + size) - (int)count;
     return first < (int)low ? (int)low : first > last ? last : first;

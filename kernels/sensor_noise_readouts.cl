@@ -1,16 +1,18 @@
-// One exposure read several times, each less sensitive than the one before, and merged.
+// One exposure that is read several times, each less sensitive than the last, and merged.
 //
-// A readout has noise, whole DN and a white level of its own. Where one comes near its white level, the next one
-// takes over, over a tenth of the range.
+// A readout has its own noise, whole DN and white level. When one comes close to its white level,
+// the next one takes over, over a tenth of the range.
 #define HANDOVER_ENDS 0.95f
 #define READOUTS 4  // at most
 
-// `table` has for each readout the number of its photodiode, the share of light that this one sees, the gain at which it
-// is read, what its reading is multiplied by when it is merged, and the variance of its read noise. Readouts of one
-// photodiode follow each other, and have one charge. `part` is the readout that is looked at alone, or -1.
-// `later` has what all photodiodes but the first see in their own exposures, planes of `columns` by `rows` with a vector more
-// at the right; 0 where all see the same. An image larger than it, as one that kernels are tried on, repeats its last
-// row and vector.
+// For each readout, `table` has the number of its photodiode, the share of light of this
+// photodiode, the gain, the factor for merging, and the variance of its read noise. Readouts of one
+// photodiode are consecutive, and have the same charge. `part` is the only readout to return, or
+// -1.
+//
+// `later` has the light of all photodiodes but the first in their own exposures: planes of
+// `columns` by `rows` with one more vector at the right, or 0 if all see the same light. An image
+// larger than it, for example in a check of the kernel, repeats its last row and vector.
 INLINE vf merged(vf y, site at, stream s, bool is_noisy, int count, int part, float a, float full_well, float range,
                  float unit, __global const float *table, __global const float *later, int columns, int rows) {
     const int last_x = columns - LANES, last_y = rows - 1;
@@ -54,7 +56,7 @@ INLINE vf exposures(vf y, site at, stream s, int count, int part, float a, float
     return merged(y, at, s, true, count, part, a, full_well, range, unit, table, later, columns, rows);
 }
 
-// The same without noise and rounding.
+// Without noise and rounding.
 INLINE vf clean_readouts(vf y, site at, int count, int part, float full_well, __global const float *table) {
     const stream none = {0, 0, 0};
     return merged(y, at, none, false, count, part, 0.0f, full_well, 1.0f, 1.0f, table, 0, 0, 0);

@@ -1,8 +1,8 @@
-// Shot and read noise of a sensor as one Gaussian z of variance a*y + b, to which as much of z^2 - 1 is
-// added as gives it the third moment of shot noise (Cornish and Fisher 1938).
+// Shot and read noise of a sensor as one Gaussian z of variance a*y + b, plus as much of z^2 - 1 as
+// gives it the third moment of shot noise (Cornish and Fisher 1938).
 #include "lib/tukey_lambda.h"
 
-// What that adds to the variance is taken from z's own part, but for its square.
+// The variance that this adds is removed from z's own part, except for its square.
 INLINE vf skewed(vf z, vf y, float a, float b) {
     const vf shot = vmax(a * y, (vf)(0.0f)), variance = vmax(a * y + b, (vf)(1e-30f));
     const vf inverse = inverse_root(variance);
@@ -15,7 +15,7 @@ INLINE vf skewed_noise(vf y, site at, stream s, float a, float b, float full_wel
     return vmin(y + skewed(normal_at(at, 0, s), y, a, b), (vf)(full_well));
 }
 
-// The same, with read noise of a Tukey lambda distribution.
+// With read noise of a Tukey lambda distribution.
 INLINE vf skewed_noise_tukey(vf y, site at, stream s, float a, float full_well, float read_noise, float shape, float scale) {
     const vf shot = skewed(normal_at(at, 0, s), y, a, 0.0f);
     const vf read = tukey_lambda_of(word_at(at, 1, s), shape, scale);

@@ -1,4 +1,4 @@
-// Unsharp mask on the root of luma; the ratios of the colours stay.
+// Unsharp mask on the root of luma; the ratios of the colours do not change.
 #include "lib/roots.h"
 
 // The root of luma, and blue and red over luma, all with the root's offset.
@@ -19,9 +19,9 @@ INLINE rgb from_root_and_ratios(ycbcr c, site at, float offset) {
     return v;
 }
 
-// Adds `amount` of what a Gaussian blur takes away, less `threshold`, and at most `limit`. The blur looks
-// at every `step`-th pixel; weights[k] is that of a pixel k steps away. Four rows at once share the sums
-// along their rows.
+// Adds `amount` of the difference from a Gaussian blur, minus `threshold`, and at most `limit`. The
+// blur uses every `step`-th pixel, and weights[k] is that of a pixel k steps away. Four rows at
+// once share the sums along their rows.
 INLINE void unsharp(site at, image planes, int reach, int step, __global const float *weights,
                     float amount, float threshold, float limit, ycbcr *out) {
 #pragma OPENCL FP_CONTRACT ON

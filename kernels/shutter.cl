@@ -1,6 +1,6 @@
-// Light that flickers, as rows see it that are exposed one after the other. One launch fills a table with
-// the gain of each row, 1 + swing * cos(2 pi (row * step + start)); the pixels are then multiplied by that
-// of their row.
+// Flickering light on rows that are exposed one after the other. One launch fills a table with the
+// gain of each row, 1 + swing * cos(2 pi (row * step + start)). The pixels are then multiplied by
+// that of their row.
 INLINE vf flicker_of_rows(vu row, float step, float start, float swing) {
     const vf turns = to_float(signed_bits(row)) * step + start;
     // cos(2 pi u) = sin(2 pi (1/4 - |u|)) for |u| <= 1/2, by Taylor's series to the ninth power.
@@ -10,8 +10,9 @@ INLINE vf flicker_of_rows(vu row, float step, float start, float swing) {
     return 1.0f + swing * sine;
 }
 
-// Light that is on in the first `duty` of each period. `step` from a row to the next, and the `start` of the first
-// one's exposure, are in 2^-32 periods; an exposure takes `rest` of one beside whole ones, which make it `steady`.
+// Light that is on in the first `duty` of each period. `step` between rows, and the `start` of the
+// first row's exposure, are in 2^-32 periods. An exposure takes `rest` of a period in addition to
+// whole ones, whose contribution is `steady`.
 INLINE vf pulses_of_rows(vu row, uint step, uint start, float rest, float duty, float steady, float scale) {
     const vf begins = to_float(signed_bits((row * (vu)(step) + (vu)(start)) >> (vu)(8))) * 0x1p-24f;
     const vf ends = begins + rest, none = (vf)(0.0f);

@@ -1,9 +1,11 @@
-// A rational curve, x (a x + b) / (x (c x + d) + 1), on the largest and the smallest of the three colours;
-// the one between keeps its relative place, which is its hue (as in Adobe's DNG software).
+// A rational curve, x (a x + b) / (x (c x + d) + 1), on the largest and the smallest of the three
+// colours. The middle one keeps its relative position, which is its hue (like in Adobe's DNG
+// software).
 #include "lib/hue.h"
 
-// The chord's slope between both ends has their denominators below it, and the difference of the ends
-// cancels: one division does for all. `twist` is a d - b c.
+// The slope of the chord between both ends has the product of their denominators as its
+// denominator, and the difference of the ends cancels. One division is enough for all. `twist` is a
+// d - b c.
 INLINE rgb neutral(rgb v, site at, float a, float b, float c, float d, float twist) {
 #pragma OPENCL FP_CONTRACT ON
     const extremes x = extremes_of(v);

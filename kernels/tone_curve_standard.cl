@@ -1,7 +1,9 @@
-// A picture style: the largest of the three colours takes the curve's value, and all keep their ratios.
+// A picture style: the largest of the three colours takes the curve's value, and all colours keep
+// their ratios.
 #include "lib/style.h"
 
-// The pieces of the curve are v (a v + b) / (v (c v + d) + 1), the bright one of what lacks to white.
+// The pieces of the curve are v (a v + b) / (v (c v + d) + 1); for the bright piece, v is the
+// distance from white.
 INLINE rgb standard(rgb v, site at, float grey, float a, float b, float c, float d, float bright_a,
                     float bright_b, float bright_c, float bright_d, float saturation) {
 #pragma OPENCL FP_CONTRACT ON

@@ -1,5 +1,5 @@
-// Light that falls off towards the corners, by the distance to the place x, y. Only * and +, so that NumPy
-// gives the same bits.
+// Light that decreases towards the corners, by the distance from the position x, y. Only * and +,
+// so that NumPy gives the same bits.
 INLINE vf squared_radius(site at, float x, float y) {
     const vf dx = to_float(iota() + (vi)((int)at.x)) + 0.5f - x;
     const float dy = (float)at.y + 0.5f - y;
@@ -17,7 +17,7 @@ INLINE rgb times(rgb c, vf gain) {
     return v;
 }
 
-// r is 1 at the last pixel of a corner.
+// r is 1 at the corner pixel.
 INLINE rgb vignetting_pa(rgb c, site at, extent e, float k1, float k2, float k3) {
     const float width = e.width > 1 ? (float)(e.width - 1) : 1.0f;
     const float height = e.height > 1 ? (float)(e.height - 1) : 1.0f;
@@ -26,8 +26,8 @@ INLINE rgb vignetting_pa(rgb c, site at, extent e, float k1, float k2, float k3)
     return times(c, vmax(((r2 * k3 + k2) * r2 + k1) * r2 + 1.0f, (vf)(0.0f)));
 }
 
-// r is the tangent of the angle to the axis, and so 1 / (1 + r^2) its cosine squared. A focal length in
-// px is `per_px`; one that counts in longer sides is `per_side`, and the other is 0.
+// r is the tangent of the angle to the axis, so 1 / (1 + r^2) is its cosine squared. `per_px` is
+// set for a focal length in px, and `per_side` for one in longer sides; the other one is 0.
 INLINE rgb vignetting_cosine(rgb c, site at, extent e, float x, float y, float per_px, float per_side) {
     const float side = (float)(e.width > e.height ? e.width : e.height);
     const vf unit = per_px > 0.0f ? (vf)(per_px) : (vf)(per_side) * reciprocal((vf)(side * side));

@@ -3,8 +3,8 @@
 // histogram, 12 octaves below 1 with 512 bins each, indexed by the upper bits of the float.
 #define WHITE_PATCH_BINS 6144
 
-// The bin of a pixel, or -1 where its 2x2 cell has a clipped sample, since the colour of a burnt-out
-// light is unknown. The last column or row of an image of odd size is a cell of its own.
+// The bin of a pixel, or -1 if its 2x2 cell has a clipped sample, since the colour of a clipped
+// light is unknown. The last column or row of an image of odd size is its own cell.
 INLINE int white_patch_bin(__global const float *origin, uint x, uint y, extent e, cfa pattern,
                            float clip) {
     const uint left = x & ~1u, right = left + 1 < e.width ? left + 1 : left;
@@ -19,8 +19,8 @@ INLINE int white_patch_bin(__global const float *origin, uint x, uint y, extent 
     return (int)off_red * WHITE_PATCH_BINS + ((as_int(inside) - 0x39800000) >> 14);
 }
 
-// The middle of the bin that holds the percentile of a colour, given in millionths; 0 where nothing was
-// counted. Behind the bins of all colours stand the sums of each RUN of them.
+// The middle of the bin that contains the percentile of a colour, in millionths; 0 if nothing was
+// counted. After the bins of all colours follow the sums of each RUN of them.
 INLINE float white_patch_level(__global const uint *histogram, uint colour, uint millionths) {
     __global const uint *bins = histogram + colour * WHITE_PATCH_BINS;
     __global const uint *runs = histogram + (3 * RUN + colour) * (WHITE_PATCH_BINS / RUN);

@@ -99,7 +99,7 @@ def test_dark_shading_from_files(develop, write_exr, size):
 def test_files_of_dark_shading_that_do_not_fit(write_exr):
     files = [str(write_exr(f"{n}.exr", np.ones((4, n, 1), np.float32), "Y")) for n in (4, 5)]
     shading = {"method": "file", "slope_file": files[0], "offset_file": files[1]}
-    with pytest.raises(RequestError, match="of different sizes: 4x4 and 5x4"):
+    with pytest.raises(RequestError, match="differ in size: 4x4 and 5x4"):
         make_chain(settings_from({"dark_shading": shading}))
     shading["slope_file"] = "nowhere.exr"
     with pytest.raises(RequestError, match=r"slope_file: .*nowhere\.exr"):
@@ -250,7 +250,7 @@ def test_a_profile_reaches_every_stage():
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("iso_range", "tukey_lambda = 0.1\niso_range", "found both"),
+        ("iso_range", "tukey_lambda = 0.1\niso_range", "set both for every ISO"),
         ("banding_period = 12.5", "", "banding_amplitude needs banding_period"),
         ("rts_amplitude = 20.0", "", "rts_share needs rts_amplitude"),
         ("[0.1, 0.4]\n\n[sources]", "[0.1]\n\n[sources]", "black_level_error must be as long as"),

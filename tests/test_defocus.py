@@ -170,7 +170,7 @@ def test_depth_of_the_file_or_a_companion(render, clpipe):
     said = blurred(image, depth, None)
     made = clpipe("run", "a.exr", "-o", "o", *RUN, *THIN)
     assert read_image(Path("o/a.exr")).pixels == pytest.approx(said, abs=1e-3)
-    assert "pixels are spread over radii up to 65.8 px" in made.output
+    assert "pixels have discs with radii up to 65.8 px" in made.output
     record = json.loads(Path("o/a.json").read_text())
     assert record["depth"][0].items() >= {"layer": "Depth", "file": "a.exr"}.items()
     render("b.exr", **colours(image))
@@ -204,10 +204,13 @@ def test_depth_that_cannot_be_used(render, clpipe, depth, options, message):
 @pytest.mark.parametrize(
     ("lens", "message"),
     [
-        ({"focus_distance": 0.04}, "not beyond the focal length of 50 mm; is depth_scale right"),
+        (
+            {"focus_distance": 0.04},
+            "must be more than the focal length of 50 mm. Check depth_scale",
+        ),
         ({"blades": 3}, "5 to 9 blades"),
-        ({"sensor_width": 36.0, "pixel_pitch": 5.0}, "set one"),
-        ({"camera": "sony-imx686"}, "sensor_width: the size of pixels is needed"),
+        ({"sensor_width": 36.0, "pixel_pitch": 5.0}, "set either sensor_width or pixel_pitch"),
+        ({"camera": "sony-imx686"}, "sensor_width: the pixel size is needed"),
     ],
 )
 def test_lenses_that_cannot_be(lens, message):
@@ -223,7 +226,7 @@ def test_in_python():
     settings = {"stages": ["defocus"], "defocus": {"method": "thin_lens", **own}}
     settings["defocus"]["sensor_width"] = width
     pipeline = clpipe_api.Pipeline(**settings, device="numpy")
-    with pytest.warns(UserWarning, match="spread over radii"):
+    with pytest.warns(UserWarning, match="discs with radii"):
         seen = pipeline.process(image, "a", depth=depth).image
     assert seen == pytest.approx(blurred(image, depth, None), abs=1e-6)
     with pytest.raises(ImageError, match="needs depth"):

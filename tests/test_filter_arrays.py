@@ -65,11 +65,11 @@ def mosaic_of(image: np.ndarray, array) -> np.ndarray:
     [
         ("bayer", "unknown filter array 'bayer'; allowed: RGGB, BGGR"),
         ("RG/GX", "'X'; a channel is one of R"),
-        ("RG/G", "rows of one length"),
-        ("RG//GB", "rows of one length"),
+        ("RG/G", "rows of the same length"),
+        ("RG//GB", "rows of the same length"),
         ("/".join(["RGB"] * 9), "at most 8x8"),
         ("R" * 9, "at most 8x8"),
-        ("HR/GB", "polarisers .* do not go with colours"),
+        ("HR/GB", "polarisers .* cannot be combined with colours"),
     ],
 )
 def test_what_is_no_filter_array(text, message):
@@ -144,7 +144,10 @@ def test_a_polarised_array_measures_degree_and_angle(device, method):
 def test_a_polarised_array_has_no_colours():
     with pytest.raises(KeyedError, match=r"mosaic.array: .*polarised.*; skip inverse_color_matrix"):
         on("polarised")
-    with pytest.raises(RequestError, match=r"method=camera: .* polarised, whose channels are no"):
+    with pytest.raises(
+        RequestError,
+        match=r"method=camera needs channels that are colours, and those of mosaic polarised",
+    ):
         on("polarised", skip=["inverse_color_matrix"], color_matrix={"method": "camera"})
     chain = on("polarised", skip=["inverse_color_matrix"])
     assert chain.filters.name == "polarised"
@@ -285,9 +288,13 @@ def test_beyond_an_edge_an_array_goes_on():
         (
             "x-trans",
             {"demosaic": {"method": "gray"}},
-            "one channel, but the mosaic is x-trans; lea",
+            "one channel, but the mosaic is x-trans; rem",
         ),
-        ("GRBG", {"demosaic": {"method": "gray"}}, "of one channel, but the mosaic is GRBG; leave"),
+        (
+            "GRBG",
+            {"demosaic": {"method": "gray"}},
+            "of one channel, but the mosaic is GRBG; remove",
+        ),
         ("q", {}, "unknown filter array 'q'"),
     ],
 )
@@ -308,7 +315,7 @@ def test_a_camera_says_its_array(clpipe, half, tmp_path):
     clpipe("run", half, "-o", "bayer", *own, "--set", "mosaic.pattern=GRBG")
     profile.write_text(text.replace("iso_range", 'filter_array = "RG/G"\niso_range', 1))
     result = clpipe("run", half, "-o", "bad", *own, status=2)
-    assert "rows of one length" in result.stderr
+    assert "rows of the same length" in result.stderr
     assert not Path("bad").exists()
     profile.write_text(text.replace("iso_range", 'filter_array = "GBRG"\niso_range', 1))
     (step,) = Pipeline(camera=str(profile), stages=["mosaic"]).chain.steps
@@ -615,7 +622,7 @@ def test_the_array_of_a_raw_is_that_of_its_pixels():
 
 @pytest.mark.parametrize("array", ["x-trans", "RGGB"])
 def test_what_has_no_cells(array):
-    with pytest.raises(RequestError, match=f"the mosaic is {array}; binning is for cells of 2x2"):
+    with pytest.raises(RequestError, match=f"the mosaic is {array}; binning needs cells of 2x2"):
         remosaiced(array, "binning")
 
 

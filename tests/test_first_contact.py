@@ -45,10 +45,16 @@ def folder(write_exr):
         ((*RUN, "--set", "denoise=mean"), "did you mean 'denoise.method=mean'?"),
         ((*RUN, "--set", "exposure.ev 1"), "'clpipe stages' lists the stages"),
         (("cameras", "canon", "--iso", "800"), "most similar: canon-5d2, canon-5d3, canon-5d4, "),
-        ((*RUN, "--iso", "99999"), "use 25600; no built-in camera goes further"),
-        ((*RUN, "--camera", "canon-6d", "--iso", "9e3"), "use 6400, or a camera that has it: fuji"),
-        ((*RUN, "--iso", "60"), "use 100, or a camera that has it: sony-a7s2"),
-        ((*RUN, "--iso", "9"), "use 100; the built-in camera that goes furthest is sony-a7s2, to"),
+        ((*RUN, "--iso", "99999"), "use 25600; no built-in camera comes closer"),
+        (
+            (*RUN, "--camera", "canon-6d", "--iso", "9e3"),
+            "use 6400, or a camera that has this ISO: fuji",
+        ),
+        ((*RUN, "--iso", "60"), "use 100, or a camera that has this ISO: sony-a7s2"),
+        (
+            (*RUN, "--iso", "9"),
+            "use 100; the built-in camera that comes closest is sony-a7s2, with",
+        ),
         (
             (*RUN, "--iso", "100", "200", "400"),
             "200: {}. To give --iso several values, use --iso 1",
@@ -57,7 +63,10 @@ def folder(write_exr):
         ((*RUN, "--lens", "Canon", "50mm"), "For a value with spaces, use --lens 'Canon 50mm'"),
         (("explore", "render.exr", "--iso", "100", "200"), "200: {}. --iso takes one value"),
         (("run", "a.json", "-o", "out"), "to make the picture of a sidecar again, use 'clpipe rep"),
-        ((*RUN, "--camera", "pngs/a.png"), "to make one of a DNG or a noise model, use 'clpipe ca"),
+        (
+            (*RUN, "--camera", "pngs/a.png"),
+            "to make one from a DNG or a noise model, use 'clpipe ca",
+        ),
         ((*RUN, "--set", "camera.iso=800"), "use --iso 800"),
         (("run", "rendr.exr", "-o", "out"), "rendr.exr: {}; did you mean render.exr?"),
         (("run", "rendrs/a.exr", "-o", "out"), "rendrs/a.exr: {}; did you mean renders/a.exr?"),

@@ -154,7 +154,7 @@ def test_a_lens_that_folds_the_image_is_refused(clpipe, write_exr):
     fold = ("--set", "distortion.method=brown_conrady", "--set", "distortion.fx=25")
     run = ("run", "a.exr", "-o", "o", "--stages", "distortion", "--device", "numpy")
     said = clpipe(*run, *fold, "--set", "distortion.k1=-0.5", status=1).stderr
-    assert "the distortion turns back at r = 0.8165, 20 px from the principal point" in said
+    assert "The distortion folds at r = 0.8165, 20 px from the principal point" in said
     assert "the corner of 60x40 pixels is at r = 1.442" in said
     said = clpipe(*run, "--set", "distortion.method=fisheye", status=2).stderr
     assert "set fx (px), or focal_length and sensor_width (mm)" in said
@@ -163,7 +163,7 @@ def test_a_lens_that_folds_the_image_is_refused(clpipe, write_exr):
     assert "distortion.fx makes the focal length of this render of 60x40 pixels 25 px" in said
     assert "but distortion.focal_length and distortion.sensor_width 40 px" in said
     lateral = PtLens(vr=1.0, br=-0.9)
-    with pytest.raises(ImageError, match="the lateral colour turns back"):
+    with pytest.raises(ImageError, match="The lateral colour folds"):
         lateral.resampling.grid(60, 40)
     shifted = PtLens(a=0.001, cx=-1e6, fit=True)
     with pytest.raises(ImageError, match="distortion: "):
@@ -227,18 +227,21 @@ def test_lensfun_says_the_same(camera, name, setting, size):
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
-        ({"lens": "Cannon EF 24-71mm"}, "knows no 'Cannon EF 24-71mm'; the nearest are Canon EF"),
-        ({"lens": "24-70"}, "'24-70' may be .*, or [0-9]+ more; name one of them in full"),
+        (
+            {"lens": "Cannon EF 24-71mm"},
+            "has no lens 'Cannon EF 24-71mm'; the nearest are Canon EF",
+        ),
+        ({"lens": "24-70"}, "'24-70' may mean .*, or [0-9]+ more; use the full name of one"),
         ({"lens": "Canon EF 24-70mm f/2.8L"}, "is a zoom; set 24 to 70 mm"),
         (
             {"lens": "Canon EF 24-70mm f/2.8L", "focal_length": 85},
-            "focal_length: found 85 mm, but Canon EF 24-70mm f/2.8L USM has 24 to 70 mm",
+            "85 mm is not possible, because Canon EF 24-70mm f/2.8L USM has 24 to 70 mm",
         ),
         (
             {"lens": "Canon EF 24-70mm f/2.8L", "focal_length": 24, "aperture": 1.4},
-            "aperture: found f/1.4, but Canon EF 24-70mm f/2.8L USM has f/2.8 to f/22",
+            "f/1.4 is not possible, because Canon EF 24-70mm f/2.8L USM has f/2.8 to f/22",
         ),
-        ({"lens": "Samyang 8mm f/3.5 Fish-Eye CS"}, "is no rectilinear lens"),
+        ({"lens": "Samyang 8mm f/3.5 Fish-Eye CS"}, "is not rectilinear"),
     ],
 )
 def test_lenses_that_lensfun_does_not_have_or_not_so(setting, said):
@@ -270,7 +273,7 @@ def test_a_lens_by_a_part_of_its_name_is_named(clpipe, write_exr):
     pytest.importorskip("lensfunpy", reason="needs lensfunpy, in the extra lens")
     pytest.importorskip("jinja2", reason="needs jinja2, in the extra report")
     run = ("run", write_exr("a.exr", np.full((20, 30, 3), 0.5)), "--device", "numpy")
-    taken = "warning: lens: 'Canon 50mm' is a part of a name, and Canon EF 50mm f/1.8 is taken"
+    taken = "warning: lens: 'Canon 50mm' is a part of a name, and clpipe uses Canon EF 50mm f/1.8"
     assert taken in clpipe(*run, "-o", "o", "--lens", "Canon 50mm").stderr
     assert json.loads(Path("o/a.json").read_text())["lens"] == "Canon EF 50mm f/1.8"
     clpipe("report", "o")
@@ -318,7 +321,7 @@ def test_what_is_said_without_lensfunpy(clpipe, monkeypatch):
     by_name._loaded.cache_clear()
     monkeypatch.setitem(sys.modules, "lensfunpy", None)
     said = clpipe("plan", "--lens", "any", status=2).stderr
-    assert "lensfunpy, which is not here; pip install lensfunpy" in said
+    assert "lensfunpy, which is not installed; pip install lensfunpy" in said
 
 
 def test_kernels_are_not_refused_for_the_image_that_compiles_them(device):
@@ -330,4 +333,4 @@ def test_kernels_are_not_refused_for_the_image_that_compiles_them(device):
 
 def test_the_table_of_parameters_has_no_message_where_a_focal_length_is_to_be_set(clpipe):
     shown = clpipe("stages", "distortion").stdout
-    assert "the middle" in shown and "set fx (px)" not in " ".join(shown.split())
+    assert "the centre" in shown and "set fx (px)" not in " ".join(shown.split())

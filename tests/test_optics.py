@@ -207,7 +207,7 @@ def test_the_poses_of_a_35_mm_render_are_those_of_its_depth_of_field(clpipe, poi
     clpipe(*posed, "-o", "p", "--focal-length", 35)
     assert spread_of(Path("p/a.exr")) == pytest.approx(disc(35, 0.5, 0.1), abs=0.3)
     said = clpipe(*posed, "-o", "q", status=2).stderr
-    assert "the focal length is 350 px, but what that is in mm is not known: set" in said
+    assert "the focal length is 350 px, and its length in mm is not known; set" in said
 
 
 def test_a_lens_is_that_of_the_depth_of_field(clpipe, point):
@@ -222,7 +222,7 @@ def test_a_lens_by_name_is_that_of_the_depth_of_field(clpipe, point):
     clpipe(*run, *ZOOM, "--set", "render.sensor_width=36", "-o", "o")
     assert spread_of(Path("o/a.exr")) == pytest.approx(disc(70, 2.8, 0.1), abs=0.3)
     said = clpipe(*run, *ZOOM, "--set", "render.focal_length=35", "-o", "p", status=2).stderr
-    assert "render.focal_length: 35, but focal_length: 70; set one" in said
+    assert "render.focal_length: 35 contradicts focal_length: 70; set one" in said
 
 
 @pytest.mark.slow
@@ -353,7 +353,7 @@ def test_a_pixel_pitch_says_how_wide_the_sensor_is():
     lens = by_name.LensCalibration("a", 50.0, {}, {})
     # 50 mm on pixels of 500 um, which is not the sensor of the lens's camera.
     Optics(fx=100.0, pixel_pitch=500.0).with_lens(lens).for_image(60, 40)
-    with pytest.raises(RequestError, match="makes it 83 px on the sensor of its camera"):
+    with pytest.raises(RequestError, match="gives 83 px on its camera's sensor"):
         Optics(fx=100.0, places={"fx": "render.fx"}).with_lens(lens).for_image(60, 40)
 
 

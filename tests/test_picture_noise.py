@@ -136,7 +136,9 @@ def test_a_report_on_several_isos(tmp_path):
         return make_chain(settings_from(settings)).steps[0].method.sigma
 
     assert sigma(100) == pytest.approx((0.01,) * 3) and sigma(800) == pytest.approx((0.03,) * 3)
-    with pytest.raises(RequestError, match=r"isos\.json has no ISO 400, only 100, 800"):
+    with pytest.raises(
+        RequestError, match=r"isos\.json does not contain ISO 400; it contains 100, 800"
+    ):
         sigma(400)
 
 
@@ -165,20 +167,20 @@ def test_what_is_refused(method, report, tmp_path):
     broken.write_text("{")
     sigma = [0.1, 0.2, 0.3]
     for values, message in (
-        ({}, "picture_noise: needs sigma, or measured"),
-        ({"sigma": sigma, "measured": report()}, "both sigma and measured"),
+        ({}, "picture_noise: set sigma, or measured"),
+        ({"sigma": sigma, "measured": report()}, "sigma and measured are both set"),
         ({"measured": "nowhere.json"}, r"picture_noise\.measured.*cannot be read: No such file"),
         ({"measured": str(tmp_path)}, "cannot be read"),
         ({"measured": str(broken)}, "not a report of clpipe measure --json"),
         (
             {"measured": report("raw.json", kind="mosaic")},
-            "reports on mosaic.*measure finished pictures",
+            "report is on mosaic.*measure finished images",
         ),
         ({"sigma": [0.1, 0.2, 1.5]}, r"picture_noise\.sigma.*1\.5.*less than or equal to 1"),
         ({"sigma": [0.1, -0.2, 0.3]}, "greater than or equal to 0"),
         ({"sigma": [0.1]}, "sigma"),
         ({"sigma": "loud"}, "sigma"),
-        ({"sigma": sigma, "correlated": True}, "correlated is true, but nothing is measured"),
+        ({"sigma": sigma, "correlated": True}, "correlated is true, but no measured noise is set"),
         ({"sigma": sigma, "correlation": [0.9, 0.9, -0.9]}, "no three channels can be correlated"),
         ({"sigma": sigma, "correlation": [2, 0, 0]}, "less than or equal to 1"),
         ({"sigma": sigma, "match": "flatt"}, "picture_noise.match"),

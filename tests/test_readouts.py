@@ -86,7 +86,9 @@ def test_each_part_is_there_alone(develop):
     assert 14 < second.max() <= 16
     assert np.array_equal(merged[first < 0.85], first[first < 0.85])
     assert np.array_equal(merged[first >= 0.95], second[first >= 0.95])
-    with pytest.raises(RequestError, match=r"sensor_noise\.part: found 2; there are 0 to 1"):
+    with pytest.raises(
+        RequestError, match=r"sensor_noise\.part: readout 2 does not exist; choose 0 to 1"
+    ):
         made(part=2)
 
 
@@ -161,8 +163,11 @@ KNOTS = "[[0,0],[4096,1024],[16383,4095]]"
     [
         (("quantize.method=pwl", "quantize.knots=[[0,0]]"), "knots: found .*expected pairs"),
         (("quantize.method=pwl", "quantize.knots=[[0,0],[9,9],[5,10]]"), "rising in both"),
-        (("quantize.method=pwl", "quantize.knots=[[0,0],[16383,5000]]"), "12 bits do not hold"),
-        (("quantize.method=pwl", "quantize.knots=[[0,0],[99,50]]"), "but the white level is 16383"),
+        (("quantize.method=pwl", "quantize.knots=[[0,0],[16383,5000]]"), "does not fit in 12 bits"),
+        (
+            ("quantize.method=pwl", "quantize.knots=[[0,0],[99,50]]"),
+            "must be the white level, 16383",
+        ),
         (("normalize.method=pwl",), "no knots are known"),
         (
             ("normalize.method=pwl", f"normalize.knots={KNOTS}"),
@@ -170,12 +175,12 @@ KNOTS = "[[0,0],[4096,1024],[16383,4095]]"
         ),
         (
             ("quantize.method=pwl", "normalize.method=linear"),
-            "set normalize.method=pwl, which goes",
+            "does not undo the curve of quantize.method=pwl; set normalize.method=pwl, or",
         ),
         (("quantize.method=pwl", "normalize.white_level=9000"), "set normalize.method=pwl"),
         (
             ("quantize.method=pwl", "normalize.method=pwl", f"normalize.knots={KNOTS}"),
-            "but those of quantize are .*leave normalize.knots out",
+            "differ from those of quantize, .*remove normalize.knots",
         ),
         (("sensor_noise.method=dual_gain",), "found a white level of 262143, but it holds DN of"),
         (("quantize.method=pwl",), "by a curve"),

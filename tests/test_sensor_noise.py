@@ -194,11 +194,11 @@ def test_hot_pixels_can_be_seen_where_the_camera_does_not_say_how_hot(develop):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"chi": 100.0}, "sensor_noise: .*need both chi and theta; found chi only"),
+        ({"chi": 100.0}, "sensor_noise: .*need both chi and theta; only chi is set"),
         ({"chi": 1e3, "theta": 1.0, "system_gain": 2.0}, "set the noise in one parametrisation"),
         (
             {"a": 1e-3, "system_gain": 2.0},
-            "sensor_noise: set the noise in one parametrisation; found a",
+            "sensor_noise: set the noise in one parametrisation; a",
         ),
         ({"chi": 1e3, "theta": 1.0, "p0": 0.1}, "sensor_noise: p0 = 0.1 makes b negative"),
         ({"method": "poisson", "a": 0.0}, "poisson needs an a above 0"),
@@ -303,5 +303,7 @@ def test_bit_depths(develop, bits):
 
 
 def test_bit_depths_that_do_not_fit_their_levels():
-    with pytest.raises(RequestError, match="white_level must be below 4096, which 12 bits hold"):
+    with pytest.raises(
+        RequestError, match="white_level must be below 4096, because the raw image has 12 bits"
+    ):
         make_chain(settings_from({"quantize": {"bits": 12, "white_level": 5000.0}}))

@@ -1,6 +1,5 @@
-"""Cameras: profiles of sensors and the noise model, and lenses by their names.
+"""Cameras: profiles of sensors, the noise model, and lenses by name.
 
-Nothing here reads images or knows the chain; a profile, one of the built-in TOML files or a user's,
-answers "what is a and b at this ISO".
-It imports ``base`` only.
+A profile is a built-in TOML file or your own, and gives a and b at an ISO. Nothing here reads
+images or depends on the chain. This package imports ``base`` only.
 """

@@ -1,4 +1,4 @@
-"""A gain stage: what was measured of a sensor at the ISOs that share one conversion gain."""
+"""A gain stage: measurements of a sensor at the ISOs that share one conversion gain."""
 
 import math
 from bisect import bisect_right
@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from clpipe.base.tracing import call
 
-LARGEST = 1e9  # figure of a sensor; its square is a number, too
+LARGEST = 1e9  # value of a sensor; its square must be finite as well
 Positive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
 Offset = Annotated[float, Field(ge=-65535, le=65535, allow_inf_nan=False)]
@@ -29,7 +29,7 @@ class GainStage(BaseModel):
 
     iso: Annotated[tuple[Positive, ...], Field(min_length=1)]
     system_gain: tuple[Positive, ...]  # DN/e-
-    read_noise: tuple[Positive, ...]  # DN, of a pixel, before it is rounded to whole DN
+    read_noise: tuple[Positive, ...]  # DN, of a pixel, before rounding to whole DN
     tukey_lambda: tuple[TukeyLambda, ...] | None = None  # shape of the read noise
     row_noise: tuple[NotNegative, ...] | None = None  # DN, new in each frame
     column_noise: tuple[NotNegative, ...] | None = None  # DN, fixed
@@ -49,16 +49,16 @@ class GainStage(BaseModel):
         return self
 
     def at(self, iso: float, values: tuple[float, ...]) -> float:
-        """The value in DN of one of this stage's tables at an ISO.
+        """Return the value in DN of one of this stage's tables at an ISO.
 
-        The table is converted to electrons and interpolated linearly in log ISO; outside the
-        table, the value in electrons stays that of the nearest end.
+        The table is converted to electrons and interpolated linearly in log ISO. Outside the table,
+        the value in electrons is that of the nearest end.
         """
         electrons = self.between(iso, _ratios(values, self.system_gain))
         return electrons * self.gain_at(iso)
 
     def between(self, iso: float, values: Sequence[float]) -> float:
-        """The value of a table without a unit at an ISO: linear in log ISO, level beyond its ends.
+        """Return the value of a unitless table at an ISO: linear in log ISO, level outside.
 
         >>> stage = GainStage(iso=(100, 400), system_gain=(1, 4), read_noise=(2, 3))
         >>> round(stage.between(200, (0.1, 0.2)), 6), stage.between(800, (0.1, 0.2))
@@ -71,16 +71,16 @@ class GainStage(BaseModel):
         return [math.log(iso) for iso in self.iso]
 
     def gain_at(self, iso: float) -> float:
-        """The system gain in DN/e-, interpolated in proportion to the ISO."""
+        """Return the system gain in DN/e-, interpolated in proportion to the ISO."""
         return self.between(iso, _ratios(self.system_gain, self.iso)) * iso
 
     @cached_property
     def adc_noise(self) -> float:
         """The part of the read noise that arises after the gain, in DN.
 
-        A least-squares fit of read_noise^2 = gain^2 * before^2 + after^2 (EMVA 1288), with each
-        ISO's residual relative to its read_noise^2. It is limited to the smallest read noise, and
-        0 where the stage has fewer than three ISOs, too few to fit.
+        It is a least-squares fit of read_noise^2 = gain^2 * before^2 + after^2 (EMVA 1288), with
+        each ISO's residual relative to its read_noise^2. It is limited to the smallest read noise.
+        With fewer than three ISOs, too few to fit, it is 0.
         """
         if len(self.iso) < 3:
             return 0.0
@@ -90,7 +90,7 @@ class GainStage(BaseModel):
         return float(np.sqrt(np.clip(after2, 0, read2.min())))
 
 
-@lru_cache(maxsize=1024)  # one object for the same tables, so that it is traced once
+@lru_cache(maxsize=1024)  # the same object for the same tables, so that it is traced once
 def _ratios(values: tuple[float, ...], over: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(value / divisor for value, divisor in zip(values, over, strict=True))
 
@@ -98,7 +98,7 @@ def _ratios(values: tuple[float, ...], over: tuple[float, ...]) -> tuple[float, 
 def _interpolated(
     iso: float, isos: Sequence[float], logs: Sequence[float], values: Sequence[float]
 ) -> float:
-    """The value at an ISO of a table; see :meth:`GainStage.between`."""
+    """Return the value at an ISO of a table; see :meth:`GainStage.between`."""
     after = bisect_right(isos, iso)
     if after in (0, len(isos)):
         return values[0 if after == 0 else -1]

@@ -1,4 +1,4 @@
-"""Lenses by name, from lensfun's database: what they do to a picture, as parameters of stages."""
+"""Lenses by name, from lensfun's database, as parameters of stages."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -16,23 +16,23 @@ from clpipe.base.text import one_line
 from clpipe.camera.profile import Camera
 
 INSTALL = installing("lensfunpy")
-FAR = 1000.0  # m, at which lensfun's calibrations for infinity stand
-OTHERS = 2  # words of a lens's name, beside the maker, that may be left out
-RECTILINEAR = "RECTILINEAR"  # lensfun's type of the lenses that are known here
-SAME_CROP = 1.01  # ratio of crop factors that are one's
-ASPECT = 1.5  # of the pictures that a lens was calibrated with, where the database says nothing
+FAR = 1000.0  # m, for lensfun's calibrations at infinity
+OTHERS = 2  # words of a lens's name, besides the maker, that you may omit
+RECTILINEAR = "RECTILINEAR"  # lensfun's type of the lenses that clpipe supports
+SAME_CROP = 1.01  # ratio of crop factors that count as equal
+ASPECT = 1.5  # of the images that a lens was calibrated with, if the database does not contain it
 
 
 @dataclass(frozen=True)
 class LensCalibration:
-    """Calibration of a lens, set in some way, as lensfun knows it.
+    """lensfun's calibration of a lens at one setting.
 
     Args:
-        name: of the lens, with its maker.
+        name: name of the lens, with its maker.
         focal_length: in mm.
-        distortion, vignetting: the method of the stage and its parameters; empty where lensfun
-            knows none.
-        crop_factor: of the sensor that the picture is of: the diagonal of 35 mm film over its own.
+        distortion, vignetting: the method of the stage and its parameters; empty if lensfun has no
+            data.
+        crop_factor: of the image's sensor: the diagonal of 35 mm film over its own.
         is_of_smaller_sensor: whether it was calibrated on a smaller sensor than the camera's.
     """
 
@@ -51,20 +51,21 @@ def calibration_of(
     aperture: float | None = None,
     focus_distance: float | None = None,
 ) -> LensCalibration:
-    """The calibration of a lens, as parameters of the stages that bend and darken a picture.
+    """Return the calibration of a lens, as parameters of the stages distortion and vignetting.
 
     Args:
-        name: the model, or a part of it that belongs to no other.
-        camera: where lensfun knows it, the picture is of its sensor's size; else of that of the
-            camera that the lens was calibrated on.
-        focal_length: in mm; None is that of a lens that has one alone.
+        name: the model, or a part of it that belongs to no other model.
+        camera: if lensfun knows it, the image has its sensor's size. Else the sensor is that of the
+            camera on which the lens was calibrated.
+        focal_length: in mm; None is that of a prime lens.
         aperture: the f-number; without it there is no vignetting.
         focus_distance: in m; None is far away.
 
     Raises:
-        RequestError: lensfunpy is not installed, there is no such lens, or it cannot be set so.
+        RequestError: lensfunpy is not installed, there is no such lens, or it cannot be set to
+            these values.
     """
-    # A camera is no key of a cache.
+    # A camera cannot be a key of a cache.
     models = camera.make, camera.model, *camera.aliases
     return _calibration(name, models, focal_length, aperture, focus_distance)
 
@@ -84,7 +85,7 @@ def _calibration(
     ratio = lens.crop_factor / (crop or lens.crop_factor)
     falloff: dict[str, Any] = {}
     if bend := _bend(lens, focal):
-        # lensfun's r = 1 is half the short side of the picture that the lens was calibrated with.
+        # lensfun's r = 1 is half the short side of the image that the lens was calibrated with.
         bend |= {"unit": 1 / (hypot(1, _aspect(lens)) * ratio)}
     if aperture is not None:
         _check_aperture(lens, aperture)
@@ -98,7 +99,7 @@ def _calibration(
 
 
 def name_note(name: str) -> str:
-    """What is to be said of a lens that is named by a part of its name; "" if it is named in full.
+    """Return a warning if a lens is named by a part of its name, else "".
 
     Raises:
         KeyedError: lensfunpy is not installed, or there is no such lens, or several.
@@ -107,13 +108,13 @@ def name_note(name: str) -> str:
     if not _left_out(lens, _words(name)):
         return ""
     return (
-        f"warning: lens: '{one_line(name)}' is a part of a name, and {_full(lens)} is taken; to be "
-        "sure of the lens, name it in full"
+        f"warning: lens: '{one_line(name)}' is a part of a name, and clpipe uses {_full(lens)}; "
+        "to be sure of the lens, use its full name"
     )
 
 
 def lens_names() -> list[str]:
-    """All lenses of lensfun's database that :func:`calibration_of` takes, in their order.
+    """Return all lenses of lensfun's database that :func:`calibration_of` accepts, in their order.
 
     Raises:
         KeyedError: lensfunpy is not installed.
@@ -123,7 +124,7 @@ def lens_names() -> list[str]:
 
 
 def _bend(lens: Any, focal: float) -> dict[str, Any]:
-    """The method of ``distortion`` and its coefficients; empty where lensfun knows none."""
+    """Return the method of ``distortion`` and its coefficients; empty if lensfun has no data."""
     bend = lens.interpolate_distortion(focal)
     lateral = lens.interpolate_tca(focal)
     names = {"POLY3": ("k1",), "POLY5": ("k1", "k2"), "PTLENS": ("a", "b", "c")}
@@ -143,7 +144,8 @@ def _database() -> Any:
         return _loaded()
     except ImportError:
         raise KeyedError(
-            "lens", f"lens: lensfun's database comes with lensfunpy, which is not here; {INSTALL}"
+            "lens",
+            f"lens: lensfun's database comes with lensfunpy, which is not installed; {INSTALL}",
         ) from None
 
 
@@ -155,7 +157,7 @@ def _loaded() -> Any:
 
 
 def _words(text: str) -> list[str]:
-    """The words of a lens's name, however they are divided, without mm and f.
+    """Return the words of a lens's name, regardless of separators, without mm and f.
 
     >>> _words("EF 24-70mm f/2.8L"), _words("ef24-70 F2.8 l")
     (['ef', '24', '70', '2.8', 'l'], ['ef', '24', '70', '2.8', 'l'])
@@ -165,17 +167,18 @@ def _words(text: str) -> list[str]:
 
 
 def _full(lens: Any) -> str:
-    """Maker and model, the maker once."""
+    """Return maker and model, without repeating the maker."""
     of_maker = lens.model.lower().startswith(lens.maker.lower())
     return lens.model if of_maker else f"{lens.maker} {lens.model}"
 
 
 def _found(database: Any, name: str, crop: float | None) -> Any:
-    """The lens of a name: of those that have all its words, the one with the fewest others, and
-    not many (:data:`OTHERS`).
+    """Return the lens with this name, or the one with all its words and the fewest others.
 
-    Of several calibrations of one lens it is that on the largest sensor that is not larger than the
-    camera's, as lensfun chooses.
+    It may have at most :data:`OTHERS` other words.
+
+    If a lens has several calibrations, the one on the largest sensor that is not larger than the
+    camera's is used, like in lensfun.
 
     Raises:
         KeyedError: there is no such lens, or several.
@@ -191,9 +194,9 @@ def _found(database: Any, name: str, crop: float | None) -> Any:
         by_lower = {each.lower(): each for each in names}
         near = [by_lower[each] for each in get_close_matches(name.lower(), by_lower, 3, 0.3)]
         nearest = (
-            f"the nearest are {', '.join(near)}" if near else "name one by its maker and model"
+            f"the nearest are {', '.join(near)}" if near else "use a name with its maker and model"
         )
-        raise KeyedError("lens", f"lens: lensfun knows no '{one_line(name)}'; {nearest}")
+        raise KeyedError("lens", f"lens: lensfun has no lens '{one_line(name)}'; {nearest}")
     fewest = min(count for count, _ in having)
     best = [lens for count, lens in having if count == fewest]
     models = sorted({_full(lens) for lens in best})
@@ -202,25 +205,26 @@ def _found(database: Any, name: str, crop: float | None) -> Any:
         more = f", or {len(models) - 5} more" if len(models) > 5 else ""
         listed = " or ".join(models[:5])
         raise KeyedError(
-            "lens", f"lens: '{one_line(name)}' may be {listed}{more}; name one of them in full"
+            "lens",
+            f"lens: '{one_line(name)}' may mean {listed}{more}; use the full name of one",
         )
     smaller = [lens for lens in best if crop and lens.crop_factor <= crop * SAME_CROP]
     return max(smaller or best, key=lambda lens: lens.crop_factor if smaller else -lens.crop_factor)
 
 
 def _left_out(lens: Any, wanted: Sequence[str]) -> int:
-    """How many words of a lens's name, beside the maker, are not among those that are wanted."""
+    """Return how many words of a lens's name, besides the maker, were not requested."""
     maker = set(_words(lens.maker)) - set(wanted)
     return len(_words(_full(lens))) - len(wanted) - len(maker)
 
 
 def _missing(wanted: Sequence[str], words: Sequence[str]) -> bool:
-    """Whether a word is wanted more often than it is there."""
+    """Return whether a word is requested more often than it occurs."""
     return any(words.count(word) < wanted.count(word) for word in wanted)
 
 
 def _crop_factor(database: Any, make: str, *models: str) -> float | None:
-    """The crop factor of a camera, None where lensfun does not know it."""
+    """Return the crop factor of a camera, None if lensfun does not know it."""
     for model in models:
         for found in database.find_cameras(make, model):
             return float(found.crop_factor)
@@ -228,17 +232,18 @@ def _crop_factor(database: Any, make: str, *models: str) -> float | None:
 
 
 def _focal_length(lens: Any, focal: float | None) -> float:
-    """A focal length that the lens has, in mm.
+    """Return a focal length of the lens, in mm.
 
     Raises:
-        RequestError: it has no such one, or several and none is set; or it is a fisheye.
+        RequestError: the lens does not have this focal length, or it has several and none is set,
+            or it is a fisheye.
     """
     name, low, high = _full(lens), lens.min_focal, lens.max_focal or lens.min_focal
     if lens.type.name != RECTILINEAR:
         raise KeyedError(
             "lens",
-            f"lens: {name} is no rectilinear lens, and lensfun describes it as departing from "
-            "another projection than a render's; set distortion.method=fisheye and its k1 to k4",
+            f"lens: {name} is not rectilinear, and lensfun describes it relative to another "
+            "projection than a render's; set distortion.method=fisheye and its k1 to k4",
         )
     if focal is None:
         if low != high:
@@ -247,36 +252,37 @@ def _focal_length(lens: Any, focal: float | None) -> float:
     if not low - 0.05 <= focal <= high + 0.05:
         raise KeyedError(
             "focal_length",
-            f"focal_length: found {focal:g} mm, but {name} has {low:g}"
-            + (f" to {high:g} mm" if low != high else " mm alone"),
+            f"focal_length: {focal:g} mm is not possible, because {name} has {low:g}"
+            + (f" to {high:g} mm" if low != high else " mm only"),
         )
     return focal
 
 
 def _check_aperture(lens: Any, aperture: float) -> None:
-    """See that a lens can be set to an f-number, where lensfun knows its range.
+    """Check that a lens can be set to an f-number, if lensfun knows its range.
 
     Raises:
         KeyedError: it cannot.
     """
-    low, high = lens.min_aperture or 0.0, lens.max_aperture or 0.0  # None where it does not
+    low, high = lens.min_aperture or 0.0, lens.max_aperture or 0.0  # None if it does not
     if (low and aperture < low - 0.06) or (high > low and aperture > high + 0.06):
         most = f" to f/{high:g}" if high > low else " and above"
         raise KeyedError(
-            "aperture", f"aperture: found f/{aperture:g}, but {_full(lens)} has f/{low:g}{most}"
+            "aperture",
+            f"aperture: f/{aperture:g} is not possible, because {_full(lens)} has f/{low:g}{most}",
         )
 
 
 def _aspect(lens: Any) -> float:
-    """The longer side over the shorter of the pictures that a lens was calibrated with."""
+    """Return the aspect ratio, long over short side, of the images a lens was calibrated with."""
     return _aspects().get((lens.maker, lens.model, round(lens.crop_factor, 3)), ASPECT)
 
 
 @cache
 def _aspects() -> dict[tuple[str, str, float], float]:
-    """The aspect ratios that the database has, by maker, model and crop factor.
+    """Return the aspect ratios in the database, by maker, model and crop factor.
 
-    lensfunpy gives all but these, so they are read in its files.
+    lensfunpy does not provide them, so they are read from its files.
     """
     import lensfunpy
 

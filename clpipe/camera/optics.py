@@ -1,7 +1,7 @@
-"""One camera's optics: focal length, aperture, focus, shutter, principal point, each stated once.
+"""One camera's optics: focal length, aperture, focus, shutter, principal point.
 
-Settings, the render's camera and the parameters of stages may state them; what one of them states
-holds for all, and what two of them state must be the same.
+Settings, the render's camera and the parameters of stages may state these facts. A fact that is
+stated in one place is valid everywhere, and two places must agree.
 """
 
 import math
@@ -14,12 +14,12 @@ from clpipe.base.errors import KeyedError, RequestError
 from clpipe.camera.lens import LensCalibration
 
 ROUNDING = 0.01  # of a length or an f-number; those of lenses are nominal
-PLACES = 1e-4  # of what counts in px
+PLACES = 1e-4  # of lengths in px
 
-NOMINAL = 0.1  # of a lens's focal length on a sensor; makers round, and shapes of pictures differ
+NOMINAL = 0.1  # of a lens's focal length on a sensor; makers round, and image shapes differ
 FILM_WIDTH, FILM_DIAGONAL = 36.0, math.hypot(36, 24)  # mm, of 35 mm film
 
-USUAL_TIME = 0.01  # s, of an exposure of which nothing says how long it is
+USUAL_TIME = 0.01  # s, default exposure time
 
 IN_PIXELS = ("fx", "fy", "cx", "cy")
 
@@ -33,14 +33,14 @@ class Optics:
         focal_length: in mm.
         sensor_width: in mm, along the longer side of the image.
         pixel_pitch: distance of the image's pixels on the sensor, um.
-        camera_angle_x: angle of view in radians, across the width of the render.
+        camera_angle_x: horizontal angle of view of the render, in radians.
         cx, cy: the principal point in px from the upper left corner of the render.
         f_number: of the aperture.
         focus_distance: in m.
         exposure_time: in s.
-        calibration: of the lens that is named.
-        is_sensor_of_lens: whether nothing states the sensor's width, and it is that of the camera
-            which the lens stands on, of a picture of 3:2; see :meth:`for_image`.
+        calibration: that of the lens with the given name.
+        is_sensor_of_lens: whether the sensor's width is not stated and is that of the lens's
+            camera, for a 3:2 image; see :meth:`for_image`.
         places: where each of them is stated.
     """
 
@@ -61,10 +61,10 @@ class Optics:
 
     @classmethod
     def of(cls, stated: Iterable[tuple[str, str, float]]) -> "Optics":
-        """The optics of statements: the place of each, the name of what it states, its value.
+        """Return the optics of statements: the place of each, the name of the fact, its value.
 
         Raises:
-            KeyedError: two contradict each other; the message names both places.
+            KeyedError: two contradict each other; the message contains both places.
 
         >>> Optics.of([("render.focal_length", "focal_length", 35.0)]).focal_length
         35.0
@@ -78,11 +78,13 @@ class Optics:
             tolerance, least = (PLACES, 0.01) if in_px else (ROUNDING, 0.0)
             if value is known or math.isclose(value, known, rel_tol=tolerance, abs_tol=least):
                 continue
-            raise KeyedError(place, f"{place}: {value:g}, but {first}: {known:g}; set one")
+            raise KeyedError(
+                place, f"{place}: {value:g} contradicts {first}: {known:g}; set one of them"
+            )
         return cls(**values, places=places)
 
     def with_lens(self, lens: LensCalibration) -> "Optics":
-        """A copy with a lens: its focal length, and its sensor where nothing says how wide one is.
+        """Return a copy with a lens: its focal length, and its sensor if no width is stated.
 
         >>> Optics().with_lens(LensCalibration("a", 50.0, {}, {}, crop_factor=1.5)).sensor_width
         24.0
@@ -97,13 +99,12 @@ class Optics:
         return replace(own, sensor_width=width, is_sensor_of_lens=True, places=places)
 
     def for_image(self, width: int, height: int) -> dict[str, float]:
-        """What is known for an image of that size in px, by the names of the fields.
+        """Return the known facts for an image of this size in px, by the names of the fields.
 
-        The sensor of a lens by name has the diagonal that lensfun knows of it, whatever the
-        picture's shape.
+        The sensor of a named lens has the diagonal from lensfun, whatever the shape of the image.
 
         Raises:
-            RequestError: the focal length in px that is stated is not that of the lens there.
+            RequestError: the stated focal length in px is not that of the lens for this image.
         """
         known, lens = self.known, self.calibration
         if lens is None:
@@ -118,29 +119,29 @@ class Optics:
         if fx and not stated and abs(fx - of_lens) > NOMINAL * of_lens:
             place = self.places.get("fx") or self.places.get("camera_angle_x")
             raise RequestError(
-                f"{place}: the focal length of this render of {width}x{height} pixels is {fx:.0f} "
-                f"px, but lens: {lens.name} at {lens.focal_length:g} mm makes it {of_lens:.0f} px "
-                f"on the sensor of its camera, {sensor:.1f} mm wide; name a lens that fits, or say "
-                "that the sensor is another with render.sensor_width"
+                f"{place}: the focal length of this render of {width}x{height} pixels is "
+                f"{fx:.0f} px, but lens: {lens.name} at {lens.focal_length:g} mm gives "
+                f"{of_lens:.0f} px on its camera's sensor, {sensor:.1f} mm wide. Use a matching "
+                "lens, or set render.sensor_width for another sensor"
             )
         return known
 
     @cached_property
     def known(self) -> dict[str, float]:
-        """The numbers that are known, by their names."""
+        """Return the known numbers, by their names."""
         return {name: value for name in NUMBERS if (value := getattr(self, name)) is not None}
 
     def without_view(self) -> "Optics":
-        """A copy in which nothing is known of focal length, sensor and principal point."""
+        """Return a copy without focal length, sensor and principal point."""
         gone: dict[str, Any] = dict.fromkeys(
             (*IN_PIXELS, "focal_length", "sensor_width", "camera_angle_x")
         )
         return replace(self, **gone, is_sensor_of_lens=False)
 
     def set_to(self, used: Mapping[str, float]) -> "Optics":
-        """A copy in which what a step used of aperture and focus holds where nothing else is known.
+        """Return a copy with the aperture and focus of a step, unless others are known.
 
-        So a default of one step is that of those behind it, and of EXIF.
+        A step's defaults are therefore also the defaults of later steps, and those in EXIF.
         """
         own = {name: used.get(name) for name in ("f_number", "focus_distance")}
         new: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""Camera profiles: what a sensor does at each ISO, from a TOML file that cites every number."""
+"""Camera profiles: a sensor's properties at each ISO, from a TOML file that cites every number."""
 
 import os
 import re
@@ -39,7 +39,7 @@ Share = Annotated[float, Field(ge=0, le=0.1)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Temperature = Annotated[float, Field(ge=-100, le=150)]  # deg C
 
-# Keys that need another one, and what that is.
+# Keys that need another key, and its description.
 NEEDED = {
     ("hot_pixel_share", "hot_pixel_level"): "the smallest extra charge of a hot pixel in e-",
     ("banding_amplitude", "banding_period"): "in rows",
@@ -48,10 +48,14 @@ NEEDED = {
 
 
 class Camera(BaseModel):
-    """A camera profile. Levels are in DN, white balance gains relative to green = 1.
+    """A camera profile. Levels are in DN, and white balance gains are relative to green = 1.
 
-    A value of None or 0 is either a fact or unknown; ``sources`` says which, and names the source
-    of each figure.
+    Use :func:`load_camera` to load one. A value of None or 0 is either a fact or unknown:
+    ``sources`` states which, and gives the source of each figure.
+
+    >>> camera = load_camera("sony-a7r2")
+    >>> camera.bits, camera.black_level, camera.white_level, camera.iso_range
+    (14, 512.0, 16383.0, (100.0, 25600.0))
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -64,7 +68,7 @@ class Camera(BaseModel):
     white_level: Annotated[float, Field(gt=0, le=65535)]
     white_balance_gains: tuple[Positive, Positive]  # red, blue
     filter_array: str = ""  # a name or rows of letters, see the stage mosaic; "" is a Bayer pattern
-    xyz_to_camera: Matrix | None = None  # XYZ to camera RGB at D65, as a DNG's ColorMatrix2
+    xyz_to_camera: Matrix | None = None  # XYZ to camera RGB at D65, like a DNG's ColorMatrix2
     row_noise_ratio: NotNegative = 0.0  # row sigma over read noise, for stages without a table
     column_noise_ratio: NotNegative = 0.0
     quantum_efficiency: Annotated[float, Field(gt=0, le=1)] | None = None  # electrons per photon
@@ -79,23 +83,24 @@ class Camera(BaseModel):
     rts_share: Share = 0.0  # of pixels with random telegraph noise
     rts_amplitude: NotNegative = 0.0  # e-, the mean distance of their two levels
     dark_current: NotNegative = 0.0  # e-/s
-    dark_current_temperature: Temperature = 20.0  # at which dark_current holds
+    dark_current_temperature: Temperature = 20.0  # at which dark_current was measured
     dark_current_doubling: Positive | None = None  # K; None: the same at every temperature
-    dark_current_spread: Fraction = 0.0  # how pixels differ, standard deviation over mean
-    dark_shading_slope: NotNegative = 0.0  # DN for each ISO, standard deviation over the sensor
-    dark_shading_offset: NotNegative = 0.0  # DN, the same of what does not depend on the ISO
+    dark_current_spread: Fraction = 0.0  # variation between pixels, standard deviation over mean
+    dark_shading_slope: NotNegative = 0.0  # DN per ISO, standard deviation over the sensor
+    # DN, likewise for the part that does not depend on the ISO
+    dark_shading_offset: NotNegative = 0.0
     dark_shading_length: Positive = 500.0  # px, over which both change
     banding_amplitude: NotNegative = 0.0  # e-, of a wave along the columns
     banding_period: Positive | None = None  # rows
-    # Where an exposure is read more than once: how much less sensitive each further readout is, and
-    # its read noise in DN over that of the first, which the gain stages are of.
+    # With several readouts: the ratio between the sensitivities of one and the next, and the read
+    # noise in DN of later ones over the first one's. The gain stages describe the first.
     readout_ratio: Annotated[float, Field(gt=1, le=1024)] | None = None
     readout_noise: NotNegative | None = None
-    # The light that the large one of two photodiodes sees over that of the small one, and the
-    # charge that leaks into the small one, over that of the large one.
+    # The light that the large photodiode sees over that of the small one, and the charge that leaks
+    # into the small one, over that of the large one.
     photodiode_ratio: Annotated[float, Field(gt=1, le=10_000)] | None = None
     photodiode_crosstalk: Annotated[float, Field(ge=0, le=0.5)] | None = None
-    pixel_pitch: Positive | None = None  # um, from the centre of a photosite to the next one's
+    pixel_pitch: Positive | None = None  # um, between the centres of adjacent photosites
     iso_range: tuple[Positive, Positive]
     gain_stages: Annotated[tuple[GainStage, ...], Field(min_length=1)]
     sources: dict[str, str]
@@ -114,10 +119,12 @@ class Camera(BaseModel):
             if getattr(self, key) and not getattr(self, needed):
                 raise ValueError(f"{key} needs {needed}, {text}")
         if self.tukey_lambda is not None and any(s.tukey_lambda for s in self.gain_stages):
-            raise ValueError("tukey_lambda is for every ISO, or in gain_stages; found both")
+            raise ValueError(
+                "tukey_lambda is set both for every ISO and in gain_stages; set one of them"
+            )
         low, high = self.iso_range
         if low > high:
-            raise ValueError(f"iso_range must ascend; found {low:g} and {high:g}")
+            raise ValueError(f"iso_range must ascend; it is {low:g} to {high:g}")
         isos = [iso for stage in self.gain_stages for iso in stage.iso]
         if isos != sorted(set(isos)):
             raise ValueError("gain_stages must ascend in iso and not overlap")
@@ -138,26 +145,26 @@ class Camera(BaseModel):
         return int(self.white_level).bit_length()
 
     def srgb_to_camera(self) -> Doubles:
-        """The 3x3 matrix from linear sRGB to white-balanced camera RGB; it maps grey to grey.
+        """Return the matrix from linear sRGB to white-balanced camera RGB, (3, 3); keeps grey.
 
-        It is the product of sRGB to XYZ and XYZ to camera RGB, each row scaled to the sum 1, which
-        is what white balance does (Coffin, dcraw: cam_xyz_coeff).
+        It is the product of sRGB to XYZ and XYZ to camera RGB, with each row scaled to the sum 1,
+        like by white balance (Coffin, dcraw: cam_xyz_coeff).
 
         Raises:
             RequestError: the profile has no ``xyz_to_camera``.
         """
         if self.xyz_to_camera is None:
-            raise RequestError(f"camera {self.name}: its profile has no xyz_to_camera matrix")
+            raise RequestError(f"camera {self.name}: its profile contains no xyz_to_camera matrix")
         matrix = np.array(self.xyz_to_camera) @ SRGB_TO_XYZ
         return matrix / matrix.sum(1, keepdims=True)
 
     def noise(self, iso: float) -> NoiseModel:
-        """Shot and read noise at an ISO: a = K / range, b = (read noise / range)^2 (EMVA 1288).
+        """Return shot and read noise at an ISO: a = K / range, b = (read noise / range)^2.
 
-        Between the ISOs of a gain stage, K / ISO is interpolated (K the system gain), and read
-        noise is interpolated in electrons, linearly in log ISO. A gain stage holds until the next
-        one begins. Beyond the last measured ISO, K stays proportional to the ISO and read noise
-        stays the same in electrons.
+        The formulas are those of EMVA 1288, with K the system gain. Between the ISOs of a gain
+        stage, K / ISO is interpolated. Read noise is interpolated in electrons, linearly in log
+        ISO. A gain stage is valid until the next one begins. Above the last measured ISO, K stays
+        proportional to the ISO, and read noise is constant in electrons.
 
         Raises:
             RequestError: the ISO is outside the camera's range, pushed by two stops.
@@ -175,12 +182,12 @@ class Camera(BaseModel):
         )
 
     def row_noise(self, iso: float) -> float:
-        """Standard deviation of row offsets in signal units; raises as :meth:`noise`."""
+        """Return the standard deviation of row offsets in signal units; see :meth:`noise`."""
         stage = self.gain_stage(iso)
         return self._line_noise(iso, stage, stage.row_noise, self.row_noise_ratio)
 
     def column_noise(self, iso: float) -> float:
-        """Standard deviation of column offsets in signal units; raises as :meth:`noise`."""
+        """Return the standard deviation of column offsets in signal units; see :meth:`noise`."""
         stage = self.gain_stage(iso)
         return self._line_noise(iso, stage, stage.column_noise, self.column_noise_ratio)
 
@@ -191,15 +198,15 @@ class Camera(BaseModel):
         return dn / self.signal_range
 
     def tukey_lambda_at(self, iso: float) -> float | None:
-        """The shape of the read noise at an ISO; None is Gaussian. Raises as :meth:`noise`."""
+        """Return the shape of the read noise at an ISO; None is Gaussian. See :meth:`noise`."""
         stage = self.gain_stage(iso)
         table = stage.tukey_lambda
         return stage.between(iso, table) if table else self.tukey_lambda
 
     def color_bias(self, iso: float) -> Offsets:
-        """The fixed errors of the black level of R, G in R's rows, G in B's rows and B, in signal.
+        """Return fixed errors of the black level, in signal: R, G in R's rows, G in B's rows, B.
 
-        Raises as :meth:`noise`.
+        Raises like :meth:`noise`.
         """
         stage = self.gain_stage(iso)
         if not stage.color_bias:
@@ -210,36 +217,39 @@ class Camera(BaseModel):
         return one, two, three, four
 
     def black_level_error(self, iso: float) -> float:
-        """Standard deviation of the black level's error in a frame, in signal; as :meth:`noise`."""
+        """Return the standard deviation of the black level's error in a frame, in signal units.
+
+        Raises like :meth:`noise`.
+        """
         stage = self.gain_stage(iso)
         return self._line_noise(iso, stage, stage.black_level_error, 0.0)
 
     def signal_of(self, electrons: float, iso: float) -> float:
-        """The signal that a charge in e- makes at an ISO; raises as :meth:`noise`."""
+        """Return the signal of a charge in e- at an ISO; raises like :meth:`noise`."""
         return electrons * self.noise(iso).a
 
     @property
     def pushed_range(self) -> tuple[float, float]:
-        """The range and two stops more, to which cameras push without more gain in the sensor."""
+        """The range plus two stops, to which cameras push without more gain in the sensor."""
         low, high = self.iso_range
         return low, high * PUSHED
 
     def check_iso(self, iso: float, pushed: bool = False) -> None:
-        """See that the camera has an ISO, or may be pushed to it.
+        """Check that the camera has an ISO, or may be pushed to it.
 
         Raises:
-            RequestError: it has not.
+            RequestError: it does not.
         """
         low, high = self.pushed_range if pushed else self.iso_range
         if not low <= iso <= high:
             low, high = self.iso_range
             raise RequestError(
-                f"iso: found {iso:g}, but camera {self.name} goes from {low:g} to {high:g}; use "
-                f"{min(max(iso, low), high):g}{_cameras_beyond(self, iso)}"
+                f"iso: found {iso:g}, but camera {self.name} goes from {low:g} to "
+                f"{high:g}; use {min(max(iso, low), high):g}{_cameras_beyond(self, iso)}"
             )
 
     def gain_stage(self, iso: float) -> GainStage:
-        """The gain stage of an ISO: the last one that begins at or below it, else the first.
+        """Return the gain stage of an ISO: the last one that begins at or below it, else the first.
 
         Raises:
             RequestError: the ISO is outside the camera's range, pushed by two stops.
@@ -251,13 +261,17 @@ class Camera(BaseModel):
 
 @cache
 def built_in_cameras() -> dict[str, Path]:
-    """The paths of the profiles inside the package, by name."""
+    """The paths of the profiles inside the package, by name.
+
+    >>> built_in_cameras()["sony-a7r2"].name
+    'sony-a7r2.toml'
+    """
     folder = Path(str(resources.files("clpipe.camera") / "profiles"))
     return {path.stem: path for path in sorted(folder.glob("*.toml"), key=lambda path: path.stem)}
 
 
 def comparable(name: str) -> str:
-    """The name of a camera as names are compared: what makers, people and files write differently.
+    """Return the name of a camera in a form that makers, people and files share.
 
     >>> comparable("NIKON CORPORATION NIKON D850") == comparable("nikon-d850") == "nikond850"
     True
@@ -268,7 +282,7 @@ def comparable(name: str) -> str:
 
 @cache
 def camera_names() -> dict[str, str]:
-    """The built-in cameras by all that they are called, as :func:`comparable` has it."""
+    """Return the built-in cameras by all their names, in the form of :func:`comparable`."""
     names: dict[str, str] = {}
     for name in built_in_cameras():
         camera = load_camera(name)
@@ -278,7 +292,7 @@ def camera_names() -> dict[str, str]:
 
 
 def built_in_name(name: str) -> str | None:
-    """The name of a built-in camera by its name, its model, or its make and model; else None.
+    """Return the name of a built-in camera by name, model, or make and model; else None.
 
     >>> built_in_name("Canon 5D Mark II"), built_in_name("sony ilce-7rm2"), built_in_name("D1")
     ('canon-5d2', 'sony-a7r2', None)
@@ -289,7 +303,7 @@ def built_in_name(name: str) -> str | None:
 
 
 def cameras_called(name: str) -> list[str]:
-    """The built-in cameras that have all words of a text in one of their names.
+    """Return the built-in cameras that have all words of a text in one of their names.
 
     >>> cameras_called("nikon d8")
     []
@@ -301,7 +315,7 @@ def cameras_called(name: str) -> list[str]:
 
 
 def similar_cameras(name: str) -> list[str]:
-    """The built-in cameras that a shortened or misspelt name may stand for."""
+    """Return the built-in cameras that a shortened or misspelt name may mean."""
     by_name = camera_names()
     near = (by_name[found] for found in alike(comparable(name), by_name))
     return cameras_called(name) or list(dict.fromkeys(near))
@@ -309,7 +323,7 @@ def similar_cameras(name: str) -> list[str]:
 
 @cache
 def _full_names() -> dict[str, str]:
-    """The built-in cameras by each of their names, with the maker."""
+    """Return the built-in cameras by each of their names, with the maker."""
     full: dict[str, str] = {}
     for name in built_in_cameras():
         camera = load_camera(name)
@@ -319,22 +333,25 @@ def _full_names() -> dict[str, str]:
 
 
 def _cameras_beyond(camera: Camera, iso: float) -> str:
-    """Which built-in cameras have an ISO that another lacks, or come nearest, for its message."""
+    """Return the part of a message that lists cameras with an ISO, or the nearest one."""
     others = [load_camera(name) for name in built_in_cameras() if name != camera.name]
     having = [o.name for o in others if o.iso_range[0] <= iso <= o.iso_range[1]]
     if having:
         more = f" or {len(having) - MOST_NAMED} others" if len(having) > MOST_NAMED else ""
-        return f", or a camera that has it: {', '.join(having[:MOST_NAMED])}{more}"
+        return f", or a camera that has this ISO: {', '.join(having[:MOST_NAMED])}{more}"
     is_high = iso > camera.iso_range[1]
     furthest = (max if is_high else min)(others, key=lambda other: other.iso_range[is_high])
     end = furthest.iso_range[is_high]
     if (end > camera.iso_range[1]) if is_high else (end < camera.iso_range[0]):
-        return f"; the built-in camera that goes furthest is {furthest.name}, to {end:g}"
-    return "; no built-in camera goes further"
+        return f"; the built-in camera that comes closest is {furthest.name}, with ISO {end:g}"
+    return "; no built-in camera comes closer"
 
 
 def load_camera(name: str) -> Camera:
     """Load a built-in camera by :func:`built_in_name`, or a file by its path (ending in .toml).
+
+    >>> load_camera("sony-a7r2")
+    Camera(sony-a7r2, ISO 100 to 25600)
 
     Raises:
         RequestError: there is no such camera or file, or the file is not a valid profile.
@@ -345,16 +362,16 @@ def load_camera(name: str) -> Camera:
     path = Path(name)
     if path.suffix != ".toml" and os.path.isfile(path):
         raise RequestError(
-            f"{path}: it is no camera profile, which ends in .toml; to make one of a DNG or a "
-            "noise model, use 'clpipe cameras import'"
+            f"{path}: not a camera profile, because these end in .toml; to make one from a DNG "
+            "or a noise model, use 'clpipe cameras import'"
         )
     if path.suffix != ".toml":
         near = similar_cameras(name)
         hint = f" (most similar: {', '.join(near)})" if near else ""
         raise RequestError(
-            f"unknown camera '{one_line(name)}': it is not built in{hint}. 'clpipe cameras' lists "
-            "those that are. For another camera, make a profile with 'clpipe cameras import' or "
-            "'clpipe calibrate', and name its .toml file"
+            f"unknown camera '{one_line(name)}': it is not built in{hint}. 'clpipe cameras' "
+            "lists those that are. For another camera, make a profile with 'clpipe cameras "
+            "import' or 'clpipe calibrate', and name its .toml file"
         )
     check_exists(path)
     try:
@@ -370,7 +387,7 @@ def _built_in(path: Path) -> Camera:
     return parse_camera(read_text(path), str(path))
 
 
-@lru_cache(maxsize=64)  # a batch loads the camera once for each image
+@lru_cache(maxsize=64)  # a batch loads the camera once per image
 def parse_camera(text: str, source: str) -> Camera:
     """Return the camera of a profile's text. ``source`` names it in messages.
 
@@ -386,7 +403,7 @@ def parse_camera(text: str, source: str) -> Camera:
 
 
 def _reason(error: ValidationError) -> str:
-    """The first problem of a profile: its key, the value found and what is allowed."""
+    """Return the first problem of a profile: its key, its value and what is allowed."""
     fault = first_fault(error)
     if fault.problem == "unknown":
         model = GainStage if "." in fault.key else Camera

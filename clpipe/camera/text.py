@@ -13,12 +13,12 @@ def profile_text(
     gain_stages: Sequence[Mapping[str, Sequence[float]]],
     sources: Mapping[str, str],
 ) -> str:
-    """The text of a profile, as :func:`clpipe.camera.profile.load_camera` reads it.
+    """Return the text of a profile, for :func:`clpipe.camera.profile.load_camera`.
 
     Args:
-        values: the keys of :class:`clpipe.camera.profile.Camera` that stand in no table.
+        values: the keys of :class:`clpipe.camera.profile.Camera` that are in no table.
         gain_stages: the tables of each :class:`clpipe.camera.profile.GainStage`.
-        sources: where each figure is from.
+        sources: the source of each figure.
     """
     lines = _lines(values)
     for stage in gain_stages:
@@ -32,7 +32,7 @@ def _lines(values: Mapping[str, Any]) -> list[str]:
 
 
 def _toml(value: Any) -> str:
-    """A TOML value: a text, a number to six digits, or a list of these.
+    """Return a TOML value: a text, a number to six digits, or a list of these.
 
     >>> _toml((100.0, 1 / 3)), _toml('a "b"')
     ('[100, 0.333333]', '"a \\\\"b\\\\""')
@@ -45,12 +45,12 @@ def _toml(value: Any) -> str:
 
 
 def check_profile_name(path: Path) -> None:
-    """See that the name of a profile ends in .toml.
+    """Check that the name of a profile ends in .toml.
 
     Raises:
         RequestError: it does not.
     """
     if path.suffix != ".toml":
         raise RequestError(
-            f"{path}: the name of a camera profile must end in .toml, such as camera.toml"
+            f"{path}: the name of a camera profile must end in .toml, for example camera.toml"
         )

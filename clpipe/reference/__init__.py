@@ -1,5 +1,5 @@
-"""NumPy twins of ``kernels/lib``: the same definitions, file by file, for the references.
+"""NumPy counterparts of ``kernels/lib``: the same definitions, file by file, for references.
 
-A function of a kernel header has the same name here and, for everything up to the raw, gives the
-same bits. Nothing here knows stages or devices. This room imports ``base`` only.
+A function has the same name as in the kernel header. For everything up to the raw image, it also
+gives the same bits. Nothing here depends on stages or devices. This package imports ``base`` only.
 """

@@ -1,6 +1,6 @@
-"""Layers beside a picture, moved as its pixels are: depth, labels, normals, optical flow, colours.
+"""Layers that are warped with their image: depth, labels, normals, optical flow, colours.
 
-Places are counted as :mod:`clpipe.reference.geometry` counts them, and exact to float64.
+Positions are counted like in :mod:`clpipe.reference.geometry`, and exact to float64.
 """
 
 from collections.abc import Sequence
@@ -15,8 +15,8 @@ from clpipe.reference.geometry import Geometry, destinations
 
 LayerKind = Literal["depth", "label", "normal", "flow", "colour"]
 
-# How each kind is resampled. Between two surfaces there is neither a depth nor a label, a normal or
-# a vector, so there these are those of one pixel.
+# How each kind is resampled. Between two surfaces there is no valid depth, label, normal or vector,
+# so values there are those of one pixel.
 RESAMPLING: dict[LayerKind, str] = {
     "depth": "its inverse bilinear within a surface, else nearest",
     "label": "nearest",
@@ -25,9 +25,9 @@ RESAMPLING: dict[LayerKind, str] = {
     "colour": "bilinear",
 }
 
-TIE = 1e-6  # px: so near to the border of two pixels, a place is on it
+TIE = 1e-6  # px: distance from the border of two pixels up to which a position is on it
 
-BLOCK = 1 << 17  # pixels that are moved at a time
+BLOCK = 1 << 17  # pixels that are warped at a time
 
 # The channels of a vector to the right and down, and the signs of those in the file.
 Vector = tuple[tuple[int, int], tuple[int, int]]
@@ -35,13 +35,13 @@ Vector = tuple[tuple[int, int], tuple[int, int]]
 
 @dataclass(frozen=True)
 class Layer:
-    """The samples of a layer, and what they are.
+    """The samples of a layer, and their meaning.
 
     Args:
-        kind: what they are.
+        kind: their kind.
         pixels: the data window, (rows, columns, channel) of any type.
         x, y: column and row of its first pixel in the image.
-        vectors: of a flow, in px from where a surface is seen to where it is seen in another frame.
+        vectors: for flow, in px from the position of a surface to its position in another frame.
     """
 
     kind: LayerKind
@@ -53,13 +53,13 @@ class Layer:
 
 @dataclass(frozen=True)
 class Move:
-    """Where some pixels of a result come from.
+    """The origin of some pixels of a result.
 
     Args:
         geometry: how pixels move.
         width, height: of the image.
         to: x and y of the pixels.
-        origins: x and y of where they come from in the image.
+        origins: x and y of their origins in the image.
     """
 
     geometry: Geometry
@@ -72,18 +72,19 @@ class Move:
 def warp(
     layers: Sequence[Layer], geometry: Geometry | None, width: int, height: int
 ) -> tuple[list[Array], Array]:
-    """Layers as a geometry moves them, and which of their pixels are known.
+    """Warp layers by a geometry. Returns them, and a mask of known pixels.
 
     Args:
-        layers: of one image.
-        geometry: how its pixels move; None leaves each where it is.
+        layers: layers of one image.
+        geometry: how its pixels move; None moves none.
         width, height: of the image.
 
     Returns:
-        Each layer, (rows, columns, channel) of its own type, but flow and what is blended of whole
-        numbers as float32. It is 0 outside the image and outside the layer's data window, and a
-        vector of flow is NaN that ends where the result has no place. Beside them a (rows, columns)
-        mask, float16: 1 where all layers are known, else 0. A depth that is not above 0 is not.
+        Each layer, (rows, columns, channel) of its own type. Flow, and blended layers of whole
+        numbers, become float32. Pixels outside the image or outside the layer's data window are 0.
+        A vector of flow is NaN if its end has no position in the result. The last item is a (rows,
+        columns) mask, float16: 1 where all layers are known, else 0. A depth that is not above 0
+        counts as unknown.
     """
     columns, rows = geometry.size(width, height) if geometry else (width, height)
     results = [
@@ -128,7 +129,7 @@ def warp(
 
 
 def _cells_of(layer: Layer) -> Mask | None:
-    """Where a layer shows one surface, see :func:`clpipe.reference.surfaces.cells`."""
+    """The parts of a layer that show one surface, see :func:`clpipe.reference.surfaces.cells`."""
     if layer.kind == "depth":
         return surfaces.cells(_inverse(layer.pixels), surfaces.DEPTH)
     if layer.kind == "label":
@@ -141,13 +142,13 @@ def _cells_of(layer: Layer) -> Mask | None:
 
 
 def _inverse(depth: Array) -> Array:
-    """1 over a depth, float64; NaN where that is none."""
+    """Return 1 over a depth, float64; NaN without a depth."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(depth > 0, 1 / depth.astype(np.float64), np.nan)
 
 
 def _blended(layer: Layer, x: Array, y: Array) -> Array:
-    """A layer between the centres of its pixels."""
+    """A layer at positions between the centres of its pixels."""
     if layer.kind != "depth":
         return bilinear(layer.pixels, x, y)
     with np.errstate(divide="ignore"):
@@ -155,16 +156,18 @@ def _blended(layer: Layer, x: Array, y: Array) -> Array:
 
 
 def _off_ties(place: Array, other: Array) -> Array:
-    """What moves places on the border of two pixels into one of them, the other in each other line.
+    """Return an offset that moves positions on the border of two pixels into one of them.
 
-    So nothing that is taken from the nearest pixel moves to one side.
+    The other one is chosen in each second line, so that nearest-neighbour values do not shift to
+    one side.
+
     """
     on_border = abs(place - np.rint(place)) < TIE
     return np.where(on_border, np.where(np.floor(other) % 2 == 0, -0.25, 0.25), 0.0)
 
 
 def nearest(pixels: Array, x: Array, y: Array) -> Array:
-    """The pixels, (rows, columns, channel), in which places lie; beyond the edges those at them.
+    """Return the pixels, (rows, columns, channel), at positions; the edge pixels outside.
 
     >>> nearest(np.array([[[1], [2]]]), np.array([0.9, 1.0]), np.array([0.5, 0.5]))[:, 0].tolist()
     [1, 2]
@@ -175,9 +178,9 @@ def nearest(pixels: Array, x: Array, y: Array) -> Array:
 
 
 def bilinear(pixels: Array, x: Array, y: Array) -> Array:
-    """Pixels, (rows, columns, channel), blended between their centres, as float64.
+    """Return pixels, (rows, columns, channel), interpolated between their centres, as float64.
 
-    A pixel without weight does not count, whatever it holds.
+    A pixel without weight does not contribute, whatever it contains.
 
     >>> bilinear(np.array([[[1], [2]]]), np.array([0.5, 1.25]), np.array([0.5, 0.5]))[:, 0].tolist()
     [1.0, 1.75]
@@ -196,18 +199,18 @@ def bilinear(pixels: Array, x: Array, y: Array) -> Array:
 
 
 def _clipped(place: Array, size: int) -> Array:
-    """The numbers of the rows or columns in which places lie, or which are nearest to them."""
-    return np.clip(place, 0, size - 1).astype(np.intp)  # what is positive is cut off, not rounded
+    """Return the numbers of the rows or columns that contain positions, or are nearest to them."""
+    return np.clip(place, 0, size - 1).astype(np.intp)  # positive values are truncated, not rounded
 
 
 def mapped(samples: Array, vectors: Sequence[Vector], move: Move) -> Array:
-    """Flow between places of an image as flow between the places of its result.
+    """Convert flow between positions of an image to flow between positions of its result.
 
-    A vector from p to p + v becomes one from where p is seen to where p + v is seen. So the other
-    frame is taken to go through the same geometry.
+    A vector from p to p + v becomes one from the new position of p to that of p + v. The other
+    frame is assumed to have the same geometry.
 
     Args:
-        samples: (..., channel), float64, that of each pixel's origin.
+        samples: (..., channel), float64, those of each pixel's origin.
         vectors: see :class:`Layer`.
         move: the pixels.
     """
@@ -225,18 +228,18 @@ def mapped(samples: Array, vectors: Sequence[Vector], move: Move) -> Array:
 
 
 def _as_long_as_1(normals: Array) -> Array:
-    """Normals with their first three channels made as long as 1; those of no length stay 0."""
+    """Scale the first three channels of normals to length 1; those of length 0 stay 0."""
     length = np.linalg.norm(normals[..., :3], axis=-1, keepdims=True)
     scaled = normals[..., :3] / np.where(length > 0, length, 1)
     return np.concatenate([scaled, normals[..., 3:]], axis=-1)
 
 
 def _type_of(layer: Layer) -> np.dtype:
-    """The type of a layer's samples when they have been moved."""
+    """Return the type of a layer's samples after warping."""
     blended = layer.kind not in ("depth", "label") and layer.pixels.dtype.kind != "f"
     return np.dtype(np.float32) if blended or layer.kind == "flow" else layer.pixels.dtype
 
 
 def _within(x: Array, y: Array, width: int, height: int) -> Array:
-    """Whether places are in an image; what is not a number is not."""
+    """Return whether positions are in an image; NaN is not."""
     return (x >= 0) & (x <= width) & (y >= 0) & (y <= height)

@@ -1,4 +1,4 @@
-"""The Bayer patterns, as ``kernels/lib/cfa.h`` has them."""
+"""The Bayer patterns, like in ``kernels/lib/cfa.h``."""
 
 from collections import Counter
 from typing import Literal, get_args
@@ -21,9 +21,9 @@ def red_site(pattern: str) -> tuple[int, int]:
 
 
 def sites(pattern: str) -> dict[str, tuple[slice, slice]]:
-    """The rows and columns of R, G1, G2 and B in a mosaic; G1 is in the rows of red.
+    """Return the rows and columns of R, G1, G2 and B in a mosaic; G1 is in the rows of red.
 
-    Of an array that is no Bayer pattern, in rows of letters, each place of its period.
+    For an array that is no Bayer pattern, in rows of letters, each position of its period.
 
     >>> sites("GRBG")["R"]
     (slice(0, None, 2), slice(1, None, 2))
@@ -53,9 +53,9 @@ def by_site(
     green: Floats | np.float32,
     blue: Floats | np.float32,
 ) -> Floats:
-    """At each pixel, the value that is given for the colour of that site; (height, width).
+    """Return at each pixel the value for the colour of that site; (height, width).
 
-    ``shape`` begins with height and width. Red, green and blue are each one value or an image of
+    ``shape`` begins with height and width. Red, green and blue are each one value, or an image of
     that height and width.
 
     >>> by_site((2, 2), "RGGB", np.float32(1), np.float32(2), np.float32(3)).tolist()

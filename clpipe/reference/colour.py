@@ -1,4 +1,4 @@
-"""Luma and colour differences, as ``kernels/lib/colour.h`` has them."""
+"""Luma and colour differences, like in ``kernels/lib/colour.h``."""
 
 import numpy as np
 
@@ -8,9 +8,10 @@ LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 
 def rgb_to_ycbcr(image: Floats) -> Floats:
-    """ITU-R BT.601, linear: Y = .299R + .587G + .114B, Cb = .564(B-Y), Cr = .713(R-Y).
+    """Apply ITU-R BT.601: Y = 0.299R + 0.587G + 0.114B, Cb = 0.564(B-Y), Cr = 0.713(R-Y).
 
-    ``image`` is (height, width, 3), linear RGB; the result has the same shape and holds Y, Cb, Cr.
+    ``image`` is (height, width, 3), linear RGB. The result has the same shape and contains Y, Cb,
+    Cr.
     """
     red, green, blue = np.moveaxis(image, -1, 0)
     y = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
@@ -18,7 +19,7 @@ def rgb_to_ycbcr(image: Floats) -> Floats:
 
 
 def ycbcr_to_rgb(image: Floats) -> Floats:
-    """The inverse of :func:`rgb_to_ycbcr`, exact but for rounding.
+    """Invert :func:`rgb_to_ycbcr`, exactly except for rounding.
 
     >>> ycbcr_to_rgb(rgb_to_ycbcr(np.float32([[[0.2, 0.5, 0.9]]]))).round(5).tolist()
     [[[0.20000000298023224, 0.5, 0.8999999761581421]]]

@@ -1,4 +1,4 @@
-"""Companding: DN to fewer DN by a curve of straight pieces (PWL), as HDR sensors send them."""
+"""Companding: DN to fewer DN by a piecewise linear curve (PWL), for HDR sensors."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -10,11 +10,12 @@ from clpipe.base.types import Doubles, Floats
 
 Knots = tuple[tuple[float, float], ...]
 
-OCTAVES = 7  # between the knots of the usual curve's ends; each piece has a quarter of the next's
+# between the end knots of the default curve; each piece is a quarter as long as the next
+OCTAVES = 7
 
 
 def usual_knots(white: float, result: float) -> Knots:
-    """Knots near a square root, along which shot noise has one size: (DN, result).
+    """Return knots close to a square root, where shot noise has one size: (DN, result).
 
     >>> usual_knots(16384, 128)[:3], usual_knots(16384, 128)[-1]
     (((0.0, 0.0), (1.0, 1.0), (4.0, 2.0)), (16384.0, 128.0))
@@ -28,10 +29,10 @@ def usual_knots(white: float, result: float) -> Knots:
 
 
 def knots_in(pairs: Sequence[Sequence[float]]) -> Knots:
-    """Knots from pairs of numbers.
+    """Return knots from pairs of numbers.
 
     Raises:
-        ValueError: they are no pairs, do not begin at 0, or do not rise.
+        ValueError: they are not pairs, do not begin at 0, or do not rise.
 
     >>> knots_in([[0, 0], [1023, 511], [4095, 1023]])[1]
     (1023.0, 511.0)
@@ -47,16 +48,16 @@ def knots_in(pairs: Sequence[Sequence[float]]) -> Knots:
     return knots
 
 
-@lru_cache(maxsize=64)  # one object for the same knots, so that it is uploaded once
+@lru_cache(maxsize=64)  # the same object for the same knots, so that it is uploaded once
 def pieces_of(knots: Knots, inverse: bool = False) -> Floats:
-    """The pieces between knots, or of the inverse: beginning, value there, slope; (piece, 3)."""
+    """Return the pieces between knots, or their inverse: start, value there, slope; (piece, 3)."""
     points: Doubles = np.array(knots)[:, ::-1] if inverse else np.array(knots)
     slopes = np.diff(points[:, 1]) / np.diff(points[:, 0])
     return np.ascontiguousarray(np.column_stack([points[:-1], slopes]), np.float32)
 
 
 def along_pieces(x: Floats, pieces: Floats) -> Floats:
-    """The curve at these places.
+    """Return the curve at these values.
 
     >>> along_pieces(np.float32([1, 3]), pieces_of(((0, 0), (2, 2), (4, 3)))).tolist()
     [1.0, 2.5]

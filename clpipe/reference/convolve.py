@@ -1,8 +1,8 @@
-"""Weighted means of the pixels around, for light that is spread: twin of ``kernels/convolve.cl``.
+"""Weighted means of surrounding pixels, for blur: the counterpart of ``kernels/convolve.cl``.
 
-A point spread function is (height, width, 3) float64 of odd sides, centred: how the light of a
-pixel falls on those around it, for red, green and blue, each of sum 1. Taps are what a pixel is
-made of, so they are its mirror image.
+A point spread function is (height, width, 3) float64 of odd sides, centred. It describes how the
+light of a pixel spreads over its neighbours, for red, green and blue, each with the sum 1. Taps
+describe which pixels contribute to a pixel, so they are the mirror image.
 """
 
 import numpy as np
@@ -11,14 +11,14 @@ from clpipe.base.tracing import traceable
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.image import tap
 
-NEGLIGIBLE = 5e-4  # share of the light that may be left out, where it is thinnest
+NEGLIGIBLE = 5e-4  # share of the light that may be omitted, from the smallest weights
 
 
 def taps_of(spread: Doubles) -> Floats:
-    """The taps of a point spread function: (tap, 5) float32, by rows.
+    """Return the taps of a point spread function: (tap, 5) float32, by rows.
 
-    Each is dx and dy in px, and the weights of the pixel there for red, green and blue, each of sum
-    1 over all taps. The smallest weights are left out, up to :data:`NEGLIGIBLE` of them all.
+    Each tap is dx and dy in px, and the weights of that pixel for red, green and blue, each with
+    the sum 1 over all taps. The smallest weights are omitted, up to a total of :data:`NEGLIGIBLE`.
 
     >>> taps_of(np.float64([[0.5, 0, 0.5]])[..., None].repeat(3, 2)).tolist()
     [[-1.0, 0.0, 0.5, 0.5, 0.5], [1.0, 0.0, 0.5, 0.5, 0.5]]
@@ -38,12 +38,12 @@ def taps_of(spread: Doubles) -> Floats:
 
 @traceable
 def reach_of(taps: Floats) -> int:
-    """The largest distance of a tap along a row or a column, in px."""
+    """Return the largest distance of a tap along a row or a column, in px."""
     return int(abs(taps[:, :2]).max())
 
 
 def convolve(image: Floats, taps: Floats) -> Floats:
-    """The weighted means; (height, width, 3) in and out, mirrored at the borders."""
+    """Return the weighted means; (height, width, 3) in and out, mirrored at the borders."""
     total: Floats = np.zeros((), np.float32)
     for dx, dy, *weights in taps:
         total = total + np.asarray(weights, np.float32) * tap(image, int(dx), int(dy))
@@ -51,9 +51,9 @@ def convolve(image: Floats, taps: Floats) -> Floats:
 
 
 def blur(image: Floats, weights: Floats) -> Floats:
-    """As :func:`convolve`, by rows and columns alike.
+    """Like :func:`convolve`, with the same weights along rows and columns.
 
-    ``weights[k]`` is that of the pixels k to either side; over both sides their sum is 1.
+    ``weights[k]`` is the weight of the pixels k to either side. Over both sides, their sum is 1.
     """
     rows = weights[0] * image
     for k, weight in enumerate(weights[1:], 1):

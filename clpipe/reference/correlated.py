@@ -1,4 +1,4 @@
-"""Normals that are correlated between channels, as ``kernels/lib/correlated.h`` has them."""
+"""Normals that are correlated between channels, like in ``kernels/lib/correlated.h``."""
 
 import math
 
@@ -7,12 +7,14 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.random import Stream, normal_at
 
-TOLERANCE = 1e-6  # by which a correlation that was measured and rounded may be impossible
+TOLERANCE = 1e-6  # by which a measured and rounded correlation may be impossible
 
 
 def mixing(red_green: float, red_blue: float, green_blue: float) -> tuple[np.float32, ...]:
-    """The lower triangle L with L L' the correlation of red, green and blue (Cholesky), without its
-    first entry, which is 1: green_red, green_green, blue_red, blue_green, blue_blue.
+    """Return the Cholesky factor of the correlation of red, green and blue.
+
+    It is the lower triangle L with L L' the correlation, without its first entry, which is 1:
+    green_red, green_green, blue_red, blue_green, blue_blue.
 
     >>> [float(x) for x in mixing(0.0, 0.0, 0.0)]
     [0.0, 1.0, 0.0, 0.0, 1.0]
@@ -32,7 +34,7 @@ def mixing(red_green: float, red_blue: float, green_blue: float) -> tuple[np.flo
 def correlated_normals(
     shape: tuple[int, ...], stream: Stream, mix: tuple[np.float32, ...]
 ) -> Floats:
-    """Standard normals for red, green and blue, (height, width, 3), correlated by :func:`mixing`.
+    """Return standard normals for red, green and blue, (height, width, 3), with a correlation.
 
     ``shape`` begins with height and width.
     """

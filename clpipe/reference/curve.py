@@ -1,8 +1,8 @@
-"""One-dimensional curves as tables, as ``kernels/lib/curve.h`` has them.
+"""One-dimensional curves as tables, like in ``kernels/lib/curve.h``.
 
-The index is the upper part of the float's own bits: 20 octaves below 1, 4096 steps each. A value
-takes the nearest entry (relative error at most 2^-13). So two curves compose into one table that
-gives, bit for bit, what two look-ups one after the other give.
+The index is the upper part of the float's bits: 20 octaves below 1, with 4096 steps each. A value
+takes the nearest entry (relative error at most 2^-13). Two curves can be composed to one table with
+the same results, bit for bit, as two look-ups in sequence.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ _FIRST = int(_SMALLEST.view(np.int32)) >> 11
 
 
 def curve_index(values: Floats) -> NDArray[np.int32]:
-    """The index of the table entry nearest to each value: 0 below 2^-20, the last above 1.
+    """Return the index of the nearest table entry: 0 below 2^-20, the last above 1.
 
     >>> curve_index(np.float32([-1, 0, 2**-20, 0.5, 1, 7])).tolist()
     [0, 0, 0, 77824, 81920, 81920]
@@ -29,9 +29,9 @@ def curve_index(values: Floats) -> NDArray[np.int32]:
 
 
 def tabulate(function: Callable[[Doubles], Doubles]) -> Floats:
-    """The table of a function on 0..1, (:data:`SIZE`,).
+    """Return the table of a function on 0..1, (:data:`SIZE`,).
 
-    Each entry is the function's value at that entry's own float; entry 0 is its value at 0.
+    Each entry is the function's value at that entry's float; entry 0 is its value at 0.
     """
     points = ((np.arange(SIZE, dtype=np.int32) + _FIRST) << 11).view(np.float32).astype(np.float64)
     points[0] = 0
@@ -39,17 +39,17 @@ def tabulate(function: Callable[[Doubles], Doubles]) -> Floats:
 
 
 def compose(first: Floats, second: Array) -> Array:
-    """One table that gives what a look-up in ``first`` and then in ``second`` gives."""
+    """Return one table for a look-up in ``first`` and then in ``second``."""
     return second[curve_index(first)]
 
 
 def to_8_bit(values: Floats) -> NDArray[np.uint8]:
-    """0..1 to 0..255, rounded to nearest (ties to even) and clipped; NaN becomes 0."""
+    """Convert 0..1 to 0..255, rounded to nearest (ties to even) and clipped; NaN becomes 0."""
     return _scaled(values, 255).astype(np.uint8)
 
 
 def to_16_bit(values: Floats) -> NDArray[np.uint16]:
-    """0..1 to 0..65535, otherwise as :func:`to_8_bit`.
+    """Convert 0..1 to 0..65535, otherwise like :func:`to_8_bit`.
 
     >>> to_16_bit(np.float32([-1, 0.25, 1, 7])).tolist()
     [0, 16384, 65535, 65535]

@@ -1,4 +1,4 @@
-"""Light spread by how far its surface is from focus: twin of ``kernels/defocus.cl``."""
+"""Depth of field from the distance to the focus: the counterpart of ``kernels/defocus.cl``."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,17 +13,17 @@ from clpipe.base.types import Array, Floats
 from clpipe.reference.image import tap
 
 HIDDEN = 1.0  # a weight, see aperture_taps
-FAR = 1e9  # from here on a surface is infinitely far; Blender's sky is at 1e10
+FAR = 1e9  # from here on, a surface is infinitely far; Blender's sky is at 1e10
 
 
 @dataclass(frozen=True, eq=False)
 class Depth:
-    """How far what each pixel shows is from the camera.
+    """The distance of the surface in each pixel from the camera.
 
     Args:
-        pixels: (height, width), above 0, in any unit; infinite where there is nothing.
-        record: what a sidecar says of where it is from.
-        derived: what follows from it, by what that depends on; renditions share it.
+        pixels: (height, width), above 0, in any unit; infinite without a surface.
+        record: its source, for a sidecar.
+        derived: values derived from it, by their parameters; renditions share them.
     """
 
     pixels: Floats
@@ -35,20 +35,22 @@ NOWHERE = Depth(np.full((1, 1), np.inf, np.float32))
 
 
 def checked_depth(pixels: Array) -> Floats:
-    """Depth as it was stored, (height, width), made float32.
+    """Convert a stored depth, (height, width), to float32.
 
-    0, which Mitsuba writes where a ray meets nothing, and :data:`FAR` and more become infinite.
+    Values of :data:`FAR` and more become infinite. So does 0, which Mitsuba writes for rays without
+    a hit.
 
     Raises:
-        ImageError: NaN or negative numbers are in it; the message says how many, and where.
+        ImageError: it contains NaN or negative numbers; the message states how many, and where.
     """
     depth = np.array(pixels, np.float32)
     wrong = ~(depth >= 0)
     if count := np.count_nonzero(wrong):
         y, x = np.unravel_index(int(np.argmax(wrong)), depth.shape)
         raise ImageError(
-            f"its depth is NaN or negative in {count} pixels, first {depth[y, x]:g} at column {x}, "
-            f"row {y}; depth is above 0, and infinite, {FAR:g} or more or 0 where there is nothing"
+            f"its depth is NaN or negative in {count} pixels, first {depth[y, x]:g} at column "
+            f"{x}, row {y}. Depth is above 0, or it is infinite, {FAR:g} or more, or 0 where "
+            "there is no surface"
         )
     depth[(depth == 0) | (depth >= FAR)] = np.inf
     return depth
@@ -56,14 +58,15 @@ def checked_depth(pixels: Array) -> Floats:
 
 @lru_cache(maxsize=64)
 def aperture_taps(blades: int, largest: float) -> Floats:
-    """The places that a disc may cover, with its edge: (tap, 4) float32, by rows.
+    """Return the positions that a disc may cover, with its edge: (tap, 4) float32, by rows.
 
-    Each is dx and dy in px from the pixel that light falls on to the one it comes from, the radius
-    of the aperture's image whose edge is there (that of a circle around its corners), and the
-    weight with which it stands for a surface that another hides.
+    A tap starts with dx and dy in px, from the pixel that receives light to the one that emits it.
+    The third number is the radius at which the edge of the aperture's image reaches it, measured by
+    the circle around its corners. The last number is the weight with which it replaces a hidden
+    surface.
 
     Args:
-        blades: corners of the aperture, of which one is below the middle; 0 is round.
+        blades: corners of the aperture, one of which points down; 0 is round.
         largest: radius of a disc, in px.
 
     >>> aperture_taps(0, 0.75)[:, :3].astype(int).tolist()
@@ -72,7 +75,7 @@ def aperture_taps(blades: int, largest: float) -> Floats:
     reach = reach_of(largest)
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1].astype(np.float64)
     radius = np.hypot(x, y)
-    # The nearest pixels before all others.
+    # The nearest pixels have by far the largest weights.
     hidden = HIDDEN / (1 + (x * x + y * y) ** 2)
     if blades:
         sides = (2 * np.arange(blades) + 1) * np.pi / blades
@@ -84,7 +87,7 @@ def aperture_taps(blades: int, largest: float) -> Floats:
 
 
 def reach_of(largest: float) -> int:
-    """How far a disc of a radius, with the soft edge, covers pixels along a row or column, in px.
+    """Return how far a disc with its soft edge extends along a row or column, in px.
 
     >>> reach_of(0), reach_of(1.5), reach_of(16), reach_of(0.75)
     (0, 1, 16, 1)
@@ -93,28 +96,31 @@ def reach_of(largest: float) -> int:
 
 
 def defocus(image: Floats, radii: Floats, taps: Floats) -> Floats:
-    """Each pixel's light spread over its disc, and hidden by what is in front.
+    """Spread each pixel's light over its disc, and hide it by nearer surfaces.
 
-    The light of pixel q counts at p where its disc, with an edge 1 px wide, covers p, divided by
-    the disc's area. Seen from p, what is around belongs to surfaces in front of p's own, to that,
-    or behind it, with 1 px of radius between them. The first take what their discs cover of p's
-    aperture. Of what is left, p's own surface takes the share of its disc's area where it is, of
-    that where nothing in front hides it: inside the edge of something that is out of focus, light
-    from behind passes by. That place is hidden in the render, and looks as what is nearest behind.
+    The light of pixel q contributes to p if q's disc, with an edge 1 px wide, covers p. It is
+    divided by the disc's area. Surfaces around p are nearer than p's own, level with it, or
+    farther, with a transition of 1 px of radius. Nearer ones take the part of p's aperture that
+    their discs cover. From the rest, p's own surface takes a share: the area of its disc where it
+    is present, over the area that nothing nearer hides. Inside the edge of an out-of-focus object,
+    light from farther surfaces passes by. The render hides that area, so the nearest of the farther
+    surfaces replace it.
 
-    Layers around a pixel are after Jimenez ("Next generation post processing in Call of Duty",
-    SIGGRAPH 2014), what is hidden after Kraus and Strengert ("Depth-of-field rendering by pyramidal
-    image processing", Eurographics 2007).
+    The layers around a pixel follow Jimenez ("Next generation post processing in Call of Duty",
+    SIGGRAPH 2014). The hidden part follows Kraus and Strengert ("Depth-of-field rendering by
+    pyramidal image processing", Eurographics 2007).
 
     Args:
         image: (height, width, 3).
-        radii: of the discs in px, (height, width); below 0 in front of what is in focus.
+        radii: radii of the discs in px, (height, width); negative if nearer than the focus
+            distance.
         taps: see :func:`aperture_taps`.
     """
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
     own, size = radii, abs(radii)
     area = _area(size)
-    light: Floats = np.zeros((3, *image.shape), np.float32)  # of what is in front, level and behind
+    # of the surfaces in front, level and behind
+    light: Floats = np.zeros((3, *image.shape), np.float32)
     total: Floats = np.zeros((3, *radii.shape), np.float32)
     free: Floats = np.zeros(radii.shape, np.float32)
     for dx, dy, edge, hidden in taps:
@@ -136,6 +142,6 @@ def defocus(image: Floats, radii: Floats, taps: Floats) -> Floats:
 
 
 def _area(radius: Floats) -> Floats:
-    """What a disc with a soft edge covers, in px."""
+    """Return the area of a disc with a soft edge, in px."""
     whole = np.float32(np.pi) * (radius * radius) + np.float32(np.pi / 12)
     return np.asarray(np.maximum(radius + np.float32(0.5), whole))

@@ -1,9 +1,10 @@
-"""Demosaicing for any filter array by several models of images, each trusted where it holds.
+"""Demosaicing for any filter array by several image models, each weighted by its fit.
 
-A model is :mod:`clpipe.reference.linear_mmse`'s, but longer in one of four directions, with little
-colour or with much. Under each, a sample can be foretold from those around it (leaving one out,
-after Besag, "Statistical analysis of non-lattice data", 1975); models that fail at that around a
-pixel count little there. So an edge is interpolated along itself, and colour is as smooth as it is.
+The models are those of :mod:`clpipe.reference.linear_mmse`, but longer in one of four directions,
+with little colour or with much. Each model predicts a sample from its neighbours (leaving one out,
+after Besag, "Statistical analysis of non-lattice data", 1975). Models with large errors around a
+pixel get little weight there. Interpolation therefore follows edges, and colour is as smooth as in
+the image.
 """
 
 from functools import lru_cache
@@ -23,27 +24,27 @@ from clpipe.reference.linear_mmse import (
 )
 
 DIRECTIONS = 4  # the row, the falling diagonal, the column, the rising one
-# The models: lengths in px along and across the direction, within which the correlation falls to
-# 1/e, and its shape between exponential (1) and Gaussian (2); the variances of chroma, where that
-# of luma is 1; and that of what a model leaves out. Chosen on sixteen of the Kodak set that
-# docs/quality.md does not show, and on every second of McMaster's, on X-Trans, quad, RGBW and
-# Bayer.
+# The models. Lengths in px along and across the direction, within which the correlation falls to
+# 1/e. Its shape between exponential (1) and Gaussian (2). The variances of chroma, relative to that
+# of luma. The variance of the rest that a model does not describe. Chosen on sixteen images of the
+# Kodak set that docs/quality.md does not show, and every second one of McMaster's, for X-Trans,
+# quad, RGBW and Bayer.
 ALONG, ACROSS, SHAPE = 32.0, 11.0, 1.65
 CHROMAS = (0.002, 0.3)
 NOISE = 2.5e-5
 MODELS = DIRECTIONS * len(CHROMAS)
 REACH = 2  # px: errors are averaged over 5x5
-UNSEEN = np.float32(1e-6)  # a squared error that is none: a thousandth of white
+UNSEEN = np.float32(1e-6)  # a negligible squared error: a thousandth of white
 
 
 @lru_cache(maxsize=16)
 def models(array: FilterArray) -> tuple[Floats, Floats]:
-    """The filters of an array under each model: direction by direction, little colour first.
+    """Return the filters of an array under each model: direction by direction, little colour first.
 
     Returns:
-        What colours they make, (row, column, tap, model, channel), as
-        :func:`~clpipe.reference.linear_mmse.filters` are; and by how much they miss a sample that
-        they foretell from the others, (row, column, tap, model).
+        The first array makes colours, (row, column, tap, model, channel), like
+        :func:`~clpipe.reference.linear_mmse.filters`. The second gives the error of a sample's
+        prediction from the others, (row, column, tap, model).
     """
     between, centre = distances()
     rows, columns = array.period
@@ -57,14 +58,14 @@ def models(array: FilterArray) -> tuple[Floats, Floats]:
             for number, chroma in enumerate(CHROMAS, direction * len(CHROMAS)):
                 made = best(seen, taps, to_centre, chroma, NOISE)
                 colours[row, column, :, number] = made
-                # The row of a precision matrix is what a value is beside its best estimate.
+                # The row of a precision matrix is the value minus its best estimate.
                 beside = np.linalg.inv(covariance(seen, taps, chroma, NOISE))[middle]
                 misses[row, column, :, number] = beside / beside[middle]
     return colours, misses
 
 
 def _correlation(apart: Doubles, angle: float) -> Doubles:
-    """The correlation of colours that far apart, (2, ...) in px, in a model of that direction."""
+    """Return the correlation of colours at these distances, (2, ...) in px, for one direction."""
     x, y = apart
     along = (x * np.cos(angle) + y * np.sin(angle)) / ALONG
     across = (y * np.cos(angle) - x * np.sin(angle)) / ACROSS
@@ -72,13 +73,13 @@ def _correlation(apart: Doubles, angle: float) -> Doubles:
 
 
 def errors(mosaic: Floats, array: FilterArray) -> Floats:
-    """The squared error of each model at each sample: (height, width, model)."""
+    """Return the squared error of each model at each sample: (height, width, model)."""
     _, misses = models(array)
     return np.square(filtered(mosaic, array.period, misses))
 
 
 def trust(squared: Floats) -> Floats:
-    """How much each model counts, (height, width, model), from :func:`errors`; the sum is 1.
+    """Return the weight of each model, (height, width, model), from :func:`errors`; the sum is 1.
 
     >>> trust(np.float32([[[0.01, 0.02]]])).astype(float).round(3).tolist()
     [[[0.941, 0.059]]]
@@ -95,7 +96,7 @@ def trust(squared: Floats) -> Floats:
 
 
 def directional_mmse(mosaic: Floats, array: FilterArray) -> Floats:
-    """RGB, (height, width, 3), from a white-balanced mosaic, (height, width)."""
+    """Return RGB, (height, width, 3), from a white-balanced mosaic, (height, width)."""
     colours, _ = models(array)
     weights = trust(errors(mosaic, array))
     result = np.zeros((*mosaic.shape, 3), np.float32)

@@ -1,6 +1,6 @@
-"""Colour filter arrays of any period: a table of channels, and what each of them sees.
+"""Colour filter arrays of any period: a table of channels, and the response of each of them.
 
-The four Bayer patterns are :mod:`clpipe.reference.cfa`'s; their kernels know them by heart.
+The four Bayer patterns are in :mod:`clpipe.reference.cfa`; their kernels have them built in.
 """
 
 from collections.abc import Mapping
@@ -15,13 +15,13 @@ from clpipe.base.types import Array, Doubles, Floats
 from clpipe.reference.cfa import PATTERNS, Pattern
 
 MAX_PERIOD = 8
-MIRRORED = 2  # the longest period that a mirrored border (reflect-101) goes on with
-LANES = 16  # the most that a device has: what is behind a row of a table, to be loaded at once
+MIRRORED = 2  # the longest period that a mirrored border (reflect-101) continues
+LANES = 16  # the most lanes of a device: entries after a row of a table, so that it loads at once
 
-# Which of the raw red, green and blue pass a filter. Clear filters and those of two colours add up
-# what the others see, as ideal dyes do (Bayer and others use R, G, B; Yamanaka, US 4,054,906, and
-# Compton and Hamilton, US 8,139,130, others). A mono sensor has no filter. An RGB render says
-# nothing of near infrared: that channel sees a quarter of what a clear one does.
+# The raw red, green and blue that pass a filter. Clear and two-colour filters pass the sum of their
+# colours, like ideal dyes. The arrays are those of Bayer (R, G, B), Yamanaka, US 4,054,906, Compton
+# and Hamilton, US 8,139,130, and others. A mono sensor has no filter. An RGB render contains no
+# near infrared: that channel sees a quarter of a clear one.
 PASSES: dict[str, tuple[float, ...]] = {
     "R": (1, 0, 0),
     "G": (0, 1, 0),
@@ -34,9 +34,9 @@ PASSES: dict[str, tuple[float, ...]] = {
     "L": (1, 1, 1),
 }
 
-# Polarisers, by the angle that passes, in degrees. Linearly polarised light is three numbers, as
-# colour is: red, green and blue are then what polarisers at these other angles pass (Fessenkov).
-# What passes at any angle follows from them by the law of Malus; unpolarised light is gray.
+# Polarisers, by the angle that passes, in degrees. Linearly polarised light has three components,
+# like colour: red, green and blue are the light after polarisers at these other angles (Fessenkov).
+# The law of Malus gives the light at any angle. Unpolarised light is gray.
 POLARISERS = {"H": 0, "D": 45, "V": 90, "A": 135}
 ANGLES = (0, 60, 120)
 PASSES |= {
@@ -68,14 +68,15 @@ class FilterArray:
     """A colour filter array.
 
     Args:
-        name: of :data:`NAMED`, or its rows.
-        rows: the letters of one period, of :data:`LETTERS`.
-        gains: white balance gains of red and blue (green = 1): raw red of white is 1/gain of green.
-        is_balanced: whether white is 1 in all channels of the mosaic; otherwise its colours are the
-            raw ones, and what a filter passes adds up.
+        name: a name in :data:`NAMED`, or its rows.
+        rows: the letters of one period, from :data:`LETTERS`.
+        gains: white balance gains of red and blue (green = 1). For white, raw red is 1/gain of
+            green.
+        is_balanced: whether white is 1 in all channels of the mosaic. Otherwise, its colours are
+            the raw ones, and the light that a filter passes is added up.
 
-    A camera exposes for the channel that saturates first: white at EV 0 fills it, and the others
-    less, by :meth:`levels`. So a clear pixel saturates while its neighbours have room.
+    A camera exposes for the channel that saturates first. White at EV 0 fills this channel, and the
+    others less, by :meth:`levels`. A clear pixel therefore saturates before its neighbours.
     """
 
     name: str
@@ -85,17 +86,17 @@ class FilterArray:
 
     @property
     def period(self) -> tuple[int, int]:
-        """After how many rows and columns it repeats."""
+        """The period in rows and columns."""
         return len(self.rows), len(self.rows[0])
 
     @property
     def pattern(self) -> str:
-        """A Bayer pattern, such as "RGGB", or the rows with / between."""
+        """A Bayer pattern, for example "RGGB", or the rows separated by /."""
         return self.bayer or "/".join(self.rows)
 
     @cached_property
     def bayer(self) -> Pattern | None:
-        """Its Bayer pattern; None where it is another array."""
+        """Its Bayer pattern; None for another array."""
         joined = "".join(self.rows)
         return next((p for p in PATTERNS if p == joined and len(self.rows) == 2), None)
 
@@ -111,7 +112,7 @@ class FilterArray:
 
     @property
     def is_gray(self) -> bool:
-        """Whether all pixels see the same."""
+        """Whether all pixels have the same response."""
         return len(self.channels) == 1
 
     @property
@@ -121,13 +122,13 @@ class FilterArray:
 
     @property
     def needs_border(self) -> bool:
-        """Whether reflect-101 gives a pixel beyond the edge another channel than the array has."""
+        """Whether reflect-101 gives a pixel outside the edge another channel than the array."""
         return max(self.period) > MIRRORED
 
     def with_gains(self, gains: tuple[float, float], is_balanced: bool = True) -> "FilterArray":
-        """The array of a mosaic whose colours depend on other gains.
+        """Return the array of a mosaic whose colours depend on other gains.
 
-        It is the same where no channel mixes colours, so its filters are computed once.
+        If no channel mixes colours, it is the same object, so its filters are computed once.
 
         >>> parse_array("x-trans").with_gains((2.0, 1.6)) == parse_array("x-trans")
         True
@@ -139,9 +140,9 @@ class FilterArray:
 
     @cached_property
     def responses(self) -> dict[str, Doubles]:
-        """What each channel sees of red, green and blue as they are in the mosaic.
+        """Return the response of each channel to the red, green and blue of the mosaic.
 
-        The sum is 1 in a balanced one.
+        In a balanced array, its sum is 1.
 
         >>> parse_array("RCCB").with_gains((2.0, 1.6), is_balanced=False).responses["W"].tolist()
         [1.0, 1.0, 1.0]
@@ -153,7 +154,7 @@ class FilterArray:
 
     @cached_property
     def levels(self) -> dict[str, float]:
-        """The raw signal of each channel in a white that fills the most sensitive one: at most 1.
+        """Return the raw signal of each channel for white; 1 for the most sensitive one.
 
         >>> parse_array("x-trans", (2.0, 1.6)).levels
         {'R': 0.5, 'G': 1.0, 'B': 0.625}
@@ -167,17 +168,17 @@ class FilterArray:
         return np.array(PASSES[letter]) / (red, 1.0, blue)
 
     def by_place(self, values: Mapping[str, float]) -> Floats:
-        """At each place of a period, the value of its channel: (row, column)."""
+        """Return the value of the channel at each position of a period: (row, column)."""
         found: Floats = np.vectorize(values.__getitem__, [np.float32])(self.letters)
         return found
 
     def spread(self, values: Mapping[str, float], shape: tuple[int, ...]) -> Floats:
-        """At each pixel of an image, (height, width), the value of its channel."""
+        """Return the value of the channel at each pixel of an image, (height, width)."""
         return tiled(self.by_place(values), shape)
 
 
 def tiled(period: Floats, shape: tuple[int, ...]) -> Floats:
-    """An image, (height, width), that repeats a period, (row, column).
+    """Return an image, (height, width), that repeats a period, (row, column).
 
     >>> tiled(np.float32([[1, 2], [3, 4]]), (3, 3)).tolist()
     [[1.0, 2.0, 1.0], [3.0, 4.0, 3.0], [1.0, 2.0, 1.0]]
@@ -187,13 +188,13 @@ def tiled(period: Floats, shape: tuple[int, ...]) -> Floats:
 
 
 def kernel_table(values: Floats) -> Floats:
-    """A table as kernels load it: each row goes on periodically for a vector of lanes.
+    """Return a table for kernels: each row continues periodically for a vector of lanes.
 
     Args:
         values: (row, ..., column), a period.
 
     Returns:
-        The same with ``column + LANES`` columns.
+        The table with ``column + LANES`` columns.
     """
     columns = values.shape[-1]
     return np.ascontiguousarray(values[..., np.arange(columns + LANES) % columns])
@@ -201,7 +202,7 @@ def kernel_table(values: Floats) -> Floats:
 
 @lru_cache(maxsize=64)
 def parse_array(text: str, gains: tuple[float, float] = (1.0, 1.0)) -> FilterArray:
-    """The filter array of a name, or of rows of letters with a slash between.
+    """Return the filter array of a name, or of rows of letters separated by slashes.
 
     >>> parse_array("RGB/GBR/BRG").period
     (3, 3)
@@ -211,28 +212,30 @@ def parse_array(text: str, gains: tuple[float, float] = (1.0, 1.0)) -> FilterArr
     """
     rows = tuple(NAMED.get(text, text).split("/"))
     if "/" not in text and text not in NAMED and not set(text) <= {*LETTERS}:
-        raise RequestError(f"{one_of('filter array', text, NAMED)}; or rows, such as RG/GB")
+        raise RequestError(f"{one_of('filter array', text, NAMED)}; or use rows, for example RG/GB")
     unknown = sorted(set("".join(rows)) - {*LETTERS})
     if unknown:
-        raise RequestError(f"found {text!r}, with {unknown[0]!r}; a channel is one of {LETTERS}")
+        raise RequestError(f"{text!r} contains {unknown[0]!r}; a channel is one of {LETTERS}")
     lengths = {len(row) for row in rows}
     if len(lengths) > 1 or not 0 < max(lengths) <= MAX_PERIOD or len(rows) > MAX_PERIOD:
         raise RequestError(
-            f"found {text!r}; expected rows of one length, with / between, and at most "
+            f"found {text!r}; expected rows of the same length, with / between, and at most "
             f"{MAX_PERIOD}x{MAX_PERIOD} letters"
         )
     array = FilterArray(text, rows, gains)
     if not array.is_polarised and POLARISERS.keys() & {*array.channels}:
-        raise RequestError(f"found {text!r}; polarisers (H, D, V, A) do not go with colours")
+        raise RequestError(
+            f"found {text!r}; polarisers (H, D, V, A) cannot be combined with colours"
+        )
     return array
 
 
 def beyond(size: int, period: int, reach: int) -> Array:
-    """For each place from ``-reach`` to ``size + reach``, the pixel that stands for it.
+    """Return the pixel to use at each position from ``-reach`` to ``size + reach``.
 
-    Beyond an edge it is the nearest one in whole periods, so that it has the channel that the array
-    has there. Mirrored (reflect-101) are a period of at most 2, which goes on so, too, and a side
-    that is shorter than a period.
+    Outside an edge, it is the nearest one at a distance of whole periods, so that its channel is
+    that of the array. A period of at most 2 is mirrored (reflect-101), which continues it as well.
+    So is a side that is shorter than a period.
 
     >>> beyond(5, 3, 2).tolist(), beyond(2, 3, 2).tolist()
     ([1, 2, 0, 1, 2, 3, 4, 2, 3], [0, 1, 0, 1, 0, 1])

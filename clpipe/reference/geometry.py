@@ -1,7 +1,7 @@
-"""Where the pixels of a picture come from: how stages move what they show, for all that goes along.
+"""The origin of pixels: how stages move image content, for all layers and annotations.
 
-Places are counted in pixels from the image's upper left corner, so that the centre of the first
-pixel is at (0.5, 0.5), as COLMAP counts; OpenCV's first centre is (0, 0).
+Positions are in pixels from the image's upper left corner. The centre of the first pixel is at
+(0.5, 0.5), like in COLMAP. In OpenCV it is at (0, 0).
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from clpipe.reference.resample import Bins, Resampling, sizes
 
 
 class Margins(NamedTuple):
-    """How far an image goes on beyond the picture, in px: overscan.
+    """How far an image extends outside the frame, in px: overscan.
 
     >>> Margins(3, 2, 1, 0).inside(10, 8), bool(NO_MARGINS)
     ((6, 6), False)
@@ -30,15 +30,15 @@ class Margins(NamedTuple):
         return any(self)
 
     def inside(self, width: int, height: int) -> tuple[int, int]:
-        """The width and height of the picture, from those of the image."""
+        """Return the width and height of the frame, from those of the image."""
         return width - self.left - self.right, height - self.top - self.bottom
 
     def around(self, width: int, height: int) -> tuple[int, int]:
-        """The width and height of the image, from those of the picture."""
+        """Return the width and height of the image, from those of the frame."""
         return width + self.left + self.right, height + self.top + self.bottom
 
     def cropped(self, image: Array) -> Array:
-        """The picture in an image, (height, width[, channel]): a view."""
+        """Return the frame of an image, (height, width[, channel]): a view."""
         height, width = image.shape[:2]
         return image[self.top : height - self.bottom, self.left : width - self.right]
 
@@ -50,49 +50,49 @@ class Geometry(Protocol):
     """How a stage moves the pixels of an image of some width and height, in px."""
 
     def size(self, width: int, height: int) -> tuple[int, int]:
-        """The width and height of what it gives, from those of what it gets."""
+        """Return the width and height of the output, from those of the input."""
         ...
 
     def origins(self, x: Array, y: Array, width: int, height: int) -> tuple[Array, Array]:
-        """Where places of its result come from in the image that it gets; float64 of any shape.
+        """Return the positions in the input for positions of the output; float64 of any shape.
 
-        For a lens with lateral colour these are the places of green. Places may lie outside the
-        image, where nothing is known.
+        For a lens with lateral colour, these are the positions of green. Positions may be outside
+        the image, where nothing is known.
 
         Args:
-            x, y: places in the result.
-            width, height: of the image that it gets.
+            x, y: positions in the output.
+            width, height: of the input.
         """
         ...
 
     def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
-        """The intrinsics of the result, from those of the image before; None where not known.
+        """Return the intrinsics of the output, from those of the input; None if not known.
 
         Raises:
-            RequestError: they contradict what it does.
+            RequestError: they contradict this stage.
         """
         ...
 
 
 class Destined:
-    """A geometry that says itself where a place of the image is in its result."""
+    """A geometry that maps positions of the image forward to its result."""
 
     def destinations(
         self, x: Array, y: Array, at: tuple[Array, Array], width: int, height: int
     ) -> tuple[Array, Array]:
-        """Where places of the image that it gets are in its result; NaN where nowhere.
+        """Return the positions in the output for positions of the input; NaN if there is none.
 
         Args:
-            x, y: the places.
-            at: places of the image in whose view they are meant, from which a vector leads there.
-            width, height: of the image that it gets.
+            x, y: the positions.
+            at: positions in the image that select the view, for the start of a vector.
+            width, height: of the input.
         """
         raise NotImplementedError(type(self).__name__)
 
 
 @dataclass(frozen=True)
 class Scaling(Destined):
-    """Rows and columns made fewer, each by one resampling at most; the first edges stay.
+    """Fewer rows and columns, each by at most one resampling; the first edges stay.
 
     >>> import numpy as np
     >>> from clpipe.reference.resample import Resampling, overlap
@@ -108,7 +108,7 @@ class Scaling(Destined):
         return sizes(self.resamplings, width, height)[-1]
 
     def shown(self, width: int, height: int) -> tuple[int, int]:
-        """The columns and rows of the image that the result shows, from the upper left corner.
+        """Return how many columns and rows of the image the result shows, from the upper left.
 
         >>> from clpipe.reference.resample import Bins
         >>> Scaling((Bins("rows", 2), Bins("columns", 2))).shown(611, 407)
@@ -140,7 +140,7 @@ class Scaling(Destined):
 
 @dataclass(frozen=True)
 class Composition:
-    """Several geometries in a row, the first one's result going into the next.
+    """Several geometries in sequence; each gets the result of the previous one.
 
     >>> import numpy as np
     >>> from clpipe.reference.resample import Resampling, overlap
@@ -177,7 +177,7 @@ class Composition:
 
 @dataclass(frozen=True)
 class Orientation:
-    """An image turned upright: flipped left to right, upside down, then transposed."""
+    """An image rotated upright: flipped left to right, upside down, then transposed."""
 
     mirrored: bool
     upside_down: bool
@@ -193,7 +193,7 @@ class Orientation:
         return width - x if self.mirrored else x, height - y if self.upside_down else y
 
     def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
-        """See :meth:`Geometry.intrinsics`; a turned picture has none of these models."""
+        """See :meth:`Geometry.intrinsics`; a rotated image has none of these models."""
         return None
 
 
@@ -222,7 +222,7 @@ class Crop:
         return replace(before, width=self.width, height=self.height, cx=cx, cy=cy)
 
 
-RESIDUAL = 1e-6  # px, in the image that a geometry gets
+RESIDUAL = 1e-6  # px, in the input of a geometry
 STEP = 1e-3  # px, of the finite differences
 ITERATIONS = 20
 
@@ -235,20 +235,20 @@ def destinations(
     height: int,
     at: tuple[Array, Array] | None = None,
 ) -> tuple[Array, Array]:
-    """Where places of the image that a geometry gets are in its result: the inverse of its origins.
+    """Return the positions in a geometry's output for positions of its input: inverse of origins.
 
-    Newton's method in two dimensions, the Jacobian by finite differences, until a place's origin is
-    within :data:`RESIDUAL` of what it should be; of a :class:`Destined` it is asked for.
+    Newton's method in two dimensions, the Jacobian by finite differences, until a position's origin
+    has an error below :data:`RESIDUAL`. A :class:`Destined` geometry computes it directly.
 
     Args:
         geometry: how the pixels move.
-        to: x and y of the places, float64 of any shape.
-        start: places of the result nearby, of that shape.
-        width, height: of the image that it gets.
-        at: see :meth:`Destined.destinations`; None is the places themselves.
+        to: x and y of the positions, float64 of any shape.
+        start: positions of the output nearby, of the same shape.
+        width, height: of the input.
+        at: see :meth:`Destined.destinations`; None is the positions themselves.
 
     Returns:
-        x and y; NaN where no place is found, as beyond the radius where a lens turns.
+        x and y; NaN if no position is found, for example beyond the radius where a lens folds.
 
     >>> import numpy as np
     >>> mirror, start = Orientation(True, False, False), (np.zeros(1), np.zeros(1))
@@ -272,7 +272,7 @@ def destinations(
 
     left = np.flatnonzero(np.isfinite(goal).all(0))
     goal, found = goal[:, left], found[:, left]
-    with np.errstate(all="ignore"):  # what runs off to infinity is left at NaN
+    with np.errstate(all="ignore"):  # diverging positions become NaN
         for _ in range(ITERATIONS):
             here = origins(found)
             error = goal - here

@@ -1,4 +1,4 @@
-"""Neighbours and borders, as ``kernels/lib/image.h`` has them."""
+"""Neighbours and borders, like in ``kernels/lib/image.h``."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from clpipe.base.types import Array, Floats
 
 
 def mirror(index: Array, size: int) -> Array:
-    """The pixel (0..size-1) that reflect-101 puts at each index; the edge pixel is not repeated.
+    """Return the pixel (0..size-1) for each index by reflect-101, without repeating the edge pixel.
 
     >>> mirror(np.arange(-3, 7), 4).tolist()
     [3, 2, 1, 0, 1, 2, 3, 2, 1, 0]
@@ -19,7 +19,7 @@ def mirror(index: Array, size: int) -> Array:
 
 
 def tap(image: Floats, dx: int, dy: int) -> Floats:
-    """At each pixel, the value ``dx`` px to the right and ``dy`` px below, mirrored at the borders.
+    """Return the value ``dx`` px to the right and ``dy`` px below each pixel, mirrored.
 
     ``image`` is (height, width) or (height, width, channel); the result has the same shape.
     """
@@ -29,7 +29,7 @@ def tap(image: Floats, dx: int, dy: int) -> Floats:
 
 
 def mirrored(image: Floats, margin: int) -> Floats:
-    """The image with ``margin`` pixels added on every side, mirrored at the borders.
+    """Return the image with ``margin`` pixels added on every side, mirrored at the borders.
 
     >>> mirrored(np.float32([[1, 2, 3]]), 1).tolist()
     [[2.0, 1.0, 2.0, 3.0, 2.0], [2.0, 1.0, 2.0, 3.0, 2.0], [2.0, 1.0, 2.0, 3.0, 2.0]]

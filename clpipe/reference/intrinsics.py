@@ -1,4 +1,4 @@
-"""A picture's intrinsics: focal lengths, principal point and distortion, as COLMAP counts them.
+"""An image's intrinsics: focal lengths, principal point and distortion, in COLMAP's convention.
 
 The first pixel's centre is at (0.5, 0.5); OpenCV's cx and cy are smaller by 0.5.
 """
@@ -16,7 +16,7 @@ from clpipe.base.types import Array
 
 PINHOLE, OPENCV, FULL_OPENCV = "PINHOLE", "OPENCV", "FULL_OPENCV"
 OPENCV_FISHEYE = "OPENCV_FISHEYE"
-POLYNOMIAL = "POLYNOMIAL"  # none of COLMAP's
+POLYNOMIAL = "POLYNOMIAL"  # not a model of COLMAP
 COEFFICIENTS = {
     PINHOLE: (),
     OPENCV: ("k1", "k2", "p1", "p2"),
@@ -31,15 +31,15 @@ AGREEMENT = 0.01  # of focal lengths; those in mm are often rounded
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """The camera of a picture, by COLMAP's models.
+    """The camera of an image, by COLMAP's models.
 
     Args:
-        width, height: of the picture, in px.
+        width, height: of the image, in px.
         fx, fy: focal lengths in px.
         cx, cy: the principal point in px from the upper left corner.
-        model: of :data:`COEFFICIENTS`.
-        distortion: the coefficients by their names; those of green where colours part.
-        residual: by how far points may be elsewhere, in px, where the model is fitted to a lens.
+        model: a key of :data:`COEFFICIENTS`.
+        distortion: the coefficients by name; those of green if there is lateral colour.
+        residual: the largest position error in px of a model that is fitted to a lens.
     """
 
     width: int
@@ -60,16 +60,16 @@ class Intrinsics:
         shot: Mapping[str, float],
         places: Mapping[str, str] = MappingProxyType({}),
     ) -> "Intrinsics | None":
-        """The intrinsics of a render, undistorted; None where its focal length is not known.
+        """Return the intrinsics of a render, undistorted; None if its focal length is not known.
 
         Args:
             width, height: in px.
-            shot: what is known: fx, fy, cx, cy in px, or focal_length and sensor_width in mm, the
-                latter along the longer side, or pixel_pitch in um, or camera_angle_x in radians.
-            places: where it is stated, for the message.
+            shot: known values: fx, fy, cx, cy in px; focal_length and sensor_width in mm, along the
+                longer side; pixel_pitch in um; camera_angle_x in radians.
+            places: where each value is stated, for the message.
 
         Raises:
-            RequestError: the focal length is known in several ways, which contradict each other.
+            RequestError: stated focal lengths contradict each other.
 
         >>> Intrinsics.of_render(400, 300, {"focal_length": 50.0, "sensor_width": 40.0}).fx
         500.0
@@ -92,13 +92,13 @@ class Intrinsics:
             if abs(length - fx) > AGREEMENT * fx:
                 raise RequestError(
                     f"{first} makes the focal length of this render of {width}x{height} pixels "
-                    f"{fx:g} px, but {other} {length:g} px; correct one, or leave it out"
+                    f"{fx:g} px, but {other} {length:g} px; correct or remove one"
                 )
         cx, cy = shot.get("cx", width / 2), shot.get("cy", height / 2)
         return cls(width, height, fx, shot.get("fy", fx), cx, cy)
 
     def scaled(self, width: int, height: int, shown: tuple[int, int]) -> "Intrinsics":
-        """The intrinsics of the picture made another size.
+        """Return the intrinsics of the resized image.
 
         Args:
             width, height: of the result.
@@ -110,10 +110,10 @@ class Intrinsics:
         return Intrinsics(width, height, *places, self.model, self.distortion, residual)
 
     def polynomial(self) -> "Intrinsics":
-        """The same camera by the model of :data:`POLYNOMIAL`, fitted where it is none.
+        """Return the same camera by the model of :data:`POLYNOMIAL`, fitted if necessary.
 
-        The radial factor is then 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8, as nerfstudio has it, and
-        the focal length goes with it. ``residual`` has what the fit leaves at most in the picture.
+        The radial factor is then ``1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8``, like in nerfstudio, and
+        the focal length is adjusted. ``residual`` is the largest error of the fit in the image.
         """
         own = self.distortion
         under = [own.get(f"k{i}", 0.0) for i in (4, 5, 6)]
@@ -149,15 +149,15 @@ class Intrinsics:
         )
 
     def record(self) -> dict[str, Any]:
-        """Intrinsics as JSON values; coefficients that are not given are 0."""
+        """Return intrinsics as JSON values; missing coefficients are 0."""
         names = COEFFICIENTS[self.model]
         return {**asdict(self), "distortion": {n: self.distortion.get(n, 0.0) for n in names}}
 
 
 def smallest_error(terms: Array, values: Array) -> list[float]:
-    """The factors of terms, (place, term), whose sum is nearest to values, and their largest error.
+    """Return the factors of terms, (place, term), that fit values best, and their largest error.
 
-    By least squares whose weights grow where the error is large (Lawson, 1961).
+    Least squares with weights that grow where the error is large (Lawson, 1961).
     """
     scale = abs(terms).max(0)
     weights = np.ones(len(values))

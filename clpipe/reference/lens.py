@@ -1,7 +1,7 @@
-"""How a lens bends a picture: radial models, their inverses, and the place that each pixel shows.
+"""Lens distortion: radial models, their inverses, and the position that each pixel shows.
 
-Places are counted as in :mod:`clpipe.reference.geometry`. What a model calls r is the distance from
-the principal point in units of its own: of the focal length, or of half the short side.
+Positions are counted like in :mod:`clpipe.reference.geometry`. In a model, r is the distance from
+the principal point in units of the focal length, or of half the short side.
 """
 
 from dataclasses import dataclass, replace
@@ -26,23 +26,23 @@ from clpipe.reference.radial import (
 
 @dataclass(frozen=True)
 class DistortionMap:
-    """A lens as a map of an image: from where each pixel of the picture gets its light.
+    """A lens as a map of an image: the origin of the light of each pixel.
 
     Args:
-        radial: the model of green, and of all channels without lateral colour.
+        radial: the model of green, and without lateral colour of all channels.
         tangential: p1 and p2 of Brown and Conrady's model.
-        focal: fx and fy in px, in which the model counts.
-        share: without ``focal``, the focal length over the longer side; without either, the model
-            counts as lateral colour does.
-        centre: the principal point in px from the corner; None, or None of one of them, is the
-            middle.
-        red, blue: lateral colour: r of red, or blue, from r of green, in the picture; r = 1 is half
+        focal: fx and fy in px, the model's unit.
+        share: without ``focal``, the focal length over the longer side. Without either, the unit is
+            that of lateral colour.
+        centre: the principal point in px from the corner; None, for one coordinate or both, is the
+            centre.
+        red, blue: lateral colour: r of red, or blue, from r of green, in the image; r = 1 is half
             the short side.
-        half_diagonals: what r = 1 of lateral colour is instead, in half diagonals of the image.
-        fit: whether the picture is scaled about the principal point so that it shows as much as
-            leaves no void.
-        margins: how far the image goes on beyond what the picture would be without the lens. The
-            image's width and height are with them; ``centre`` and all units are without.
+        half_diagonals: r = 1 of lateral colour in half diagonals of the image, if set.
+        fit: whether the image is scaled about the principal point to show as much as possible
+            without void pixels.
+        margins: how far the input extends outside the frame that the lens-free image would have.
+            The input's width and height include them. ``centre`` and all units do not.
     """
 
     radial: Radial = STRAIGHT
@@ -70,18 +70,18 @@ class DistortionMap:
 
     @property
     def is_identity(self) -> bool:
-        """Whether it leaves every image as it is."""
+        """Whether it leaves every image unchanged."""
         models = self.radial, self.red, self.blue
         return all(each.is_identity for each in models) and not any(self.tangential)
 
     def unit(self, width: int, height: int) -> tuple[float, float]:
-        """What r = 1 is in a picture of that size, in px across and down."""
+        """Return r = 1 for an image of this size, in px across and down."""
         side = self.share * max(width, height) if self.share else self.side(width, height)
         return self.focal or (side, side)
 
     def side(self, width: int, height: int) -> float:
-        """What r = 1 of lateral colour is in a picture of that size, in px."""
-        across, down = max(width - 1, 1), max(height - 1, 1)  # as lensfun counts
+        """Return r = 1 of lateral colour for an image of this size, in px."""
+        across, down = max(width - 1, 1), max(height - 1, 1)  # lensfun's definition
         if self.half_diagonals:
             return float(self.half_diagonals * np.hypot(across, down) / 2)
         return min(across, down) / 2
@@ -97,15 +97,15 @@ class DistortionMap:
     def seen(
         self, x: Array, y: Array, width: int, height: int, lateral: Radial | None = None
     ) -> tuple[Array, Array]:
-        """The places in the render that places of the picture show, in px, float64.
+        """Return the positions in the render that positions of the image show, in px, float64.
 
         Args:
-            x, y: places in the picture; float64, of any shape.
-            width, height: of the image.
+            x, y: positions in the image; float64, of any shape.
+            width, height: of the input.
             lateral: the lateral colour of the channel.
 
         Raises:
-            ImageError: the lens folds the image over, or no scale leaves no void.
+            ImageError: the lens folds the image over, or no scale avoids void pixels.
         """
         scale = self.scale(width, height)
         bend = _Bend(self, *self.size(width, height), scale)
@@ -115,9 +115,10 @@ class DistortionMap:
     def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
         """See :meth:`clpipe.reference.geometry.Geometry.intrinsics`.
 
-        Those of the render are of its part without margins. Where they are not known, they are what
-        the model counts in, if that is focal lengths. COLMAP's models hold those of Brown and
-        Conrady, the fisheye's, poly3 and poly5; ptlens, whose powers are odd, is fitted by theirs.
+        Those of the render are for its part without margins. If they are not known, they follow
+        from the model's unit, if that is focal lengths. COLMAP's models cover those of Brown and
+        Conrady, the fisheye's, poly3 and poly5. The model ptlens, whose powers are odd, is fitted
+        by them.
         """
         longer = self.scale(width, height)
         width, height = self.size(width, height)
@@ -135,8 +136,9 @@ class DistortionMap:
         for name, value in own.items():
             if not np.isclose(value, known := getattr(before, name), rtol=1e-6):
                 raise RequestError(
-                    f"distortion: its {name} is {value:g} px, but that of the render is {known:g} "
-                    f"px; set render.{name} and distortion to the same, or one of them"
+                    f"distortion: its {name} is {value:g} px, but that of the render is "
+                    f"{known:g} px; set render.{name} and distortion to the same value, or only "
+                    "one of them"
                 )
         is_square = counts or np.isclose(before.fx, before.fy, rtol=1e-4)
         bend = _Bend(self, width, height, longer)
@@ -161,13 +163,13 @@ class DistortionMap:
         return Intrinsics(width, height, *places, FULL_OPENCV, named, residual)
 
     def scale(self, width: int, height: int) -> float:
-        """By how much ``fit`` makes an image's focal length longer; 1 without it.
+        """Return the factor by which ``fit`` lengthens an image's focal length; 1 without it.
 
-        With margins the picture shows no more of them than fills it: the focal length becomes no
-        shorter than it is, or than it becomes without them.
+        With margins, the image shows only as much of them as it needs. The focal length does not
+        become shorter than it is, or than it would become without margins.
 
         Raises:
-            ImageError: as :meth:`seen`.
+            ImageError: like in :meth:`seen`.
         """
         if not self.fit:
             return 1.0
@@ -182,7 +184,7 @@ class DistortionMap:
 
 
 class _Bend:
-    """A lens and a picture of some size, scaled by ``scale``; margins are beside it."""
+    """A lens and an image of some size, scaled by ``scale``; margins are outside the image."""
 
     def __init__(self, lens: DistortionMap, width: int, height: int, scale: float) -> None:
         self.lens, self.scale, self.side = lens, scale, lens.side(width, height)
@@ -195,24 +197,24 @@ class _Bend:
         self.corner = float(np.hypot(*(away / self.unit).T).max())
         self.corner_side = float(np.hypot(*(away / self.side).T).max()) / scale
         away = self._corners(-left, -top, width + right, height + bottom)
-        self.farthest = float(np.hypot(*(away / self.unit).T).max())  # of the image
+        self.farthest = float(np.hypot(*(away / self.unit).T).max())  # of the input
         self._check(lens.radial, self.farthest, self.corner, "distortion", max(self.unit))
         for lateral in (lens.red, lens.blue):
             self._check(lateral, self.corner_side, self.corner_side, "lateral colour", self.side)
 
     def _corners(self, left: int, top: int, right: int, bottom: int) -> Array:
-        """The ways from the principal point to the corners of a rectangle, (corner, 2) in px."""
+        """Return the vectors from the principal point to a rectangle's corners, (corner, 2) px."""
         return np.array([(x, y) for x in (left, right) for y in (top, bottom)], float) - self.centre
 
     def _check(
         self, radial: Radial, farthest: float, corner: float, what: str, unit: float
     ) -> None:
-        """See that a model does not turn back within the image, where the picture shows it.
+        """Check that a model does not fold within the part of the input that the image shows.
 
         Args:
             radial: the model.
-            farthest: r of the farthest corner of the image.
-            corner: r_d of that of the picture.
+            farthest: r of the farthest corner of the input.
+            corner: r_d of the farthest corner of the image.
             what, unit: for the message.
         """
         at = None if radial.is_identity else fold_radius(radial, farthest)
@@ -220,21 +222,21 @@ class _Bend:
             raise self.folded(what, at, at * unit)
 
     def folded(self, what: str, r: float, px: float) -> ImageError:
-        """The error for coefficients that fold the image over at some radius."""
+        """Return the error for coefficients that fold the image over at some radius."""
         width, height = self.lens.margins.around(*self.size)
         less = ", or less overscan" if self.lens.margins else ""
         return ImageError(
-            f"distortion: these coefficients fold the image over: the {what} turns back at "
-            f"r = {r:.4g}, {px:.0f} px from the principal point, but the corner of "
-            f"{width}x{height} pixels is at r = {self.farthest:.4g}; use coefficients that grow "
-            f"up to there, or a longer focal length{less}"
+            f"distortion: these coefficients fold the image over. The {what} folds at r = "
+            f"{r:.4g}, {px:.0f} px from the principal point, but the corner of {width}x{height} "
+            f"pixels is at r = {self.farthest:.4g}. Use coefficients that grow up to there, or "
+            f"a longer focal length{less}"
         )
 
     def seen(self, x: Array, y: Array, lateral: Radial) -> tuple[Array, Array]:
         """See :meth:`DistortionMap.seen`."""
         lens = self.lens
         dx, dy = (x - self.centre[0]) / self.scale, (y - self.centre[1]) / self.scale
-        # The radius of green where that of the channel is the pixel's.
+        # The radius of green at which the channel's radius is the pixel's.
         grown = grown_by(lateral, np.hypot(dx, dy) / self.side, self.corner_side)
         dx, dy = dx * grown / self.unit[0], dy * grown / self.unit[1]
         grown = grown_by(lens.radial, np.hypot(dx, dy), self.farthest)
@@ -280,11 +282,11 @@ class _Bend:
 
 @lru_cache(maxsize=256)
 def fitting_scale(lens: DistortionMap, width: int, height: int) -> float:
-    """The scale of the picture at which it shows as much of the render as leaves no void.
+    """Return the scale at which the image shows as much as possible without void pixels.
 
     Args:
         lens: the lens, with the margins of the render.
-        width, height: of the picture.
+        width, height: of the image.
 
     Raises:
         ImageError: there is none between 1/8 and 8, or the lens folds the image over.
@@ -299,7 +301,7 @@ def fitting_scale(lens: DistortionMap, width: int, height: int) -> float:
             bend = _Bend(lens, width, height, scale)
             channels = dict.fromkeys((lens.red, STRAIGHT, lens.blue))
             places = [bend.seen(x, y, each) for each in channels]
-        except ImageError:  # so far out, the lens folds
+        except ImageError:  # the lens folds this far outside
             return False
         return all(
             u.min() >= -left
@@ -309,12 +311,12 @@ def fitting_scale(lens: DistortionMap, width: int, height: int) -> float:
             for u, v in places
         )
 
-    _Bend(lens, width, height, 1.0)  # refuses a lens that folds the image
+    _Bend(lens, width, height, 1.0)  # rejects a lens that folds the image
     low, high = 1 / 8, 8.0
     if not is_full(high):
         raise ImageError(
-            f"distortion: no scale fits the picture of {width}x{height} pixels into the render; "
-            "see that cx and cy lie in the image, or say fit=false"
+            f"distortion: no scale fits the image of {width}x{height} pixels into the render; "
+            "check that cx and cy are in the image, or set fit=false"
         )
     for _ in range(26):  # to 1e-7
         middle = (low * high) ** 0.5

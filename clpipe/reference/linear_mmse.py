@@ -1,9 +1,9 @@
-"""Linear demosaicing for any filter array: the best linear estimate under a model of images.
+"""Linear demosaicing for any filter array: the best linear estimate under an image model.
 
 After Trussell and Hartley, "Primary demosaicing using Kodak cameras" (ICIP 2002), and Portilla,
 Otaduy and Dorronsoro, "Low-complexity linear demosaicing using joint spatial-chromatic image
-statistics" (ICIP 2005): of each place of the period, the filters that leave the least mean square
-error. The statistics are a model's here, so that they are there for any array.
+statistics" (ICIP 2005). For each position of the period, the filters have the least mean square
+error. The statistics come from a model, so that they exist for any array.
 """
 
 from collections.abc import Iterator
@@ -16,20 +16,21 @@ from clpipe.reference.filter_array import FilterArray, beyond
 
 RADIUS = 3  # px: windows of 7x7
 SIDE = 2 * RADIUS + 1
-# The model: luma, the same in red, green and blue, of variance 1, and chroma, whose sum is zero, of
-# variance CHROMA for each; both isotropic, with a correlation of NEIGHBOURS to the power of the
-# distance in px. Chosen on eight of the Kodak set, RGGB, quad and X-Trans (docs/quality.md).
+# The model: luma, the same in red, green and blue, of variance 1, and chroma, with the sum zero and
+# the variance CHROMA each. Both are isotropic, with a correlation of NEIGHBOURS to the power of the
+# distance in px. Chosen on eight images of the Kodak set, for RGGB, quad and X-Trans
+# (docs/quality.md).
 NEIGHBOURS = 0.95
 CHROMA = 0.05
-NOISE = 1e-4  # the variance of what the model leaves out
+NOISE = 1e-4  # variance of the rest that the model does not describe
 
 
 @lru_cache(maxsize=16)
 def filters(array: FilterArray) -> Floats:
-    """The filters of an array: (row, column, tap, channel) float32; taps go along rows of 7x7.
+    """Return the filters of an array: (row, column, tap, channel) float32; taps by rows of 7x7.
 
-    They keep a sample of red, green or blue, and leave a flat colour as it is; of an array that
-    cannot tell all colours, flat gray.
+    The filters keep samples of red, green or blue, and do not change a flat colour. For an array
+    that cannot distinguish all colours, flat grey does not change.
     """
     between, centre = (NEIGHBOURS ** np.hypot(*apart) for apart in distances())
     rows, columns = array.period
@@ -40,7 +41,7 @@ def filters(array: FilterArray) -> Floats:
 
 
 def distances() -> tuple[Doubles, Doubles]:
-    """How far apart two taps of a window are, and a tap and the centre, in x and y.
+    """Return the distances between two taps of a window, and of a tap and the centre, in x and y.
 
     Both in px: (2, tap, tap) and (2, tap).
     """
@@ -51,7 +52,7 @@ def distances() -> tuple[Doubles, Doubles]:
 
 
 def windows(array: FilterArray) -> Iterator[tuple[int, int, Doubles]]:
-    """Each place of an array's period: its row, its column, and what each tap sees, (tap, 3)."""
+    """Yield each position of an array's period: its row, column, and taps' responses, (tap, 3)."""
     rows, columns = array.period
     span = range(-RADIUS, RADIUS + 1)
     for row in range(rows):
@@ -63,33 +64,34 @@ def windows(array: FilterArray) -> Iterator[tuple[int, int, Doubles]]:
 
 
 def covariance(seen: Doubles, between: Doubles, chroma: float, noise: float) -> Doubles:
-    """The covariance of a window's samples under a model, (tap, tap).
+    """Return the covariance of a window's samples under a model, (tap, tap).
 
     Args:
-        seen: what each tap sees of a colour, (tap, 3).
+        seen: the response of each tap to a colour, (tap, 3).
         between: the correlation of two taps' colours, (tap, tap).
-        chroma: the variance of chroma, where that of luma is 1.
-        noise: that of what the model leaves out.
+        chroma: the variance of chroma, relative to that of luma.
+        noise: the variance of the rest that the model does not describe.
     """
     return np.asarray(between * (seen @ _colours(chroma) @ seen.T) + noise * np.eye(len(seen)))
 
 
 def _colours(chroma: float) -> Doubles:
-    """The covariance of red, green and blue in one place."""
+    """Return the covariance of red, green and blue at one position."""
     gray = np.ones((3, 3))
     return np.asarray(gray + chroma * (np.eye(3) - gray / 3))
 
 
 def best(seen: Doubles, between: Doubles, centre: Doubles, chroma: float, noise: float) -> Doubles:
-    """The filters of one place, (tap, channel): least mean square error, flat colours exact, and a
-    sample of red, green or blue kept.
+    """Return the filters of one position, (tap, channel), with the least mean square error.
+
+    Flat colours are exact, and a sample of red, green or blue is kept.
 
     Args:
-        seen: what each tap sees of a colour, (tap, 3).
+        seen: the response of each tap to a colour, (tap, 3).
         between: the correlation of the colours of two taps, (tap, tap).
-        centre: that of the colours of a tap and the centre, (tap,).
-        chroma: the variance of chroma, where that of luma is 1.
-        noise: that of what the model leaves out.
+        centre: the correlation of the colours of a tap and the centre, (tap,).
+        chroma: the variance of chroma, relative to that of luma.
+        noise: the variance of the rest that the model does not describe.
     """
     samples = covariance(seen, between, chroma, noise)
     wanted = centre[:, None] * (seen @ _colours(chroma))
@@ -101,23 +103,24 @@ def best(seen: Doubles, between: Doubles, centre: Doubles, chroma: float, noise:
     lacking = exact.T - lit.T @ free
     made = np.asarray(free + flat @ np.linalg.solve(lit.T @ flat, lacking))
     middle = len(seen) // 2
-    if 1 in seen[middle].tolist() and np.isclose(seen[middle].sum(), 1):  # a colour that is there
+    # a colour that was sampled
+    if 1 in seen[middle].tolist() and np.isclose(seen[middle].sum(), 1):
         made[:, seen[middle].argmax()] = np.arange(len(seen)) == middle
     return made
 
 
 def linear_mmse(mosaic: Floats, array: FilterArray) -> Floats:
-    """RGB, (height, width, 3), from a white-balanced mosaic, (height, width)."""
+    """Return RGB, (height, width, 3), from a white-balanced mosaic, (height, width)."""
     return filtered(mosaic, array.period, filters(array))
 
 
 def filtered(mosaic: Floats, period: tuple[int, int], made: Floats) -> Floats:
-    """A mosaic through filters by place: (height, width, channel).
+    """Apply filters by position to a mosaic: (height, width, channel).
 
     Args:
         mosaic: (height, width).
-        period: of its array, by which it goes on beyond its edges.
-        made: the filters, (row, column, tap, channel), of a multiple of the period.
+        period: period of its array, which continues it outside its edges.
+        made: the filters, (row, column, tap, channel), for a multiple of the period.
     """
     height, width = mosaic.shape
     wide = mosaic[np.ix_(beyond(height, period[0], RADIUS), beyond(width, period[1], RADIUS))]

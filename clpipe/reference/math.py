@@ -1,7 +1,7 @@
-"""Short polynomials for log, exp and roots, bit for bit as ``kernels/lib/math.h`` has them.
+"""Short polynomials for log, exp and roots, bit for bit equal to ``kernels/lib/math.h``.
 
-They use only multiplication, addition and operations on bits, which round alike on every device.
-The coefficients are our own least-squares minimax fits; ``tests/test_noise.py`` holds the errors
+They use only multiplication, addition and operations on bits, which round equally on every device.
+The coefficients are our own least-squares minimax fits. ``tests/test_noise.py`` checks the errors
 that are stated here.
 """
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from clpipe.base.types import Floats
 
-# Of ln(1 + y) / y for 1 + y in [sqrt(1/2), sqrt(2)), and of (2^f - 1) / f for f in [-1/2, 1/2];
-# lowest power first.
+# Coefficients of ln(1 + y) / y for 1 + y in [sqrt(1/2), sqrt(2)), and of (2^f - 1) / f for f in
+# [-1/2, 1/2]; lowest power first.
 LOG_COEFFICIENTS = np.array(
     [1.0000032, -0.50001967, 0.33303297, -0.24881342, 0.20604694, -0.18901953, 0.118273675],
     np.float32,
@@ -21,7 +21,7 @@ POWER_COEFFICIENTS = np.array(
 
 
 def negative_log(t: Floats) -> Floats:
-    """-ln(t) for t > 0, float32; error 4e-7, relative where |ln(t)| is above 1, else absolute."""
+    """Return -ln(t) for t > 0, float32; error 4e-7, relative if |ln(t)| > 1, else absolute."""
     bits = t.view(np.int32)
     exponent = (bits - np.int32(0x3F3504F3)) >> np.int32(23)
     y = (bits - (exponent << np.int32(23))).view(np.float32) - np.float32(1)
@@ -29,7 +29,7 @@ def negative_log(t: Floats) -> Floats:
 
 
 def square_root(x: Floats) -> Floats:
-    """sqrt(x) for x >= 0, float32, relative error 5e-6.
+    """Return sqrt(x) for x >= 0, float32, relative error 5e-6.
 
     >>> square_root(np.float32([0, 1, 4])).round(4).tolist()
     [0.0, 1.0, 2.0]
@@ -38,10 +38,10 @@ def square_root(x: Floats) -> Floats:
 
 
 def inverse_root(x: Floats) -> Floats:
-    """1/sqrt(x) for x > 0, float32, relative error 5e-6.
+    """Return 1/sqrt(x) for x > 0, float32, relative error 5e-6.
 
-    Two Newton steps from an estimate on the float's bits (Lomont, "Fast inverse square root",
-    2003).
+    It takes two Newton steps from an estimate on the float's bits (Lomont, "Fast inverse square
+    root", 2003).
     """
     half_x = x * np.float32(0.5)
     r = (np.int32(0x5F375A86) - (x.view(np.int32) >> np.int32(1))).view(np.float32)
@@ -51,9 +51,9 @@ def inverse_root(x: Floats) -> Floats:
 
 
 def power_of_two(x: Floats) -> tuple[Floats, Floats]:
-    """(s, e) with 2^x = s * (1 + e), for |x| < 126.
+    """Return (s, e) with 2^x = s * (1 + e), for |x| < 126.
 
-    s is a whole power of two; e keeps its relative accuracy near x = 0, where it is small.
+    s is an integer power of two; e keeps its relative accuracy near x = 0, where it is small.
     """
     whole = (x + np.float32(12582912)) - np.float32(12582912)
     f = x - whole
@@ -62,7 +62,7 @@ def power_of_two(x: Floats) -> tuple[Floats, Floats]:
 
 
 def exponential(x: Floats) -> Floats:
-    """e^x for |x| < 87, float32, relative error 1e-6 for |x| < 20 and 4e-6 beyond.
+    """Return e^x for |x| < 87, float32, relative error 1e-6 for |x| < 20, otherwise 4e-6.
 
     >>> exponential(np.float32([-2.3025851, 0, 1])).round(4).tolist()
     [0.10000000149011612, 1.0, 2.7183001041412354]
@@ -72,7 +72,7 @@ def exponential(x: Floats) -> Floats:
 
 
 def exponential_minus_1(x: Floats) -> Floats:
-    """e^x - 1 for |x| < 87, float32, relative error as :func:`exponential`, also near x = 0.
+    """Return e^x - 1 for |x| < 87, float32; relative error of :func:`exponential`, also near 0.
 
     >>> exponential_minus_1(np.float32([1e-6, 1])).tolist()
     [1.0000005659094313e-06, 1.7182817459106445]
@@ -82,7 +82,7 @@ def exponential_minus_1(x: Floats) -> Floats:
 
 
 def estrin(coefficients: Floats, x: Floats) -> Floats:
-    """The value at x of a polynomial, float32; the coefficients begin with the lowest power.
+    """Return the value at x of a polynomial, float32; coefficients from the lowest power up.
 
     Estrin's scheme, in the kernels' order: pairs, then pairs of pairs, then their sum from the
     lowest power up.

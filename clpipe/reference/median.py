@@ -1,4 +1,4 @@
-"""The median filter, as ``kernels/lib/median.h`` has it."""
+"""The median filter, like in ``kernels/lib/median.h``."""
 
 import numpy as np
 
@@ -7,9 +7,9 @@ from clpipe.reference.image import tap
 
 
 def median_filter(image: Floats, size: int) -> Floats:
-    """Median of the ``size`` x ``size`` pixels around each pixel, mirrored at the borders.
+    """Return the median of ``size`` x ``size`` pixels around each pixel, mirrored at the borders.
 
-    ``image`` is (height, width) or (height, width, plane); each plane is filtered by itself, and
+    ``image`` is (height, width) or (height, width, plane). Each plane is filtered separately, and
     the result has the same shape.
 
     >>> median_filter(np.float32([[1, 9, 2, 3, 4]]), 3).tolist()

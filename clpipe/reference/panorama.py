@@ -1,8 +1,7 @@
-"""What is seen all around one point: perspective views, or a map of longitude and latitude.
+"""The surroundings of one point: perspective views, or a map of longitude and latitude.
 
-Its pixels are in one image, the atlas: views stand one below the other, each with a border that
-shows what is beside it. Directions are (3, ...), to the right, down and along the axis of the
-camera whose picture is made of it.
+Its pixels are in one image, the atlas. Views are stacked vertically, each with a border that shows
+its surroundings. Directions are (3, ...): right, down and along the axis of the output camera.
 """
 
 from collections.abc import Sequence
@@ -16,9 +15,9 @@ from clpipe.base.types import Array
 from clpipe.reference.carried import bilinear, nearest
 from clpipe.reference.warp import FILTERS
 
-BORDER = 4  # px; filters reach 3 beyond a place
-ROUNDS = 2  # in which borders are filled; in the second from each other, too
-EDGE = 1e-6  # of a view's side: so far beyond it a direction is still its own
+BORDER = 4  # px; filters extend 3 px around a position
+ROUNDS = 2  # to fill borders; in the second pass also from each other
+EDGE = 1e-6  # of a view's side: distance outside it up to which a direction still belongs to it
 
 Rotation = tuple[tuple[float, float, float], ...]
 
@@ -32,8 +31,8 @@ DOWN: Rotation = ((1, 0, 0), (0, 0, 1), (0, -1, 0))
 
 CUBE = {"front": FRONT, "right": RIGHT, "back": BACK, "left": LEFT, "up": UP, "down": DOWN}
 
-# OpenEXR's order, +x, -x, +y, -y, +z and -z, where y is up, z ahead, and x to the left; the faces
-# above and below are turned by half a turn (ImfEnvmap.cpp of OpenEXR 3).
+# OpenEXR's order, +x, -x, +y, -y, +z and -z, where y is up, z ahead, and x to the left. The faces
+# above and below are rotated by 180 degrees (ImfEnvmap.cpp of OpenEXR 3).
 OPENEXR_CUBE = (
     LEFT,
     RIGHT,
@@ -45,7 +44,7 @@ OPENEXR_CUBE = (
 
 
 class Panorama(Protocol):
-    """Where directions are in an atlas.
+    """The mapping between directions and an atlas.
 
     A subclass has a ``border``, px around each view in the atlas.
     """
@@ -54,7 +53,7 @@ class Panorama(Protocol):
 
     @property
     def count(self) -> int:
-        """How many images the atlas is made of."""
+        """The number of images in the atlas."""
         return 1
 
     @property
@@ -64,30 +63,30 @@ class Panorama(Protocol):
 
     @property
     def record(self) -> dict[str, Any]:
-        """What it is, as JSON values."""
+        """Its description, as JSON values."""
         ...
 
     def places(self, rays: Array) -> tuple[Array, Array]:
-        """Where directions are in the atlas, x and y in px; NaN where they are in no view."""
+        """Return the positions of directions in the atlas, x and y in px; NaN outside all views."""
         ...
 
     def rays(self, x: Array, y: Array, at: tuple[Array, Array] | None = None) -> Array:
-        """The directions of places of the atlas, of any length above 0.
+        """Return the directions of positions of the atlas, of any length above 0.
 
         Args:
-            x, y: the places, px.
-            at: places of the views in which they are meant; None is themselves. So a vector may
-                lead out of a view.
+            x, y: the positions, px.
+            at: positions in the views that select the view; None is the positions themselves. A
+                vector may therefore end outside a view.
         """
         ...
 
     def atlas(self, images: Sequence[Array], filter_: str) -> Array:
-        """The atlas of the images of all views, (height, width, channel), of their type.
+        """Return the atlas of the images of all views, (height, width, channel), of their type.
 
         Args:
             images: by view, without borders.
-            filter_: how borders are filled from other views: of :data:`FILTERS`, "linear" or
-                "nearest"; "" leaves them as the view's own edge, as what counts in its pixels.
+            filter_: how borders are filled from other views: a key of :data:`FILTERS`, "linear" or
+                "nearest". "" repeats the view's own edge, for data in units of its pixels.
         """
         if not self.border:
             return np.concatenate(images)
@@ -100,7 +99,7 @@ class Panorama(Protocol):
 
     @cached_property
     def _borders(self) -> tuple[Array, Array, Array, Array]:
-        """Rows and columns of border pixels that are seen elsewhere, and the places there."""
+        """Return rows and columns of border pixels that other views show, and positions there."""
         width, height = self.size
         is_border = np.ones((height // self.count, width), bool)
         is_border[self.border : -self.border, self.border : -self.border] = False
@@ -124,12 +123,12 @@ class View:
 
     @classmethod
     def of_angle(cls, rotation: Rotation, width: int, height: int, angle: float) -> "View":
-        """A view whose field is so many degrees across."""
+        """Return a view with a horizontal field of view in degrees."""
         f = width / 2 / np.tan(np.radians(angle / 2))
         return cls(rotation, f, f, width / 2, height / 2, width, height)
 
     def lengths(self) -> Array:
-        """(height, width): the distance of what has the depth 1 along the axis."""
+        """Return the distance at depth 1 along the axis, (height, width)."""
         x = (np.arange(self.width) + 0.5 - self.cx) / self.fx
         y = (np.arange(self.height) + 0.5 - self.cy) / self.fy
         return np.sqrt(1 + x * x + (y * y)[:, None])
@@ -137,10 +136,10 @@ class View:
 
 @dataclass(frozen=True)
 class Views(Panorama):
-    """Perspective views from one point; a direction is taken from where it is farthest from edges.
+    """Perspective views from one point; each direction uses the view whose edges are farthest.
 
     Args:
-        views: all of one size.
+        views: the views, all of one size.
         border: px around each view in the atlas.
     """
 
@@ -160,7 +159,7 @@ class Views(Panorama):
 
     @property
     def record(self) -> dict[str, Any]:
-        """See :attr:`Panorama.record`; the rotations lead from a view's axes to the picture's."""
+        """See :attr:`Panorama.record`; the rotations lead from a view's axes to the image's."""
         return {"views": [asdict(view) for view in self.views]}
 
     def places(self, rays: Array) -> tuple[Array, Array]:
@@ -200,12 +199,12 @@ class Views(Panorama):
 
 @dataclass(frozen=True)
 class LatitudeLongitude(Panorama):
-    """All directions by longitude, to the right, and latitude; the middle is ahead.
+    """All directions by longitude, to the right, and latitude; the centre is ahead.
 
     Args:
         width, height: of the map in px.
         on_edges: whether the first and last columns and rows are at the ends of longitude and
-            latitude, as OpenEXR has them, and not half a pixel inside.
+            latitude, like in OpenEXR, and not half a pixel inside.
         border: px around the map in the atlas.
     """
 
@@ -226,7 +225,7 @@ class LatitudeLongitude(Panorama):
 
     @property
     def _steps(self) -> tuple[float, float]:
-        """Radians from column to column and from row to row."""
+        """The radians between columns and between rows."""
         less = 1 if self.on_edges else 0
         return 2 * np.pi / max(self.width - less, 1), np.pi / max(self.height - less, 1)
 
@@ -250,12 +249,12 @@ class LatitudeLongitude(Panorama):
 
 
 def sampled(pixels: Array, x: Array, y: Array, filter_: str) -> Array:
-    """Pixels, (rows, columns, channel), at places between their centres, of their type.
+    """Return pixels, (rows, columns, channel), at positions between their centres.
 
     Args:
-        pixels: the image; beyond its edges it is as at them.
-        x, y: the places, 1-D.
-        filter_: of :data:`FILTERS`, or "linear" or "nearest".
+        pixels: the image, continued by its edge pixels.
+        x, y: the positions, 1-D.
+        filter_: a key of :data:`FILTERS`, or "linear" or "nearest".
     """
     if filter_ == "nearest":
         return nearest(pixels, x, y)

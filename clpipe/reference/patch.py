@@ -1,7 +1,7 @@
 """Distances between 3x3 patches, for non-local means.
 
-"IPOL 2011" is Buades, Coll and Morel, "Non-Local Means Denoising", Image Processing On Line 1,
-2011. The kernels have their own, blocked form in ``kernels/lib/patch.h``.
+The abbreviation "IPOL 2011" stands for Buades, Coll and Morel, "Non-Local Means Denoising", Image
+Processing On Line 1, 2011. The kernels have their own blocked form in ``kernels/lib/patch.h``.
 """
 
 from collections.abc import Iterator
@@ -14,16 +14,16 @@ from clpipe.reference.image import mirrored, tap
 
 
 def patch_distances(planes: Floats, reach: int, step: int = 1) -> Iterator[tuple[int, int, Floats]]:
-    """Squared distances between each pixel's 3x3 patch and those in its window (IPOL 2011, eq. 2).
+    """Yield squared distances between the 3x3 patches of pixels in a window (IPOL 2011, eq. 2).
 
     Args:
         planes: (height, width, plane).
-        reach: the largest offset of the window, px.
-        step: the distance between offsets, px.
+        reach: largest offset in the window, px.
+        step: distance between offsets, px.
 
     Yields:
-        For each offset, dx, dy and the squared differences summed over patch and planes,
-        (height, width).
+        For each offset, dx, dy and the squared differences summed over patch and planes, (height,
+        width).
 
     >>> step = np.float32([[[0], [0], [0], [1], [1], [1]]])
     >>> {dx: d[0].tolist() for dx, dy, d in patch_distances(step, 1) if dy == 0}[1]
@@ -41,7 +41,7 @@ def patch_distances(planes: Floats, reach: int, step: int = 1) -> Iterator[tuple
 
 
 def bias_of(strength: float) -> np.float32:
-    """The squared distance that noise alone is expected to make, in units of its variance.
+    """Return the squared distance expected from noise alone, in units of its variance.
 
     It is 2, since the difference of two samples has the variance 2 sigma^2 (IPOL 2011, sec. 3). A
     ``strength`` below 1 scales sigma down.
@@ -50,12 +50,12 @@ def bias_of(strength: float) -> np.float32:
 
 
 def decay_of(h: float) -> np.float32:
-    """The factor c for which exp(-distance / h^2) = 2^(c * distance)."""
+    """Return the factor c for which exp(-distance / h^2) = 2^(c * distance)."""
     return np.float32(-log2(e) / max(h, 1e-3) ** 2)
 
 
 def patch_sum(image: Floats) -> Floats:
-    """Sum of the 3x3 pixels around each pixel of a plane; (height, width) in and out.
+    """Return the sum of the 3x3 pixels around each pixel of a plane; (height, width) in and out.
 
     >>> patch_sum(np.float32([[1, 2, 4]])).tolist()
     [[15.0, 21.0, 24.0]]

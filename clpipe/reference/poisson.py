@@ -1,4 +1,4 @@
-"""Poisson numbers by inverse CDF, bit for bit as ``kernels/lib/poisson.h`` has them.
+"""Poisson numbers by inverse CDF, bit for bit equal to ``kernels/lib/poisson.h``.
 
 After M. Giles, "Algorithm 955: Approximation of the inverse Poisson cumulative distribution
 function", ACM TOMS 42(1), 2016.
@@ -10,7 +10,7 @@ from clpipe.base.types import Floats
 from clpipe.reference.math import estrin, exponential, inverse_root
 from clpipe.reference.random import Words, in_upper_half, normal_of, tail_probability
 
-LARGE = np.float32(10)  # the mean from which on the expansion is used
+LARGE = np.float32(10)  # mean from which the expansion is used
 TERMS = 36  # a Poisson number of mean 10 exceeds this with a probability of 1e-10
 
 # The polynomials of the expansion, lowest power first: our own weighted least-squares fits.
@@ -41,10 +41,10 @@ C = np.array([-0.0197614673525095, 0.016855543479323387], np.float32)
 
 
 def poisson_of(mean: Floats, words: Words) -> Floats:
-    """Poisson numbers, one for each random word, as whole float32; ``mean`` is float32, >= 0.
+    """Return a Poisson number per random word, as whole float32; ``mean`` is float32, >= 0.
 
-    Below a mean of 10 the CDF is summed; from there on the quantile is expanded, with an error of
-    3e-4 of a number within 3 sigma.
+    Below a mean of 10, the CDF is summed. From 10 on, the quantile is expanded, with an error of
+    3e-4 within 3 sigma.
 
     >>> poisson_of(np.float32([0, 3, 50]), np.uint32([1 << 30] * 3)).tolist()
     [0.0, 4.0, 55.0]
@@ -55,10 +55,10 @@ def poisson_of(mean: Floats, words: Words) -> Floats:
 
 
 def poisson_small(mean: Floats, words: Words) -> Floats:
-    """Poisson numbers for means up to 10.
+    """Return Poisson numbers for means up to 10.
 
-    The number is how many k have a CDF below u; for u above 1/2, how many k have P(X >= k) above
-    1 - u. Both sums begin with their smallest terms, which keeps the tails exact.
+    The number is the count of k with a CDF below u. For u above 1/2, it is the count of k with P(X
+    >= k) above 1 - u. Both sums begin with their smallest terms, which keeps the tails exact.
     """
     p = tail_probability(words)
     one = np.float32(1)
@@ -77,7 +77,7 @@ def poisson_small(mean: Floats, words: Words) -> Floats:
 
 
 def poisson_large(mean: Floats, words: Words) -> Floats:
-    """Poisson numbers for means from 10 on, the whole part of a continuous quantile.
+    """Return Poisson numbers for means from 10 on: the integer part of a continuous quantile.
 
     The quantile is mean + sqrt(mean) w + w^2 A(s) + B(s) + C(s) / mean, with w the normal quantile
     and s = w / sqrt(mean).
@@ -94,6 +94,6 @@ def poisson_large(mean: Floats, words: Words) -> Floats:
 
 
 def nearest(v: Floats) -> Floats:
-    """The nearest whole number, ties to even, for |v| < 2^22."""
+    """Return the nearest whole number, ties to even, for |v| < 2^22."""
     magic = np.float32(12582912)
     return (v + magic) - magic

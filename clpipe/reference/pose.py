@@ -1,8 +1,8 @@
-"""A picture's pose: where its camera stands, world to camera in OpenCV's axes.
+"""An image's camera pose: world to camera in OpenCV's axes.
 
-x_cam = R X + t; x_cam points to the right, y_cam down and z_cam into the scene. Files differ:
-COLMAP's are the same with R as a quaternion, NeRF's go from the camera to the world in OpenGL's
-axes, where y points up and z out of the scene.
+x_cam = R X + t, where x_cam points to the right, y_cam down and z_cam into the scene. File formats
+differ. COLMAP uses the same with R as a quaternion. NeRF's poses map the camera to the world in
+OpenGL's axes, where y points up and z out of the scene.
 """
 
 from collections.abc import Sequence
@@ -17,14 +17,14 @@ Matrix: TypeAlias = tuple[Vector, Vector, Vector]
 
 OPENGL = np.diag([1.0, -1.0, -1.0])  # OpenCV's axes in OpenGL's, and back
 
-TOLERANCE = 1e-3  # of R R^T - 1; texts may have been rounded to four digits
+TOLERANCE = 1e-3  # of R R^T - 1; text files may be rounded to four digits
 
 
 def rotation(rows: Matrix) -> Matrix:
-    """A matrix, which must be a rotation.
+    """Return a matrix that is checked to be a rotation.
 
     Raises:
-        ValueError: it is none; the message says why.
+        ValueError: it is not a rotation; the message states why.
     """
     r = np.array(rows, np.float64)
     with np.errstate(all="ignore"):
@@ -33,16 +33,16 @@ def rotation(rows: Matrix) -> Matrix:
     if not off <= TOLERANCE:
         lengths = ", ".join(f"{length:.4g}" for length in np.sqrt((r * r).sum(1)))
         raise ValueError(
-            f"it is no rotation: its rows have the lengths {lengths}, and R R^T is off by "
-            f"{off:.2g} from 1; take scale and shear out of it"
+            f"not a rotation: its rows have the lengths {lengths}, and R R^T differs from 1 by "
+            f"{off:.2g}; remove scale and shear from it"
         )
     if determinant < 0:
-        raise ValueError("it is no rotation but mirrors: its determinant is -1; flip one axis")
+        raise ValueError("not a rotation but a reflection: its determinant is -1; flip one axis")
     return rows
 
 
 def from_opengl(matrix: Array) -> tuple[Array, Array]:
-    """R and t of a pose from the camera to the world in OpenGL's axes, (3 or 4, 4) float64.
+    """Return R and t of a pose from camera to world in OpenGL's axes, (3 or 4, 4) float64.
 
     >>> r, t = from_opengl(np.array([[1.0, 0, 0, 5], [0, 1, 0, 6], [0, 0, 1, 7]]))
     >>> r.diagonal().tolist(), t.tolist()
@@ -53,7 +53,7 @@ def from_opengl(matrix: Array) -> tuple[Array, Array]:
 
 
 def to_opengl(rows: Matrix, t: Vector) -> Array:
-    """The inverse of :func:`from_opengl`, (4, 4) float64."""
+    """Invert :func:`from_opengl`, (4, 4) float64."""
     r = np.array(rows, np.float64)
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = r.T @ OPENGL, -(r.T @ np.array(t, np.float64))
@@ -61,7 +61,7 @@ def to_opengl(rows: Matrix, t: Vector) -> Array:
 
 
 def from_quaternion(q: Sequence[float]) -> Array:
-    """The rotation of a quaternion w, x, y, z of any length but 0, (3, 3) float64.
+    """Return the rotation of a quaternion w, x, y, z of any length but 0, (3, 3) float64.
 
     >>> from_quaternion([2.0, 0, 0, 2.0]).round(12).tolist()
     [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
@@ -76,9 +76,9 @@ def from_quaternion(q: Sequence[float]) -> Array:
 
 
 def to_quaternion(rows: Matrix) -> Array:
-    """The unit quaternion w, x, y, z of a rotation, w not negative.
+    """Return the unit quaternion w, x, y, z of a rotation, with w not negative.
 
-    By the largest of its elements, so that none is divided by a small one (Shepperd 1978).
+    It starts from its largest element, so that no division is by a small one (Shepperd 1978).
 
     >>> to_quaternion(((1.0, 0, 0), (0, -1.0, 0), (0, 0, -1.0))).tolist()
     [0.0, 1.0, 0.0, 0.0]

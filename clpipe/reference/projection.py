@@ -1,4 +1,4 @@
-"""A picture of a panorama through a wide lens: the place of the atlas that each pixel shows."""
+"""An image of a panorama through a wide lens: the position in the atlas for each pixel."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,27 +16,27 @@ from clpipe.reference.resample import PADDING, Axis, Parameters
 from clpipe.reference.warp import FILTERS, Gathering, gather, within_border
 from clpipe.reference.wide import WideLens
 
-FACE = 256  # places across a face, at which it is looked for
+FACE = 256  # positions across a face at which it is searched
 
-NOWHERE = -1e6  # px: a place that is in no image
+NOWHERE = -1e6  # px: a position outside every image
 
 Facts = tuple[tuple[str, float], ...]
 
 
 @dataclass(frozen=True)
 class Projection(Gathering, Destined):
-    """How a wide picture is made of an image: its geometry, and its resampling.
+    """How a wide-angle image is made from an input: its geometry, and its resampling.
 
     It is a :class:`~clpipe.reference.geometry.Geometry`, and a
     :class:`~clpipe.reference.resample.Resampler`.
 
     Args:
         lens: the lens.
-        filter: of :data:`clpipe.reference.warp.FILTERS`.
-        panorama: what the image is; None makes it a single view ahead, or a map.
+        filter: a key of :data:`clpipe.reference.warp.FILTERS`.
+        panorama: the layout of the input; None is a single view ahead, or a map.
         is_map: whether it is a map of longitude and latitude, without a border.
-        angle: of a single view's field, in degrees across.
-        shot: what is known of the camera of a single view, see :meth:`Intrinsics.of_render`.
+        angle: horizontal field of view of a single view, in degrees.
+        shot: known values of the camera of a single view, see :meth:`Intrinsics.of_render`.
     """
 
     parameters: ClassVar[Parameters] = (
@@ -54,10 +54,10 @@ class Projection(Gathering, Destined):
     shot: Facts = ()
 
     def of_image(self, width: int, height: int) -> Panorama:
-        """What an image of some size is.
+        """Return the layout of an image of some size.
 
         Raises:
-            ImageError: the focal length of a view is not known, or is said to be another.
+            ImageError: the focal length of a view is not known, or contradicts another.
         """
         if self.panorama:
             self._check(self.panorama)
@@ -71,18 +71,18 @@ class Projection(Gathering, Destined):
         known = Intrinsics.of_render(width, height, dict(self.shot))
         if known is None:
             raise ImageError(
-                "projection: the focal length of the render is not known: set render.fx, or "
-                "render.focal_length and render.sensor_width, or projection.face_angle; or give "
-                "the six faces of a cube, *_front, *_right, *_back, *_left, *_up and *_down"
+                "projection: the focal length of the render is not known. Set render.fx, or "
+                "render.focal_length and render.sensor_width, or projection.face_angle. Or use "
+                "the six faces of a cube: *_front, *_right, *_back, *_left, *_up and *_down"
             )
         place = known.fx, known.fy, known.cx, known.cy
         return Views((View(FRONT, *place, width, height),), border=0)
 
     def _check(self, panorama: Panorama) -> None:
-        """See that what is known of the render's focal length is so in a panorama.
+        """Check that the known focal length of the render agrees with a panorama.
 
         Raises:
-            ImageError: it is not.
+            ImageError: it does not.
         """
         if not isinstance(panorama, Views):
             return
@@ -90,8 +90,9 @@ class Projection(Gathering, Destined):
         known = Intrinsics.of_render(view.width, view.height, dict(self.shot))
         if known and abs(known.fx - view.fx) > AGREEMENT * view.fx:
             raise ImageError(
-                f"projection: render's focal length is {known.fx:.4g} px, but that of a view of "
-                f"{view.width}x{view.height} pixels is {view.fx:.4g} px by its angle; leave one out"
+                f"projection: render's focal length is {known.fx:.4g} px, but a view of "
+                f"{view.width}x{view.height} pixels with this angle has {view.fx:.4g} px; "
+                "remove one of them"
             )
 
     def size(self, width: int, height: int) -> tuple[int, int]:
@@ -103,7 +104,7 @@ class Projection(Gathering, Destined):
         return self.lens.picture
 
     def origins(self, x: Array, y: Array, width: int, height: int) -> tuple[Array, Array]:
-        """See :meth:`Geometry.origins`; NaN beyond the field, and where there is no view."""
+        """See :meth:`Geometry.origins`; NaN outside the field of view, and outside all views."""
         return self.of_image(width, height).places(self.lens.rays(x, y))
 
     def destinations(
@@ -113,7 +114,7 @@ class Projection(Gathering, Destined):
         return self.lens.seen(self.of_image(width, height).rays(x, y, at))
 
     def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
-        """See :meth:`Geometry.intrinsics`; those of the lens, whatever they were before."""
+        """See :meth:`Geometry.intrinsics`; those of the lens, whatever the input's are."""
         return self.lens.intrinsics()
 
     def values(self, width: int, height: int) -> Mapping[str, Any]:
@@ -127,7 +128,7 @@ class Projection(Gathering, Destined):
         return _lines(self, axis, width, height)
 
     def reference(self, image: Floats) -> Floats:
-        """The picture, (height, width, 3) float32, of an image; black where nothing is seen."""
+        """Return the image, (height, width, 3) float32, of an input; black outside the view."""
         height, width = image.shape[:2]
         columns, rows = self.lens.picture
         across, down = (each[:rows, :columns] for each in _ways(self, width, height))
@@ -136,22 +137,23 @@ class Projection(Gathering, Destined):
 
 
 def seen_faces(lens: WideLens) -> tuple[int, list[str]]:
-    """The side in px of a cube's faces that are as fine as a picture, and those that it shows."""
+    """Return the side in px of cube faces as fine as an image, and the faces that it shows."""
     cube = Views(tuple(View.of_angle(turn, FACE, FACE, 90.0) for turn in CUBE.values()))
     width, height = lens.picture
     x, y = np.meshgrid(np.linspace(0, width, FACE), np.linspace(0, height, FACE))
     _, row = cube.places(lens.rays(x, y))
     numbers = np.unique(row[np.isfinite(row)] * len(CUBE) // cube.size[1])
-    # In the middle, where a face is coarsest, it has half a side for a radian.
+    # In its centre, where a face is coarsest, one radian is half its side.
     side = 2 * int(np.ceil(lens.finest))
     return side, [list(CUBE)[int(number)] for number in numbers]
 
 
 @lru_cache(maxsize=4)
 def _ways(projection: Projection, width: int, height: int) -> tuple[Floats, Floats]:
-    """How far it is from each pixel to the place that it shows, across and down, in px.
+    """Return the offset from each pixel to the position that it shows, across and down, in px.
 
-    Float32, (height, width) of the picture with :data:`PADDING` more each, which a kernel reads.
+    The arrays are float32, (height, width) of the image plus :data:`PADDING` each, which a kernel
+    reads.
     """
     columns, rows = (each + PADDING for each in projection.lens.picture)
     across, down = (np.full((rows, columns), NOWHERE, np.float32) for _ in range(2))

@@ -1,6 +1,6 @@
-"""Radial models of lenses: how far from the axis a point comes to lie, and the inverse.
+"""Radial lens models: the distance of a point from the axis, and the inverse.
 
-What a model calls r is the distance from the principal point in units of its own.
+In a model, r is the distance from the principal point in the model's unit.
 """
 
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ from numpy.polynomial.polynomial import polyder, polyval
 from clpipe.base.types import Array
 from clpipe.reference.rational import fit_even
 
-# Newton's method ends where the place that it finds is bent to within this of the place asked for,
-# in the unit of r: 4e-9 px for a focal length of 4000 px.
+# Newton's method ends when the error after distortion is below this value, in the unit of r: 4e-9
+# px for a focal length of 4000 px.
 RESIDUAL = 1e-12
-SAMPLES = 2049  # of a radial model, between which its inverse is begun
-# Beyond the corner the model still holds for this share of its radius, for what is interpolated
-# there; then it goes on straight.
+SAMPLES = 2049  # of a radial model, as starting points for its inverse
+# The model continues outside the corner for this share of its radius, for interpolation. After
+# that, it continues as a straight line.
 BEYOND = 1.25
 
 
@@ -26,7 +26,7 @@ BEYOND = 1.25
 class Radial:
     """r_d = N(r) / M(r), polynomials with their coefficients from the lowest power up.
 
-    With ``of_angle`` they are polynomials of atan(r), the angle to the axis.
+    With ``of_angle``, they are polynomials of atan(r), the angle to the axis.
 
     >>> cubic = Radial((0.0, 1.0, 0.0, -0.1))
     >>> float(cubic.bent(np.array(0.5))), float(cubic.slope(np.array(0.5)))
@@ -39,7 +39,7 @@ class Radial:
 
     @classmethod
     def of(cls, *numerator: float, below: tuple[float, ...] = (), of_angle: bool = False) -> Self:
-        """The model N(r) / (1 + M(r)), each polynomial from r^1 up, without zeros at its end.
+        """Return the model N(r) / (1 + M(r)), each polynomial from r^1 up, without trailing zeros.
 
         >>> Radial.of(1.0, 0.0, 0.0).is_identity
         True
@@ -55,12 +55,12 @@ class Radial:
         return self == STRAIGHT
 
     def bent(self, r: Array) -> Array:
-        """r_d, the radius in the picture, of r, the radius without the lens; float64."""
+        """Return r_d, the radius in the image, of r, the radius without the lens; float64."""
         x = np.arctan(r) if self.of_angle else r
         return polyval(x, self.numerator) / polyval(x, self.denominator)
 
     def slope(self, r: Array) -> Array:
-        """The derivative of :meth:`bent`."""
+        """Return the derivative of :meth:`bent`."""
         x = np.arctan(r) if self.of_angle else r
         n, m = polyval(x, self.numerator), polyval(x, self.denominator)
         dn, dm = polyval(x, polyder(self.numerator)), polyval(x, polyder(self.denominator))
@@ -68,12 +68,12 @@ class Radial:
         return slope / (1 + r * r) if self.of_angle else slope
 
     def unbent(self, r_d: Array, farthest: float) -> Array:
-        """r of each r_d, by Newton's method to :data:`RESIDUAL`.
+        """Return r of each r_d, by Newton's method to :data:`RESIDUAL`.
 
         Args:
-            r_d: radii in the picture.
-            farthest: the radius up to which the model grows and is inverted; beyond its r_d, r goes
-                on straight.
+            r_d: radii in the image.
+            farthest: the radius up to which the model grows and is inverted. Outside its r_d, r
+                continues as a straight line.
         """
         if self.is_identity:
             return r_d
@@ -86,7 +86,7 @@ class Radial:
             if np.abs(error).max(initial=0) < RESIDUAL:
                 break
             r = np.clip(r - error / np.maximum(self.slope(r), 1e-9), 0, farthest)
-        # A slope near 0 would throw what is outside of the image far away.
+        # A slope near 0 would move points outside the image far away.
         slope = max(float(self.slope(known[-1])), 0.25 * bent[-1] / farthest)
         return r + (r_d - inside) / slope
 
@@ -96,7 +96,7 @@ STRAIGHT = Radial()  # every r_d is r
 
 @lru_cache(maxsize=64)
 def fold_radius(radial: Radial, farthest: float) -> float | None:
-    """The first radius up to ``farthest`` at which r_d no longer grows; None if it always does.
+    """Return the first radius up to ``farthest`` at which r_d stops growing; None if there is none.
 
     >>> round(fold_radius(Radial((0.0, 1.0, 0.0, -0.5)), 1.0), 3)
     0.816
@@ -116,13 +116,13 @@ def fold_radius(radial: Radial, farthest: float) -> float | None:
 
 
 def farthest_of(radial: Radial, corner: float) -> float:
-    """The radius up to which a model is inverted: somewhat beyond the corner."""
+    """Return the radius up to which a model is inverted: slightly outside the corner."""
     at = fold_radius(radial, BEYOND * corner)
     return BEYOND * corner if at is None else max(0.999 * at, min(corner, at))
 
 
 def grown_by(radial: Radial, r_d: Array, corner: float) -> Array:
-    """r over r_d, the inverse of a model as a factor."""
+    """Return r over r_d, the inverse of a model as a factor."""
     if radial.is_identity:
         return np.ones_like(r_d)
     at_centre = 1 / radial.slope(np.zeros(()))
@@ -134,15 +134,15 @@ def grown_by(radial: Radial, r_d: Array, corner: float) -> Array:
 def even_powers(
     radial: Radial, corner: float, farthest: float
 ) -> tuple[list[float], list[float], float] | None:
-    """N and M of r_d = r N(r^2) / M(r^2), from the lowest power up, and by how much it is off.
+    """Return N and M of r_d = r N(r^2) / M(r^2), from the lowest power up, and their error.
 
-    Those of the model itself, or, where it has odd powers, those of :func:`fit_even`; None where
-    there are none.
+    They are those of the model or, if it has odd powers, those of :func:`fit_even`. The result is
+    None if there are none.
 
     Args:
-        radial: the model; of the angle, r^2 is its square.
-        corner: r_d at the corner of the picture.
-        farthest: up to which r there is something to be seen.
+        radial: the model; for a model of the angle, r^2 is its square.
+        corner: r_d at the corner of the image.
+        farthest: largest r that is visible.
     """
     above, below = radial.numerator[1:], radial.denominator
     if not any(above[1::2]) and not any(below[1::2]):

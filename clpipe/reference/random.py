@@ -1,8 +1,8 @@
-"""Counter-based random numbers, bit for bit as ``kernels/lib/random.h`` has them.
+"""Counter-based random numbers, bit for bit equal to ``kernels/lib/random.h``.
 
-Words come from Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3",
-SC 2011), normals from them. A number depends only on the key and on the pixel's place, so not on
-order, tiles or device.
+Words come from Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC
+2011), normals from them. A number depends only on the key and on the position of the pixel. It does
+not depend on processing order, tiles or device.
 """
 
 import zlib
@@ -20,7 +20,7 @@ from clpipe.reference.math import estrin, negative_log, square_root
 Words = NDArray[np.uint32]
 
 # Lowest power first. The form is after M. Giles, "Approximating the erfinv function", GPU Computing
-# Gems 2011; the fit is our own, and tests/test_noise.py holds its error.
+# Gems 2011. The fit is our own, and tests/test_noise.py checks its error.
 NORMAL_COEFFICIENTS = np.array(
     [
         2.9601128,
@@ -39,15 +39,15 @@ NORMAL_COEFFICIENTS = np.array(
 )
 
 
-# Of sqrt(2) sin(f pi/4) / f and sqrt(2) cos(f pi/4) in powers of f^2, for f in [-1, 1]; our own
-# minimax fits.
+# Coefficients of sqrt(2) sin(f pi/4) / f and sqrt(2) cos(f pi/4) in powers of f^2, for f in [-1,
+# 1]; our own minimax fits.
 SINE_COEFFICIENTS = np.array([1.1107191, -0.11416271, 0.0034451601], np.float32)
 COSINE_COEFFICIENTS = np.array([1.4141995, -0.43592441, 0.02173903], np.float32)
 
 
 @dataclass(frozen=True)
 class Stream:
-    """The source of one stage's random numbers: a 64-bit key in two words, the stage's number."""
+    """The source of one stage's random numbers: a 64-bit key in two words, and its number."""
 
     key0: int
     key1: int
@@ -55,11 +55,11 @@ class Stream:
 
 
 def stream_of(owner: str, stage: str) -> Stream:
-    """The stream of one stage's noise.
+    """Return the stream of one stage's noise.
 
     Args:
-        owner: names what the noise belongs to (seed and image key, or the camera id); the key is
-            its 64-bit BLAKE2b hash.
+        owner: the scope of the noise (seed and image key, or the camera id); the key is its 64-bit
+            BLAKE2b hash.
         stage: the stage's name in the chain; its number is the name's CRC-32.
     """
     return Stream(*_key_of(owner), zlib.crc32(stage.encode()))
@@ -72,7 +72,7 @@ def _key_of(owner: str) -> tuple[int, int]:
 
 
 def philox(c0: Words, c1: Words, c2: Words, c3: Words, stream: Stream) -> tuple[Words, ...]:
-    """Philox4x32-10 of four counters, which are broadcast against each other; four words.
+    """Apply Philox4x32-10 to four counters, which are broadcast against each other; four words.
 
     >>> zero = np.zeros(1, np.uint32)
     >>> [hex(int(w[0])) for w in philox(zero, zero, zero, zero, Stream(0, 0, 0))]
@@ -83,7 +83,7 @@ def philox(c0: Words, c1: Words, c2: Words, c3: Words, stream: Stream) -> tuple[
 
 
 def philox_rounds(w0: Any, w1: Any, w2: Any, w3: Any, stream: Stream) -> tuple[Any, Any, Any, Any]:
-    """The same of uint64 arrays, or of whole numbers, which take little time for a few of them.
+    """Apply it to uint64 arrays or, for a few numbers, to Python integers, which is faster.
 
     >>> hex(philox_rounds(0, 0, 0, 0, Stream(0, 0, 0))[0])
     '0x6627e8d5'
@@ -98,7 +98,7 @@ def philox_rounds(w0: Any, w1: Any, w2: Any, w3: Any, stream: Stream) -> tuple[A
 
 
 def tail_probability(words: Words) -> Floats:
-    """The probability of the nearer tail, in (0, 1/2], from the lower 31 bits of each word."""
+    """Return the probability of the nearer tail, in (0, 1/2], from each word's lower 31 bits."""
     low = words.view(np.int32) & np.int32(0x7FFFFFFF)
     return (low.astype(np.float32) + np.float32(0.5)) * np.float32(2.3283064e-10)
 
@@ -115,12 +115,12 @@ def exponential_of(bits: NDArray[np.int32], limit: int = 1 << 31) -> Floats:
 
 
 def in_upper_half(words: Words) -> NDArray[np.bool_]:
-    """Whether the word stands for the upper half of the distribution: its top bit is 0."""
+    """Return whether the word is in the upper half of the distribution: its top bit is 0."""
     return words.view(np.int32) >= 0
 
 
 def normal_of(words: Words) -> Floats:
-    """Standard normals from 32-bit words by inverse CDF: up to 6.3 sigma, relative error 8e-5.
+    """Return standard normals from words by inverse CDF: up to 6.3 sigma, relative error 8e-5.
 
     >>> normal_of(np.uint32([0x7fffffff, 0x14514514, 0x94514514])).round(3).tolist()
     [0.0, 1.409000039100647, -1.409000039100647]
@@ -134,11 +134,11 @@ def normal_of(words: Words) -> Floats:
 
 
 def normals_of(distance: Words, direction: Words) -> tuple[Floats, Floats]:
-    """Two independent standard normals from two words: up to 6.6 sigma, error 2e-5 of the radius.
+    """Return two independent standard normals from two words: up to 6.6 sigma.
 
-    After Box and Muller, "A note on the generation of random normal deviates" (1958). The angle is
-    an eighth of a turn to either side at most; the top bit of ``direction`` exchanges sine and
-    cosine, the next one is the cosine's sign.
+    The error is 2e-5 of the radius. The method is that of Box and Muller, "A note on the generation
+    of random normal deviates" (1958). The angle is at most an eighth of a turn to either side. The
+    top bit of ``direction`` exchanges sine and cosine, and the next one is the cosine's sign.
 
     >>> one, other = normals_of(np.uint32([0, 0]), np.uint32([0, 0x80000000]))
     >>> [f"{x:.2f}" for x in (*one, *other)]
@@ -162,17 +162,17 @@ def normals_of(distance: Words, direction: Words) -> tuple[Floats, Floats]:
 
 
 def word_at(shape: tuple[int, ...], draw: int, stream: Stream) -> Words:
-    """One random word for each pixel, (height, width).
+    """Return one random word for each pixel, (height, width).
 
     Pixel (x, y) takes word y % 4 of the counter (x, y // 4, draw, stage). ``shape`` begins with
-    height and width; ``draw`` numbers the draws of one stage.
+    height and width. ``draw`` numbers the draws of one stage.
     """
     words = words_at(shape, draw, stream)
     return np.stack(words, axis=1).reshape(-1, shape[1])[: shape[0]]
 
 
 def words_at(shape: tuple[int, ...], draw: int, stream: Stream) -> tuple[Words, ...]:
-    """The four words of each counter (x, y // 4, draw, stage), each (quarter of height, width)."""
+    """Return the four words of each counter (x, y // 4, draw, stage), each (height / 4, width)."""
     height, width = shape[:2]
     quarter = np.arange((height + 3) // 4, dtype=np.uint32)[:, None]
     return philox(
@@ -185,9 +185,10 @@ def words_at(shape: tuple[int, ...], draw: int, stream: Stream) -> tuple[Words, 
 
 
 def normal_at(shape: tuple[int, ...], draw: int, stream: Stream) -> Floats:
-    """One standard normal for each pixel, (height, width); arguments as :func:`word_at`.
+    """Return a standard normal for each pixel, (height, width); arguments of :func:`word_at`.
 
-    Rows 0 and 1 of four share the counter's first two words, rows 2 and 3 the others.
+    In each group of four rows, rows 0 and 1 share the counter's first two words, rows 2 and 3 the
+    others.
     """
     word0, word1, word2, word3 = words_at(shape, draw, stream)
     pairs = *normals_of(word0, word1), *normals_of(word2, word3)
@@ -195,7 +196,7 @@ def normal_at(shape: tuple[int, ...], draw: int, stream: Stream) -> Floats:
 
 
 def normal_of_line(count: int, stream: Stream) -> Floats:
-    """One standard normal for each of the first ``count`` rows or columns, (count,)."""
+    """Return a standard normal for each of the first ``count`` rows or columns, (count,)."""
     zero = np.zeros(1, np.uint32)
     stage = np.full(1, stream.stage, np.uint32)
     return normal_of(philox(np.arange(count, dtype=np.uint32), zero, zero, stage, stream)[0])

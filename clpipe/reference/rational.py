@@ -1,26 +1,26 @@
-"""A rational function of r^2 in the place of a radial model that has odd powers of r, too."""
+"""A rational function of r^2 that approximates a radial model with odd powers of r."""
 
 import numpy as np
 
 from clpipe.base.types import Array
 
-DEGREE = 3  # of numerator and denominator in r^2, as OpenCV's k1 to k6 have it
+DEGREE = 3  # of numerator and denominator in r^2, like OpenCV's k1 to k6
 ITERATIONS = 40
 
 
 def fit_even(r: Array, r_d: Array) -> tuple[list[float], list[float], float] | None:
-    """N and M of r_d = r N(r^2) / M(r^2), from the lowest power up, M(0) = 1.
+    """Return N and M of r_d = r N(r^2) / M(r^2), from the lowest power up, M(0) = 1.
 
-    Least squares, linearised with the denominator of the step before (Sanathanan and Koerner 1963),
-    whose weights grow where the error is large (Lawson 1961), so that the largest error, and not
-    their mean, becomes small.
+    Least squares, linearised with the denominator of the previous step (Sanathanan and Koerner
+    1963). Weights grow where the error is large (Lawson 1961), so that the largest error becomes
+    small instead of the mean.
 
     Args:
         r: radii from 0 up, float64.
-        r_d: what each becomes.
+        r_d: the radius that each becomes.
 
     Returns:
-        N, M and the largest error; None where no denominator without zeros is found.
+        N, M and the largest error; None if no denominator without zeros is found.
 
     >>> r = np.linspace(0, 1, 200)
     >>> above, below, error = fit_even(r, r * (1.02 - 0.03 * r + 0.01 * r**2))

@@ -1,9 +1,9 @@
-"""Smaller images: where the pixels of one lie in the larger, and of which it is a weighted mean.
+"""Smaller images: the positions of their pixels in the larger one, and their weighted means.
 
-A resampling makes the rows or the columns of an image fewer. Its ``shown`` lines, counted from the
-first edge, become ``smaller`` lines: place x becomes x * smaller / shown, counted in pixels from
-that edge, in depth maps and other companions as well. A :class:`Resampling` shows all of them, so
-the field of view stays. :class:`Bins` cuts off the lines after the last whole bin.
+A resampling reduces the rows or the columns of an image. Its ``shown`` lines, counted from the
+first edge, become ``smaller`` lines. Position x becomes x * smaller / shown, in pixels from that
+edge, also in depth maps and other layers. A :class:`Resampling` shows all lines, so the field of
+view does not change. :class:`Bins` crops the lines after the last whole bin.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -15,12 +15,12 @@ import numpy as np
 
 from clpipe.base.types import Array, Floats
 
-# Lines beyond the last one whose taps a kernel reads, though it stores nothing there: rows of a
+# Lines after the last one whose taps a kernel reads, though it stores nothing there: rows of a
 # block and lanes.
 PADDING = 16
 
 # The weight of samples by their distance from the centre of the new pixel, in pixels of the larger
-# image, of which the new pixel is ``ratio`` wide.
+# image. The new pixel is ``ratio`` of these wide.
 Weight = Callable[[Array, float], Array]
 
 
@@ -31,47 +31,49 @@ Parameters = tuple[tuple[str, str], ...]
 
 
 class Resampler(Protocol):
-    """How an image is made of another, from which its pixels are gathered.
+    """How an image is made by gathering pixels of another.
 
-    What a kernel gets for it has the names and OpenCL types of ``parameters``, in that order.
+    Its kernel arguments have the names and OpenCL types of ``parameters``, in that order.
     """
 
     parameters: ClassVar[Parameters]
 
     @property
     def scale(self) -> float:
-        """About how many pixels the new image has for each of the old one."""
+        """Approximate number of pixels in the new image for each of the old one."""
         ...
 
     def resized(self, width: int, height: int) -> tuple[int, int]:
-        """The width and height of the new image, from those of the old one."""
+        """Return the width and height of the new image, from those of the old one."""
         ...
 
     def values(self, width: int, height: int) -> Mapping[str, Any]:
-        """The kernel's values by name, for an old image of that size; arrays are kept objects."""
+        """Return the kernel's values by name, for an old image of this size; arrays are cached."""
         ...
 
     def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
-        """The old rows or columns, first and behind the last, of which some new ones are made.
+        """Return the range of old rows or columns that contribute to a range of new ones.
 
         ``size`` is the width and height of the old image.
         """
         ...
 
     def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
-        """The most old rows or columns before and behind a place that new ones are made of, which
-        begin and end at most ``low`` before and ``high`` behind the same place.
+        """Return how many old rows or columns before and after a position new ones need at most.
+
+        The new ones begin at most ``low`` before and end at most ``high`` after the same position.
         """
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Taps:
-    """The lines of the larger image that each line of the smaller is made of.
+    """The lines of the larger image that contribute to each line of the smaller one.
 
     Line i is the sum of ``weights[i, k] * line(first[i] + k)``, with ``weights`` float32 (line,
-    tap) of sum 1, and ``first`` int32. All of these lines lie in the larger image. Both arrays go
-    on for :data:`PADDING` lines as the last one; ``table`` is ``weights`` as the kernel reads it.
+    tap) of sum 1, and ``first`` int32. All of these lines are in the larger image. Both arrays
+    repeat the last line :data:`PADDING` times. ``table`` contains ``weights`` in the kernel's
+    layout.
     """
 
     first: Array
@@ -80,7 +82,7 @@ class Taps:
 
     @property
     def count(self) -> int:
-        """How many old lines each new one is made of."""
+        """How many old lines contribute to each new one."""
         return int(self.weights.shape[1])
 
     @property
@@ -90,7 +92,7 @@ class Taps:
 
 
 class AlongAxis:
-    """What all have in common that make rows or columns fewer; see :class:`Resampler`."""
+    """The base of resamplings that reduce rows or columns; see :class:`Resampler`."""
 
     parameters: ClassVar[Parameters] = (
         ("first", "__global const int *restrict"),
@@ -102,19 +104,19 @@ class AlongAxis:
     axis: Axis
 
     def size(self, size: int) -> int:
-        """The new number of rows or columns, at least 1."""
+        """Return the new number of rows or columns, at least 1."""
         raise NotImplementedError(type(self).__name__)
 
     def shown(self, size: int) -> int:
-        """How many of an image's rows or columns, from the first on, the new ones show."""
+        """Return how many of an image's rows or columns, from the first on, the new ones show."""
         return size
 
     def taps(self, size: int) -> Taps:
-        """What the new rows or columns of an image of ``size`` are made of."""
+        """Return the taps of the new rows or columns of an image of ``size``."""
         raise NotImplementedError(type(self).__name__)
 
     def along(self, width: int, height: int) -> int:
-        """The one of an image's sides that becomes shorter."""
+        """Return the side of an image that becomes shorter."""
         return height if self.axis == "rows" else width
 
     def resized(self, width: int, height: int) -> tuple[int, int]:
@@ -138,13 +140,13 @@ class AlongAxis:
 
 @dataclass(frozen=True)
 class Resampling(AlongAxis):
-    """How many rows, or columns, an image becomes, and how.
+    """A reduction of the rows, or columns, of an image.
 
     Args:
-        axis: which of them.
+        axis: rows or columns.
         scale: the new size over the old one, at most 1.
         weight: the filter.
-        support: the largest distance at which ``weight`` is not 0, over the ratio, less 1/2 px.
+        support: the largest distance with ``weight`` other than 0, over the ratio, minus 1/2 px.
     """
 
     axis: Axis
@@ -153,7 +155,7 @@ class Resampling(AlongAxis):
     support: float
 
     def size(self, size: int) -> int:
-        """The new number of rows or columns: at least 1, a half rounded up.
+        """Return the new number of rows or columns: at least 1, with halves rounded up.
 
         >>> halved = Resampling("rows", 0.5, overlap, 0.5)
         >>> [halved.size(n) for n in (1, 2, 3, 4, 5)]
@@ -162,7 +164,7 @@ class Resampling(AlongAxis):
         return max(int(np.floor(size * self.scale + 0.5)), 1)
 
     def taps(self, size: int) -> Taps:
-        """What the new rows or columns of an image of ``size`` are made of."""
+        """Return the taps of the new rows or columns of an image of ``size``."""
         return _taps(self, size)
 
     def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
@@ -178,7 +180,7 @@ class Resampling(AlongAxis):
 class Bins(AlongAxis):
     """Binning: each new row, or column, is the mean of the next ``factor`` old ones.
 
-    What is left behind the last whole bin is cut off; a side that is shorter than a bin is one.
+    Lines after the last whole bin are cropped. A side that is shorter than a bin is one bin.
     """
 
     axis: Axis
@@ -190,7 +192,7 @@ class Bins(AlongAxis):
         return 1 / self.factor
 
     def size(self, size: int) -> int:
-        """The new number of rows or columns.
+        """Return the new number of rows or columns.
 
         >>> [Bins("rows", 2).size(n) for n in (1, 2, 5)]
         [1, 1, 2]
@@ -217,7 +219,7 @@ class Bins(AlongAxis):
 
 
 def sizes(resamplings: Iterable[Resampler], width: int, height: int) -> tuple[tuple[int, int], ...]:
-    """The width and height of an image, and after each of these resamplings, one after the other.
+    """Return the width and height of an image, and after each of these resamplings in sequence.
 
     >>> halves = [Resampling(axis, 0.5, overlap, 0.5) for axis in ("rows", "columns")]
     >>> sizes(halves, 7, 5)
@@ -265,7 +267,7 @@ def _taps_of_bins(bins: Bins, size: int) -> Taps:
 
 
 def overlap(distance: Array, ratio: float) -> Array:
-    """The share of a pixel, one wide, that lies within one of width ``ratio``: the area average.
+    """Return the share of a pixel, one wide, within one of width ``ratio``: the area average.
 
     >>> overlap(np.array([0.0, 1.0, 1.5, 2.0]), 2.5).tolist()
     [1.0, 0.75, 0.25, 0.0]
@@ -275,9 +277,10 @@ def overlap(distance: Array, ratio: float) -> Array:
 
 
 def lanczos3(distance: Array, ratio: float) -> Array:
-    """sinc(x) * sinc(x / 3) for |x| < 3, x = distance / ratio (Duchon, J. Appl. Meteor. 1979).
+    """Return sinc(x) * sinc(x / 3) for |x| < 3, x = distance / ratio.
 
-    Stretched by the ratio, it takes out what the smaller image cannot hold.
+    It is that of Duchon (J. Appl. Meteor. 1979). Stretched by the ratio, it removes frequencies
+    that the smaller image cannot represent.
 
     >>> lanczos3(np.array([0.0, 1.0, 3.0, 6.0]), 2.0).round(3).tolist()
     [1.0, 0.608, -0.135, 0.0]
@@ -287,7 +290,7 @@ def lanczos3(distance: Array, ratio: float) -> Array:
 
 
 def resample(image: Floats, resampling: AlongAxis) -> Floats:
-    """The smaller image, (height, width[, channel]) float32; taps are added up in order.
+    """Return the smaller image, (height, width[, channel]) float32; taps are summed in order.
 
     >>> halved = Resampling("columns", 0.5, overlap, 0.5)
     >>> resample(np.float32([[1, 3, 5, 7]]), halved).tolist()

@@ -1,8 +1,8 @@
-"""Square roots of the signal, as ``kernels/lib/roots.h`` has them.
+"""Square roots of the signal, like in ``kernels/lib/roots.h``.
 
-Shot noise grows as the root of the signal, so in roots it has the same size at all levels (Anscombe
-1948), as it has nearly in a finished picture, whose encoding for a display is close to a root. The
-offset, in signal units, keeps the slope of the root finite at black.
+Shot noise grows with the root of the signal, so in roots it has the same size at all levels
+(Anscombe 1948). In a finished image this is nearly true as well, because its display encoding is
+close to a root. The offset, in signal units, keeps the slope of the root finite at black.
 """
 
 import numpy as np
@@ -12,12 +12,12 @@ from clpipe.base.types import Floats
 
 
 def root_of(signal: Floats, offset: np.float32) -> Floats:
-    """The root of a signal of any shape, 0 for all below -offset."""
+    """Return the root of a signal of any shape, 0 for all values below -offset."""
     return np.sqrt(np.maximum(signal + offset, np.float32(0)))
 
 
 def from_root(root: Floats, offset: np.float32) -> Floats:
-    """The inverse of :func:`root_of`; -offset for all roots below 0, as sums of colours can be.
+    """Return the inverse of :func:`root_of`; -offset for roots below 0, from sums of colours.
 
     >>> offset = np.float32(0.01)
     >>> from_root(root_of(np.float32([0, 0.25, 1]), offset), offset).round(6).tolist()
@@ -29,10 +29,10 @@ def from_root(root: Floats, offset: np.float32) -> Floats:
 
 
 def in_steps(root: Floats) -> Floats:
-    """Roots in steps of 2^-20, from 0 on.
+    """Return roots in steps of 2^-20, from 0 on.
 
-    They are the same when they have been squared and taken again, so what goes on from a picture's
-    roots has the bits of what goes on from its light.
+    They do not change if they are squared and the root is taken again. A result from an image's
+    roots therefore has the same bits as one from its light.
 
     >>> roots, offset = in_steps(np.linspace(0, 1.2, 9999, dtype=np.float32)), np.float32(0.007)
     >>> np.array_equal(in_steps(root_of(from_root(roots, offset), offset)), roots)
@@ -43,7 +43,7 @@ def in_steps(root: Floats) -> Floats:
 
 @traceable
 def noise_in_roots(sigma: float, level: float, offset: float) -> float:
-    """The standard deviation in roots of noise of ``sigma`` at a level, all in signal units.
+    """Return the standard deviation in roots of noise of ``sigma`` at a level, in signal units.
 
     >>> round(noise_in_roots(0.01, 0.24, 0.01), 6)
     0.01

@@ -1,4 +1,4 @@
-"""Which neighbouring pixels of a layer show one surface, so that it may be interpolated there."""
+"""Neighbouring pixels of a layer that show one surface, so that it may be interpolated there."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,34 +7,35 @@ import numpy as np
 
 from clpipe.base.types import Array, Mask
 
-STEEPER = 3.0  # times as steep as both slopes around it, a slope is an edge between surfaces
+# a slope steeper by this factor than both adjacent slopes is an edge between surfaces
+STEEPER = 3.0
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How far neighbours on one surface may be apart at least, and as a share of their values."""
+    """The allowed difference of neighbours on one surface: absolute, and relative."""
 
     least: float = 0.0
     share: float = 0.0
 
 
-# Of inverse depth, which is linear on a plane; of normals; of flow in px.
+# For inverse depth, which is linear on a plane; for normals; for flow in px.
 DEPTH, NORMAL, FLOW = Tolerance(share=1e-3), Tolerance(least=0.02), Tolerance(least=0.05)
 
 
 def cells(values: Array, tolerance: Tolerance | None) -> Mask:
-    """Whether the four pixels around each corner of a layer's pixels show one surface.
+    """Return whether the four pixels around each corner of a layer's pixels show one surface.
 
-    Two neighbours do where they hardly differ, or no more than the pixels before and behind them
-    lead one to expect, as on a slanted plane. A pixel that is not a number shows none.
+    Two neighbours do if they hardly differ, or by no more than expected from the pixels before and
+    after them, like on a slanted plane. A NaN pixel shows no surface.
 
     Args:
         values: (rows, columns, channel).
-        tolerance: None is of labels, which are equal or not.
+        tolerance: None for labels, which are equal or not.
 
     Returns:
-        (rows + 1, columns + 1): the corner at (row, column) is that between the pixels (row - 1,
-        column - 1) and (row, column); beyond the edges the pixels there go on.
+        (rows + 1, columns + 1): the corner at (row, column) is between the pixels (row - 1, column
+        - 1) and (row, column). Edge pixels are repeated outside.
 
     >>> slope, edge = np.array([[4.0, 3, 2, 1]]), np.array([[4.0, 4, 2, 2]])
     >>> cells(slope[..., None], DEPTH)[0].all(), cells(edge[..., None], DEPTH)[0].tolist()
@@ -51,7 +52,7 @@ def cells(values: Array, tolerance: Tolerance | None) -> Mask:
 
 
 def _linked(values: Array, tolerance: Tolerance | None) -> Mask:
-    """Whether each pixel shows one surface with the next one in its row: (rows, columns - 1)."""
+    """Return whether each pixel shows one surface with the next in its row: (rows, columns - 1)."""
     if tolerance is None:
         return np.asarray((values[:, 1:] == values[:, :-1]).all(-1))
     if values.shape[1] == 1:

@@ -1,6 +1,6 @@
-"""Transfer functions: between linear light and display values, both 0..1.
+"""Transfer functions between linear light and display values, both 0..1.
 
-No kernel header has these: kernels read them from tables, see :mod:`clpipe.reference.curve`.
+They are in no kernel header: kernels read them from tables, see :mod:`clpipe.reference.curve`.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ from clpipe.base.types import Doubles
 
 
 def srgb_curve(x: Doubles) -> Doubles:
-    """From linear light to sRGB (IEC 61966-2-1, 1999): a straight line up to 0.0031308.
+    """Convert linear light to sRGB (IEC 61966-2-1, 1999): a straight line up to 0.0031308.
 
     >>> srgb_curve(np.array([0.001, 0.5])).round(5).tolist()
     [0.01292, 0.73536]
@@ -18,7 +18,7 @@ def srgb_curve(x: Doubles) -> Doubles:
 
 
 def inverse_srgb_curve(x: Doubles) -> Doubles:
-    """From sRGB to linear light (IEC 61966-2-1, 1999): a straight line up to 0.04045.
+    """Convert sRGB to linear light (IEC 61966-2-1, 1999): a straight line up to 0.04045.
 
     >>> inverse_srgb_curve(np.array([0.01292, 0.73536])).round(4).tolist()
     [0.001, 0.5]

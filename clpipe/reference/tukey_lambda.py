@@ -1,4 +1,4 @@
-"""The symmetric Tukey lambda distribution, as ``kernels/lib/tukey_lambda.h`` has it.
+"""The symmetric Tukey lambda distribution, like in ``kernels/lib/tukey_lambda.h``.
 
 It models read noise with heavy tails (Wei et al., "A physics-based noise formation model for
 extreme low-light raw denoising", CVPR 2020).
@@ -18,11 +18,11 @@ NEARLY_ZERO = 1e-4  # replaces smaller lambdas: at 0, the logistic distribution,
 
 @traceable
 def shape_and_scale(shape: float) -> tuple[np.float32, np.float32]:
-    """The kernel's arguments for a shape lambda above -1/2: lambda and 1 / (lambda * sigma).
+    """Return the kernel's arguments for a shape lambda above -1/2: lambda and 1 / (lambda * sigma).
 
-    sigma is the standard deviation of the distribution at scale 1: sigma^2 = 2 / lambda^2 *
-    (1 / (1 + 2 lambda) - G(lambda + 1)^2 / G(2 lambda + 2)), G the gamma function (Joiner and
-    Rosenblatt, JASA 66, 1971).
+    The standard deviation of the distribution at scale 1 is sigma. It follows from ``sigma^2 = 2 /
+    lambda^2 * (1 / (1 + 2 lambda) - G(lambda + 1)^2 / G(2 lambda + 2))``, with G the gamma function
+    (Joiner and Rosenblatt, JASA 66, 1971).
 
     >>> shape, scale = shape_and_scale(1)  # uniform, of width sqrt(12) at a variance of 1
     >>> round(float(shape * scale * scale), 4)
@@ -34,7 +34,7 @@ def shape_and_scale(shape: float) -> tuple[np.float32, np.float32]:
 
 
 def tukey_lambda_of(words: Words, shape: np.float32, scale: np.float32) -> Floats:
-    """Tukey lambda numbers of mean 0 and variance 1, one for each random word, by inverse CDF.
+    """Return a Tukey lambda number of mean 0 and variance 1 per random word, by inverse CDF.
 
     ``shape`` and ``scale`` are those of :func:`shape_and_scale`.
 

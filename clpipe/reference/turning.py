@@ -1,4 +1,4 @@
-"""The streaks of a camera that turns: each pixel is the mean of what it saw of a still image."""
+"""The streaks of a rotating camera: each pixel is the mean of the still image that it saw."""
 
 import math
 from collections.abc import Mapping
@@ -16,27 +16,27 @@ from clpipe.reference.warp import gather
 
 # (tap, power), see :data:`clpipe.reference.warp.FILTERS`
 BILINEAR = np.array([[1, -1], [0, 1]], np.float32)
-SPACING = 0.5  # px at most between the places of which a streak is made
+SPACING = 0.5  # px at most between the positions that make up a streak
 
 
 @dataclass(frozen=True)
 class Turning:
-    """A camera that turns evenly about an axis in the plane of its picture.
+    """A camera that rotates evenly about an axis in its image plane.
 
-    In the middle of the exposure it shows the image as it is. A point at (u, v), in focal lengths
-    from the middle of the picture along and aside of the way in which that moves, is seen after a
-    turn t at ((u cos t + sin t) / w, v / w), w = cos t - u sin t: the pinhole's homography (Hartley
-    and Zisserman, "Multiple view geometry", 2004, section 8.4). See
+    In the middle of the exposure, the image is unchanged. Let a point be at (u, v), in focal
+    lengths from the image centre, along and across the direction in which the centre moves. After a
+    rotation t it is at ((u cos t + sin t) / w, v / w), w = cos t - u sin t. This is the pinhole's
+    homography (Hartley and Zisserman, "Multiple view geometry", 2004, section 8.4). See
     :class:`clpipe.reference.resample.Resampler`.
 
     Args:
-        rotation: degrees in all, above 0.
-        angle: the way of the middle of the picture, in degrees, from the right upwards.
+        rotation: in degrees in total, above 0.
+        angle: direction in which the image centre moves, in degrees, from right towards up.
         focal_length: px; None is ``share``.
-        share: the focal length over the longer side of the picture.
-        centre: the principal point in px from the picture's corner; None, or None of one of them,
-            is the middle.
-        margins: how far the image goes on beyond the picture, about whose middle it turns.
+        share: the focal length over the longer side of the image.
+        centre: the principal point in px from the frame's corner; None, for one coordinate or both,
+            is the centre.
+        margins: how far the image extends outside the frame, about whose centre it rotates.
     """
 
     parameters: ClassVar[Parameters] = (
@@ -69,7 +69,7 @@ class Turning:
         """See :meth:`Resampler.values`.
 
         Raises:
-            ImageError: a corner of the image turns out of what a pinhole can show.
+            ImageError: a corner of the image leaves the range of a pinhole camera.
         """
         turns = _turns(self, 2 * self.farthest(width, height))
         x, y = math.cos(math.radians(self.angle)), -math.sin(math.radians(self.angle))
@@ -80,20 +80,20 @@ class Turning:
         return {"turns": turns, "count": np.uint32(len(turns) // 3), "focal": focal, **numbers}
 
     def focal(self, width: int, height: int) -> float:
-        """The focal length in px, of an image of that size."""
+        """Return the focal length in px, for an image of this size."""
         if self.focal_length:
             return self.focal_length
         assert self.share
         return self.share * max(self.margins.inside(width, height))
 
     def middle(self, width: int, height: int) -> tuple[float, float]:
-        """The principal point, from the image's corner, px."""
+        """Return the principal point, from the image's corner, px."""
         middle = (side / 2 for side in self.margins.inside(width, height))
         x, y = (m if c is None else c for m, c in zip(middle, self.centre, strict=True))
         return self.margins.left + x, self.margins.top + y
 
     def farthest(self, width: int, height: int) -> float:
-        """How far, in px, what a pixel shows is at most from its place in the middle of the turn.
+        """Return the largest distance, in px, of a pixel's light from its position in mid-exposure.
 
         Raises:
             ImageError: see :meth:`values`.
@@ -104,10 +104,10 @@ class Turning:
         u = math.hypot(max(x, width - x), max(y, height - y)) / focal  # of a corner
         if math.atan(u) + turn > math.radians(85):
             raise ImageError(
-                f"motion_blur: a turn of {self.rotation:g} degrees at a focal length of "
-                f"{focal:g} px takes the corners of {width}x{height} pixels to "
-                f"{math.degrees(math.atan(u) + turn):.0f} degrees from the axis; expected at most "
-                "85; set a smaller rotation or a longer focal length"
+                f"motion_blur: a rotation of {self.rotation:g} degrees at a focal length of "
+                f"{focal:g} px moves the corners of {width}x{height} pixels to "
+                f"{math.degrees(math.atan(u) + turn):.0f} degrees from the axis; at most 85 are "
+                "allowed. Set a smaller rotation or a longer focal length"
             )
         w = math.cos(turn) - u * math.sin(turn)
         along, aside = math.sin(turn) * (1 + u * u) / w, u * (1 / w - 1)
@@ -125,7 +125,7 @@ class Turning:
         return low + reach, high + reach
 
     def reference(self, image: Floats) -> Floats:
-        """The blurred image, (height, width, 3) float32 in and out."""
+        """Return the blurred image, (height, width, 3) float32 in and out."""
         height, width = image.shape[:2]
         values = self.values(width, height)
         focal, x, y = values["focal"], values["x"], values["y"]
@@ -148,7 +148,7 @@ class Turning:
 
 @lru_cache(maxsize=64)
 def _turns(turning: Turning, length: float) -> Floats:
-    """Sine, cosine and 1 less the cosine, for each moment of which a streak is made."""
+    """Return sine, cosine and 1 minus cosine for each moment of a streak."""
     count = max(math.ceil(length / SPACING), 1)
     turn = np.deg2rad(turning.rotation) * ((np.arange(count) + 0.5) / count - 0.5)
     table = np.stack([np.sin(turn), np.cos(turn), 2 * np.sin(turn / 2) ** 2], -1)

@@ -1,8 +1,8 @@
-"""Bent images: each pixel gathered where a lens sees it, with a filter, as the kernel does it.
+"""Warped images: each pixel is gathered with a filter from the position that a lens sees.
 
-The map is worked out exactly at the nodes of a grid, and interpolated between them with cubic
+The map is computed exactly at the nodes of a grid. Between them it is interpolated with cubic
 polynomials (Lagrange's, through four nodes), in float32 and in the kernel's order. The grid is as
-coarse as keeps that within :data:`WITHIN` of the map at the middle of its cells.
+coarse as possible with an error below :data:`WITHIN` at the centres of its cells.
 """
 
 from collections.abc import Iterator, Mapping
@@ -20,20 +20,20 @@ from clpipe.reference.lens import DistortionMap
 from clpipe.reference.radial import Radial
 from clpipe.reference.resample import Axis, Parameters, lanczos3
 
-WITHIN = 0.003  # px, of the map at the middle of a cell
+WITHIN = 0.003  # px, of the map at the centre of a cell
 STEPS = (64, 32, 16, 8, 4, 2, 1)  # px from node to node
 MOST_NODES = 2**22
-FIELDS = 8  # of a node: x and y of red, green and blue, and two that fill it up
+FIELDS = 8  # of a node: x and y of red, green and blue, and two for alignment
 
 
 def _catmull_rom() -> Floats:
-    """The four weights as polynomials of the fraction (Catmull and Rom 1974; Keys 1981, a=-1/2)."""
+    """Return the four weights as polynomials of the fraction (Keys 1981, a=-1/2)."""
     halves = [[0, -1, 2, -1], [2, 0, -5, 3], [0, 1, 4, -3], [0, 0, -1, 1]]
     return np.array(halves, np.float32) / np.float32(2)
 
 
 def _lanczos3() -> Floats:
-    """The six weights, scaled to the sum 1, as least-squares polynomials of the fraction."""
+    """Return the six weights, scaled to the sum 1, as least-squares polynomials of the fraction."""
     fraction = (1 - np.cos(np.pi * (np.arange(256) + 0.5) / 256)) / 2
     taps = np.arange(-2, 4)[:, None]
     weights = lanczos3(fraction - taps, 1.0)
@@ -48,10 +48,10 @@ FILTERS: dict[str, Floats] = {"bicubic": _catmull_rom(), "lanczos3": _lanczos3()
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """The map of a picture on nodes ``step`` px apart, the first at its first pixel's centre.
+    """The map of an image on nodes ``step`` px apart, the first at its first pixel's centre.
 
-    ``nodes`` are (row, column, field) float32: how far, in px, from a pixel to the place in the
-    image that it shows, across and down, of red, green and blue.
+    ``nodes`` are (row, column, field) float32: the offset in px from a pixel to the position in the
+    input that it shows, across and down, for red, green and blue.
     """
 
     step: int
@@ -59,17 +59,17 @@ class Grid:
 
     @cached_property
     def flat(self) -> Floats:
-        """The nodes as the kernel reads them."""
+        """The nodes in the kernel's layout."""
         return np.ascontiguousarray(self.nodes).reshape(-1)
 
     def at(self, place: Array, axis: int) -> tuple[Array, list[Floats]]:
-        """For rows (axis 0) or columns, the first of the four nodes around, and their weights."""
+        """Return, for rows (axis 0) or columns, the first of four adjacent nodes, and weights."""
         first = np.clip(place // self.step - 1, 0, self.nodes.shape[axis] - 4)
         t = (place - first * self.step).astype(np.float32) * np.float32(1 / self.step)
         return first, lagrange(t)
 
     def fields(self, rows: Array, columns: Array) -> Iterator[Floats]:
-        """Each field at these rows and columns, (row, column) float32, as the kernel has it."""
+        """Return each field at these rows and columns, (row, column) float32, like the kernel."""
         first, weights = self.at(rows, 0)
         lines = sum_of(w[:, None, None] * self.nodes[first + k] for k, w in enumerate(weights))
         first, weights = self.at(columns, 1)
@@ -79,7 +79,7 @@ class Grid:
 
 
 def sum_of(terms: Iterator[Floats]) -> Floats:
-    """The sum of terms, in order."""
+    """Return the sum of terms, in order."""
     total = next(terms)
     for term in terms:
         total = total + term
@@ -87,7 +87,7 @@ def sum_of(terms: Iterator[Floats]) -> Floats:
 
 
 def lagrange(t: Floats) -> list[Floats]:
-    """The weights of four nodes at 0, 1, 2 and 3 for a place t among them; float32.
+    """Return the weights of four nodes at 0, 1, 2 and 3 for a position t among them; float32.
 
     >>> [float(w) for w in lagrange(np.float32(1.5))]
     [-0.0625, 0.5625, 0.5625, -0.0625]
@@ -103,7 +103,7 @@ def lagrange(t: Floats) -> list[Floats]:
 
 
 class Gathering:
-    """A resampler that gathers each pixel at a place of its own, with one of :data:`FILTERS`."""
+    """A resampler that gathers each pixel at its own position, with one of :data:`FILTERS`."""
 
     filter: str
 
@@ -114,11 +114,11 @@ class Gathering:
 
     @property
     def support(self) -> int:
-        """How many pixels on either side of a place have a weight."""
+        """The number of pixels on either side of a position that have a weight."""
         return len(FILTERS[self.filter]) // 2
 
     def lines(self, axis: Axis, width: int, height: int) -> tuple[Array, Array]:
-        """The first and the last old row, or column, of which each new one is made at most."""
+        """Return the first and last old row, or column, that may contribute to each new one."""
         raise NotImplementedError(type(self).__name__)
 
     def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
@@ -138,7 +138,7 @@ class Gathering:
 
 
 def within_border(first: Array, last: Array, size: int, support: int) -> tuple[Array, Array]:
-    """Lines of an image, with those that its border mirrors: as many as the filter reaches."""
+    """Return lines of an image, with those that its border mirrors, as many as the filter needs."""
     first = np.clip(np.minimum(first, size - 1 - support), 0, size - 1)
     last = np.clip(np.maximum(last, support), 0, size - 1)
     return first.astype(np.int64), last.astype(np.int64)
@@ -150,7 +150,7 @@ class Warp(Gathering):
 
     Args:
         lens: the lens.
-        filter: of :data:`FILTERS`.
+        filter: a key of :data:`FILTERS`.
     """
 
     parameters: ClassVar[Parameters] = (
@@ -169,7 +169,7 @@ class Warp(Gathering):
         return self.lens.size(width, height)
 
     def grid(self, width: int, height: int) -> Grid:
-        """The map of an image of that size.
+        """Return the map of an image of this size.
 
         Raises:
             ImageError: the lens folds the image over, or nearly.
@@ -188,7 +188,7 @@ class Warp(Gathering):
         return _lines(self, axis, width, height)
 
     def reference(self, image: Floats) -> Floats:
-        """The bent image, (height, width, 3) float32 in and out; black where the lens sees none."""
+        """Return the warped image, (height, width, 3) float32; black where the lens sees none."""
         height, width = image.shape[:2]
         columns, rows = self.resized(width, height)
         fields = self.grid(width, height).fields(np.arange(rows), np.arange(columns))
@@ -199,12 +199,12 @@ class Warp(Gathering):
 
 
 def gather(plane: Floats, across: Floats, down: Floats, polynomials: Floats) -> Floats:
-    """A channel at places between its pixels; 0 where they are outside it.
+    """Return a channel at positions between its pixels; 0 outside it.
 
     Args:
         plane: (height, width) float32.
-        across, down: how far each pixel of the result is from its place, px; float32.
-        polynomials: of the filter's weights, (tap, power), as in :data:`FILTERS`.
+        across, down: offset of each pixel of the result from its position, px; float32.
+        polynomials: those of the filter's weights, (tap, power), in :data:`FILTERS`.
     """
     height, width = plane.shape
     rows, columns = across.shape
@@ -223,13 +223,13 @@ def gather(plane: Floats, across: Floats, down: Floats, polynomials: Floats) -> 
 
 
 def _split(distance: Floats, line: Array) -> tuple[Array, Floats]:
-    """The pixel before the place that a distance leads to, and the fraction beyond it."""
+    """Return the pixel before the position at an offset, and the remaining fraction."""
     whole = np.floor(distance)
     return line + whole.astype(np.int32), distance - whole
 
 
 def _is_inside(pixel: Array, fraction: Floats, size: int) -> Array:
-    """Whether a place lies within the image, up to the edges of its pixels."""
+    """Return whether a position is in the image, up to the edges of its pixels."""
     low = (pixel >= 0) | ((pixel == -1) & (fraction >= np.float32(0.5)))
     return low & ((pixel < size - 1) | ((pixel == size - 1) & (fraction <= np.float32(0.5))))
 
@@ -255,15 +255,15 @@ def _grid(lens: DistortionMap, width: int, height: int) -> Grid:
         if step == 1 or _error(lens, width, height, grid) <= WITHIN:
             return grid
     raise ImageError(
-        f"distortion: the map of {width}x{height} pixels bends too sharply to be followed; "
-        "these coefficients nearly fold the image over"
+        f"distortion: the map of {width}x{height} pixels bends too sharply to be interpolated; "
+        "these coefficients nearly fold the image over, so use smaller ones"
     )
 
 
 def _distances(
     lens: DistortionMap, width: int, height: int, rows: Array, columns: Array
 ) -> Iterator[Array]:
-    """The fields of a grid at these rows and columns, exactly: (row, column) float64."""
+    """Return the fields of a grid at these rows and columns, exactly: (row, column) float64."""
     x, y = columns + 0.5, rows[:, None] + 0.5
     x, y = np.broadcast_arrays(x, y)
     green: tuple[Array, Array] | None = None
@@ -276,7 +276,7 @@ def _distances(
 
 
 def _error(lens: DistortionMap, width: int, height: int, grid: Grid) -> float:
-    """How far, in px, a grid is off in the middle of its cells, where the lens sees the image."""
+    """Return the error in px of a grid at the centres of its cells, where the lens sees it."""
     rows, columns = (
         np.minimum(np.arange(0, size, grid.step) + grid.step // 2, size - 1)
         for size in lens.size(width, height)[::-1]
@@ -293,9 +293,9 @@ def _error(lens: DistortionMap, width: int, height: int, grid: Grid) -> float:
     return largest
 
 
-# Of cubic interpolation in two dimensions between any four nodes in a row: the sum of the weights'
-# magnitudes is at most 1.632 in each, so a value is at most this far beyond the nodes', over their
-# range.
+# For cubic interpolation in two dimensions between four nodes in a row: the sum of the weights'
+# magnitudes is at most 1.632 in each dimension. A value exceeds those of the nodes by at most this
+# share of their range.
 OVERSHOOT = (1.632**2 - 1) / 2
 
 
@@ -317,7 +317,7 @@ def _lines(warp: Warp, axis: Axis, width: int, height: int) -> tuple[Array, Arra
         first = begin.reshape(shape) + low[..., number::2].min(-1)
         last = end.reshape(shape) + high[..., number::2].max(-1)
         ends.append((last >= -1) & (first <= size))
-    seen = ends[0] & ends[1]  # the others see nothing of the image
+    seen = ends[0] & ends[1]  # the others see no part of the image
     number, size = (1, height) if axis == "rows" else (0, width)
     least = np.where(seen, low[..., number::2].min(-1), np.inf).min(number)
     most = np.where(seen, high[..., number::2].max(-1), -np.inf).max(number)

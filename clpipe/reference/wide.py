@@ -1,7 +1,7 @@
-"""Wide lenses: how far from the principal point a ray at some angle to the axis is seen.
+"""Wide lenses: the distance from the principal point for a ray at some angle to the axis.
 
-All of them are turned about the axis, and see also what is beside and behind the camera. The angle
-to the axis is theta, and the distance from the principal point, in focal lengths, r.
+All models are rotationally symmetric and may see more than 180 degrees. The angle to the axis is
+theta, and the distance from the principal point, in focal lengths, is r.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from clpipe.reference.intrinsics import OPENCV_FISHEYE, Intrinsics, smallest_err
 
 Coefficients = tuple[float, ...]
 
-ANGLES = 1 << 16  # of a table from the axis to the edge of the field
+ANGLES = 1 << 16  # of a table from the axis to the edge of the field of view
 
 
 def kannala_brandt(theta: Array, k: Coefficients) -> Array:
@@ -30,7 +30,7 @@ def kannala_brandt(theta: Array, k: Coefficients) -> Array:
 
 
 def unified(theta: Array, k: Coefficients) -> Array:
-    """r = sin / (alpha sqrt(beta sin^2 + cos^2) + (1 - alpha) cos), k being alpha and beta.
+    """r = sin / (alpha sqrt(beta sin^2 + cos^2) + (1 - alpha) cos), with k = (alpha, beta).
 
     Khomutenko, Garcia and Martinet, "An enhanced unified camera model", RA-L 2016, equation 6.
     """
@@ -40,7 +40,7 @@ def unified(theta: Array, k: Coefficients) -> Array:
 
 
 def double_sphere(theta: Array, k: Coefficients) -> Array:
-    """r = sin / (alpha sqrt(sin^2 + (xi + cos)^2) + (1 - alpha) (xi + cos)), k being xi and alpha.
+    """r = sin / (alpha sqrt(sin^2 + (xi + cos)^2) + (1 - alpha) (xi + cos)), k = (xi, alpha).
 
     Usenko, Demmel and Cremers, "The double sphere camera model", 3DV 2018, equations 40 to 42.
     """
@@ -64,16 +64,16 @@ MODELS: dict[str, Callable[[Array, Coefficients], Array]] = {
 
 @dataclass(frozen=True)
 class WideLens:
-    """A wide lens with a sensor behind it.
+    """A wide lens with a sensor.
 
     Args:
-        model: of :data:`MODELS`.
-        coefficients: of the model.
+        model: a key of :data:`MODELS`.
+        coefficients: those of the model.
         fx, fy: focal lengths in px.
-        field_of_view: the angle, in degrees, through the axis, that is seen.
-        size: width and height of the picture in px; None is that of the whole field, to either side
-            of the principal point.
-        centre: the principal point in px from the corner; None of one of them is the middle.
+        field_of_view: the visible angle, in degrees, through the axis.
+        size: width and height of the image in px; None is that of the whole field of view, to
+            either side of the principal point.
+        centre: the principal point in px from the corner; None for a coordinate is the centre.
     """
 
     model: str
@@ -86,10 +86,10 @@ class WideLens:
 
     @property
     def picture(self) -> tuple[int, int]:
-        """The width and height of the picture.
+        """Return the width and height of the image.
 
         Raises:
-            ImageError: the model turns back within the field of view.
+            ImageError: the model folds within the field of view.
         """
         if self.size:
             return self.size
@@ -98,25 +98,25 @@ class WideLens:
 
     @property
     def finest(self) -> float:
-        """The most px of the picture for a radian away from the axis."""
+        """Return the largest number of px in the image per radian from the axis."""
         angles, radii = _table(self)
         return float(np.diff(radii).max() / angles[1] * max(self.fx, self.fy))
 
     @property
     def principal_point(self) -> tuple[float, float]:
-        """cx and cy in px from the corner."""
+        """Return cx and cy in px from the corner."""
         middle = (side / 2 for side in self.picture)
         cx, cy = (m if c is None else c for c, m in zip(self.centre, middle, strict=True))
         return cx, cy
 
     def rays(self, x: Array, y: Array) -> Array:
-        """The directions that places of the picture see.
+        """Return the directions that positions of the image see.
 
         Args:
             x, y: in px from the corner, float64 of any shape.
 
         Returns:
-            (3, ...): to the right, down and along the axis, of length 1; NaN beyond the field.
+            (3, ...): right, down and along the axis, of length 1; NaN outside the field of view.
         """
         cx, cy = self.principal_point
         across, down = (x - cx) / self.fx, (y - cy) / self.fy
@@ -127,9 +127,9 @@ class WideLens:
         return np.stack([across * ratio, down * ratio, np.cos(theta)])
 
     def seen(self, rays: Array) -> tuple[Array, Array]:
-        """The places of the picture, x and y, where directions, (3, ...), are seen.
+        """Return the positions in the image, x and y, of directions, (3, ...).
 
-        NaN beyond the field. It is the inverse of :meth:`rays`.
+        NaN outside the field of view. It is the inverse of :meth:`rays`.
         """
         cx, cy = self.principal_point
         side = np.hypot(rays[0], rays[1])
@@ -139,7 +139,7 @@ class WideLens:
         return cx + self.fx * rays[0] * ratio, cy + self.fy * rays[1] * ratio
 
     def intrinsics(self) -> Intrinsics:
-        """The picture's, by OpenCV's fisheye model; where it is another, by a fit to the field."""
+        """Return the intrinsics by OpenCV's fisheye model; other models are fitted to it."""
         (width, height), (cx, cy) = self.picture, self.principal_point
         k: list[float] = [*self.coefficients]
         longer, off = 1.0, 0.0
@@ -156,7 +156,7 @@ class WideLens:
 
 @lru_cache(maxsize=32)
 def _table(lens: WideLens) -> tuple[Array, Array]:
-    """Angles from the axis to the edge of the field, and the r of each.
+    """Return angles from the axis to the edge of the field of view, and the r of each.
 
     Raises:
         ImageError: r does not grow with the angle.
@@ -168,8 +168,8 @@ def _table(lens: WideLens) -> tuple[Array, Array]:
     if turns.any():
         seen = np.degrees(angles[int(turns.argmax())])
         raise ImageError(
-            f"projection: {lens.model} with these coefficients sees no farther than "
-            f"{2 * seen:.1f} degrees, but field_of_view is {lens.field_of_view:g}; make it "
-            "smaller, or use coefficients with which r grows up to there"
+            f"projection: {lens.model} with these coefficients sees at most {2 * seen:.1f} "
+            f"degrees, but field_of_view is {lens.field_of_view:g}; make it smaller, or use "
+            "coefficients with which r grows up to there"
         )
     return angles, radii

@@ -1,11 +1,11 @@
-"""What a stage is: the image kinds it reads and writes, how it touches pixels, its parameters.
+"""Stages: the kinds of images they read and write, how they access pixels, their parameters.
 
-A stage is declared once, in ``clpipe/stages/<name>.py``, as a :class:`Stage` with one or more
-:class:`Method` classes. The fields of a method are its parameters; their validation, help,
+Each stage is declared once, in ``clpipe/stages/<name>.py``, as a :class:`Stage` with one or more
+:class:`Method` classes. The fields of a method are its parameters. Their validation, help,
 ``--set``, kernel arguments and sidecar entries are all derived from that declaration.
 
-What a stage file may import is all in ``__all__`` here, and only from here. The room imports
-``camera``, ``reference`` and ``base``; it knows nothing of chains, devices and files.
+Stage files import only the names in ``__all__`` here, and only from here. This package imports
+``camera``, ``reference`` and ``base``, and nothing about chains, devices or files.
 """
 
 from clpipe.base.types import Array, Floats

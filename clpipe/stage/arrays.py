@@ -1,4 +1,4 @@
-"""What stages share that know filter arrays of any period: arguments of their kernels."""
+"""Kernel arguments of stages that support filter arrays of any period."""
 
 from functools import lru_cache
 
@@ -10,12 +10,12 @@ PERIOD = ("rows", "columns")  # arguments of ``kernels/lib/table.h``
 
 
 def period_of(period: tuple[int, ...]) -> dict[str, CompileTime]:
-    """A period of rows and columns as compiled-in arguments."""
+    """Return a period of rows and columns as compiled-in arguments."""
     return dict(zip(PERIOD, (CompileTime(f"{size}u") for size in period), strict=True))
 
 
-@lru_cache(maxsize=64)  # one object for the same array, so that it is uploaded once
+@lru_cache(maxsize=64)  # the same object for the same array, so that it is uploaded once
 def levels_table(array: FilterArray, inverse: bool) -> Floats:
-    """The level of white at each place, or its inverse, as kernels load it: (row, column)."""
+    """Return the level of white at each position, or its inverse, for kernels: (row, column)."""
     levels = {k: 1 / v if inverse else v for k, v in array.levels.items()}
     return kernel_table(array.by_place(levels))

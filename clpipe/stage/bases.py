@@ -1,4 +1,4 @@
-"""Parts that several methods have in common: bases to derive from, and a check of window sizes."""
+"""Base classes that several methods share."""
 
 from typing import ClassVar, NamedTuple
 
@@ -16,7 +16,7 @@ from clpipe.stage.signal import SignalMethod
 
 
 class Unchanged(Method):
-    """Leaves the image as it is, at no cost. A subclass gives the method's name."""
+    """Leaves the image unchanged, at no cost. A subclass sets the method's name."""
 
     kernel: ClassVar = ""
 
@@ -28,13 +28,13 @@ class Unchanged(Method):
 
 
 class FromLens(Method):
-    """An effect of the lens that ``--lens`` names, as lensfun knows it."""
+    """An effect of the lens that ``--lens`` names, from lensfun's data."""
 
     method: ClassVar = "lens"
     kernel: ClassVar = ""
 
     def of_lens(self, lens: LensCalibration | None) -> Method:
-        """The method that does it; one that leaves the image as it is where nothing is known."""
+        """Return the method for a lens; one that does nothing if lensfun has no data."""
         raise NotImplementedError(type(self).__name__)
 
     def resolve(self, context: Context) -> Method:
@@ -42,38 +42,38 @@ class FromLens(Method):
 
 
 class AboutAxis(Method):
-    """A method that counts from the principal point."""
+    """A method that measures positions from the principal point."""
 
     cx: float | None = parameter(
         None,
-        "Principal point, from the left edge: OpenCV's cx + 0.5.",
+        "Distance of the principal point from the left edge; OpenCV's cx + 0.5.",
         "px",
-        "render.cx, the middle",
+        "render.cx, else the centre",
         optics=True,
     )
     cy: float | None = parameter(
         None,
-        "Principal point, from the upper edge: OpenCV's cy + 0.5.",
+        "Distance of the principal point from the upper edge; OpenCV's cy + 0.5.",
         "px",
-        "render.cy, the middle",
+        "render.cy, else the centre",
         optics=True,
     )
 
 
 class InFocalLengths(Method):
-    """A method that counts in focal lengths: px, or mm over the width of the sensor."""
+    """A method that is defined in focal lengths: in px, or in mm with the width of the sensor."""
 
     alternatives: ClassVar = frozenset({"fx", "focal_length"})
 
     fx: float | None = parameter(
-        None, "Focal length across.", "px", "the camera's", optics=True, gt=0, le=1e7
+        None, "Horizontal focal length.", "px", "the camera's", optics=True, gt=0, le=1e7
     )
     focal_length: float | None = parameter(
         None, "Focal length.", "mm", "the camera's", optics=True, gt=0, le=1e4
     )
     sensor_width: float | None = parameter(
         None,
-        "Of the sensor, along the longer side of the image.",
+        "Width of the sensor, along the longer side of the image.",
         "mm",
         "the camera's",
         optics=True,
@@ -83,32 +83,32 @@ class InFocalLengths(Method):
 
     @property
     def share(self) -> float | None:
-        """The focal length over the longer side; None where it is in px, or not known."""
+        """The focal length over the longer side; None if it is in px, or not known."""
         if self.fx or not (self.focal_length and self.sensor_width):
             return None
         return self.focal_length / self.sensor_width
 
     def check_focal_length(self, stage: str) -> None:
-        """See that the focal length is known, in one of the two ways.
+        """Check that the focal length is known, in px or in mm with the sensor's width.
 
         Raises:
-            RequestError: it is not. It is refused when a chain is resolved because options may
-                choose the method, and each row of a manifest its camera.
+            RequestError: it is not known. The check takes place when a chain is resolved, because
+                options may choose the method, and each row of a manifest its camera.
         """
         if not self.fx and not self.share:
             raise RequestError(
-                f"{stage}: {self.method} counts in focal lengths: set fx (px), or focal_length "
-                "and sensor_width (mm), here or in render"
+                f"{stage}: {self.method} needs a focal length; set fx (px), or focal_length and "
+                "sensor_width (mm), here or in render"
             )
 
 
 class OfDepth(Method):
-    """A method that needs the depth of its image, which :attr:`Context.depth` then has."""
+    """A method that needs the depth of its image, from :attr:`Context.depth`."""
 
-    layer: str = parameter("", "The layer that has the depth; else one of a usual name.")
+    layer: str = parameter("", "Depth layer; by default one with a usual name.")
 
     def check_depth(self, depth: Depth) -> str:
-        """See that this (resolved) method can use a depth: a warning, or "".
+        """Check that this (resolved) method can use a depth. Returns a warning, or "".
 
         Raises:
             RequestError: it cannot.
@@ -117,26 +117,26 @@ class OfDepth(Method):
 
 
 class Span(NamedTuple):
-    """When an exposure begins, and how long it is, in exposures of the first one."""
+    """Start and length of an exposure, in units of the first exposure."""
 
     start: float = 0.0
     length: float = 1.0
 
     @property
     def end(self) -> float:
-        """When it ends."""
+        """The end of the exposure."""
         return self.start + self.length
 
 
 class Noiseless(Unchanged):
-    """A stage that only adds noise, or only takes it away, where there is none."""
+    """A stage that only adds or only removes noise, in a chain without noise."""
 
     method: ClassVar = "none"
     summary: ClassVar = "no noise"
 
 
 class Curve(Method):
-    """A curve on each channel. A subclass gives its table, see :mod:`clpipe.reference.curve`."""
+    """A curve on each channel. A subclass sets its table, see :mod:`clpipe.reference.curve`."""
 
     kernel: ClassVar = "curve"
 
@@ -155,10 +155,10 @@ class Curve(Method):
 
 
 class GaussianNoise(SignalMethod):
-    """Gaussian noise of one sigma; at sigma 0 the image stays as it is, at no cost.
+    """Gaussian noise of one sigma; with sigma 0 the image does not change, at no cost.
 
-    A subclass gives the default of sigma, the passes and :meth:`apply`; and the variance, if the
-    noise is not an offset.
+    A subclass defines the default of sigma, the passes and :meth:`apply`. If the noise is not an
+    offset, it also defines the variance.
     """
 
     method: ClassVar = "gaussian"
@@ -174,7 +174,7 @@ class GaussianNoise(SignalMethod):
     )
 
     def draw(self) -> tuple[Pass, ...]:
-        """The kernel functions for a sigma above 0."""
+        """Return the kernel functions for a sigma above 0."""
         raise NotImplementedError(type(self).__name__)
 
     def passes(self) -> tuple[Pass, ...]:
@@ -188,7 +188,7 @@ class GaussianNoise(SignalMethod):
 
 
 def odd_size(size: int, largest: int) -> int:
-    """The width of a window, checked.
+    """Check the width of a window, and return it.
 
     >>> odd_size(5, 15)
     5

@@ -1,4 +1,4 @@
-"""Methods apart from any chain: their variants, their references run alone."""
+"""Methods outside a chain: their variants, and their references on a single image."""
 
 import typing
 from collections.abc import Iterator, Mapping
@@ -14,10 +14,11 @@ from clpipe.stage.passes import NoiseScope
 
 
 def variants(method: type[Method]) -> Iterator[dict[str, Any]]:
-    """Parameters for each variant of a method that is compiled differently.
+    """Return parameters for each variant of a method that is compiled differently.
 
-    The first is the defaults; then each other choice of a structural parameter; then the method's
-    other examples. CFA patterns are no variants here, since they go with every variant.
+    The first variant has the defaults. Then follow each other choice of a structural parameter, and
+    the method's other examples. CFA patterns are not variants here, since they are combined with
+    every variant.
     """
     yield {}
     for name, declared in method.model_fields.items():
@@ -30,14 +31,14 @@ def variants(method: type[Method]) -> Iterator[dict[str, Any]]:
 
 
 def variant_label(method: type[Method], values: Mapping[str, Any]) -> str:
-    """The name of a method with the parameters that are not at their defaults."""
+    """Return the name of a method with the parameters that differ from their defaults."""
     return " ".join([method.method, *(f"{name}={value}" for name, value in values.items())])
 
 
 def run_reference(
     method: Method, image: Floats, iso: float = 100, pattern: Pattern = "RGGB"
 ) -> Floats:
-    """The reference of a method on an image of the default camera, for examples and experiments.
+    """Run the reference of a method on an image of the default camera, for examples.
 
     The noise is that of the image key "".
     """

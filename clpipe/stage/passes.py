@@ -1,4 +1,4 @@
-"""Image kinds, and passes: functions of a kernel file, as the planner places them."""
+"""Image kinds, and passes: functions of a kernel file that the planner arranges."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from clpipe.reference.resample import Axis, Resampler
 
 
 class Kind(Enum):
-    """A kind of image: what its samples mean, its OpenCL type, its planes."""
+    """A kind of image: the meaning of its samples, its OpenCL type, its planes."""
 
     RGB = ("rgb", "rgb", ("R", "G", "B"))  # linear, 1 = sensor full scale at EV 0
     MOSAIC = ("mosaic", "vf", ("Y",))  # signal: 0 = black level, 1 = white level
     RAW = ("raw", "vf", ("Y",))  # mosaic in DN
-    DISPLAY = ("display", "rgb", ("R", "G", "B"))  # as a screen wants it, 0..1
+    DISPLAY = ("display", "rgb", ("R", "G", "B"))  # for a screen, 0..1
     YCBCR = ("ycbcr", "ycbcr", ("Y", "Cb", "Cr"))  # inside a stage only
-    PAIR = ("pair", "pair", ("first", "second"))  # two planes of anything, inside a stage only
+    PAIR = ("pair", "pair", ("first", "second"))  # any two planes, inside a stage only
 
     def __init__(self, label: str, c_type: str, channels: tuple[str, ...]) -> None:
         self.label = label
@@ -29,12 +29,12 @@ class Kind(Enum):
 
     @property
     def c_name(self) -> str:
-        """The name in the kernel library's functions, such as ``tap_mosaic``."""
+        """The name in functions of the kernel library, for example ``tap_mosaic``."""
         return "mosaic" if self.c_type == "vf" else self.c_type
 
 
 class NoiseScope(Enum):
-    """The owner of a draw of noise; the random key is made of it."""
+    """The scope of a draw of noise, which is a part of the random key."""
 
     IMAGE = "image"  # each image has its own
     CAMERA = "camera"  # fixed pattern: the same in all images of a camera
@@ -42,14 +42,14 @@ class NoiseScope(Enum):
 
 @dataclass(frozen=True)
 class Pointwise:
-    """Makes a pixel of that pixel.
+    """Computes a pixel from the pixel at the same position.
 
     Args:
-        inline_at_taps: whether a stencil after it may redo it at each of its taps, where that costs
-            less than to store the image.
-        inverse_of: of the first pass of a stage, the function that it undoes, bit for bit. If that
-            is the last pass of the stage before, with arguments of the same values, neither is
-            done.
+        inline_at_taps: whether a later stencil may recompute it at each of its taps if that costs
+            less than storing the image.
+        inverse_of: for the first pass of a stage, the function that it inverts, bit for bit. If
+            that function is the last pass of the previous stage, with arguments of the same values,
+            both are omitted.
     """
 
     inline_at_taps: bool = False
@@ -58,17 +58,17 @@ class Pointwise:
 
 @dataclass(frozen=True)
 class TableLookup:
-    """Takes each channel of a pixel through the argument "table"."""
+    """Maps each channel of a pixel through the argument "table"."""
 
 
 @dataclass(frozen=True)
 class Stencil:
-    """Makes a pixel of its neighbours.
+    """Computes a pixel from its neighbours.
 
     Args:
-        radius: how far away the neighbours are at most, in rows and in columns.
-        vectors_per_row: 0 where the function returns its pixel. One that does not fills an array,
-            its last argument, with 4 rows of COLUMNS vectors: of that many, on one lane of one.
+        radius: largest distance of the neighbours, in rows and in columns.
+        vectors_per_row: 0 if the function returns its pixel. Otherwise, it fills an array, its last
+            argument, with 4 rows of COLUMNS vectors. COLUMNS is this number, or 1 on a single lane.
     """
 
     radius: int
@@ -77,11 +77,11 @@ class Stencil:
 
 @dataclass(frozen=True)
 class Resample:
-    """Makes a pixel of a smaller or bent image of pixels of the image.
+    """Computes a pixel of a resized or warped image from pixels of the image.
 
     Args:
-        resampler: which pixels are of which.
-        radius: how far from these places the function reads.
+        resampler: the mapping between the two images.
+        radius: distance from the mapped positions up to which the function reads.
     """
 
     resampler: Resampler
@@ -90,19 +90,19 @@ class Resample:
 
 @dataclass(frozen=True)
 class LineTable:
-    """Makes a table, named by ``writes``, with a value for each row or column, from no image."""
+    """Makes a table, named by ``writes``, with a value for each row or column, without an image."""
 
     axis: Axis
 
 
 @dataclass(frozen=True)
 class Reduction:
-    """Sums over the whole image, or a histogram of it, and a few numbers estimated from that.
+    """Sums over the whole image, or its histogram, and a few numbers estimated from them.
 
     Args:
         finish: the function that computes the estimates.
         estimates: names of the estimated numbers, at most four; passes after it may take them.
-        finish_arguments: of that function, as ``arguments`` of :class:`Pass`.
+        finish_arguments: arguments of that function, like ``arguments`` of :class:`Pass`.
         bins: of the histogram; 0 for sums.
     """
 
@@ -117,18 +117,18 @@ Access = Pointwise | TableLookup | Stencil | Resample | LineTable | Reduction
 
 @dataclass(frozen=True)
 class Pass:
-    """One function of a method's kernel file, and how the planner may place it.
+    """One function of a method's kernel file, and how the planner may use it.
 
     Args:
         function: its name.
-        access: how it touches pixels.
-        arguments: those after the pixel, in order: names from :meth:`Method.arguments`, from the
-            estimates of an earlier :class:`Reduction`, or of the table of an earlier
+        access: how it accesses pixels.
+        arguments: those after the pixel, in order. Their names are from :meth:`Method.arguments`,
+            the estimates of an earlier :class:`Reduction`, or the table of an earlier
             :class:`LineTable`.
         reads: images of the stage: "src" is its input, any other name an image between its passes.
         writes: another such name, or "dst", the stage's output.
-        kind: of what it writes; None is what the stage writes.
-        random: what the noise belongs to, for a function whose first argument is a random stream.
+        kind: kind of the image it writes; None is the kind that the stage writes.
+        random: scope of the noise, for a function whose first argument is a random stream.
     """
 
     function: str
@@ -152,7 +152,7 @@ class Pass:
 
     @property
     def gives(self) -> tuple[str, ...]:
-        """Arguments that it makes for later passes: its estimates, and its table."""
+        """The arguments that it provides for later passes: its estimates, and its table."""
         estimates = self.access.estimates if isinstance(self.access, Reduction) else ()
         return *estimates, self.writes
 
@@ -170,7 +170,7 @@ Arguments = Mapping[str, Argument | float | None]
 
 
 def typed_arguments(arguments: Arguments) -> dict[str, Argument]:
-    """Kernel arguments as kernels take them.
+    """Return kernel arguments in the types that kernels take.
 
     >>> typed_arguments({"gain": 0.5, "count": np.uint32(3)})
     {'gain': np.float32(0.5), 'count': np.uint32(3)}
@@ -181,7 +181,7 @@ def typed_arguments(arguments: Arguments) -> dict[str, Argument]:
 
 
 def bytes_of(argument: Argument) -> bytes:
-    """An argument's value, to compare it.
+    """Return an argument's value in a form that can be compared.
 
     >>> bytes_of(np.float32(1)) == bytes_of(np.float32(1.0)), bytes_of(CompileTime("1u"))
     (True, b'1u')

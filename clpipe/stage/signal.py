@@ -1,7 +1,7 @@
 """Methods on the signal of a mosaic, written once for NumPy and for PyTorch.
 
 Such a method overrides :meth:`SignalMethod.apply` instead of ``reference``. NumPy runs it on one
-image, as the reference of the kernel; :mod:`clpipe.torch` runs it on a batch.
+image, as the reference of the kernel. :mod:`clpipe.torch` runs it on a batch.
 """
 
 from collections.abc import Callable, Mapping
@@ -44,7 +44,7 @@ def nothing(method: Any, context: Context) -> tuple[Any, ...]:
 
 
 class Backend:
-    """What :meth:`SignalMethod.apply` uses besides operators: functions, and random numbers.
+    """Functions and random numbers that :meth:`SignalMethod.apply` uses besides operators.
 
     Random numbers are new in each image, except those of :meth:`fixed`.
     """
@@ -84,7 +84,7 @@ class Backend:
         raise NotImplementedError
 
     def fixed(self, make: Callable[..., Floats], own: Own = nothing) -> Signal:
-        """Return what is fixed to a sensor.
+        """Return values that are fixed to a sensor.
 
         Args:
             make: a NumPy function of the height, the width, the stream of the sensor, and ``own``.
@@ -101,11 +101,11 @@ class SignalMethod(Method):
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
         """Return the signal after this method.
 
-        Only ``+ - *``, comparisons and what ``backend`` has round alike everywhere; constants are
-        Python numbers that float32 represents exactly.
+        Use only ``+ - *``, comparisons and ``backend``, which round equally everywhere. Constants
+        are Python numbers that float32 represents exactly.
 
         Args:
-            y: the signal before.
+            y: the signal before this method.
             n: the numbers among :meth:`arguments`, by name.
             backend: functions and random numbers.
         """
@@ -113,7 +113,7 @@ class SignalMethod(Method):
 
     @classmethod
     def on_tensors(cls) -> bool:
-        """Return whether :meth:`apply` is all of it: a subclass may have a reference of its own."""
+        """Return whether PyTorch can use :meth:`apply`: a subclass may have its own reference."""
         return cls.reference is SignalMethod.reference
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

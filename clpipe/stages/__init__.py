@@ -1,9 +1,9 @@
-"""The stages, one in each file or folder, and the default chain.
+"""The stages, one per file or folder, and the default chain.
 
-A file declares one stage: its methods, their parameters, kernels and NumPy references. Every module
-here must define ``STAGE``: :func:`own_stages` imports them all, so nothing else lists them. Code
-that several stages share belongs in ``reference`` or ``stage``. This room imports ``images``,
-``stage``, ``reference``, ``camera`` and ``base``.
+Each file declares one stage: its methods, their parameters, kernels and NumPy references. Every
+module here must define ``STAGE``; :func:`own_stages` imports them all, so no other list exists.
+Code that several stages share belongs in ``reference`` or ``stage``. This package imports
+``images``, ``stage``, ``reference``, ``camera`` and ``base``.
 """
 
 from functools import cache
@@ -52,7 +52,7 @@ DEFAULT_CHAIN = (
 
 @cache
 def own_stages() -> dict[str, Stage]:
-    """clpipe's own stages by name: those of the default chain in its order, then the others."""
+    """Return clpipe's built-in stages by name: the default chain in its order, then the others."""
     stages: dict[str, Stage] = {
         module.name: import_module(f"{__name__}.{module.name}").STAGE
         for module in iter_modules(__path__)

@@ -1,4 +1,4 @@
-"""Banding: a periodic disturbance of the readout, as a power supply makes it."""
+"""Banding: a periodic disturbance of the readout, for example from a power supply."""
 
 from collections.abc import Callable
 from typing import ClassVar
@@ -26,7 +26,7 @@ SINE = tuple(map(np.float32, (42.058693, -76.705859, 81.605249, -41.341702, 6.28
 
 
 def sine_of_turns(turns: Signal, where: Callable[..., Signal] = np.where) -> Signal:
-    """The sine of an angle in whole turns, to 4e-6, by * and + alone.
+    """Return the sine of an angle in turns, to within 4e-6, using only * and +.
 
     >>> sine_of_turns(np.float32([0, 0.125, 0.25, 0.5, 7.75])).round(3).tolist()
     [0.0, 0.7070000171661377, 1.0, 0.0, -1.0]
@@ -44,10 +44,10 @@ def sine_of_turns(turns: Signal, where: Callable[..., Signal] = np.where) -> Sig
 
 
 class Sine(SignalMethod):
-    """y + amplitude * sin(2 pi (row / period + phase)): a wave, of another phase in each frame.
+    """y + amplitude * sin(2 pi (row / period + phase)): a wave with a new phase in each frame.
 
-    Rows are read one after the other, so what disturbs the readout in time is a wave over the rows
-    (EMVA 1288, release 4.0, 2021, finds it as a peak of the spectrogram of rows).
+    Rows are read one after the other, so a disturbance in time becomes a wave over the rows. EMVA
+    1288, release 4.0 (2021), finds it as a peak in the spectrogram of rows.
 
     >>> from clpipe.stage import run_reference
     >>> wave = run_reference(Sine(amplitude=0.1, period=4.0), np.zeros((400, 2), np.float32))
@@ -57,14 +57,14 @@ class Sine(SignalMethod):
 
     method: ClassVar = "sine"
     kernel: ClassVar = "banding"
-    summary: ClassVar = "add a wave over the rows, of another phase in each image"
+    summary: ClassVar = "add a sine wave over the rows, with a new phase in each image"
     example: ClassVar = {"amplitude": 0.01, "period": 9.7}
 
     amplitude: float | None = parameter(
-        None, "Of the wave.", "signal", "from the camera and ISO", ge=0, le=1
+        None, "Amplitude of the wave.", "signal", "from the camera and ISO", ge=0, le=1
     )
     period: float | None = parameter(
-        None, "Of the wave.", "rows", "from the camera; else 16", ge=2, le=1e5
+        None, "Period of the wave.", "rows", "from the camera; else 16", ge=2, le=1e5
     )
 
     def resolve(self, context: Context) -> "Sine":
@@ -83,7 +83,7 @@ class Sine(SignalMethod):
 
     @property
     def frequency(self) -> np.float32:
-        """Of the wave, in turns a row."""
+        """The frequency of the wave, in turns per row."""
         assert self.period is not None
         return float32(1 / self.period)
 
@@ -99,4 +99,4 @@ class Sine(SignalMethod):
         return y + sine_of_turns(turns, backend.where) * n["amplitude"]
 
 
-STAGE = Stage("banding", "Add a wave over the rows.", Kind.MOSAIC, Kind.MOSAIC, (Sine,))
+STAGE = Stage("banding", "Add a periodic wave over the rows.", Kind.MOSAIC, Kind.MOSAIC, (Sine,))

@@ -1,4 +1,4 @@
-"""Errors of the black level: what is taken for black is not, in each colour and each frame."""
+"""Errors of the black level, different in each colour and each frame."""
 
 from typing import Annotated, ClassVar
 
@@ -27,12 +27,11 @@ Bias = tuple[float, float, float, float]
 
 
 class Offsets(SignalMethod):
-    """y + bias + sigma * n: one offset for each place of the filter array in each frame.
+    """y + bias + sigma * n: one offset per position in the filter array and frame.
 
-    bias is fixed for a camera and ISO, one number for R, G in the rows of R, G in the rows of B
-    and B (the colour bias of Wei et al., "Physics-based noise modeling for extreme low-light
-    photography", TPAMI 2021, sec. 3.3); n is a standard normal of that colour, new in each frame.
-    Both are in signal units.
+    The bias is fixed for a camera and ISO: one number for R, for G in the rows of R, for G in the
+    rows of B, and for B. It is the colour bias of Wei et al., TPAMI 2021, sec. 3.3. n is a standard
+    normal of that colour, new in each frame. Both are in signal units.
 
     >>> from clpipe.stage import run_reference
     >>> black = np.zeros((4, 4), np.float32)
@@ -43,12 +42,14 @@ class Offsets(SignalMethod):
 
     method: ClassVar = "offsets"
     kernel: ClassVar = "black_level_error"
-    summary: ClassVar = "add an offset to each colour, with a part that is new in each frame"
+    summary: ClassVar = (
+        "add an offset to each colour: a fixed part and a part that changes with each image"
+    )
     example: ClassVar = {"sigma": 0.01, "bias": [0.004, -0.002, 0.001, 0.003]}
 
     sigma: float | None = parameter(
         None,
-        "Standard deviation of the offsets of a frame.",
+        "Standard deviation of the offsets that change with each image.",
         "signal",
         "from the camera and ISO",
         ge=0,
@@ -56,7 +57,7 @@ class Offsets(SignalMethod):
     )
     bias: Annotated[Bias, Field(strict=False)] | None = parameter(
         None,
-        "Fixed offsets of R, G in the rows of R, G in the rows of B and B.",
+        "Fixed offsets of R, of G in the rows of R, of G in the rows of B, and of B.",
         "signal",
         "from the camera and ISO",
     )
@@ -78,7 +79,7 @@ class Offsets(SignalMethod):
         )
 
     def _places(self, pattern: str) -> dict[tuple[int, int], np.float32]:
-        """The fixed offset of each place, by its column and row in the filter array."""
+        """Return the fixed offset at a column and row of the filter array."""
         red, with_red, with_blue, blue = map(float32, self.bias or (0.0,) * 4)
         green = with_red if "R" in pattern[:2] else with_blue
         others = with_blue if "R" in pattern[:2] else with_red
@@ -108,7 +109,7 @@ class Offsets(SignalMethod):
 
 STAGE = Stage(
     "black_level_error",
-    "Miss the black level, in each colour.",
+    "Add an error of the black level to each colour.",
     Kind.MOSAIC,
     Kind.MOSAIC,
     (Offsets,),

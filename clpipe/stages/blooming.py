@@ -1,4 +1,4 @@
-"""Blooming: what a full pixel cannot hold goes to its neighbours in the column."""
+"""Blooming: charge that a full pixel cannot hold flows to its neighbours in the column."""
 
 from typing import ClassVar
 
@@ -22,17 +22,17 @@ REACH = 16  # px
 
 
 class NoBlooming(Unchanged):
-    """No blooming, as of sensors that drain what is too much."""
+    """No blooming, for sensors that drain excess charge."""
 
     method: ClassVar = "none"
-    summary: ClassVar = "no blooming, as of sensors with a drain"
+    summary: ClassVar = "no blooming, for sensors that drain excess charge"
 
 
 class Column(SignalMethod):
-    """Charge above the full well goes on along the column, half up and half down.
+    """Charge above the full well flows along the column, half of it up and half down.
 
-    The pixel k places on gets the share (1 - spill) * spill^(k - 1) of each half, up to 16 px, and
-    holds no more than its own full well. Bright lamps so get streaks.
+    The pixel at distance k receives the share (1 - spill) * spill^(k - 1) of each half, up to 16
+    px. It holds no more than its own full well. Bright lamps get streaks in this way.
 
     >>> import numpy as np
     >>> from clpipe.stage import run_reference
@@ -44,14 +44,14 @@ class Column(SignalMethod):
 
     method: ClassVar = "column"
     kernel: ClassVar = "blooming"
-    summary: ClassVar = "let charge above the full well go on along the column"
+    summary: ClassVar = "charge above the full well flows along the column"
     example: ClassVar = {"full_signal": 0.4, "spill": 0.7}
 
     full_signal: float | None = parameter(
         None, "Signal of a full pixel.", "signal", "from the camera and ISO; else 1", gt=0, le=1e6
     )
     spill: float = parameter(
-        0.7, "Share of what a pixel gets too much of that goes one pixel on.", ge=0, lt=1
+        0.7, "Share of the excess charge that each pixel passes on to the next one.", ge=0, lt=1
     )
 
     def resolve(self, context: Context) -> "Column":
@@ -80,7 +80,7 @@ class Column(SignalMethod):
 
 STAGE = Stage(
     "blooming",
-    "Let full pixels overflow.",
+    "Let charge overflow from full pixels.",
     Kind.MOSAIC,
     Kind.MOSAIC,
     (NoBlooming, Column),

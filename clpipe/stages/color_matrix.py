@@ -1,4 +1,4 @@
-"""Colour matrix: from a camera's white-balanced RGB to linear sRGB."""
+"""Colour matrix: converts a camera's white-balanced RGB to linear sRGB."""
 
 from typing import Annotated, Any, ClassVar
 
@@ -25,7 +25,7 @@ NAMES = tuple(f"{row}_{column}" for row in "rgb" for column in "rgb")
 
 
 def as_tuples(value: Any) -> Any:
-    """A 3x3 list of numbers, as TOML has it, as the tuples that strict validation needs."""
+    """Convert a 3x3 list, which TOML gives, to the tuples that strict validation needs."""
     if value is None:
         return None
     rows = value if isinstance(value, list | tuple) else ()
@@ -37,7 +37,7 @@ def as_tuples(value: Any) -> Any:
 
 
 def apply_matrix(image: Floats, matrix: Floats) -> Floats:
-    """Multiply a (3, 3) matrix by the colour of each pixel; (height, width, 3) in and out.
+    """Multiply the colour of each pixel by a (3, 3) matrix; (height, width, 3) in and out.
 
     >>> swap = np.float32([[0, 1, 0], [1, 0, 0], [1, 1, 1]])
     >>> apply_matrix(np.float32([[[1, 2, 4]]]), swap).tolist()
@@ -48,45 +48,49 @@ def apply_matrix(image: Floats, matrix: Floats) -> Floats:
 
 
 def srgb_to_camera(camera: Camera) -> Doubles:
-    """A camera's matrix, :meth:`clpipe.camera.profile.Camera.srgb_to_camera`, (3, 3).
+    """Return a camera's matrix, :meth:`clpipe.camera.profile.Camera.srgb_to_camera`, (3, 3).
 
     Raises:
-        RequestError: the camera has none; the message says what can be set.
+        RequestError: the camera has no matrix; the message lists what you can set.
     """
     try:
         return camera.srgb_to_camera()
     except RequestError as error:
         raise RequestError(
-            f"{error}; set color_matrix.method=as_shot, add the matrix to a profile of your own, "
-            "or choose another camera"
+            f"{error}; set color_matrix.method=as_shot, add the matrix to your own profile, or "
+            "choose another camera"
         ) from None
 
 
 class NoMatrix(Unchanged):
-    """No matrix: colours stay as they are."""
+    """No matrix: colours do not change."""
 
     method: ClassVar = "none"
-    summary: ClassVar = "no matrix: colours stay as they are"
+    summary: ClassVar = "no matrix: colours do not change"
 
 
 class FixedMatrix(Method):
-    """A user's 3x3 matrix: each pixel's linear RGB becomes matrix * RGB."""
+    """Your own 3x3 matrix: each pixel's linear RGB becomes matrix * RGB."""
 
     method: ClassVar = "given"
     kernel: ClassVar = "color_matrix"
-    summary: ClassVar = "a 3x3 matrix of your own"
+    summary: ClassVar = "your own 3x3 matrix"
     example: ClassVar = {"matrix": [[1.6, -0.5, -0.1], [-0.2, 1.5, -0.3], [0.05, -0.6, 1.55]]}
 
     matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = parameter(
         IDENTITY,
-        "Three rows of three numbers: the new red, green and blue, each as a sum of the old ones.",
+        "Three rows of three numbers. Each row makes the new red, green or blue from the old "
+        "three.",
     )
 
     @field_validator("matrix")
     @classmethod
     def _invertible(cls, matrix: Matrix | None) -> Matrix | None:
         if matrix is not None and abs(np.linalg.det(matrix)) < 1e-6:
-            raise ValueError("the matrix is singular: different colours would become the same")
+            raise ValueError(
+                "the matrix is singular, so different colours would become the "
+                "same; set an invertible matrix"
+            )
         return matrix
 
     def next_context(self, context: Context) -> Context:
@@ -108,9 +112,9 @@ class FixedMatrix(Method):
 
 
 class AsShot(FixedMatrix):
-    """Back to linear sRGB: the inverse of the matrix with which a render became camera RGB.
+    """The inverse of the matrix that converted the render from linear sRGB to camera RGB.
 
-    Where there was none, colours stay as they are.
+    If the render was not converted, colours do not change.
     """
 
     method: ClassVar = "as_shot"
@@ -121,7 +125,7 @@ class AsShot(FixedMatrix):
     matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = parameter(
         None,
         "Three rows of three numbers, from camera RGB to linear sRGB.",
-        auto="the inverse of what inverse_color_matrix did",
+        auto="the inverse of the matrix that inverse_color_matrix used",
     )
 
     def resolve(self, context: Context) -> "AsShot":
@@ -131,13 +135,13 @@ class AsShot(FixedMatrix):
 
 
 class CameraToSrgb(FixedMatrix):
-    """White-balanced camera RGB to linear sRGB: the inverse of the camera's matrix.
+    """White-balanced camera RGB to linear sRGB, with the inverse of the camera's matrix.
 
     The camera's matrix is :meth:`clpipe.camera.profile.Camera.srgb_to_camera`.
     """
 
     method: ClassVar = "camera"
-    summary: ClassVar = "camera RGB to linear sRGB, for a camera's raws"
+    summary: ClassVar = "camera RGB to linear sRGB, for raw files of a camera"
     example: ClassVar = {}
 
     matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = parameter(
@@ -147,15 +151,16 @@ class CameraToSrgb(FixedMatrix):
     )
 
     def resolve(self, context: Context) -> "CameraToSrgb":
-        """The method with a matrix.
+        """Return the method with a matrix.
 
         Raises:
-            RequestError: the camera has none, or the channels are no colours.
+            RequestError: the camera has no matrix, or the mosaic's channels are not colours.
         """
         if context.array and context.array.is_polarised:
             raise RequestError(
-                f"color_matrix.method=camera: the mosaic is {context.array.name}, whose channels "
-                "are no colours; leave color_matrix.method out, or skip color_matrix"
+                "color_matrix.method=camera needs channels that are colours, and those of "
+                f"mosaic {context.array.name} are not; remove color_matrix.method, or skip "
+                "color_matrix"
             )
         if self.matrix is not None:
             return self

@@ -1,4 +1,4 @@
-"""Column noise: offsets that all pixels of a column share, from that column's readout circuit."""
+"""Column noise: an offset that all pixels of a column share, from its readout circuit."""
 
 from typing import ClassVar
 
@@ -7,7 +7,7 @@ from clpipe.stages.row_noise import LineNoise
 
 
 class Gaussian(LineNoise):
-    """y + sigma * n_x: one Gaussian offset for each column, the same in every image of a camera.
+    """y + sigma * n_x: one Gaussian offset per column, the same in every image of a camera.
 
     n_x is a standard normal of column x; sigma is in signal units.
 

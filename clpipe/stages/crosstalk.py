@@ -1,4 +1,4 @@
-"""Crosstalk: light and charge that a pixel's neighbours get."""
+"""Crosstalk: light and charge that leak to neighbouring pixels."""
 
 from typing import ClassVar
 
@@ -20,8 +20,8 @@ from clpipe.stage import (
 class Neighbours(SignalMethod):
     """y + share * (the four neighbours - 4 y): each pixel gives a share of its charge to each side.
 
-    Neighbours have other colours, so colours come nearer to grey, and edges become softer. It is
-    before shot noise, which stays independent (Holst and Lomheim, CMOS/CCD Sensors and Camera
+    The neighbours have other colours, so colours become less saturated and edges softer. The stage
+    comes before shot noise, which stays independent (Holst and Lomheim, CMOS/CCD Sensors and Camera
     Systems, 2nd ed. 2011).
 
     >>> import numpy as np
@@ -39,7 +39,7 @@ class Neighbours(SignalMethod):
 
     share: float | None = parameter(
         None,
-        "Share of a pixel's charge that each neighbour gets.",
+        "Share of a pixel's charge that leaks to each of its four neighbours.",
         "",
         "from the camera",
         ge=0,
@@ -63,5 +63,5 @@ class Neighbours(SignalMethod):
 
 
 STAGE = Stage(
-    "crosstalk", "Let charge leak to neighbours.", Kind.MOSAIC, Kind.MOSAIC, (Neighbours,)
+    "crosstalk", "Let charge leak to neighbouring pixels.", Kind.MOSAIC, Kind.MOSAIC, (Neighbours,)
 )

@@ -1,4 +1,4 @@
-"""Dark current: charge that heat sets free while the shutter is open."""
+"""Dark current: thermal charge that accumulates during the exposure."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -25,12 +25,13 @@ from clpipe.stage import (
 
 
 class Thermal(SignalMethod):
-    """The dark current's shot noise and fixed pattern; its mean is taken off with the black level.
+    """Shot noise and fixed pattern of the dark current. Black level subtraction removes its mean.
 
-    A pixel gathers D = current * 2^((temperature - reference) / doubling) * time electrons in the
-    mean (EMVA 1288, release 4.0, 2021: dark current). Pixels differ: their own charge has a shifted
-    exponential distribution of the standard deviation spread * D, as hot pixels make its tail long,
-    and stays put for a camera. Its shot noise, new in each frame, has that charge as variance.
+    On average a pixel accumulates D = current * 2^((temperature - reference) / doubling) * time
+    electrons (EMVA 1288, release 4.0, 2021: dark current). Pixels differ: their charge has a
+    shifted exponential distribution with the standard deviation spread * D, because hot pixels make
+    its tail long. This pattern is fixed for a camera. The shot noise is new in each frame, and its
+    variance is the pixel's charge.
 
     >>> from clpipe.stage import run_reference
     >>> hot = Thermal(exposure_time=10.0, current=2.0, spread=0.0, per_electron=1e-3)
@@ -45,30 +46,36 @@ class Thermal(SignalMethod):
 
     exposure_time: float | None = parameter(
         None,
-        "How long charge is gathered.",
+        "Exposure time. 0 disables dark current.",
         "s",
-        "the camera's, by the exposure's EV; else 0, which is off",
+        "the camera's, from the exposure's EV; else 0",
         optics=True,
         ge=0,
         le=86400,
     )
     temperature: float | None = parameter(
         None,
-        "Of the sensor.",
+        "Temperature of the sensor.",
         "deg C",
         "the reference temperature",
         ge=-150,
         le=150,
     )
     current: float | None = parameter(
-        None, "At the reference temperature.", "e-/s", "from the camera", ge=0, le=1e6
+        None, "Dark current at the reference temperature.", "e-/s", "from the camera", ge=0, le=1e6
     )
     reference_temperature: float | None = parameter(
-        None, "At which the current holds.", "deg C", "from the camera", ge=-150, le=150
+        None,
+        "Reference temperature, at which the current was measured.",
+        "deg C",
+        "from the camera",
+        ge=-150,
+        le=150,
     )
     doubling: float | None = parameter(
         None,
-        "Difference of temperature that doubles the current; 0: it does not depend on it.",
+        "Temperature difference that doubles the current. With 0 it does not depend on "
+        "temperature.",
         "K",
         "from the camera; else 0",
         ge=0,
@@ -76,18 +83,18 @@ class Thermal(SignalMethod):
     )
     spread: float | None = parameter(
         None,
-        "How pixels differ: standard deviation over mean.",
+        "Variation between pixels: standard deviation over mean.",
         "",
         "from the camera",
         ge=0,
         le=1,
     )
     per_electron: float | None = parameter(
-        None, "Signal of an electron.", "signal/e-", "from the camera and ISO", gt=0, le=1
+        None, "Signal of one electron.", "signal/e-", "from the camera and ISO", gt=0, le=1
     )
 
     def optics(self) -> Mapping[str, float]:
-        return super().optics() if self.exposure_time else {}  # 0 switches it off
+        return super().optics() if self.exposure_time else {}  # 0 disables it
 
     def resolve(self, context: Context) -> "Thermal":
         camera = context.camera
@@ -103,7 +110,7 @@ class Thermal(SignalMethod):
 
     @property
     def electrons(self) -> float:
-        """What a pixel gathers in the mean, e-."""
+        """The mean charge of a pixel, e-."""
         if not self.current or not self.exposure_time:
             return 0.0
         warmer = (self.temperature or 0.0) - (self.reference_temperature or 0.0)
@@ -131,7 +138,7 @@ class Thermal(SignalMethod):
 
     @property
     def _charge(self) -> tuple[np.float32, np.float32, np.float32]:
-        """The mean charge, its standard deviation over pixels, and an electron, in signal."""
+        """Return the mean charge, its deviation over pixels, and the signal of an electron."""
         assert self.spread is not None and self.per_electron is not None
         mean = self.electrons * self.per_electron
         return float32(mean), float32(mean * self.spread), float32(self.per_electron)
@@ -154,8 +161,14 @@ class Thermal(SignalMethod):
 
 
 def charge_of_sensor(height: int, width: int, stream: Stream) -> Floats:
-    """Return exponential numbers of mean 1, less 1."""
+    """Return exponential numbers of mean 1, minus 1."""
     return exponential_of(sensor_bits(height, width, stream)) - np.float32(1)
 
 
-STAGE = Stage("dark_current", "Add what heat sets free.", Kind.MOSAIC, Kind.MOSAIC, (Thermal,))
+STAGE = Stage(
+    "dark_current",
+    "Add the shot noise and fixed pattern of thermal charge.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (Thermal,),
+)

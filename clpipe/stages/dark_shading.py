@@ -1,4 +1,4 @@
-"""Dark shading: smooth maps that a sensor adds to every frame, in the dark as well."""
+"""Dark shading: smooth maps that a sensor adds to every frame, even without light."""
 
 from math import sqrt
 from pathlib import Path
@@ -29,16 +29,16 @@ from clpipe.stage import (
     parameter,
 )
 
-MAPS = 4  # products of a curve over the rows and one over the columns; two for each of both maps
+MAPS = 4  # products of a curve over the rows and one over the columns: two for each of the two maps
 
 
 def curve(count: int, number: int, per_px: np.float32, stream: Stream) -> Floats:
-    """A smooth random curve of variance 1, (count,): a cubic B-spline of standard normals.
+    """Return a smooth random curve of variance 1, (count,): a cubic B-spline of standard normals.
 
     Args:
-        count: of rows or columns.
-        number: of the curve, in the stream.
-        per_px: knots for each row or column.
+        count: number of rows or columns.
+        number: number of the curve in the stream.
+        per_px: knots per row or column.
         stream: the source of the normals.
     """
     t = np.arange(count, dtype=np.float32) * per_px
@@ -66,9 +66,10 @@ class Smooth(SignalMethod):
     """y + ISO * k(x, y) + b(x, y): two smooth maps, fixed for a camera.
 
     Feng et al., "Learnability enhancement for low-light raw image denoising: A data perspective"
-    (PMN; TPAMI 2023), find dark shading to be linear in the ISO. The maps here are random, the same
-    for the same camera and seed of the sensor: of each two products of a curve over the rows and
-    one over the columns, which are cubic B-splines with a knot every ``length`` pixels.
+    (PMN; TPAMI 2023), find that dark shading is linear in the ISO. The maps here are random and
+    depend only on the camera and the sensor's seed. Each map is the sum of two products of a curve
+    over the rows and a curve over the columns. The curves are cubic B-splines with a knot every
+    ``length`` pixels.
 
     >>> from clpipe.stage import run_reference
     >>> shaded = run_reference(Smooth(offset=0.01, length=100.0), np.zeros((900, 900), np.float32))
@@ -79,13 +80,15 @@ class Smooth(SignalMethod):
 
     method: ClassVar = "smooth"
     kernel: ClassVar = "dark_shading"
-    summary: ClassVar = "add two smooth random maps of the camera, one in proportion to the ISO"
+    summary: ClassVar = (
+        "add two smooth random maps of the camera, one of them proportional to the ISO"
+    )
     example: ClassVar = {"slope": 1e-5, "offset": 0.01, "length": 7.3}
 
     slope: float | None = parameter(
         None,
         "Standard deviation of the map k.",
-        "signal for each ISO",
+        "signal per ISO",
         "from the camera",
         ge=0,
         le=1,
@@ -94,7 +97,7 @@ class Smooth(SignalMethod):
         None, "Standard deviation of the map b.", "signal", "from the camera", ge=0, le=1
     )
     length: float | None = parameter(
-        None, "Distance of the maps' knots.", "px", "from the camera", ge=4, le=1e5
+        None, "Distance between the knots of the maps.", "px", "from the camera", ge=4, le=1e5
     )
 
     def resolve(self, context: Context) -> "Smooth":
@@ -125,7 +128,7 @@ class Smooth(SignalMethod):
         )
 
     def _amplitudes(self, iso: float) -> tuple[np.float32, np.float32]:
-        """Of each product of the two maps, so that the standard deviation is what was said."""
+        """The factors of the products in both maps that give the maps their standard deviations."""
         assert self.slope is not None and self.offset is not None
         return float32(self.slope * iso / sqrt(2)), float32(self.offset / sqrt(2))
 
@@ -140,7 +143,7 @@ class Smooth(SignalMethod):
         return {**numbers, "per_px": self._per_px, "slope": slope, "offset": offset}
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        """That of noise: what is the same in every frame of a camera, and smooth, is none."""
+        """The variance of the noise: a smooth map that is the same in every frame adds none."""
         return before
 
     @classmethod
@@ -159,10 +162,10 @@ def shading(height: int, width: int, stream: Stream, per_px: np.float32, first: 
 
 
 def measured(path: str) -> Floats:
-    """The map in a file of one channel, (height, width), DN; read again when the file changes.
+    """Return the map in a file of one channel, (height, width), DN. A changed file is read again.
 
     Raises:
-        ValueError: the file cannot be read, or holds no such map.
+        ValueError: the file cannot be read, or does not contain such a map.
     """
     try:
         return _measured(path)
@@ -174,44 +177,45 @@ def measured(path: str) -> Floats:
 
 @read_when_changed
 def _measured(path: str) -> Floats:
-    from clpipe.images.read import read_image  # few need what it imports
+    from clpipe.images.read import read_image  # this import is slow and rarely needed
 
     return np.asarray(read_image(Path(path), mosaic=True).pixels, np.float32)
 
 
 def combined(slope: str | None, offset: str | None, iso: float, unit: float) -> Floats:
-    """The map ISO * k + b in signal of two files, of which one may be missing.
+    """Return the map ISO * k + b, in signal units, from two files, one of which may be absent.
 
     Raises:
-        ValueError: they are of different sizes.
+        ValueError: the two maps differ in size.
     """
     maps = [measured(path) for path in (slope, offset) if path]
     if len({each.shape for each in maps}) > 1:
         sizes = " and ".join(f"{w}x{h}" for h, w in (each.shape for each in maps))
-        raise ValueError(f"slope_file and offset_file are of different sizes: {sizes}")
+        raise ValueError(f"slope_file and offset_file differ in size: {sizes}")
     factors = [factor for path, factor in ((slope, iso), (offset, 1.0)) if path]
     total = sum(each * factor for each, factor in zip(maps, factors, strict=True))
     return np.asarray(total / unit, np.float32)
 
 
 class File(SignalMethod):
-    """y + ISO * k(x, y) + b(x, y): the maps of a sensor, from files.
+    """y + ISO * k(x, y) + b(x, y): measured maps of a sensor, from files.
 
-    Each is an image of one channel (EXR or TIFF of floats) in DN, such as means over blocks; from
-    its samples, ``block`` pixels apart, it is taken linearly, and beyond them the nearest holds.
+    Each file is an image of one channel (EXR or TIFF of floats) in DN, for example of means over
+    blocks. Its samples are ``block`` pixels apart. Values between them are interpolated linearly,
+    and pixels outside take the value of the nearest sample.
     """
 
     method: ClassVar = "file"
     kernel: ClassVar = "dark_shading_file"
-    summary: ClassVar = "add measured maps of a sensor, one in proportion to the ISO"
+    summary: ClassVar = "add measured maps of a sensor, one of them proportional to the ISO"
 
     slope_file: str | None = parameter(
-        None, "The image of k, in DN for each ISO.", "", "none", file=True
+        None, "Image of the map k, in DN per ISO.", "", "none", file=True
     )
-    offset_file: str | None = parameter(None, "The image of b, in DN.", "", "none", file=True)
-    block: float = parameter(32.0, "Distance of their samples.", "px", ge=1, le=4096)
+    offset_file: str | None = parameter(None, "Image of the map b, in DN.", "", "none", file=True)
+    block: float = parameter(32.0, "Distance between the samples of the maps.", "px", ge=1, le=4096)
     unit: float | None = parameter(
-        None, "Signal of 1 in DN.", "DN", "from the camera", gt=0, le=1e6
+        None, "DN that correspond to a signal of 1.", "DN", "from the camera", gt=0, le=1e6
     )
 
     @field_validator("slope_file", "offset_file")
@@ -250,7 +254,7 @@ class File(SignalMethod):
         return y + backend.fixed(map_at_iso, lambda method, context: (method, context.iso))
 
     def at_iso(self, height: int, width: int, iso: float) -> Floats:
-        """What is added, (height, width), signal."""
+        """Return the map that is added, (height, width), in signal units."""
         own = self._map(iso)
         (up, down, v), (left, right, x) = (
             between(n, np.float32(1 / self.block), count)
@@ -265,12 +269,12 @@ class File(SignalMethod):
 
 
 def map_at_iso(height: int, width: int, stream: Stream, method: File, iso: float) -> Floats:
-    """Return what a method adds, (height, width), signal. It depends on no random numbers."""
+    """Return the map that a method adds, (height, width), in signal units. It is not random."""
     return method.at_iso(height, width, iso)
 
 
 def between(pixels: int, per_px: np.float32, count: int) -> tuple[Array, Array, Floats]:
-    """For each pixel of a row: the sample before it, the next one, and the share of that."""
+    """Return the samples before and after each pixel of a row, and the weight of the second."""
     half, zero = np.float32(0.5), np.float32(0)
     t = (np.arange(pixels, dtype=np.float32) + half) * per_px - half
     t = np.minimum(np.maximum(t, zero), np.float32(count - 1))
@@ -279,5 +283,9 @@ def between(pixels: int, per_px: np.float32, count: int) -> tuple[Array, Array, 
 
 
 STAGE = Stage(
-    "dark_shading", "Add smooth maps of the sensor.", Kind.MOSAIC, Kind.MOSAIC, (Smooth, File)
+    "dark_shading",
+    "Add smooth dark shading maps of the sensor.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (Smooth, File),
 )

@@ -1,4 +1,4 @@
-"""Defect pixels: hot ones, with too much charge, and dead ones, without signal."""
+"""Defect pixels: hot ones with too much charge, and dead ones without signal."""
 
 from typing import ClassVar
 
@@ -21,15 +21,15 @@ from clpipe.stage import (
     sensor_bits,
 )
 
-WORDS = 1 << 31  # the number of different random words that choose the pixels
-DEFAULT_LEVEL = 0.1  # signal units; chosen to be visible, where the camera gives no charge
+WORDS = 1 << 31  # number of different random words that choose the pixels
+DEFAULT_LEVEL = 0.1  # signal units; chosen to be visible, if the camera has no value
 
 
 class Random(SignalMethod):
     """Hot and dead pixels at random places, the same in every image of a camera.
 
-    A hot pixel gets y + hot_level * (1 + e), e from an exponential distribution of mean 1; in
-    electrons, the camera's level is the same at every ISO. A dead pixel gets 0. Levels are in
+    A hot pixel becomes y + hot_level * (1 + e), with e from an exponential distribution of mean 1.
+    The camera's level is the same at every ISO in electrons. A dead pixel becomes 0. Levels are in
     signal units.
 
     >>> from clpipe.stage import run_reference
@@ -41,7 +41,7 @@ class Random(SignalMethod):
 
     method: ClassVar = "random"
     kernel: ClassVar = "defect_pixels"
-    summary: ClassVar = "make pixels at random places of the sensor hot or dead"
+    summary: ClassVar = "make pixels at random positions of the sensor hot or dead"
     example: ClassVar = {"hot_share": 0.05, "hot_level": 0.3, "dead_share": 0.05}
 
     hot_share: float | None = parameter(
@@ -49,7 +49,7 @@ class Random(SignalMethod):
     )
     hot_level: float | None = parameter(
         None,
-        "The smallest extra signal of a hot pixel; the mean is twice as much.",
+        "Smallest extra signal of a hot pixel; the mean is twice as large.",
         "signal",
         "from the camera and ISO; else 0.1",
         ge=0,
@@ -73,7 +73,7 @@ class Random(SignalMethod):
         return (Pass("defect_pixels", arguments=names, random=NoiseScope.CAMERA),)
 
     def limits(self) -> tuple[int, int]:
-        """The words below which a pixel is hot, and above which it is dead."""
+        """Return the words below which a pixel is hot, and above which it is dead."""
         assert self.hot_share is not None and self.dead_share is not None
         return round(self.hot_share * WORDS), WORDS - 1 - round(self.dead_share * WORDS)
 
@@ -87,7 +87,7 @@ class Random(SignalMethod):
         }
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        """The variance without the defect pixels: they are few, and not part of the noise model."""
+        """The variance without defect pixels, which are few and not part of the noise model."""
         return before
 
     @classmethod
@@ -104,7 +104,7 @@ def hot_charge(height: int, width: int, stream: Stream, limit: int) -> Floats:
 
 
 def alive_pixels(height: int, width: int, stream: Stream, limit: int) -> Floats:
-    """Return 1 for each pixel that is not dead, and 0 for the others."""
+    """Return 1 for pixels that work, and 0 for dead ones."""
     return (sensor_bits(height, width, stream) <= limit).astype(np.float32)
 
 

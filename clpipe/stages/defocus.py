@@ -1,4 +1,4 @@
-"""Depth of field: what is nearer or farther than the focus is spread over discs."""
+"""Depth of field: points in front of or beyond the focus distance become discs."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar, Self
@@ -23,7 +23,7 @@ from clpipe.stage import (
     parameter,
 )
 
-LARGEST = 31  # px, of a disc's radius
+LARGEST = 31  # px, radius of a disc
 VECTOR = 16  # lanes at most
 
 
@@ -35,11 +35,11 @@ class InFocus(Unchanged):
 
 
 class ThinLens(InFocalLengths, OfDepth):
-    """A thin lens: a point at distance z is spread over a disc of diameter c.
+    """A thin lens: a point at distance z becomes a disc of diameter c.
 
     c = f^2 |z - zf| / (N z (zf - f)), with focal length f, f-number N and focus distance zf
-    (Potmesil and Chakravarty, SIGGRAPH 1981). Depth is measured along the axis of view. Light is
-    gathered from the discs around; see :func:`clpipe.reference.defocus.defocus`.
+    (Potmesil and Chakravarty, SIGGRAPH 1981). Depth is measured along the optical axis. Each pixel
+    gathers light from the discs that cover it; see :func:`clpipe.reference.defocus.defocus`.
 
     >>> lens = ThinLens(focal_length=50.0, f_number=2.0, focus_distance=2.0, pixel_pitch=10.0)
     >>> lens.radii(np.float32([[1.0, 2.0, 4.0, np.inf]])).astype(int).tolist()
@@ -49,7 +49,7 @@ class ThinLens(InFocalLengths, OfDepth):
     method: ClassVar = "thin_lens"
     kernel: ClassVar = "defocus"
     overscan: ClassVar = True
-    summary: ClassVar = "a thin lens, by a depth channel"
+    summary: ClassVar = "thin lens; needs a depth channel"
     tolerance: ClassVar = 1e-5
     example: ClassVar = {"max_radius": 3}
     alternatives: ClassVar = frozenset({"sensor_width", "pixel_pitch"})
@@ -58,36 +58,38 @@ class ThinLens(InFocalLengths, OfDepth):
         None,
         "Focal length.",
         "mm",
-        "the camera's, from fx and the pixels' size, else 50",
+        "the camera's, else from fx and the pixel pitch, else 50",
         optics=True,
         gt=0,
         le=2000,
     )
     f_number: float | None = parameter(
-        None, "f-number of the aperture.", "", "aperture, else 2.8", optics=True, ge=0.5, le=64
+        None, "f-number of the aperture.", "", "the camera's, else 2.8", optics=True, ge=0.5, le=64
     )
     focus_distance: float | None = parameter(
         None,
-        "Distance that is in focus, in the unit of the depth.",
+        "Focus distance, in the unit of the depth.",
         "",
-        "focus_distance, which is in m, else 3",
+        "the camera's, converted from m, else 3",
         gt=0,
         le=1e9,
     )
-    depth_scale: float = parameter(1.0, "Metres in a unit of the depth.", "m", gt=0, le=1e6)
+    depth_scale: float = parameter(1.0, "Length of the depth's unit.", "m", gt=0, le=1e6)
     pixel_pitch: float | None = parameter(
         None,
-        "Distance of the image's pixels on the sensor, in place of its width.",
+        "Distance between pixels on the sensor; set it instead of sensor_width.",
         "um",
         "from sensor_width or the focal lengths, else the camera",
         optics=True,
         gt=0,
         le=1000,
     )
-    blades: int = parameter(0, "Blades of the aperture, 5 to 9; 0 is round.", ge=0, le=9)
+    blades: int = parameter(
+        0, "Number of aperture blades, 5 to 9. With 0 the aperture is round.", ge=0, le=9
+    )
     max_radius: int = parameter(
         16,
-        "The largest radius of a disc; larger ones become as large.",
+        "Largest radius of a disc; larger discs are reduced to it.",
         "px",
         structural=True,
         ge=1,
@@ -104,7 +106,9 @@ class ThinLens(InFocalLengths, OfDepth):
     @model_validator(mode="after")
     def _one_size(self) -> "ThinLens":
         if self.sensor_width and self.pixel_pitch:
-            raise ValueError("sensor_width and pixel_pitch both give the pixels' size; set one")
+            raise ValueError(
+                "set either sensor_width or pixel_pitch: both define the size of a pixel"
+            )
         return self
 
     def optics(self) -> Mapping[str, float]:
@@ -112,10 +116,10 @@ class ThinLens(InFocalLengths, OfDepth):
         return {**super().optics(), **(in_metres if self.focus_distance else {})}
 
     def resolve(self, context: Context) -> Self:
-        """The method with a size of pixels, and a focal length in mm or, with a sensor, in px.
+        """Return the method with a pixel size, and a focal length in mm or, with a sensor, in px.
 
         Raises:
-            RequestError: one of them is not known, or nothing is in focus.
+            RequestError: one of them is not known, or the focus distance is too short.
         """
         metres = context.optics.focus_distance
         distance = 3.0 if metres is None else metres / self.depth_scale
@@ -125,15 +129,16 @@ class ThinLens(InFocalLengths, OfDepth):
                 own = own.with_defaults(pixel_pitch=own.focal_length / own.fx * 1000)
             elif own.fx and not own.pixel_pitch:
                 raise RequestError(
-                    f"defocus: the focal length is {own.fx:g} px, but what that is in mm is not "
-                    "known: set focal_length, sensor_width (mm) or pixel_pitch (um), here or in "
-                    "render"
+                    f"defocus: the focal length is {own.fx:g} px, and its length in mm is not "
+                    "known; set focal_length, sensor_width (mm) or pixel_pitch (um), here or "
+                    "in render"
                 )
             own = own.with_defaults(pixel_pitch=context.camera.pixel_pitch)
             if not own.pixel_pitch:
                 raise RequestError(
-                    f"defocus.sensor_width: the size of pixels is needed, and camera "
-                    f"{context.camera.name} does not say it; set it in mm, or pixel_pitch in um"
+                    "defocus.sensor_width: the pixel size is needed, and the profile of camera "
+                    f"{context.camera.name} does not contain it; set sensor_width in mm, or "
+                    "pixel_pitch in um"
                 )
             if own.fx:
                 own = own.with_defaults(focal_length=own.fx * own.pixel_pitch / 1000)
@@ -145,26 +150,26 @@ class ThinLens(InFocalLengths, OfDepth):
 
     @property
     def focus(self) -> float:
-        """The distance that is in focus, in mm."""
+        """The focus distance, in mm."""
         return (self.focus_distance or 0.0) * self.depth_scale * 1000
 
     def check_focus(self, focal_length: float) -> None:
-        """See that what is in focus lies beyond a focal length in mm.
+        """Check that the focus distance is more than a focal length, in mm.
 
         Raises:
-            RequestError: it does not.
+            RequestError: it is not.
         """
         if self.focus <= focal_length:
             raise RequestError(
-                f"defocus: focus_distance {self.focus_distance:g} is {self.focus:g} mm, which is "
-                f"not beyond the focal length of {focal_length:g} mm; is depth_scale right?"
+                f"defocus: focus_distance {self.focus_distance:g} is {self.focus:g} mm; it must "
+                f"be more than the focal length of {focal_length:g} mm. Check depth_scale"
             )
 
     def check_depth(self, depth: Depth) -> str:
-        """A warning where discs are larger than they may be, with how many.
+        """Return a warning with the number of discs that exceed the largest radius, or "".
 
         Raises:
-            RequestError: what is in focus is nearer than the focal length.
+            RequestError: the focus distance is less than the focal length.
         """
         height, width = depth.pixels.shape
         self.check_focus(self.camera(width, height)[0])
@@ -172,12 +177,12 @@ class ThinLens(InFocalLengths, OfDepth):
         if not (count := np.count_nonzero(radii > self.max_radius)):
             return ""
         return (
-            f"{count} of {radii.size} pixels are spread over radii up to {radii.max():.1f} px; "
-            f"max_radius makes them {self.max_radius} px"
+            f"{count} of {radii.size} pixels have discs with radii up to {radii.max():.1f} px; "
+            f"max_radius reduces them to {self.max_radius} px"
         )
 
     def camera(self, width: int, height: int) -> tuple[float, float]:
-        """The focal length and the distance of pixels, in mm, of an image of that size."""
+        """Return the focal length and the pixel pitch, in mm, for an image of this size."""
         side = max(self.margins.inside(width, height))
         pitch = self.sensor_width / side if self.sensor_width else (self.pixel_pitch or 0.0) / 1000
         return self.focal_length or (self.fx or 0.0) * pitch, pitch
@@ -187,10 +192,10 @@ class ThinLens(InFocalLengths, OfDepth):
         return (Pass("defocus", Stencil(self.max_radius), given),)
 
     def radii(self, depth: Floats) -> Floats:
-        """The radii of discs in px, below 0 in front of the focus, as large as they may be.
+        """Return the radii of the discs in px, without the limit; negative for near points.
 
         Args:
-            depth: (height, width) of the whole image, above 0; it may be infinite.
+            depth: (height, width) of the whole image, above 0; infinity is allowed.
         """
         assert self.f_number
         length, pitch = self.camera(depth.shape[1], depth.shape[0])
@@ -199,7 +204,7 @@ class ThinLens(InFocalLengths, OfDepth):
         return np.asarray(np.float32(widest) * (1 - nearness))
 
     def clipped(self, depth: Floats) -> Floats:
-        """The radii that are used, see :meth:`radii`: none above ``max_radius``."""
+        """Return the radii that are used, see :meth:`radii`, limited to ``max_radius``."""
         return np.clip(self.radii(depth), -self.max_radius, self.max_radius)
 
     def arguments(self, context: Context) -> Arguments:
@@ -215,9 +220,9 @@ class ThinLens(InFocalLengths, OfDepth):
         }
 
     def _tables(self, depth: Floats) -> tuple[Floats, int, Floats]:
-        """The radii with a border, how wide that is, and the taps of the largest disc."""
+        """Return the radii with a border, the border's width, and the taps of the largest disc."""
         radii = self.clipped(depth)
-        largest = float(np.ceil(abs(radii).max() * 4)) / 4  # few tables for many images
+        largest = float(np.ceil(abs(radii).max() * 4)) / 4  # so that many images share a few tables
         reach = reach_of(largest)
         border = ((reach, reach), (reach, reach + VECTOR))
         return np.pad(radii, border, "reflect"), reach, aperture_taps(self.blades, largest)
@@ -231,7 +236,7 @@ class ThinLens(InFocalLengths, OfDepth):
 
 
 def _depth_in(context: Context) -> Depth:
-    """The depth of the image; where there is no image yet, everything is infinitely far."""
+    """Return the depth of the image. Without an image, everything is infinitely far."""
     if context.depth is None:
         return NOWHERE
     depth: Any = context.depth()
@@ -239,4 +244,6 @@ def _depth_in(context: Context) -> Depth:
     return depth
 
 
-STAGE = Stage("defocus", "Blur what is out of focus.", Kind.RGB, Kind.RGB, (InFocus, ThinLens))
+STAGE = Stage(
+    "defocus", "Blur surfaces that are out of focus.", Kind.RGB, Kind.RGB, (InFocus, ThinLens)
+)

@@ -1,11 +1,11 @@
-"""Lens distortion with lateral colour: straight lines bend, and red and blue part from green.
+"""Lens distortion with lateral colour: straight lines bend, and red and blue shift from green.
 
-The render is without distortion, and the picture has it. For each pixel of the picture the place
-that it shows is found by inverting the model (:mod:`clpipe.reference.lens`), and each channel is
-gathered there in one resampling (:mod:`clpipe.reference.warp`), also from beyond the picture where
-the render goes on there (:mod:`clpipe.chain.overscan`). Lateral colour and lensfun's models are
-those of lensfun (lensfun.github.io, "Lens correction models"), with r = 1 at half the short side of
-the picture, between the centres of the outermost pixels.
+The render has no distortion, and the finished image has it. For each pixel of the image,
+:mod:`clpipe.reference.lens` inverts the model to find the position in the render.
+:mod:`clpipe.reference.warp` then samples each channel there in one resampling. Positions outside
+the frame are sampled too if the render has overscan (:mod:`clpipe.chain.overscan`). Lateral colour
+and lensfun's models are those of lensfun (lensfun.github.io, "Lens correction models"). Their r = 1
+is half the short side of the image, between the centres of the outermost pixels.
 """
 
 from collections.abc import Mapping
@@ -41,11 +41,11 @@ class NoDistortion(Unchanged):
     """No distortion."""
 
     method: ClassVar = "none"
-    summary: ClassVar = "straight lines stay straight"
+    summary: ClassVar = "no distortion"
 
 
 def filter_arguments(name: str) -> Arguments:
-    """The kernel's arguments for the filter of this name."""
+    """Return the kernel's arguments for the filter of this name."""
     filter_ = warp.FILTERS[name]
     taps, powers = filter_.shape
     return {
@@ -56,22 +56,22 @@ def filter_arguments(name: str) -> Arguments:
 
 
 class HasPicture(AboutAxis):
-    """Parameters of the picture, whatever the lens."""
+    """Parameters that every lens model has."""
 
     fit: bool = parameter(
-        False, "Scale the picture so that it shows as much of the render as leaves no void."
+        False, "Scale the image to show as much of the render as possible without void pixels."
     )
     filter: Literal["bicubic", "lanczos3"] = parameter(
         "bicubic",
-        "How pixels are weighted: bicubic (Catmull-Rom), or lanczos3, which is sharper and rings.",
+        "Resampling filter: bicubic (Catmull-Rom), or lanczos3, which is sharper and rings.",
         structural=True,
     )
 
 
 class DistortionOfLens(FromLens, HasPicture):
-    """Distortion of the lens that ``--lens`` names, as lensfun knows it; without it, none."""
+    """Distortion of the lens that ``--lens`` names, from lensfun; without it, none."""
 
-    summary: ClassVar = "that of the lens which --lens names; none without it"
+    summary: ClassVar = "distortion of the lens that --lens names; none without it"
 
     def of_lens(self, lens: LensCalibration | None) -> Method:
         if lens is None or not lens.distortion:
@@ -87,10 +87,10 @@ class Distortion(HasPicture):
     overscan: ClassVar = True
 
     kr: float = parameter(
-        1.0, "Lateral colour, linear: size of red over that of green.", gt=0.5, lt=2
+        1.0, "Lateral colour, linear: size of red relative to green.", gt=0.5, lt=2
     )
     kb: float = parameter(
-        1.0, "Lateral colour, linear: size of blue over that of green.", gt=0.5, lt=2
+        1.0, "Lateral colour, linear: size of blue relative to green.", gt=0.5, lt=2
     )
     vr: float = parameter(1.0, "Lateral colour, poly3, red: r (vr + cr r + br r^2).", gt=0.5, lt=2)
     cr: float = parameter(0.0, "See vr.", ge=-1, le=1)
@@ -100,11 +100,11 @@ class Distortion(HasPicture):
     bb: float = parameter(0.0, "See vb.", ge=-1, le=1)
 
     def radial(self) -> Radial:
-        """The model."""
+        """The lens model."""
         raise NotImplementedError(type(self).__name__)
 
     def lens(self) -> DistortionMap:
-        """The map of places, of all channels."""
+        """The map from pixels to positions in the render, for all channels."""
         return DistortionMap(
             radial=self.radial(),
             centre=(self.cx, self.cy),
@@ -116,7 +116,7 @@ class Distortion(HasPicture):
 
     @property
     def resampling(self) -> warp.Warp:
-        """How the picture is made of the render."""
+        """The geometry from render to image."""
         return warp.Warp(self.lens(), self.filter)
 
     def passes(self) -> tuple[Pass, ...]:
@@ -130,7 +130,7 @@ class Distortion(HasPicture):
         return self.lens() if self.passes() else None
 
     def estimates_for(self, width: int, height: int) -> Mapping[str, float]:
-        """The factor by which ``fit`` changes the focal length."""
+        """Return the factor by which ``fit`` changes the focal length."""
         return {"focal_length_factor": self.lens().scale(width, height)} if self.fit else {}
 
     def arguments(self, context: Context) -> Arguments:
@@ -144,12 +144,14 @@ Coefficient = Annotated[float, Field(ge=-1e4, le=1e4)]
 
 
 class OfCamera(InFocalLengths, Distortion):
-    """A model that counts in focal lengths."""
+    """A model that is defined in focal lengths."""
 
-    fy: float | None = parameter(None, "Focal length down.", "px", "fx", optics=True, gt=0, le=1e7)
+    fy: float | None = parameter(
+        None, "Vertical focal length.", "px", "fx", optics=True, gt=0, le=1e7
+    )
 
     def resolve(self, context: Context) -> Self:
-        """The method with the camera's focal length.
+        """Return the method with the camera's focal length.
 
         Raises:
             RequestError: it is not known.
@@ -159,7 +161,7 @@ class OfCamera(InFocalLengths, Distortion):
         return own.with_defaults(fy=own.fx)
 
     def estimates_for(self, width: int, height: int) -> Mapping[str, float]:
-        """The factor by which ``fit`` changes the focal length, and that in px."""
+        """Return the factor by which ``fit`` changes the focal length, and the result in px."""
         found = super().estimates_for(width, height)
         if not found:
             return found
@@ -178,9 +180,9 @@ class OfCamera(InFocalLengths, Distortion):
 class BrownConrady(OfCamera):
     """x_d = x R(r) + 2 p1 x y + p2 (r^2 + 2 x^2), y_d likewise: OpenCV's and COLMAP's model.
 
-    R = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6); x and y count from the
-    principal point in focal lengths (Brown, "Decentering distortion of lenses", 1966; OpenCV,
-    "Camera calibration and 3D reconstruction").
+    The radial factor is ``R = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)``. x
+    and y start at the principal point and are in focal lengths (Brown, "Decentering distortion of
+    lenses", 1966; OpenCV, "Camera calibration and 3D reconstruction").
 
     >>> import numpy as np
     >>> lens = BrownConrady(fx=100.0, fy=100.0, k1=-0.1).lens()
@@ -190,20 +192,20 @@ class BrownConrady(OfCamera):
     """
 
     method: ClassVar = "brown_conrady"
-    summary: ClassVar = "OpenCV's and COLMAP's: radial k1 to k6, tangential p1 and p2"
+    summary: ClassVar = "model of OpenCV and COLMAP: radial k1 to k6, tangential p1 and p2"
     example: ClassVar = {
         **{"focal_length": 20.0, "sensor_width": 24.0, "k1": -0.2, "k4": 0.05, "p1": 0.002},
         **{"p2": -0.003, "vr": 1.01, "bb": 0.01},
     }
 
-    k1: Coefficient = parameter(0.0, "Of r^2.")
-    k2: Coefficient = parameter(0.0, "Of r^4.")
-    k3: Coefficient = parameter(0.0, "Of r^6.")
-    k4: Coefficient = parameter(0.0, "Of r^2 in the denominator.")
-    k5: Coefficient = parameter(0.0, "Of r^4 in the denominator.")
-    k6: Coefficient = parameter(0.0, "Of r^6 in the denominator.")
-    p1: Coefficient = parameter(0.0, "Tangential, down.")
-    p2: Coefficient = parameter(0.0, "Tangential, across.")
+    k1: Coefficient = parameter(0.0, "Radial coefficient of r^2.")
+    k2: Coefficient = parameter(0.0, "Radial coefficient of r^4.")
+    k3: Coefficient = parameter(0.0, "Radial coefficient of r^6.")
+    k4: Coefficient = parameter(0.0, "Radial coefficient of r^2 in the denominator.")
+    k5: Coefficient = parameter(0.0, "Radial coefficient of r^4 in the denominator.")
+    k6: Coefficient = parameter(0.0, "Radial coefficient of r^6 in the denominator.")
+    p1: Coefficient = parameter(0.0, "Tangential coefficient, vertical.")
+    p2: Coefficient = parameter(0.0, "Tangential coefficient, horizontal.")
 
     def radial(self) -> Radial:
         below = (0.0, self.k4, 0.0, self.k5, 0.0, self.k6)
@@ -216,20 +218,20 @@ class BrownConrady(OfCamera):
 class Fisheye(OfCamera):
     """r_d = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8), a = atan(r): OpenCV's fisheye model.
 
-    r counts from the principal point in focal lengths (Kannala and Brandt, PAMI 2006; COLMAP calls
-    it OPENCV_FISHEYE). What is beside the render's own field, with its overscan, stays black.
+    r starts at the principal point and is in focal lengths (Kannala and Brandt, PAMI 2006; COLMAP
+    calls it OPENCV_FISHEYE). Pixels outside the render's field of view and overscan are black.
     """
 
     method: ClassVar = "fisheye"
-    summary: ClassVar = "OpenCV's fisheye: a polynomial of the angle to the axis"
+    summary: ClassVar = "OpenCV's fisheye model: a polynomial of the angle to the axis"
     example: ClassVar = {
         **{"fx": 300.0, "fy": 330.0, "k1": -0.02, "k2": 0.003, "cx": 20.0, "kr": 0.995}
     }
 
-    k1: Coefficient = parameter(0.0, "Of the angle squared.")
-    k2: Coefficient = parameter(0.0, "Of its fourth power.")
-    k3: Coefficient = parameter(0.0, "Of its sixth power.")
-    k4: Coefficient = parameter(0.0, "Of its eighth power.")
+    k1: Coefficient = parameter(0.0, "Coefficient of a^2, with a the angle to the axis.")
+    k2: Coefficient = parameter(0.0, "Coefficient of a^4.")
+    k3: Coefficient = parameter(0.0, "Coefficient of a^6.")
+    k4: Coefficient = parameter(0.0, "Coefficient of a^8.")
 
     def radial(self) -> Radial:
         powers = (1.0, 0.0, self.k1, 0.0, self.k2, 0.0, self.k3, 0.0, self.k4)
@@ -237,11 +239,11 @@ class Fisheye(OfCamera):
 
 
 class OfLensfun(Distortion):
-    """A model of lensfun, which counts as its lateral colour does."""
+    """A model of lensfun, in the units of lensfun's lateral colour."""
 
     unit: float | None = parameter(
         None,
-        "What r = 1 is, in half diagonals of the image, where it is not half the short side.",
+        "Radius of r = 1, in half diagonals of the image, if it is not half the short side.",
         gt=0.01,
         le=100,
     )
@@ -254,10 +256,10 @@ class Poly3(OfLensfun):
     """r_d = r (1 - k1 + k1 r^2), lensfun's model of that name."""
 
     method: ClassVar = "poly3"
-    summary: ClassVar = "lensfun's: r (1 - k1 + k1 r^2)"
+    summary: ClassVar = "lensfun's poly3: r (1 - k1 + k1 r^2)"
     example: ClassVar = {"k1": 0.02, "kr": 1.002, "kb": 0.998, "fit": True}
 
-    k1: Coefficient = parameter(0.0, "Above 0 a pincushion, below 0 a barrel.")
+    k1: Coefficient = parameter(0.0, "Positive for pincushion, negative for barrel distortion.")
 
     def radial(self) -> Radial:
         return Radial.of(1 - self.k1, 0.0, self.k1)
@@ -267,11 +269,11 @@ class Poly5(OfLensfun):
     """r_d = r (1 + k1 r^2 + k2 r^4), lensfun's model of that name."""
 
     method: ClassVar = "poly5"
-    summary: ClassVar = "lensfun's: r (1 + k1 r^2 + k2 r^4)"
+    summary: ClassVar = "lensfun's poly5: r (1 + k1 r^2 + k2 r^4)"
     example: ClassVar = {"k1": 0.03, "k2": 0.001}
 
-    k1: Coefficient = parameter(0.0, "Of r^2.")
-    k2: Coefficient = parameter(0.0, "Of r^4.")
+    k1: Coefficient = parameter(0.0, "Coefficient of r^2.")
+    k2: Coefficient = parameter(0.0, "Coefficient of r^4.")
 
     def radial(self) -> Radial:
         return Radial.of(1.0, 0.0, self.k1, 0.0, self.k2)
@@ -281,12 +283,12 @@ class PtLens(OfLensfun):
     """r_d = r (a r^3 + b r^2 + c r + 1 - a - b - c), lensfun's and Hugin's model of that name."""
 
     method: ClassVar = "ptlens"
-    summary: ClassVar = "lensfun's and Hugin's: r (a r^3 + b r^2 + c r + 1 - a - b - c)"
+    summary: ClassVar = "ptlens of lensfun and Hugin: r (a r^3 + b r^2 + c r + 1 - a - b - c)"
     example: ClassVar = {"a": 0.001, "b": 0.01, "c": 0.02, "cy": 20.0}
 
-    a: Coefficient = parameter(0.0, "Of r^3.")
-    b: Coefficient = parameter(0.0, "Of r^2.")
-    c: Coefficient = parameter(0.0, "Of r.")
+    a: Coefficient = parameter(0.0, "Coefficient of r^3.")
+    b: Coefficient = parameter(0.0, "Coefficient of r^2.")
+    c: Coefficient = parameter(0.0, "Coefficient of r.")
 
     def radial(self) -> Radial:
         return Radial.of(1 - self.a - self.b - self.c, self.c, self.b, self.a)
@@ -294,7 +296,7 @@ class PtLens(OfLensfun):
 
 STAGE = Stage(
     "distortion",
-    "Bend the picture as a lens does, and part its colours.",
+    "Apply a lens's distortion and lateral colour.",
     Kind.RGB,
     Kind.RGB,
     (DistortionOfLens, NoDistortion, BrownConrady, Fisheye, Poly3, Poly5, PtLens),

@@ -1,4 +1,4 @@
-"""Dark-signal non-uniformity (DSNU); the part that a column shares is ``column_noise``."""
+"""Dark-signal non-uniformity (DSNU); ``column_noise`` adds the part that columns share."""
 
 from typing import ClassVar
 
@@ -19,8 +19,8 @@ from clpipe.stage import (
 class Gaussian(GaussianNoise):
     """y + sigma * n: one Gaussian offset for each pixel, fixed for a camera (EMVA 1288, DSNU).
 
-    n is a standard normal of the pixel; sigma is in signal units. In electrons, the camera's sigma
-    is the same at every ISO.
+    n is a standard normal of the pixel; sigma is in signal units. The camera's sigma is the same at
+    every ISO in electrons.
 
     >>> import numpy as np
     >>> from clpipe.stage import run_reference
@@ -44,4 +44,6 @@ class Gaussian(GaussianNoise):
         return y + backend.fixed(sensor_normals) * n["sigma"]
 
 
-STAGE = Stage("dsnu", "Add a fixed offset to each pixel.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,))
+STAGE = Stage(
+    "dsnu", "Add a fixed offset to each pixel (DSNU).", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,)
+)

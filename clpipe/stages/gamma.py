@@ -13,7 +13,7 @@ from clpipe.stage import Curve, Kind, Stage, StageRole, parameter
 @traceable
 @lru_cache(maxsize=16)
 def power_table(exponent: float) -> Floats:
-    """The table of x^exponent; cached, so that it is uploaded once."""
+    """Return the table of x^exponent; cached, so that it is uploaded once."""
     return tabulate(lambda x: x**exponent)
 
 
@@ -23,7 +23,7 @@ class Power(Curve):
     method: ClassVar = "power"
     summary: ClassVar = "x^(1/exponent)"
 
-    exponent: float = parameter(2.2, "Gamma; 1 leaves the values as they are.", ge=0.1, le=10)
+    exponent: float = parameter(2.2, "Gamma; 1 leaves the values unchanged.", ge=0.1, le=10)
 
     def table(self) -> Floats:
         return power_table(1 / self.exponent)
@@ -44,7 +44,7 @@ class Srgb(Curve):
 
 STAGE = Stage(
     "gamma",
-    "Encode for a display.",
+    "Encode linear light for a display.",
     Kind.RGB,
     Kind.DISPLAY,
     (Srgb, Power),

@@ -10,14 +10,15 @@ from clpipe.stages.color_matrix import FixedMatrix, NoMatrix, as_tuples
 
 
 class SrgbToCamera(FixedMatrix):
-    """Linear sRGB to white-balanced camera RGB, as the sensor sees a render.
+    """Linear sRGB to white-balanced camera RGB, the colours in which a sensor sees a render.
 
-    The matrix is :meth:`clpipe.camera.profile.Camera.srgb_to_camera`. The way back mixes the noise
-    of the three colours, as in a camera. Where a camera's matrix is not known, colours stay.
+    The matrix is :meth:`clpipe.camera.profile.Camera.srgb_to_camera`. The conversion back mixes the
+    noise of the three colours, like in a camera. Without a matrix of the camera, colours do not
+    change.
     """
 
     method: ClassVar = "camera"
-    summary: ClassVar = "linear sRGB to camera RGB, where the camera's matrix is known"
+    summary: ClassVar = "linear sRGB to camera RGB, if the camera's matrix is known"
     example: ClassVar = {}
 
     matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = parameter(

@@ -31,5 +31,5 @@ class Power(gamma.Power):
 
 
 STAGE = Stage(
-    "inverse_gamma", "Undo the encoding for a display.", Kind.DISPLAY, Kind.RGB, (Srgb, Power)
+    "inverse_gamma", "Decode display values to linear light.", Kind.DISPLAY, Kind.RGB, (Srgb, Power)
 )

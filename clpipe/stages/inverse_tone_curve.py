@@ -1,4 +1,4 @@
-"""Inverse tone curve: from a photograph's contrast back to that of the scene."""
+"""Inverse tone curve: from the contrast of a photograph back to that of the scene."""
 
 from functools import lru_cache
 from typing import ClassVar
@@ -27,21 +27,21 @@ from clpipe.stages.tone_curve.table import table_of
 
 @lru_cache(maxsize=16)
 def inverse_table(path: str) -> Floats:
-    """The table of the inverse of a file's curve; where the curve is level, the darkest input.
+    """Return the table of the inverse of a file's curve; level parts give the darkest input.
 
     Raises:
-        ValueError: the file holds no curve, or the curve falls somewhere, or it never rises.
+        ValueError: the file contains no curve, or the curve falls somewhere, or it never rises.
     """
     table = table_of(path).astype(np.float64)
     if np.any(np.diff(table) < 0) or table[-1] <= table[0]:
-        raise ValueError(f"{path}: only a curve that rises can be undone")
+        raise ValueError(f"{path}: only a rising curve can be inverted")
     linear = tabulate(lambda x: x).astype(np.float64)
     value, first = np.unique(table, return_index=True)
     return tabulate(lambda y: np.interp(y, value, linear[first]))
 
 
 class Standard(standard.Standard):
-    """The inverse of the curve standard: the raw's light, with its one stop of headroom."""
+    """The inverse of the curve standard: the light of the raw image, with one stop of headroom."""
 
     kernel: ClassVar = "inverse_tone_curve_standard"
     summary: ClassVar = "undo the curve standard"
@@ -63,7 +63,7 @@ class Standard(standard.Standard):
 
 
 class Neutral(Method):
-    """The inverse of the curve neutral: the raw's light, with its one stop of headroom."""
+    """The inverse of the curve neutral: the light of the raw image, with one stop of headroom."""
 
     method: ClassVar = "neutral"
     kernel: ClassVar = "inverse_tone_curve_neutral"
@@ -99,7 +99,7 @@ class CameraRaw(Curve):
 
 
 class Linear(Unchanged):
-    """No curve to undo: the image stays as it is."""
+    """No curve to undo: the image does not change."""
 
     method: ClassVar = "linear"
     summary: ClassVar = "no curve to undo"
@@ -114,7 +114,7 @@ class File(tone_curve.File):
 
 STAGE = Stage(
     "inverse_tone_curve",
-    "Undo the contrast of a photograph.",
+    "Undo the tone curve of a photograph.",
     Kind.RGB,
     Kind.RGB,
     (Standard, Neutral, CameraRaw, Linear, File),

@@ -1,4 +1,4 @@
-"""Inverse white balance: it comes before the noise, which depends on the sensor's own signal."""
+"""Inverse white balance, before the noise, which depends on the sensor's own signal."""
 
 from typing import ClassVar
 
@@ -54,7 +54,7 @@ class Gains(CameraGains):
 
 
 class ArrayGains(OfArray, Gains):
-    """The same, on any filter array: white fills the most sensitive channel."""
+    """Division by the gains on any filter array: white fills the most sensitive channel."""
 
     function: ClassVar = "white_to_level"
     inverse: ClassVar = False
@@ -68,7 +68,7 @@ class ArrayGains(OfArray, Gains):
 
 STAGE = Stage(
     "inverse_white_balance",
-    "Divide by the white balance gains: the render becomes what the sensor sees.",
+    "Divide by the white balance gains, so that a render becomes what the sensor sees.",
     Kind.MOSAIC,
     Kind.MOSAIC,
     (Gains,),

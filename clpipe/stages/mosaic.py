@@ -43,7 +43,7 @@ class Bayer(Method):
 
     method: ClassVar = "bayer"
     kernel: ClassVar = "mosaic"
-    summary: ClassVar = "keep one colour of each pixel, by a Bayer pattern"
+    summary: ClassVar = "keep one colour per pixel, by a Bayer pattern"
 
     pattern: Pattern = parameter(
         "RGGB", "Colours of the 2x2 pixels in the upper left corner, row by row.", structural=True
@@ -66,12 +66,12 @@ class Bayer(Method):
 class AnyArray(Method):
     """A filter array of any period to 8x8: mono, RCCB, Quad Bayer, X-Trans, or rows of letters.
 
-    Channels are R, G, B, W (clear), Y, C, M, I (near infrared) and L (no filter at all), or
-    the polarisers H, D, V and A (0, 45, 90 and 135 degrees), for which a render's red, green and
-    blue are what polarisers at 0, 60 and 120 degrees pass. What each sees of white-balanced
-    red, green and blue follows from the gains of inverse_white_balance, or else the camera's. White
-    is 1 in all of them. After inverse_white_balance, white fills the most sensitive channel,
-    because a camera exposes for that one.
+    Channels are R, G, B, W (clear), Y, C, M, I (near infrared) and L (no filter at all). H, D, V
+    and A are polarisers at 0, 45, 90 and 135 degrees. For polarisers, the render's red, green and
+    blue are the light after polarisers at 0, 60 and 120 degrees. The response of each channel to
+    white-balanced red, green and blue follows from the gains of inverse_white_balance, or else from
+    the camera's. White is 1 in all channels. After inverse_white_balance, white fills the most
+    sensitive channel, because a camera exposes for that one.
 
     >>> from clpipe.stage import run_reference
     >>> image = np.float32([1, 2, 3]) * np.ones((1, 4, 1), np.float32)
@@ -95,12 +95,12 @@ class AnyArray(Method):
     )
 
     def resolve(self, context: Context) -> "Method":
-        array = self._laid(context)  # or it is refused
+        array = self._laid(context)  # or it is rejected
         if array.is_polarised and context.colours != IDENTITY:
             raise KeyedError(
                 "mosaic.array",
-                f"mosaic.array: found {array.name}, but the render was given a camera's colours, "
-                "and its channels are what polarisers pass; skip inverse_color_matrix",
+                f"mosaic.array: the channels of {array.name} are polarisers, but the render was "
+                "converted to a camera's colours; skip inverse_color_matrix",
             )
         return self
 
@@ -124,14 +124,14 @@ class AnyArray(Method):
 
 
 def responses_of(array: FilterArray) -> Floats:
-    """What the filter at each place lets through: (row, colour, column)."""
+    """Return the transmission of the filter at each position: (row, colour, column)."""
     colours = [{k: float(v[c]) for k, v in array.responses.items()} for c in range(3)]
     return np.stack([array.by_place(each) for each in colours], axis=1)
 
 
-@lru_cache(maxsize=64)  # one object for the same array, so that it is uploaded once
+@lru_cache(maxsize=64)  # the same object for the same array, so that it is uploaded once
 def responses_table(array: FilterArray) -> Floats:
-    """The same, as kernels load it."""
+    """Return :func:`responses_of` an array in the layout of kernels."""
     return kernel_table(responses_of(array))
 
 
@@ -144,7 +144,7 @@ def _of_camera(context: Context) -> Method | None:
 
 STAGE = Stage(
     "mosaic",
-    "Lay a colour filter array over the image.",
+    "Apply a colour filter array to the image.",
     Kind.RGB,
     Kind.MOSAIC,
     (Bayer, AnyArray),

@@ -1,4 +1,4 @@
-"""Denoising before demosaicing, where the noise of different samples is still independent."""
+"""Denoising before demosaicing, while the noise of the samples is still independent."""
 
 from typing import ClassVar
 
@@ -26,8 +26,9 @@ from clpipe.stage import (
     parameter,
 )
 
-# h = FACTOR * strength * noise. Found by trying: at strength 1 it is within 0.1 dB of the highest
-# PSNR of the picture in tests/data, ISO 1600 to 12800. tools/pages/quality.py measures that PSNR.
+# h = FACTOR * strength * noise. Found by experiment: at strength 1 it is within 0.1 dB of the
+# highest PSNR for the image in tests/data, ISO 1600 to 12800. tools/pages/quality.py measures that
+# PSNR.
 FACTOR = 1.3
 LARGEST = 15  # px, of the window
 
@@ -36,15 +37,16 @@ class NonLocalMeans(Method):
     """Non-local means (Buades, Coll and Morel, CVPR 2005; IPOL 2011) on 3x3 patches of the mosaic.
 
     Offsets inside the window are even, so that samples of one colour are compared with each other.
-    Patches are compared after :func:`stabilized` has given the noise, of variance a*y + b, the same
-    variance at all levels; the samples themselves are averaged, and may stay below black. Gains
-    that white balance has already applied are divided out before and multiplied in after. Those
-    that gray_world and white_patch estimate are not known in advance; the as-shot gains stand in.
+    Patches are compared after :func:`stabilized`, which gives noise of variance a*y + b the same
+    variance at all levels. The samples themselves are averaged, and may stay below black. White
+    balance gains that were already applied are divided out before and multiplied back after. Gains
+    that gray_world and white_patch estimate are not known in advance, so the as-shot gains are used
+    instead.
     """
 
     method: ClassVar = "non_local_means"
     kernel: ClassVar = "mosaic_denoise_non_local_means"
-    summary: ClassVar = "mean of the samples of one colour that have similar surroundings"
+    summary: ClassVar = "mean of samples of one colour with similar surroundings"
     tolerance: ClassVar = 2e-4  # the kernel's exp is a short polynomial
 
     size: int = parameter(
@@ -54,13 +56,13 @@ class NonLocalMeans(Method):
         structural=True,
     )
     strength: float = parameter(
-        1.0, "Strength relative to the expected noise; 0 is off.", ge=0, le=100
+        1.0, "Strength relative to the expected noise; 0 disables it.", ge=0, le=100
     )
     a: float | None = parameter(
         None,
         "Shot noise: the variance per unit of signal.",
         "signal",
-        "as sensor_noise used it, else from the camera and ISO",
+        "the a of sensor_noise, else from the camera and ISO",
         ge=0,
         le=1,
     )
@@ -68,7 +70,7 @@ class NonLocalMeans(Method):
         None,
         "Read noise: the variance without light.",
         "signal^2",
-        "as sensor_noise used it, else from the camera and ISO",
+        "the b of sensor_noise, else from the camera and ISO",
         ge=0,
         le=1,
     )
@@ -118,7 +120,7 @@ class NonLocalMeans(Method):
         )
 
     def numbers(self, context: Context) -> dict[str, np.float32]:
-        """The run-time arguments of all passes, by name."""
+        """Return the run-time arguments of all passes, by name."""
         assert self.a is not None and self.b is not None
         red, blue = context.applied_gains
         offset = max(0.375 * self.a**2 + self.b, 1e-12)
@@ -154,10 +156,10 @@ class NonLocalMeans(Method):
 def mosaic_non_local_means(
     samples: Floats, stable: Floats, reach: int, bias: np.float32, scale: np.float32
 ) -> Floats:
-    """Non-local means of a (height, width) mosaic over even offsets (IPOL 2011, eq. 1 to 3).
+    """Filter a (height, width) mosaic by non-local means over even offsets (IPOL 2011, eq. 1 to 3).
 
-    The weight is 2^(scale * max(d^2 - bias, 0)), with d^2 the squared distance of the 3x3 patches
-    of ``stable``.
+    The weight is 2^(scale * max(d^2 - bias, 0)). d^2 is the squared distance of the 3x3 patches of
+    ``stable``.
 
     >>> noisy = np.float32([[0, 5, 1, 5, 0, 5, 1]])  # two colours
     >>> filtered = mosaic_non_local_means(noisy, noisy / 9, 2, np.float32(2), np.float32(-1))
@@ -174,12 +176,12 @@ def mosaic_non_local_means(
 
 
 def stabilized(y: Floats, a: np.float32, offset: np.float32, root_of_offset: np.float32) -> Floats:
-    """A third of the generalized Anscombe transform (Murtagh, Starck and Bijaoui, A&AS 1995).
+    """Return a third of the generalized Anscombe transform (Murtagh et al., A&AS 1995).
 
-    The transform is 2/a * (sqrt(a*y + c) - sqrt(c)), with the ``offset`` c = 3/8 a^2 + b, written
-    as 2*y / (sqrt(a*y + c) + sqrt(c)), which also holds for a = 0. It gives noise of variance
-    a*y + b the variance 1; a third of it has 1/9, so that the 9 squares of a patch add up to their
-    mean.
+    The transform is 2/a * (sqrt(a*y + c) - sqrt(c)), with the ``offset`` c = 3/8 a^2 + b. It is
+    written as 2*y / (sqrt(a*y + c) + sqrt(c)), which is also valid for a = 0. Noise of variance a*y
+    + b gets the variance 1, and a third of the transform has 1/9. The 9 squares of a patch
+    therefore add up to their mean.
 
     >>> a, c = np.float32(0.01), np.float32(1e-3)
     >>> below, above = 3 * stabilized(np.float32([0.1, 0.11]), a, c, c ** np.float32(0.5))

@@ -1,4 +1,4 @@
-"""Blur by a camera that moves while the shutter is open."""
+"""Motion blur of a camera that moves during the exposure."""
 
 from functools import lru_cache
 from typing import ClassVar, Self
@@ -27,19 +27,19 @@ from clpipe.stage import (
 )
 
 LONGEST = 200.0  # px
-PARTS = 64  # of a pixel of a streak's length, that are placed one by one
+PARTS = 64  # per pixel of a streak's length, one tap each
 
 
 @traceable
 @lru_cache(maxsize=64)
 def streak(length: float, angle: float) -> Floats:
-    """The taps of a straight streak, light at rest for the same time all along it.
+    """Return the taps of a straight streak with the same light along its length.
 
-    Each part of it is shared by the four pixels around in proportion (bilinearly).
+    Each tap is distributed bilinearly to the four surrounding pixels.
 
     Args:
         length: px, above 0.
-        angle: degrees, from the right upwards.
+        angle: degrees, from right towards up.
 
     >>> streak(2.0, 0.0)[:, 2].round(3).tolist()
     [0.25, 0.5, 0.25]
@@ -58,12 +58,12 @@ def streak(length: float, angle: float) -> Floats:
 
 
 class Linear(Method):
-    """A straight streak, the same everywhere: that of a small rotation of the camera.
+    """A straight streak, the same everywhere, from a small rotation of the camera.
 
-    The camera turns evenly, about an axis in the plane of the picture. Away from its centre a real
-    streak is longer, by 1 / cos^2 of the angle to the axis of view, and bends; that is left out, as
-    in SyB3R's "linear blur" (Ley, Hänsch and Hellwich, ICCV Workshops 2017); ``perspective`` has
-    it.
+    The camera rotates evenly about an axis in the image plane. Away from the centre, a real streak
+    bends and is longer by 1 / cos^2 of the angle to the optical axis. This method ignores both,
+    like SyB3R's "linear blur" (Ley, Hänsch and Hellwich, ICCV Workshops 2017). ``perspective``
+    includes them.
 
     >>> from clpipe.stage import run_reference
     >>> dot = np.zeros((1, 7, 3), np.float32)
@@ -80,14 +80,19 @@ class Linear(Method):
     alternatives: ClassVar = frozenset({"length", "rotation"})
 
     length: float | None = parameter(
-        None, "Length of the streak; 0 is off.", "px", "from rotation, else 0", ge=0, le=LONGEST
+        None,
+        "Length of the streak; 0 disables it.",
+        "px",
+        "from rotation, else 0",
+        ge=0,
+        le=LONGEST,
     )
     angle: float = parameter(
-        0.0, "Its direction, from the right upwards.", "degrees", ge=-360, le=360
+        0.0, "Direction of the streak, from right towards up.", "degrees", ge=-360, le=360
     )
     rotation: float | None = parameter(
         None,
-        "How far the camera turns while the shutter is open, in place of a length.",
+        "Rotation of the camera during the exposure; set it instead of length.",
         "degrees",
         "none",
         ge=0,
@@ -106,11 +111,11 @@ class Linear(Method):
     @model_validator(mode="after")
     def _one_measure(self) -> "Linear":
         if self.length is not None and self.rotation is not None:
-            raise ValueError("length and rotation both say how long the streak is; set one")
+            raise ValueError("set either length or rotation: both define the length of the streak")
         return self
 
     def resolve(self, context: Context) -> Self:
-        """The method with a length: f tan(rotation), in the middle of the picture.
+        """Return the method with a length: f tan(rotation), in the middle of the image.
 
         Raises:
             RequestError: the focal length is not known in px, or the streak is too long.
@@ -119,12 +124,14 @@ class Linear(Method):
         if not own.rotation:
             return own.with_defaults(length=0.0)
         if not own.fx:
-            raise RequestError("motion_blur: rotation needs fx, in px, here or in render")
+            raise RequestError(
+                "motion_blur: rotation needs a focal length; set fx, in px, here or in render"
+            )
         length = float(own.fx * np.tan(np.deg2rad(own.rotation)))
         if length > LONGEST:
             raise RequestError(
-                f"motion_blur: rotation {own.rotation:g} at fx {own.fx:g} is a streak of "
-                f"{length:.0f} px; at most {LONGEST:g} are possible"
+                f"motion_blur: rotation {own.rotation:g} at fx {own.fx:g} makes a streak of "
+                f"{length:.0f} px; at most {LONGEST:g} px are allowed, so lower rotation"
             )
         return own.model_copy(update={"length": length, "rotation": None})
 
@@ -154,10 +161,10 @@ class Linear(Method):
 
 
 class Perspective(InFocalLengths, AboutAxis):
-    """The streaks of a camera that turns, as they are in each place of a picture in perspective.
+    """Streaks of a rotating camera, with their perspective at each position of the image.
 
-    It turns evenly about an axis in the plane of its picture, and shows the render as it is in the
-    middle of the exposure. Each pixel is the mean of what it saw, from
+    The camera rotates evenly about an axis in its image plane. It shows the render unchanged in the
+    middle of the exposure. Each pixel is the mean of the light it received, from
     :class:`clpipe.reference.turning.Turning`.
 
     >>> from clpipe.stage import run_reference
@@ -172,26 +179,26 @@ class Perspective(InFocalLengths, AboutAxis):
     method: ClassVar = "perspective"
     kernel: ClassVar = "motion_blur"
     overscan: ClassVar = True
-    summary: ClassVar = "longer and bent away from the middle, as a turning camera's are"
+    summary: ClassVar = "streaks of a rotating camera, longer and bent away from the image centre"
     example: ClassVar = {"rotation": 4.0, "angle": 30.0, "fx": 90.0}
     other_examples: ClassVar = ({"fx": None, "focal_length": 40.0, "sensor_width": 20.0},)
 
     rotation: float = parameter(
-        0.0, "How far the camera turns while the shutter is open; 0 is off.", "degrees", ge=0, lt=45
+        0.0, "Rotation of the camera during the exposure; 0 disables it.", "degrees", ge=0, lt=45
     )
     angle: float = parameter(
         0.0,
-        "The way that the middle of the picture takes, from the right upwards.",
+        "Direction in which the middle of the image moves, from right towards up.",
         "degrees",
         ge=-360,
         le=360,
     )
 
     def resolve(self, context: Context) -> Self:
-        """The method with the camera's focal length and principal point.
+        """Return the method with the camera's focal length and principal point.
 
         Raises:
-            RequestError: the focal length is not known, and it turns.
+            RequestError: the rotation is not 0, and the focal length is not known.
         """
         own = self.with_optics(context)
         if own.rotation:
@@ -200,7 +207,7 @@ class Perspective(InFocalLengths, AboutAxis):
 
     @property
     def turning(self) -> Turning:
-        """How the picture is made of the render."""
+        """The geometry from render to image."""
         centre = self.cx, self.cy
         return Turning(self.rotation, self.angle, self.fx, self.share, centre, self.margins)
 
@@ -219,7 +226,7 @@ class Perspective(InFocalLengths, AboutAxis):
 
 STAGE = Stage(
     "motion_blur",
-    "Move the camera while its shutter is open.",
+    "Blur by camera motion during the exposure.",
     Kind.RGB,
     Kind.RGB,
     (Linear, Perspective),

@@ -45,7 +45,7 @@ class Linear(SignalMethod):
         None,
         "DN that becomes 0.",
         "DN",
-        "as quantize used it, else from the camera",
+        "the black level of quantize, else from the camera",
         ge=0,
         le=MAX_DN,
     )
@@ -53,7 +53,7 @@ class Linear(SignalMethod):
         None,
         "DN that becomes 1.",
         "DN",
-        "as quantize used it, for the first of several readouts; else from the camera",
+        "the white level of quantize, or of the first of several readouts; else from the camera",
         gt=0,
         le=MAX_DN,
     )
@@ -63,21 +63,21 @@ class Linear(SignalMethod):
         black, white = self.black_level, self.white_level
         if black is not None and white is not None and white <= black:
             raise ValueError(
-                f"white_level must be above black_level; "
-                f"found {self.white_level} and {self.black_level}"
+                f"white_level must be above black_level; they are {self.white_level} and "
+                f"{self.black_level}"
             )
         return self
 
     def resolve(self, context: Context) -> "Linear":
-        """The method with its levels.
+        """Return the method with its levels.
 
         Raises:
-            RequestError: quantize made the DN fewer by a curve.
+            RequestError: quantize compressed the DN with a curve.
         """
         if context.knots:
             raise RequestError(
-                "normalize.method=linear: quantize.method=pwl made the DN fewer by a curve; set "
-                "normalize.method=pwl, which goes back along it, or quantize.method=linear"
+                "normalize.method=linear does not undo the curve of quantize.method=pwl; set "
+                "normalize.method=pwl, or quantize.method=linear"
             )
         return self._with_levels(context)
 
@@ -114,7 +114,7 @@ class Linear(SignalMethod):
 
 
 class Pwl(Linear):
-    """The same, after the inverse of the curve of ``quantize.method=pwl``.
+    """The inverse of the curve of ``quantize.method=pwl``, then the levels.
 
     >>> from clpipe.stage import run_reference
     >>> knots = [[0.0, 0.0], [1023.0, 511.0], [4095.0, 1023.0]]
@@ -125,11 +125,11 @@ class Pwl(Linear):
 
     method: ClassVar = "pwl"
     kernel: ClassVar = "companding"
-    summary: ClassVar = "the same, of DN that quantize.method=pwl made fewer"
+    summary: ClassVar = "undo the curve of quantize.method=pwl, then apply the levels"
     example: ClassVar = {"knots": [[0.0, 0.0], [4096.0, 512.0], [16383.0, 1023.0]]}
 
     knots: list[list[float]] | None = parameter(
-        None, "Those of quantize.", auto="as quantize used them"
+        None, "The knots of quantize.", auto="those of quantize"
     )
 
     @model_validator(mode="after")
@@ -139,21 +139,21 @@ class Pwl(Linear):
         return self
 
     def resolve(self, context: Context) -> "Linear":
-        """The method with its levels and knots.
+        """Return the method with its levels and knots.
 
         Raises:
-            RequestError: no knots are known, or quantize has others.
+            RequestError: no knots are known, or those of quantize differ.
         """
         filled = self._with_levels(context)
         if self.knots is None and not context.knots:
             raise RequestError(
-                "normalize.method=pwl: no knots are known; set normalize.knots, or quantize with "
+                "normalize.method=pwl: no knots are known; set normalize.knots, or use "
                 "quantize.method=pwl"
             )
         if self.knots and context.knots and knots_in(self.knots) != context.knots:
             raise RequestError(
-                f"normalize.knots: found {self.knots}, but those of quantize are "
-                f"{[list(pair) for pair in context.knots]}; leave normalize.knots out"
+                f"normalize.knots: {self.knots} differ from those of quantize, "
+                f"{[list(pair) for pair in context.knots]}; remove normalize.knots"
             )
         return filled.with_defaults(knots=[list(pair) for pair in context.knots])
 
@@ -182,7 +182,7 @@ def _of_curve(context: Context) -> Method | None:
 
 STAGE = Stage(
     "normalize",
-    "Apply the levels: DN to signal.",
+    "Apply black and white level: DN to signal.",
     Kind.RAW,
     Kind.MOSAIC,
     (Linear, Pwl),

@@ -1,4 +1,4 @@
-"""Blur by what lies before the photosites: lens, low-pass filter, and their own area."""
+"""Blur by the optics before the photosites: lens, low-pass filter, and photosite area."""
 
 from functools import lru_cache
 from math import erf, sqrt
@@ -26,21 +26,19 @@ from clpipe.stage import (
     parameter,
 )
 
-WAVELENGTHS = (0.600, 0.540, 0.460)  # um, about the middle of what red, green and blue let through
+WAVELENGTHS = (0.600, 0.540, 0.460)  # um, about the middle of the passbands of red, green and blue
 LARGEST = 65  # px, of a measured function
-FINE = 8  # samples a pixel where diffraction is worked out
-INSIDE = 0.995  # share of the light of a diffraction figure that is kept: its rings go on for ever
+FINE = 8  # samples per pixel for the calculation of diffraction
+INSIDE = 0.995  # share of the light of a diffraction pattern that is kept: its rings are infinite
 GOOD_LENS = 0.4  # px
-UNROLLED = (
-    3  # px; a blur that goes further takes two launches, one along rows and one along columns
-)
+UNROLLED = 3  # px; a wider blur takes two launches, one along rows and one along columns
 
 
 def along(sigma: float, low_pass: float, pixel_area: float) -> Doubles:
-    """The light of a pixel along a row or a column: (pixel,) of odd length, of sum 1.
+    """Return the light of a pixel along a row or a column: (pixel,) of odd length, of sum 1.
 
-    The light is even over the pixel's square, spread by a Gaussian, doubled by the low-pass filter,
-    and collected by photosites of some side. All arguments are in px; see :class:`Lens`.
+    The light is uniform over the pixel's square, blurred by a Gaussian, doubled by the low-pass
+    filter, and collected by photosites of some side. All arguments are in px; see :class:`Lens`.
 
     >>> along(0, 0, 0).tolist(), along(0, 1, 0).tolist(), along(0.3, 0, 0).round(2).tolist()
     ([0.0, 1.0, 0.0], [0.25, 0.5, 0.25], [0.0, 0.05, 0.9, 0.05, 0.0])
@@ -62,11 +60,11 @@ def along(sigma: float, low_pass: float, pixel_area: float) -> Doubles:
 def diffracted(
     sigma: float, low_pass: float, pixel_area: float, f_number: float, pitch: float
 ) -> Doubles:
-    """The light of :func:`along`, with diffraction: a point spread function, (height, width, 3).
+    """Return the light of :func:`along` with diffraction: a point spread function.
 
-    It is the Fourier transform of the product of all transfer functions. That of a round aperture
-    is (2 / pi)(acos(v) - v sqrt(1 - v^2)), v = frequency * wavelength * f-number (Goodman,
-    Introduction to Fourier Optics, 3rd ed. 2005, eq. 6-31).
+    It has the shape (height, width, 3), and is the Fourier transform of the product of all transfer
+    functions. That of a round aperture is (2 / pi)(acos(v) - v sqrt(1 - v^2)), v = frequency *
+    wavelength * f-number (Goodman, Introduction to Fourier Optics, 3rd ed. 2005, eq. 6-31).
 
     Args:
         sigma, low_pass, pixel_area: in px.
@@ -74,7 +72,7 @@ def diffracted(
         pitch: of the photosites, in um.
     """
     size = 2 * LARGEST * FINE
-    frequency = np.fft.fftfreq(size, 1 / FINE)  # cycles a pixel
+    frequency = np.fft.fftfreq(size, 1 / FINE)  # cycles per pixel
     one = np.exp(-2 * (np.pi * sigma * frequency) ** 2) * np.cos(np.pi * low_pass * frequency)
     one *= np.sinc(pixel_area * frequency) * np.sinc(frequency)
     radial = np.hypot(frequency[:, None], frequency)
@@ -95,12 +93,12 @@ def diffracted(
 
 @lru_cache(maxsize=16)
 def measured(path: str) -> Doubles:
-    """The point spread function in an image file, (height, width, 3), each channel of sum 1.
+    """Return the point spread function in an image file, (height, width, 3), each channel of sum 1.
 
     Raises:
-        ValueError: the file cannot be read, or holds no such function.
+        ValueError: the file cannot be read, or does not contain such a function.
     """
-    from clpipe.images.read import ReadOptions, read_source  # few need what it imports
+    from clpipe.images.read import ReadOptions, read_source  # this import is slow and rarely needed
 
     try:
         pixels = read_source(Path(path), Kind.RGB, ReadOptions(transfer="linear")).pixels
@@ -109,11 +107,14 @@ def measured(path: str) -> Doubles:
     height, width = pixels.shape[:2]
     if height % 2 == 0 or width % 2 == 0 or max(height, width) > LARGEST:
         raise ValueError(
-            f"{path}: a point spread function has odd sides up to {LARGEST} px, its middle pixel "
-            f"being the centre; found {width}x{height}"
+            f"{path}: a point spread function has odd sides up to {LARGEST} px, and its middle "
+            f"pixel is the centre; this image is {width}x{height}"
         )
     if pixels.min() < 0:
-        raise ValueError(f"{path}: light cannot be negative; found {pixels.min():g}")
+        raise ValueError(
+            f"{path}: a point spread function has no negative values, but the "
+            f"smallest here is {pixels.min():g}"
+        )
     total = pixels.sum((0, 1), dtype=np.float64)
     if not total.all():
         raise ValueError(f"{path}: a channel has no light")
@@ -123,7 +124,7 @@ def measured(path: str) -> Doubles:
 @traceable
 @lru_cache(maxsize=64)
 def half_of(sigma: float, low_pass: float, pixel_area: float) -> Floats:
-    """The middle and one side of :func:`along`, without what is negligible; the whole of sum 1.
+    """Return the middle and one side of :func:`along`, without negligible weights.
 
     >>> [round(float(weight), 2) for weight in half_of(0.4, 0, 0)]
     [0.79, 0.11]
@@ -138,7 +139,7 @@ def half_of(sigma: float, low_pass: float, pixel_area: float) -> Floats:
 @traceable
 @lru_cache(maxsize=64)
 def line_taps(sigma: float, low_pass: float, pixel_area: float) -> tuple[Floats, Floats]:
-    """The taps of :func:`half_of` along a row, and those along a column."""
+    """Return the taps of :func:`half_of` along a row, and those along a column."""
     side = half_of(sigma, low_pass, pixel_area).astype(np.float64)
     row = np.concatenate([side[:0:-1], side])[None, :, None].repeat(3, 2)
     return taps_of(row), taps_of(row.transpose(1, 0, 2))
@@ -149,7 +150,7 @@ def line_taps(sigma: float, low_pass: float, pixel_area: float) -> tuple[Floats,
 def lens_taps(
     sigma: float, low_pass: float, pixel_area: float, f_number: float, pitch: float, psf: str
 ) -> Floats:
-    """The taps of a lens; see :class:`Lens`. An ``f_number`` of 0 is without diffraction."""
+    """Return the taps of a lens; see :class:`Lens`. An ``f_number`` of 0 disables diffraction."""
     if f_number:
         spread = diffracted(sigma, low_pass, pixel_area, f_number, pitch)
     else:
@@ -159,7 +160,7 @@ def lens_taps(
 
 
 def convolved(first: Doubles, second: Doubles) -> Doubles:
-    """Two point spread functions one after the other."""
+    """Return the convolution of two point spread functions."""
     height, width = (a + b - 1 for a, b in zip(first.shape, second.shape[:2], strict=False))
     total = np.zeros((height, width, 3))
     for (y, x), weights in zip(np.ndindex(*second.shape[:2]), second.reshape(-1, 3), strict=True):
@@ -168,14 +169,14 @@ def convolved(first: Doubles, second: Doubles) -> Doubles:
 
 
 class Lens(Method):
-    """Light is spread as by a good lens, so that hard edges alias no more than in photographs.
+    """The blur of a good lens, so that hard edges alias no more than in photographs.
 
-    The point spread function is the Gaussian of the lens's aberrations, with the diffraction of an
-    aperture, the four spots of a low-pass filter, and the area of the photosites where they are
-    set. The light of a pixel of the render is even over the pixel. So along a row the modulation
-    transfer function of aberrations is exp(-2 (pi sigma f)^2) sinc(f), f in cycles a pixel, but for
-    what sampling folds back. Renderers average over pixels themselves, so photosites are points
-    unless they are set. Light is only moved: the mean stays.
+    The point spread function is the Gaussian of the lens's aberrations. You can add the diffraction
+    of an aperture, the four spots of a low-pass filter, and the area of the photosites. The light
+    of a pixel of the render is uniform over the pixel. The modulation transfer function of
+    aberrations along a row is therefore exp(-2 (pi sigma f)^2) sinc(f), f in cycles per pixel,
+    apart from aliasing. Renderers average over pixels themselves, so photosites are points by
+    default. The blur only moves light, so the mean does not change.
 
     >>> from clpipe.stage import run_reference
     >>> dot = np.zeros((3, 5, 3), np.float32)
@@ -187,7 +188,9 @@ class Lens(Method):
     method: ClassVar = "lens"
     kernel: ClassVar = "convolve"
     overscan: ClassVar = True
-    summary: ClassVar = "a good lens; diffraction, a low-pass filter or a measured function"
+    summary: ClassVar = (
+        "a good lens; optionally diffraction, a low-pass filter or a measured function"
+    )
     example: ClassVar = {"sigma": 0.7}
     other_examples: ClassVar = (
         {"sigma": 1.6},
@@ -196,18 +199,18 @@ class Lens(Method):
 
     sigma: float | None = parameter(
         None,
-        "Sigma of the lens's aberrations; 0 is off.",
+        "Sigma of the lens's aberrations; 0 disables them.",
         "px",
         f"{GOOD_LENS:g}, 0 with a psf",
         ge=0,
         le=8,
     )
     f_number: float | None = parameter(
-        None, "Diffraction at this f-number.", "", "no diffraction", optics=True, ge=0.5, le=64
+        None, "f-number for diffraction.", "", "no diffraction", optics=True, ge=0.5, le=64
     )
     pixel_pitch: float | None = parameter(
         None,
-        "Distance of photosites, for diffraction.",
+        "Distance between photosites, for diffraction.",
         "um",
         "from the camera",
         optics=True,
@@ -215,14 +218,18 @@ class Lens(Method):
         le=100,
     )
     low_pass: float = parameter(
-        0.0, "Distance of the spots of an optical low-pass filter; 0 is none.", "px", ge=0, le=4
+        0.0,
+        "Distance between the spots of an optical low-pass filter; 0 means none.",
+        "px",
+        ge=0,
+        le=4,
     )
     pixel_area: float = parameter(
         0.0, "Side of a photosite's light-sensitive square; 0 is a point.", "px", ge=0, le=1
     )
     psf: str | None = parameter(
         None,
-        "An image of a measured point spread function, up to 65x65, in linear light.",
+        "Image of a measured point spread function, up to 65x65, in linear light.",
         "",
         "none",
         file=True,
@@ -239,14 +246,14 @@ class Lens(Method):
         pitch = context.optics.pixel_pitch or context.camera.pixel_pitch
         if self.f_number and not (pitch or self.pixel_pitch):
             raise ValueError(
-                f"pixel_pitch: diffraction needs it, and camera {context.camera.name} does not "
-                "say; set it in um"
+                "pixel_pitch: diffraction needs it, and the profile of camera "
+                f"{context.camera.name} does not contain it; set it in um"
             )
         return self.with_defaults(sigma=0.0 if self.psf else GOOD_LENS, pixel_pitch=pitch)
 
     @property
     def _by_lines(self) -> tuple[float, float, float] | None:
-        """The arguments of :func:`along`, where it is all; None for what is no product of lines."""
+        """The arguments of :func:`along` if it describes the whole blur, else None."""
         assert self.sigma is not None
         whole = self.f_number is None and self.psf is None
         return (self.sigma, self.low_pass, self.pixel_area) if whole else None
@@ -298,7 +305,7 @@ class Lens(Method):
 
 
 class NoBlur(Unchanged):
-    """No blur: a render is as sharp as no lens."""
+    """No blur: the image keeps the sharpness of the render."""
 
     method: ClassVar = "none"
     summary: ClassVar = "no blur"
@@ -306,7 +313,7 @@ class NoBlur(Unchanged):
 
 STAGE = Stage(
     "optical_blur",
-    "Spread light as a lens and the filter before a sensor do.",
+    "Blur by the lens and by the filter before the sensor.",
     Kind.RGB,
     Kind.RGB,
     (Lens, NoBlur),

@@ -1,8 +1,8 @@
-"""Noise on the finished picture, as synthetic data usually has it: baselines to compare with.
+"""Noise on the finished image, like in most synthetic data: baselines for comparison.
 
-Real noise arises before the processing, which shapes it; see ``sensor_noise``. Here noise that is
-independent in each pixel is added after the processing, with a sigma of the user's, of ``clpipe
-measure --json``, or of the picture itself (``clpipe run --truth iid``).
+Real noise arises before the processing, which shapes it; see ``sensor_noise``. The methods here add
+independent noise to each pixel after the processing. You set sigma, or take it from ``clpipe
+measure --json`` or from the image itself (``clpipe run --truth iid``).
 """
 
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ from clpipe.stage import (
 )
 
 ENTRIES = 256  # of the kernel's table
-UNKNOWN = "unknown"  # in a report, the ISO of images that do not say theirs
+UNKNOWN = "unknown"  # the ISO of images in a report that do not state theirs
 RESOLVED = 65  # entries of a measured curve in the resolved parameters, and so in the sidecar
 CHANNELS = Kind.DISPLAY.channels
 MIXING = ("green_red", "green_green", "blue_red", "blue_green", "blue_blue")  # kernel arguments
@@ -48,12 +48,12 @@ Correlation = Annotated[float, Field(ge=-1, le=1)]
 
 
 class Matched(Method):
-    """How noise on the finished picture is matched to measured noise."""
+    """Parameters for matching the noise of the finished image to measured noise."""
 
     match: Literal["picture", "flat", "halved"] = parameter(
         "picture",
-        "Where measured noise and this one have the same variance: in the whole picture, in its "
-        "flat places, or in the whole picture after averaging 2x2 pixels.",
+        "Where the variance equals the measured one: in the whole image, in its flat areas, or "
+        "in the whole image after averaging 2x2 pixels.",
     )
     correlated: bool = parameter(
         False, "Draw red, green and blue with the measured correlation between them."
@@ -61,20 +61,20 @@ class Matched(Method):
 
 
 class NoNoise(Unchanged, Matched):
-    """No noise on the finished picture; ``clpipe run --truth iid`` is matched as it says."""
+    """No noise on the finished image; with ``clpipe run --truth iid``, how to match the noise."""
 
     method: ClassVar = "none"
-    summary: ClassVar = "no noise here; sensor_noise adds it where a sensor does"
+    summary: ClassVar = "no noise on the finished image"
 
     jpeg: bool = parameter(
         False,
-        "Match the noise of --truth in the decoded JPEG, which keeps more of a camera's noise "
-        "than of independent noise.",
+        "Match the noise of --truth in the decoded JPEG, which preserves more of a camera's "
+        "noise than of independent noise.",
     )
 
 
 def _as_three(value: Any) -> Any:
-    """Three equal numbers for one, and a tuple for a list, as TOML has it."""
+    """Convert one number to three equal ones, and a list, which TOML gives, to a tuple."""
     if isinstance(value, float | int) and not isinstance(value, bool):
         return (float(value),) * 3
     return tuple(value) if isinstance(value, list) else value
@@ -87,7 +87,7 @@ class IndependentNoise(Matched):
 
     measured: str = parameter(
         "",
-        "A report of clpipe measure --json on finished pictures; the noise gets its sigma.",
+        "Report of clpipe measure --json on finished images, from which sigma is taken.",
         file=True,
     )
     correlation: (
@@ -96,7 +96,7 @@ class IndependentNoise(Matched):
         None,
         "Correlation of red with green, of red with blue, and of green with blue.",
         "",
-        "as measured, where correlated is true; else 0",
+        "as measured if correlated is true, else 0",
     )
 
     @field_validator("measured")
@@ -116,56 +116,57 @@ class IndependentNoise(Matched):
     @model_validator(mode="after")
     def _at_most_one(self) -> Self:
         if getattr(self, "sigma", None) is not None and self.measured:
-            raise ValueError("found both sigma and measured; set one of them")
+            raise ValueError("sigma and measured are both set; set one of them")
         return self
 
     def noise(self, iso: float) -> "MeasuredNoise":
-        """The measured noise, where it is matched.
+        """The measured noise for this kind of matching.
 
         Args:
-            iso: of the picture; a report may be on several.
+            iso: ISO of the image; a report may contain several.
 
         Raises:
-            RequestError: neither sigma nor a report is set. It is refused as late as here because
-                options may choose the method, and each row of a manifest its report. Or the
-                report is on other ISOs.
+            RequestError: neither sigma nor a report is set, or the report contains other ISOs. The
+                check is this late because options may choose the method, and each row of a manifest
+                its report.
         """
         if not self.measured:
             raise RequestError(
-                "picture_noise: needs sigma, or measured, a report of clpipe measure --json"
+                "picture_noise: set sigma, or measured, a report of clpipe measure --json"
             )
         by_iso = measured_noise(self.measured)
         noise = by_iso.get(iso, by_iso.get(None))
         if noise is None:
             found = ", ".join(f"{each:g}" for each in by_iso if each is not None)
             raise RequestError(
-                f"picture_noise.measured: {self.measured} has no ISO {iso:g}, only {found}"
+                f"picture_noise.measured: {self.measured} does not contain ISO {iso:g}; it "
+                f"contains {found}"
             )
         return noise[self.match]
 
     def with_correlation(self, iso: float) -> Self:
-        """A copy with the correlation that is set or measured.
+        """Return a copy with the correlation that is set or measured.
 
         Raises:
-            RequestError: it is to be the measured one, and no report is set.
+            RequestError: the measured correlation is requested, but no report is set.
         """
         if self.correlation is not None or not self.correlated:
             return self.with_defaults(correlation=(0.0, 0.0, 0.0))
         if not self.measured:
             raise RequestError(
-                "picture_noise: correlated is true, but nothing is measured; set correlation, or "
-                "measured, a report of clpipe measure --json"
+                "picture_noise: correlated is true, but no measured noise is set; set "
+                "correlation, or measured, a report of clpipe measure --json"
             )
         return self.with_defaults(correlation=self.noise(iso).correlation)
 
     def normals(self, image: Floats, given: ReferenceContext) -> Floats:
-        """The normals of each sample, (height, width, 3), of the image's stream."""
+        """Return the normals of each sample, (height, width, 3), from the image's stream."""
         assert self.correlation is not None
         stream = given.stream[NoiseScope.IMAGE]
         return correlated_normals(image.shape, stream, mixing(*self.correlation))
 
     def mixing_arguments(self) -> dict[str, Argument]:
-        """The kernel's arguments for the correlation."""
+        """Return the kernel's arguments for the correlation."""
         assert self.correlation is not None
         return dict(zip(MIXING, mixing(*self.correlation), strict=True))
 
@@ -215,10 +216,10 @@ class IidGaussian(IndependentNoise):
 class IntensityDependent(IndependentNoise):
     """v + sigma(v) * n: independent Gaussian noise whose sigma follows each channel's intensity.
 
-    SyB3R adds such noise to finished pictures (Ley, Haensch, Hellwich, "SyB3R: A realistic
-    synthetic benchmark for 3D reconstruction from images", ECCV 2016). v is a display value, 0..1,
-    n a standard normal for each pixel and channel; sigma(v) comes from a table. Beyond the measured
-    intensities, sigma stays that of the nearest one.
+    SyB3R adds such noise to finished images (Ley, Haensch, Hellwich, "SyB3R: A realistic synthetic
+    benchmark for 3D reconstruction from images", ECCV 2016). In the formula, v is a display value,
+    0..1, and n a standard normal for each pixel and channel. sigma(v) comes from a table. Outside
+    the measured intensities, sigma is that of the nearest one.
 
     >>> from clpipe.stage import run_reference
     >>> grey = np.full((300, 300, 3), 0.5, np.float32)
@@ -235,8 +236,8 @@ class IntensityDependent(IndependentNoise):
     sigma: Sigmas | Annotated[tuple[Sigmas, Sigmas, Sigmas], Field(strict=False)] | None = (
         parameter(
             None,
-            "Standard deviations at intensities evenly spaced from 0 to 1, linear between them: "
-            "one list, or one each for red, green and blue.",
+            "Standard deviations at intensities evenly spaced from 0 to 1, with linear "
+            "interpolation: one list, or one each for red, green and blue.",
             "of full scale",
             "as measured",
         )
@@ -252,7 +253,7 @@ class IntensityDependent(IndependentNoise):
         return correlated.with_defaults(sigma=sigma)
 
     def table(self) -> Floats:
-        """Sigma at the 256 intensities v = i / 255 of red, of green and of blue, (768,)."""
+        """Return sigma at the 256 intensities v = i / 255 of red, of green and of blue, (768,)."""
         assert self.sigma is not None
         return _table(self.sigma)
 
@@ -279,8 +280,8 @@ def _table(sigma: tuple[Any, ...]) -> Floats:
 class MeasuredNoise(NamedTuple):
     """Measured noise of red, green and blue, in display values, 0..1.
 
-    ``sigma`` is that of all samples. A curve is the intensities, ascending, and sigma at each.
-    ``correlation`` is that of red with green, of red with blue, and of green with blue.
+    ``sigma`` is that of all samples. A curve contains the intensities, ascending, and sigma at
+    each. ``correlation`` lists red with green, red with blue, and green with blue.
     """
 
     sigma: tuple[float, ...]
@@ -289,18 +290,17 @@ class MeasuredNoise(NamedTuple):
 
 
 def measured_noise(path: str) -> Mapping[float | None, Mapping[str, MeasuredNoise]]:
-    """The noise in a report of ``clpipe measure --json``, by ISO and by where it is matched.
+    """Return the noise in a report of ``clpipe measure --json``, by ISO and kind of matching.
 
-    The ISO is None where the report is on one alone, or does not say it.
+    The ISO is None if the report has only one, or does not state it.
 
-    That of "halved" is what leaves the measured variance after averaging 2x2 pixels, which leaves a
-    quarter of the variance of independent noise.
+    The noise of "halved" has the measured variance after averaging 2x2 pixels. This averaging
+    leaves a quarter of the variance of independent noise.
 
-    The file is read again when it changes.
+    A changed file is read again.
 
     Raises:
-        ValueError: the file cannot be read, is not such a report, or does not report on display
-            values.
+        ValueError: the file cannot be read, is not such a report, or is not on display values.
     """
     try:
         return _measured_noise(path)
@@ -327,14 +327,16 @@ def _measured_noise(path: str) -> Mapping[float | None, Mapping[str, MeasuredNoi
     except (ValueError, OverflowError, LookupError, TypeError, AttributeError):
         raise ValueError("not a report of clpipe measure --json") from None
     raise ValueError(
-        f"reports on {kind}, but this noise is in display values; "
-        "measure finished pictures (JPEG, PNG, or EXR kept after gamma)"
+        f"the report is on {kind}, but this noise is in display values; measure finished images "
+        "(JPEG, PNG, or EXR kept after gamma)"
     )
 
 
 def _noise_of(report: Any, where: str, curve: str, averaged: int = 1) -> MeasuredNoise:
-    """The noise in one place of a report, after averaging so many pixels; the curves are scaled to
-    the sigma there. Rounding is left out, since the noisy picture will be rounded again.
+    """Return the noise in one area of a report, after averaging this number of pixels.
+
+    The curves are scaled to the sigma there. Rounding is not included, because the noisy image will
+    be rounded again.
     """
     covariance = np.array(report["covariance"][where], float)
     variance = np.diag(covariance)
@@ -356,7 +358,7 @@ def _noise_of(report: Any, where: str, curve: str, averaged: int = 1) -> Measure
 
 
 def _curve_of(record: Any, wanted: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """A curve of a report, scaled so that all of its samples have one sigma together."""
+    """Return a curve of a report, scaled so that all of its samples together have one sigma."""
     mean, sigma, samples = (np.array(record[key], float) for key in ("mean", "sigma", "samples"))
     are_noise = ((sigma >= 0) & (sigma <= 1) & (samples > 0)).all()
     is_curve = mean.shape == sigma.shape == samples.shape == (mean.size,) and mean.size > 0
@@ -368,7 +370,7 @@ def _curve_of(record: Any, wanted: float) -> tuple[tuple[float, ...], tuple[floa
 
 STAGE = Stage(
     "picture_noise",
-    "Add noise to the finished picture, as a baseline.",
+    "Add noise to the finished image, as a baseline.",
     Kind.DISPLAY,
     Kind.DISPLAY,
     (NoNoise, IidGaussian, IntensityDependent),

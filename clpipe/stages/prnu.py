@@ -58,4 +58,6 @@ class Gaussian(GaussianNoise):
         return y * (backend.fixed(sensor_normals) * n["sigma"] + 1)
 
 
-STAGE = Stage("prnu", "Make pixels differ in sensitivity.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,))
+STAGE = Stage(
+    "prnu", "Vary the sensitivity of pixels (PRNU).", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,)
+)

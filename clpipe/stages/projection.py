@@ -1,9 +1,8 @@
-"""Wide lenses, to 220 degrees: the picture is made of what a render shows all around.
+"""Wide lenses, to 220 degrees: the image is made from a render of the whole surroundings.
 
-That is six faces of a cube, several overlapping views, a map of longitude and latitude, or one
-render. For each pixel of the picture the direction that it sees is found from the model
-(:mod:`clpipe.reference.wide`), and each channel is gathered where that is
-(:mod:`clpipe.reference.projection`).
+The render is six faces of a cube, several overlapping views, a map of longitude and latitude, or
+one view. The model (:mod:`clpipe.reference.wide`) gives the direction that each pixel of the image
+sees. Each channel is then sampled in that direction (:mod:`clpipe.reference.projection`).
 """
 
 from collections.abc import Mapping
@@ -34,56 +33,66 @@ from clpipe.stages.distortion import filter_arguments
 
 
 class NoProjection(Unchanged):
-    """The picture is in the render's own perspective."""
+    """The image keeps the render's perspective."""
 
     method: ClassVar = "none"
-    summary: ClassVar = "the render's own perspective"
+    summary: ClassVar = "keep the render's perspective"
 
 
 class Wide(Method):
-    """A wide lens, with the sensor behind it."""
+    """A wide lens with a sensor."""
 
     kernel: ClassVar = "projection"
 
     cx: float | None = parameter(
-        None, "Principal point, from the left edge: OpenCV's cx + 0.5.", "px", "the middle"
+        None,
+        "Distance of the principal point from the left edge; OpenCV's cx + 0.5.",
+        "px",
+        "the centre",
     )
     cy: float | None = parameter(
-        None, "Principal point, from the upper edge: OpenCV's cy + 0.5.", "px", "the middle"
+        None,
+        "Distance of the principal point from the upper edge; OpenCV's cy + 0.5.",
+        "px",
+        "the centre",
     )
     width: int | None = parameter(
-        None, "Of the picture.", "px", "that of the whole field", ge=1, le=65536
+        None, "Width of the image.", "px", "that of the whole field of view", ge=1, le=65536
     )
     height: int | None = parameter(
-        None, "Of the picture.", "px", "that of the whole field", ge=1, le=65536
+        None, "Height of the image.", "px", "that of the whole field of view", ge=1, le=65536
     )
     field_of_view: float = parameter(
-        180.0, "What is seen, through the axis; beyond it is black.", "deg", gt=1, le=220
+        180.0,
+        "Field of view, through the axis; pixels outside it are black.",
+        "degrees",
+        gt=1,
+        le=220,
     )
     source: Literal["auto", "map"] = parameter(
         "auto",
-        "What the render is: a map of longitude and latitude, or what its file and the files' "
-        "names say: a map, a cube, else a view in perspective.",
+        "Layout of the render: map of longitude and latitude, cube or perspective view. auto "
+        "uses the file's metadata and the file names, else a view.",
     )
     face_angle: float | None = parameter(
         None,
-        "Of a face of a cube, or of a view, across.",
-        "deg",
-        "90 for a cube, the render's focal length",
+        "Horizontal field of view of a cube's face, or of a view.",
+        "degrees",
+        "90 for a cube, else from the render's focal length",
         gt=1,
         lt=179,
     )
     views: str | None = parameter(
         None,
-        "The cameras of overlapping renders, in a form of --poses; the world's axes are the "
-        "picture's, and files end with the views' names.",
+        "Cameras of overlapping renders, in a format of --poses. The world's axes are the "
+        "image's, and file names end with the names of the views.",
         "",
         "the faces of a cube",
         file=True,
     )
     filter: Literal["bicubic", "lanczos3"] = parameter(
         "bicubic",
-        "How pixels are weighted: bicubic (Catmull-Rom), or lanczos3, which is sharper and rings.",
+        "Resampling filter: bicubic (Catmull-Rom), or lanczos3, which is sharper and rings.",
         structural=True,
     )
 
@@ -91,7 +100,7 @@ class Wide(Method):
     _shot: tuple[tuple[str, float], ...] = PrivateAttr(())
 
     def with_panorama(self, panorama: Panorama) -> Self:
-        """The (resolved) method for an image that is the atlas of a panorama."""
+        """Return the (resolved) method for an image that is the atlas of a panorama."""
         other = self.model_copy()
         other._panorama = panorama
         return other
@@ -140,28 +149,28 @@ class Wide(Method):
 
 
 class InPixels(Wide):
-    """A model that counts in focal lengths."""
+    """A model that is defined in focal lengths."""
 
     fx: float | None = parameter(
-        None, "Focal length across.", "px", "none: it must be set", gt=0, le=1e7
+        None, "Horizontal focal length.", "px", "none: you must set it", gt=0, le=1e7
     )
-    fy: float | None = parameter(None, "Focal length down.", "px", "fx", gt=0, le=1e7)
+    fy: float | None = parameter(None, "Vertical focal length.", "px", "fx", gt=0, le=1e7)
 
     def resolve(self, context: Context) -> Self:
-        """The method with both focal lengths.
+        """Return the method with both focal lengths.
 
         Raises:
-            RequestError: there is none.
+            RequestError: there is no focal length.
         """
         if not self.fx:
             raise RequestError(
-                f"projection.fx: {self.method} needs the lens's focal length in px; about the "
-                "picture's width over the field of view in radians"
+                f"projection.fx: {self.method} needs the lens's focal length in px, which is "
+                "about the image's width over the field of view in radians; set projection.fx"
             )
         return super().resolve(context).with_defaults(fy=self.fx)
 
     def coefficients(self) -> tuple[float, ...]:
-        """The model's, in its order."""
+        """The coefficients of the model, in its order."""
         raise NotImplementedError(type(self).__name__)
 
     def lens(self) -> WideLens:
@@ -174,20 +183,20 @@ EXAMPLE: Mapping[str, Any] = {"face_angle": 30.0, "width": 203, "height": 150}
 
 
 class KannalaBrandt(InPixels):
-    """r = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8), a being the angle to the axis.
+    """r = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8), where a is the angle to the axis.
 
     OpenCV's fisheye model, COLMAP's OPENCV_FISHEYE (Kannala and Brandt, PAMI 2006). With zeros it
     is the equidistant projection.
     """
 
     method: ClassVar = "kannala_brandt"
-    summary: ClassVar = "OpenCV's fisheye: a polynomial of the angle to the axis"
+    summary: ClassVar = "OpenCV's fisheye model: a polynomial of the angle to the axis"
     example: ClassVar = {**EXAMPLE, "fx": 380.0, "fy": 390.0, "k1": -0.2, "k2": 0.03, "cx": 110.0}
 
-    k1: float = parameter(0.0, "Of the angle squared.", ge=-1e4, le=1e4)
-    k2: float = parameter(0.0, "Of its fourth power.", ge=-1e4, le=1e4)
-    k3: float = parameter(0.0, "Of its sixth power.", ge=-1e4, le=1e4)
-    k4: float = parameter(0.0, "Of its eighth power.", ge=-1e4, le=1e4)
+    k1: float = parameter(0.0, "Coefficient of a^2, with a the angle to the axis.", ge=-1e4, le=1e4)
+    k2: float = parameter(0.0, "Coefficient of a^4.", ge=-1e4, le=1e4)
+    k3: float = parameter(0.0, "Coefficient of a^6.", ge=-1e4, le=1e4)
+    k4: float = parameter(0.0, "Coefficient of a^8.", ge=-1e4, le=1e4)
 
     def coefficients(self) -> tuple[float, ...]:
         return self.k1, self.k2, self.k3, self.k4
@@ -203,8 +212,8 @@ class Unified(InPixels):
     summary: ClassVar = "the enhanced unified camera model (EUCM)"
     example: ClassVar = {**EXAMPLE, "fx": 380.0, "alpha": 0.6, "beta": 1.1, "field_of_view": 190.0}
 
-    alpha: float = parameter(0.6, "0 is a perspective view.", ge=0, le=1)
-    beta: float = parameter(1.0, "Of the square of the way across the axis.", gt=0, le=100)
+    alpha: float = parameter(0.6, "Projection parameter; 0 is a perspective view.", ge=0, le=1)
+    beta: float = parameter(1.0, "Coefficient of the squared distance from the axis.", gt=0, le=100)
 
     def coefficients(self) -> tuple[float, ...]:
         return self.alpha, self.beta
@@ -217,37 +226,43 @@ class DoubleSphere(InPixels):
     summary: ClassVar = "the double-sphere camera model"
     example: ClassVar = {**EXAMPLE, "fx": 380.0, "xi": -0.2, "alpha": 0.59}
 
-    xi: float = parameter(-0.2, "From one sphere's centre to the other's.", ge=-1, le=2)
-    alpha: float = parameter(0.6, "From the second sphere's centre to the pinhole.", ge=0, le=1)
+    xi: float = parameter(-0.2, "Distance between the centres of the two spheres.", ge=-1, le=2)
+    alpha: float = parameter(
+        0.6, "Shift of the pinhole from the centre of the second sphere.", ge=0, le=1
+    )
 
     def coefficients(self) -> tuple[float, ...]:
         return self.xi, self.alpha
 
 
 class FTheta(Wide):
-    """r = k1 a + k2 a^2 + k3 a^3 + k4 a^4 + k5 a^5 in px, a being the angle to the axis in radians.
+    """r = k1 a + k2 a^2 + k3 a^3 + k4 a^4 + k5 a^5 in px, where a is the angle in radians.
 
     NVIDIA's F-theta model by its polynomial from angles to pixels.
     """
 
     method: ClassVar = "f_theta"
-    summary: ClassVar = "NVIDIA's F-theta: a polynomial from the angle in radians to px"
+    summary: ClassVar = "NVIDIA's F-theta model: a polynomial from the angle in radians to px"
     example: ClassVar = {**EXAMPLE, "k1": 380.0, "k2": -1.5, "k3": 2.0, "filter": "lanczos3"}
 
-    k1: float | None = parameter(None, "Of the angle.", "px", "none: it must be set", gt=0, le=1e7)
-    k2: float = parameter(0.0, "Of its square.", "px", ge=-1e7, le=1e7)
-    k3: float = parameter(0.0, "Of its cube.", "px", ge=-1e7, le=1e7)
-    k4: float = parameter(0.0, "Of its fourth power.", "px", ge=-1e7, le=1e7)
-    k5: float = parameter(0.0, "Of its fifth power.", "px", ge=-1e7, le=1e7)
+    k1: float | None = parameter(
+        None, "Coefficient of the angle a.", "px", "none: you must set it", gt=0, le=1e7
+    )
+    k2: float = parameter(0.0, "Coefficient of a^2.", "px", ge=-1e7, le=1e7)
+    k3: float = parameter(0.0, "Coefficient of a^3.", "px", ge=-1e7, le=1e7)
+    k4: float = parameter(0.0, "Coefficient of a^4.", "px", ge=-1e7, le=1e7)
+    k5: float = parameter(0.0, "Coefficient of a^5.", "px", ge=-1e7, le=1e7)
 
     def resolve(self, context: Context) -> Self:
-        """The method with what it knows of the render.
+        """Return the method with the properties of the render.
 
         Raises:
             RequestError: there is no k1.
         """
         if not self.k1:
-            raise RequestError("projection.k1: f_theta needs it, the focal length in px a radian")
+            raise RequestError(
+                "projection.k1: f_theta needs it; set the focal length in px per radian"
+            )
         return super().resolve(context)
 
     def lens(self) -> WideLens:
@@ -265,7 +280,7 @@ METHODS: tuple[type[Method], ...] = (
 
 STAGE = Stage(
     "projection",
-    "Look at what is all around through a wide lens.",
+    "Make a wide-angle image from a render of the whole surroundings.",
     Kind.RGB,
     Kind.RGB,
     METHODS,

@@ -29,14 +29,15 @@ from clpipe.stage import (
     parameter,
 )
 
-MAX_BITS = 24  # whole DN that a float32 holds
+MAX_BITS = 24  # largest whole DN that a float32 represents
 MAX_DN = 2**MAX_BITS - 1
 
 
 class Linear(SignalMethod):
     """Signal to DN: black + y * (white - black), rounded to nearest and clipped to 0..white.
 
-    Behind several readouts white is the last one's, and there are as many bits more.
+    After several readouts, white is that of the last one, and the raw image has correspondingly
+    more bits.
 
     >>> from clpipe.stage import run_reference
     >>> signal = np.float32([[-1, 0, 0.1, 0.5, 7]])
@@ -50,7 +51,7 @@ class Linear(SignalMethod):
 
     bits: int | None = parameter(
         None,
-        "Bit depth of the raw; the camera's levels are scaled to it.",
+        "Bit depth of the raw image; the camera's levels are scaled to it.",
         "",
         "from the levels",
         ge=8,
@@ -67,13 +68,13 @@ class Linear(SignalMethod):
     def _ordered(self) -> "Linear":
         if None not in (self.black_level, self.white_level) and self._range <= 0:
             raise ValueError(
-                f"white_level must be above black_level; "
-                f"found {self.white_level} and {self.black_level}"
+                f"white_level must be above black_level; they are {self.white_level} and "
+                f"{self.black_level}"
             )
         if self.bits and self.white_level and self.white_level >= 2**self.bits:
             raise ValueError(
-                f"white_level must be below {2**self.bits}, which {self.bits} bits hold; "
-                f"found {self.white_level}"
+                f"white_level must be below {2**self.bits}, because the raw image has "
+                f"{self.bits} bits; it is {self.white_level}"
             )
         return self
 
@@ -110,7 +111,7 @@ class Linear(SignalMethod):
         }
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
-        """In DN^2; rounding adds 1/12, and clipping, which reduces variance, is not modelled."""
+        """The variance in DN^2: rounding adds 1/12. Clipping reduces it, which is not modelled."""
         scale = self._range / context.full_scale
         return before * np.float32(scale**2) + np.float32(1 / 12)
 
@@ -121,9 +122,9 @@ class Linear(SignalMethod):
 
 
 class Pwl(Linear):
-    """The same, and then fewer DN by a curve of straight pieces, as HDR sensors send them.
+    """Signal to DN, then fewer DN by a piecewise linear curve, which HDR sensors apply.
 
-    ``normalize`` goes back by itself.
+    ``normalize`` inverts the curve by default.
 
     >>> from clpipe.stage import run_reference
     >>> knots = [[0.0, 0.0], [1023.0, 511.0], [4095.0, 1023.0]]
@@ -134,14 +135,14 @@ class Pwl(Linear):
 
     method: ClassVar = "pwl"
     kernel: ClassVar = "companding"
-    summary: ClassVar = "the same, and fewer bits by a curve of straight pieces"
+    summary: ClassVar = "the same, then fewer bits by a piecewise linear curve"
     example: ClassVar = {"result_bits": 10}
 
-    result_bits: int = parameter(12, "Bits of what comes out.", ge=8, le=16)
+    result_bits: int = parameter(12, "Bit depth after the curve.", ge=8, le=16)
     knots: list[list[float]] | None = parameter(
         None,
-        "Where pieces meet: DN before and after, from [0, 0] to the white level.",
-        auto="near a square root",
+        "Knots of the curve: DN before and after, from [0, 0] to the white level.",
+        auto="close to a square root",
     )
 
     @model_validator(mode="after")
@@ -151,11 +152,13 @@ class Pwl(Linear):
         last = knots_in(self.knots)[-1]
         if last[1] >= 2**self.result_bits:
             raise ValueError(
-                f"knots: found {last[1]:g} in the end, which {self.result_bits} bits do not hold"
+                f"knots: the last output is {last[1]:g}, which does not fit in "
+                f"{self.result_bits} bits"
             )
         if self.white_level is not None and last[0] != self.white_level:
             raise ValueError(
-                f"knots: found {last[0]:g} in the end, but the white level is {self.white_level:g}"
+                f"knots: the last input is {last[0]:g}, but it must be the white level, "
+                f"{self.white_level:g}"
             )
         return self
 
@@ -191,4 +194,6 @@ class Pwl(Linear):
         return np.rint(along_pieces(super().reference(image, given), pieces_of(self._knots)))
 
 
-STAGE = Stage("quantize", "Digitise: signal to DN.", Kind.MOSAIC, Kind.RAW, (Linear, Pwl))
+STAGE = Stage(
+    "quantize", "Digitise with the ADC: signal to DN.", Kind.MOSAIC, Kind.RAW, (Linear, Pwl)
+)

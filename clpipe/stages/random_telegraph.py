@@ -22,17 +22,17 @@ from clpipe.stage import (
     sensor_bits,
 )
 
-WORDS = 1 << 31  # the number of different random words that choose the pixels
+WORDS = 1 << 31  # number of different random words that choose the pixels
 
 
 class TwoLevels(SignalMethod):
     """y + A / 2 or y - A / 2 in a share of the pixels, at random in each frame.
 
-    A trap in a pixel's transistor catches an electron and sets it free again, which moves the
-    pixel's level (Wang et al., "Random telegraph signal in CMOS image sensor pixels", IEDM 2006).
-    Which pixels have one, and the distance A of their levels, stays put for a camera; A has an
-    exponential distribution. So some pixels have more read noise than others, and the read noise of
-    all has longer tails.
+    A trap in a pixel's transistor catches an electron and releases it, which shifts the pixel's
+    level (Wang et al., "Random telegraph signal in CMOS image sensor pixels", IEDM 2006). For a
+    camera, the affected pixels and the distance A of their levels are fixed; A has an exponential
+    distribution. Some pixels therefore have more read noise than others, and the read noise of the
+    sensor has longer tails.
 
     >>> from clpipe.stage import run_reference
     >>> black = np.zeros((400, 400), np.float32)
@@ -43,7 +43,7 @@ class TwoLevels(SignalMethod):
 
     method: ClassVar = "two_levels"
     kernel: ClassVar = "random_telegraph"
-    summary: ClassVar = "let a share of the pixels jump between two levels of their own"
+    summary: ClassVar = "a share of the pixels jumps between two levels"
     example: ClassVar = {"share": 0.05, "amplitude": 0.05}
 
     share: float | None = parameter(
@@ -51,7 +51,7 @@ class TwoLevels(SignalMethod):
     )
     amplitude: float | None = parameter(
         None,
-        "Mean distance of the two levels.",
+        "Mean distance between the two levels.",
         "signal",
         "from the camera and ISO",
         ge=0,
@@ -80,7 +80,7 @@ class TwoLevels(SignalMethod):
 
     @property
     def _chosen(self) -> tuple[np.int32, np.float32]:
-        """The words below which a pixel is chosen, and 1 over their number."""
+        """Return the words below which a pixel is chosen, and 1 over their number."""
         assert self.share is not None
         limit = round(self.share * WORDS)
         return int32(limit), float32(1 / max(limit, 1))
@@ -108,7 +108,7 @@ def levels_of_sensor(height: int, width: int, stream: Stream, share: float) -> F
 
 STAGE = Stage(
     "random_telegraph",
-    "Let some pixels jump between two levels.",
+    "Add random telegraph noise: some pixels jump between two levels.",
     Kind.MOSAIC,
     Kind.MOSAIC,
     (TwoLevels,),

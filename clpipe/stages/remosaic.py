@@ -1,4 +1,4 @@
-"""From cells of several pixels of a colour to a Bayer pattern, as sensors with quad arrays do."""
+"""Remosaicing: from cells of equal filters to a Bayer pattern, like in quad sensors."""
 
 import math
 from dataclasses import replace
@@ -32,11 +32,11 @@ from clpipe.stage import (
 
 
 class Binning(Method):
-    """The mean of each cell of equal filters, as the digital binning of 2x2 or 3x3 pixels.
+    """The mean of each cell of equal filters: digital binning of 2x2 or 3x3 pixels.
 
-    Noise that is there falls as that of a mean of 4 or 9. Between mosaic and sensor_noise it bins
-    charge: noise comes once for each cell. What is left of rows and columns behind the last whole
-    cell is cut off.
+    Noise that is already present decreases like that of a mean of 4 or 9. Between mosaic and
+    sensor_noise, the stage bins charge, and noise is added once per cell. Rows and columns after
+    the last whole cell are cropped.
 
     >>> from clpipe.stage import Context, ReferenceContext
     >>> from clpipe.camera.profile import load_camera
@@ -48,7 +48,7 @@ class Binning(Method):
 
     method: ClassVar = "binning"
     kernel: ClassVar = "remosaic_binning"
-    summary: ClassVar = "the mean of each cell, a half or a third as wide and as high"
+    summary: ClassVar = "mean of each cell, for half or a third of the width and height"
     any_array: ClassVar = True
     only_arrays: ClassVar = ("quad-RGGB", "nona-RGGB")
 
@@ -59,8 +59,8 @@ class Binning(Method):
         factor = next((n for n in (3, 2) if binned(array, n)), None)
         if factor is None:
             raise RequestError(
-                f"remosaic.method=binning: the mosaic is {array.name}; binning is for cells of 2x2 "
-                "or 3x3 equal filters, such as quad-RGGB and nona-RGGB"
+                f"remosaic.method=binning: the mosaic is {array.name}; binning needs cells of "
+                "2x2 or 3x3 equal filters, for example quad-RGGB and nona-RGGB"
             )
         other = self.model_copy()
         other._factor = factor
@@ -94,7 +94,7 @@ class Binning(Method):
 
 
 def binned(array: FilterArray, factor: int) -> FilterArray | None:
-    """The array of an array's cells of so many equal filters; None where it has no such cells.
+    """Return the array after binning cells of equal filters; None if it has no such cells.
 
     >>> binned(parse_array("quad-RGGB"), 2).rows, binned(parse_array("x-trans"), 2)
     (('RG', 'GB'), None)
@@ -110,17 +110,17 @@ def binned(array: FilterArray, factor: int) -> FilterArray | None:
 
 
 class LinearMmse(Method):
-    """The pattern's own samples where the array has them, else linear filters of 7x7.
+    """Samples that match the Bayer pattern are kept, others come from linear 7x7 filters.
 
-    They are those of ``demosaic.method=linear_mmse``: white-balanced mosaics go in.
+    The filters are those of ``demosaic.method=linear_mmse``, so the mosaic must be white-balanced.
     """
 
     method: ClassVar = "linear_mmse"
     kernel: ClassVar = "remosaic_linear_mmse"
-    summary: ClassVar = "a Bayer pattern of full size, by linear filters of 7x7"
+    summary: ClassVar = "a Bayer pattern of full size, by linear 7x7 filters"
     any_array: ClassVar = True
 
-    pattern: Pattern = parameter("RGGB", "The pattern that is made.", structural=True)
+    pattern: Pattern = parameter("RGGB", "Bayer pattern of the result.", structural=True)
 
     def next_context(self, context: Context) -> Context:
         return context.but(array=None, pattern=self.pattern)
@@ -140,7 +140,7 @@ class LinearMmse(Method):
 
 @lru_cache(maxsize=16)
 def weights_of(array: FilterArray, pattern: Pattern) -> Floats:
-    """At each place of the common period, the filter of the colour there: (row, column, tap)."""
+    """Return the filter at each position of the common period: (row, column, tap)."""
     wanted = parse_array(pattern)
     rows, columns = (math.lcm(a, b) for a, b in zip(array.period, wanted.period, strict=True))
     made = filters(array)
@@ -150,15 +150,15 @@ def weights_of(array: FilterArray, pattern: Pattern) -> Floats:
     return np.ascontiguousarray(chosen[..., 0])
 
 
-@lru_cache(maxsize=16)  # one object for the same array, so that it is uploaded once
+@lru_cache(maxsize=16)  # the same object for the same array, so that it is uploaded once
 def table_of(array: FilterArray, pattern: Pattern) -> Floats:
-    """The same as kernels load it: (row, tap, column)."""
+    """Return :func:`weights_of` in the layout of kernels: (row, tap, column)."""
     return kernel_table(weights_of(array, pattern).transpose(0, 2, 1))
 
 
 STAGE = Stage(
     "remosaic",
-    "Make a Bayer pattern of an array of larger cells, as sensors with quad arrays do.",
+    "Convert a quad or other filter array to a Bayer pattern.",
     Kind.MOSAIC,
     Kind.MOSAIC,
     (Binning, LinearMmse),

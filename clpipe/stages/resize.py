@@ -9,17 +9,19 @@ from clpipe.stage import Kind, Method, Pass, ReferenceContext, Resample, Stage, 
 
 
 class Filter(Method):
-    """A weighted mean of the pixels around: of rows, then of columns.
+    """A weighted mean of surrounding pixels, first of rows, then of columns.
 
     WIDTH x HEIGHT becomes round(WIDTH * scale) x round(HEIGHT * scale), at least 1 pixel each. Each
-    side is scaled by what it became, so the field of view stays as it is, to the edges.
+    side is scaled by the ratio of its rounded sizes, so the field of view does not change.
     """
 
     kernel: ClassVar = "resize"
     example: ClassVar = {"scale": 0.4}
     filter: ClassVar[tuple[Weight, float]]  # weight and support, see Resampling
 
-    scale: float = parameter(1.0, "New width over old width, and of heights.", ge=1 / 8, le=1)
+    scale: float = parameter(
+        1.0, "New width over old width; the height is scaled likewise.", ge=1 / 8, le=1
+    )
 
     def passes(self) -> tuple[Pass, ...]:
         if self.scale == 1:
@@ -50,7 +52,7 @@ class Filter(Method):
 
 
 class Area(Filter):
-    """Mean over the area of the new pixel, with parts of pixels at its edges.
+    """Mean over the area of the new pixel, including fractions of pixels at its edges.
 
     >>> import numpy as np
     >>> from clpipe.stage import run_reference
@@ -65,9 +67,9 @@ class Area(Filter):
 
 
 class Lanczos3(Filter):
-    """The sinc windowed by a wider sinc, three lobes to either side: sharper than the mean.
+    """The sinc windowed by a wider sinc, three lobes on each side: sharper than the mean.
 
-    It rings beside edges, also below 0 and above 1. What would lie outside the image has no weight.
+    It rings next to edges, also below 0 and above 1. Samples outside the image have no weight.
     """
 
     method: ClassVar = "lanczos3"
@@ -78,7 +80,7 @@ class Lanczos3(Filter):
 
 STAGE = Stage(
     "resize",
-    "Make the picture smaller, as for a camera's small JPEG.",
+    "Reduce the image size.",
     Kind.RGB,
     Kind.RGB,
     (Area, Lanczos3),

@@ -13,11 +13,11 @@ from clpipe.stages.white_balance.gains import CameraGains, gain_parameter
 class Brooks2019(CameraGains):
     """Red and blue of nearly white pixels, raised so that dividing by the gains leaves them white.
 
-    Where a photograph is white, all three colours of the sensor are clipped; dividing red and blue
-    by their gains would tint it. So each is multiplied by max(m*gain + 1 - m, 1), with
-    m = (max(grey - 0.9, 0) / 0.1)^2, at most 1, and grey the mean of the colours;
-    ``inverse_white_balance`` divides later (Brooks et al., "Unprocessing images for learned raw
-    denoising", CVPR 2019, sec. 3.3).
+    Where a photograph is white, all three colours of the sensor are clipped, and dividing red and
+    blue by their gains would tint it. Each colour is therefore multiplied by ``max(m*gain + 1 - m,
+    1)``, with ``m = (max(grey - 0.9, 0) / 0.1)^2``, at most 1. In it, grey is the mean of the
+    colours. ``inverse_white_balance`` divides later. The method is that of Brooks et al.,
+    "Unprocessing images for learned raw denoising", CVPR 2019, sec. 3.3.
 
     >>> from clpipe.stage import run_reference
     >>> image = np.float32([[[1, 1, 1], [0.5, 0.5, 0.5]]])
@@ -29,8 +29,8 @@ class Brooks2019(CameraGains):
     kernel: ClassVar = "restore_highlights"
     summary: ClassVar = "raise red and blue of nearly white pixels by the gains"
 
-    red_gain: float | None = gain_parameter("red", auto="as inverse_white_balance uses it")
-    blue_gain: float | None = gain_parameter("blue", auto="as inverse_white_balance uses it")
+    red_gain: float | None = gain_parameter("red", auto="the gain of inverse_white_balance")
+    blue_gain: float | None = gain_parameter("blue", auto="the gain of inverse_white_balance")
 
     def resolve(self, context: Context) -> CameraGains:
         red, blue = context.gains_of_light
@@ -58,7 +58,7 @@ class Brooks2019(CameraGains):
 
 STAGE = Stage(
     "restore_highlights",
-    "Give the highlights of a photograph the red and blue that clipping took.",
+    "Restore red and blue in the clipped highlights of a photograph.",
     Kind.RGB,
     Kind.RGB,
     (Brooks2019,),

@@ -1,4 +1,4 @@
-"""Row noise: offsets that all pixels of a row share, from the readout of that row."""
+"""Row noise: an offset that all pixels of a row share, from the readout of that row."""
 
 from typing import ClassVar
 
@@ -20,7 +20,7 @@ from clpipe.stage import (
 
 
 class LineNoise(GaussianNoise):
-    """One Gaussian offset for each row or each column. A subclass says which, and whose it is."""
+    """One Gaussian offset for each row or each column; subclasses choose which, and its scope."""
 
     kernel: ClassVar = "line_noise"
     axis: ClassVar[Axis]

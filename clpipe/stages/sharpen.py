@@ -1,4 +1,4 @@
-"""Sharpening, as cameras do it: an unsharp mask on luma."""
+"""Sharpening, like in cameras: an unsharp mask on luma."""
 
 from functools import lru_cache
 from typing import ClassVar, Self
@@ -30,25 +30,25 @@ from clpipe.stages.denoise.strength import (
     predicted_noise,
 )
 
-# Found by trying, with the denoising of the default chain, against the noise of real cameras'
-# pictures: the amount without noise; what is added where denoising softens most; and the luma
-# noise, in roots of the signal, at which that is.
+# Found by experiment, with the denoising of the default chain, against the noise of real cameras'
+# images. These are the amount without noise, the amount that is added where denoising softens most,
+# and the luma noise of that maximum, in roots of the signal.
 LEAST_AMOUNT, MORE_AMOUNT, SOFTEST = 0.2, 0.55, 0.009
-THRESHOLD = 0.2  # of the luma noise; without one, small noise is sharpened and large is not
+THRESHOLD = 0.2  # of the luma noise; without it, small noise is sharpened and large noise is not
 LEAST_LIMIT = 0.008  # without noise; two levels of 255
 
 
 def blur_step(radius: float) -> int:
-    """The distance of the pixels that a blur looks at: every second one is enough for wide ones."""
+    """Return the step between the pixels of a blur: wide blurs use every second one."""
     return 1 if radius < 2 else 2
 
 
 @traceable
 @lru_cache(maxsize=64)
 def blur_weights(radius: float) -> Floats:
-    """The weights of a Gaussian blur 0, 1, 2... steps away, to twice the radius, rounded.
+    """Return the weights of a Gaussian blur 0, 1, 2... steps away, to twice the radius, rounded.
 
-    Their sum over both sides is 1. Cached, so that they are uploaded once.
+    Both sides together sum to 1. Cached, so that they are uploaded once.
 
     >>> blur_weights(0.5).round(2).tolist(), len(blur_weights(2.2))
     ([0.7900000214576721, 0.10999999940395355], 3)
@@ -60,23 +60,23 @@ def blur_weights(radius: float) -> Floats:
 
 
 class Unsharp(Method):
-    """Unsharp mask on the root of luma: what a Gaussian blur takes away is added once more.
+    """Unsharp mask on the root of luma: the difference from a Gaussian blur is added again.
 
-    All three colours are scaled alike, so hues stay. The default amount follows the noise, as the
-    denoising does that softens the picture: most at middle ISOs; less where there is little noise
-    and so little softened, and where noise would be sharpened.
+    All three colours are scaled equally, so hues do not change. The default amount follows the
+    noise, like the denoising that softens the image. It is largest at middle ISOs. It is smaller if
+    there is little noise and so little softening, and where noise would be sharpened.
     """
 
     method: ClassVar = "unsharp"
     kernel: ClassVar = "sharpen"
-    summary: ClassVar = "unsharp mask on luma, with a limit to halos"
+    summary: ClassVar = "unsharp mask on luma, with a limit for halos"
     tolerance: ClassVar = 1e-4  # the kernel's root is a short iteration
     example: ClassVar = {"amount": 0.8, "threshold": 0.002, "limit": 0.03}
 
     radius: float = parameter(1.2, "Sigma of the blur.", "px", structural=True, ge=0.3, le=8)
     amount: float | None = parameter(
         None,
-        "How much of the difference from the blurred picture is added; 0 is off.",
+        "Share of the difference from the blurred image that is added; 0 disables it.",
         "",
         "0.2 to 0.75, from the noise",
         ge=0,
@@ -84,7 +84,7 @@ class Unsharp(Method):
     )
     threshold: float | None = parameter(
         None,
-        "Differences up to this are not sharpened.",
+        "Threshold: smaller differences are not sharpened.",
         "root of signal",
         "a fifth of the noise",
         ge=0,
@@ -92,7 +92,7 @@ class Unsharp(Method):
     )
     limit: float | None = parameter(
         None,
-        "The largest change of the root of luma, which bounds halos.",
+        "Largest change of the root of luma, which limits halos.",
         "root of signal",
         "0.008 plus the noise",
         ge=0,
@@ -173,7 +173,7 @@ class NoSharpening(Unchanged):
 
 STAGE = Stage(
     "sharpen",
-    "Sharpen luma, as cameras do.",
+    "Sharpen luma, like a camera.",
     Kind.RGB,
     Kind.RGB,
     (Unsharp, NoSharpening),

@@ -1,4 +1,4 @@
-"""When each row of the sensor sees the scene: a rolling shutter, and lamps that flicker."""
+"""The exposure of each row of the sensor: a rolling shutter, and flickering lamps."""
 
 from dataclasses import replace
 from typing import Any, ClassVar, Self
@@ -32,12 +32,13 @@ def _sinc(x: float) -> float:
 class Rows(Method):
     """Row y is exposed from y * line_time on, for exposure_time.
 
-    Further exposures of a sensor that staggers them follow in each row, one behind the other.
+    On a sensor with staggered exposures, each row's further exposures follow one after the other.
 
-    Light that flickers as 1 + depth cos(2 pi f t + phase) comes, averaged over a row's exposure T,
-    as 1 + depth sinc(f T) cos(2 pi f (y line_time + T / 2) + phase). With a duty it is pulsed, as
-    an LED's: 1 - depth, and depth / duty more while the fraction of f t + phase / 2 pi is below
-    the duty; a row gets the share of its exposure in which it is on. Both have the mean 1.
+    Light may flicker as ``1 + depth cos(2 pi f t + phase)``. Averaged over a row's exposure T, it
+    is ``1 + depth sinc(f T) cos(2 pi f (y line_time + T / 2) + phase)``. With a duty, light is
+    pulsed, like an LED. It is 1 - depth, plus depth / duty while the fraction of f t + phase / 2 pi
+    is below the duty. A row then gets the share of its exposure in which the light is on. Both
+    kinds of light have the mean 1.
 
     >>> from clpipe.stage import run_reference
     >>> banded = Rows(exposure_time=1e-3, line_time=1e-3, flicker_depth=0.5, flicker_frequency=250)
@@ -52,7 +53,9 @@ class Rows(Method):
     method: ClassVar = "rows"
     kernel: ClassVar = "shutter"
     overscan: ClassVar = True
-    summary: ClassVar = "rows one after the other, or all at once"
+    summary: ClassVar = (
+        "rows one after the other (rolling shutter), or all at once (global shutter)"
+    )
     tolerance: ClassVar = 1e-5
     example: ClassVar = {"flicker_depth": 0.4, "line_time": 1e-3, "exposure_time": 4e-3}
     other_examples: ClassVar = (
@@ -62,14 +65,14 @@ class Rows(Method):
 
     subframes: int = parameter(
         1,
-        "How many files in a row are one exposure: their mean; rows take of each frame what "
-        "falls into their time.",
+        "Number of consecutive files that make one exposure, their mean. With a rolling "
+        "shutter, each row averages the frames within its own exposure.",
         ge=1,
         le=10_000,
     )
     exposure_time: float | None = parameter(
         None,
-        "How long each row is exposed.",
+        "Exposure time of each row.",
         "s",
         "the camera's, else 0.01",
         optics=True,
@@ -78,41 +81,46 @@ class Rows(Method):
     )
     line_time: float = parameter(
         0.0,
-        "From the start of a row to that of the next; 0 is a global shutter.",
+        "Time from the start of a row to the start of the next; 0 is a global shutter.",
         "s",
         ge=0,
         le=1,
     )
     flicker_depth: float | None = parameter(
         None,
-        "How much the light swings about its mean, or which share of it is pulsed; 0 is steady.",
+        "Amplitude of the flicker relative to the mean, or share of the light that is pulsed; 0 "
+        "is steady.",
         auto="1 with a duty, else 0",
         ge=0,
         le=1,
     )
     flicker_frequency: float = parameter(
-        100.0, "Frequency of the light, of a lamp twice that of the mains.", "Hz", gt=0, le=1e6
+        100.0,
+        "Frequency of the light, which for lamps is twice that of the mains.",
+        "Hz",
+        gt=0,
+        le=1e6,
     )
     flicker_phase: float = parameter(
         0.0,
-        "Phase of the light when the first row's exposure starts; a pulse begins at 0.",
+        "Phase of the light when the exposure of the first row starts; a pulse begins at 0.",
         "degrees",
         ge=-360,
         le=360,
     )
     flicker_duty: float = parameter(
         0.0,
-        "The share of a period in which a pulsed light, as an LED, is on; 0 swings as a cosine.",
+        "Share of a period in which a pulsed light, like an LED, is on; 0 flickers as a cosine.",
         ge=0,
         le=1,
     )
     flicker_layer: str = parameter(
         "",
-        "The layer of the render that has the flickering light alone; without one, all flickers.",
+        "Layer of the render with only the flickering light; without one, all light flickers.",
     )
 
-    _span: Span = PrivateAttr(Span())  # of the exposure that it is for
-    _end: float = PrivateAttr(1.0)  # of the last one, in exposures of the first
+    _span: Span = PrivateAttr(Span())  # of this exposure
+    _end: float = PrivateAttr(1.0)  # of the last exposure, in exposures of the first
 
     def resolve(self, context: Context) -> Self:
         known = self.with_optics(context).with_defaults(exposure_time=USUAL_TIME)
@@ -123,21 +131,21 @@ class Rows(Method):
 
     @property
     def depth(self) -> float:
-        """How much the light swings, or which share of it is pulsed."""
+        """Amplitude of the flicker, or share of the light that is pulsed."""
         usual = 1.0 if self.flicker_duty else 0.0
         return usual if self.flicker_depth is None else self.flicker_depth
 
     @property
     def layer_of_light(self) -> str:
-        """The layer of the image's file of which it must have the light; "" is none."""
+        """The layer with the flickering light that the image's file must contain, or ""."""
         return self.flicker_layer if self.depth else ""
 
     def during(self, spans: tuple[Span, ...], number: int) -> Self:
-        """The method for one of several exposures.
+        """Return the method for one of several exposures.
 
         Args:
-            spans: of all of them.
-            number: of the one.
+            spans: those of all exposures.
+            number: the number of this exposure.
         """
         other = self.model_copy()
         other._span, other._end = spans[number], spans[-1].end
@@ -149,26 +157,26 @@ class Rows(Method):
 
     @property
     def time(self) -> float:
-        """How long each row is exposed, s."""
+        """Exposure time of each row, s."""
         return self._longest * self._span.length
 
     def times(self, rows: int) -> Doubles:
-        """When the exposure of each row starts, in s: (row,)."""
+        """Return when the exposure of each row starts, in s: (row,)."""
         start = self._longest * self._span.start
         return np.arange(rows, dtype=np.float64) * self.line_time + start
 
     def duration(self, rows: int) -> float:
-        """From the start of the first row's exposure to the end of the last row's last one, s."""
+        """Return the time from the start of the first row to the end of the last row, s."""
         return (rows - 1) * self.line_time + self._longest * self._end
 
     def weights(self, frames: int, rows: int, lit: bool = False) -> Doubles:
-        """The share of each row's exposure that falls to each of some frames: (frame, row).
+        """Return the share of each row's exposure in each of the frames: (frame, row).
 
         The frames follow each other without a gap, over all of :meth:`duration`.
 
         Args:
-            frames, rows: how many there are.
-            lit: of the light that flickers, over its mean; shares then need not add up to 1.
+            frames, rows: their numbers.
+            lit: weight by the flickering light over its mean; shares need not add up to 1 then.
         """
         starts = self.times(rows)
         bounds = np.linspace(0, self.duration(rows), frames + 1)[:, None]
@@ -177,7 +185,7 @@ class Rows(Method):
         return np.asarray(shares / self.time)
 
     def _light_until(self, time: Doubles) -> Doubles:
-        """The light that there was until some times, over its mean, s."""
+        """Return the integral of the light, over its mean, until some times, s."""
         cycles = self.flicker_frequency * time + self.flicker_phase / 360
         if not self.flicker_duty:
             light = self.depth * np.sin(2 * np.pi * cycles) / (2 * np.pi)
@@ -188,18 +196,18 @@ class Rows(Method):
 
     @property
     def cycles(self) -> float:
-        """Periods of the light while a row is exposed."""
+        """Periods of the light during a row's exposure."""
         return self.flicker_frequency * self.time
 
     @property
     def swing(self) -> float:
-        """The flicker that is left after a row's exposure has averaged it."""
+        """The amplitude of the flicker after averaging over a row's exposure."""
         if not self.flicker_duty:
             return self.depth * _sinc(self.cycles)
         return self.depth * (1 - self.flicker_duty) * (self.cycles % 1) / self.cycles
 
     def passes(self) -> tuple[Pass, ...]:
-        if not self.swing or self.layer_of_light:  # which was done as the file was read
+        if not self.swing or self.layer_of_light:  # which was applied when the file was read
             return ()
         table = Pass(
             "flicker_of_rows", LineTable("rows"), ("step", "start", "swing"), writes="rows"
@@ -212,7 +220,7 @@ class Rows(Method):
     def arguments(self, context: Context) -> Arguments:
         step = self.flicker_frequency * self.line_time % 1
         start = self.flicker_frequency * self._longest * self._span.start
-        start += self.flicker_phase / 360 - self.margins.top * step  # the picture's first row
+        start += self.flicker_phase / 360 - self.margins.top * step  # the image's first row
         if not self.flicker_duty:
             middle = float32((start + self.cycles / 2) % 1)
             return {"step": float32(step), "start": middle, "swing": float32(self.swing)}
@@ -244,7 +252,7 @@ class Rows(Method):
 
 
 def _turn(cycles: float) -> np.uint32:
-    """What is left of whole periods, in 2^-32 of one: its sums stay exact.
+    """Return the fraction of a period, in units of 2^-32: its sums stay exact.
 
     >>> int(_turn(-2.75)) == 2**30
     True
@@ -254,7 +262,7 @@ def _turn(cycles: float) -> np.uint32:
 
 STAGE = Stage(
     "shutter",
-    "Expose rows one after the other, under lamps that flicker.",
+    "Expose with a rolling shutter and flickering light.",
     Kind.RGB,
     Kind.RGB,
     (Rows,),

@@ -34,13 +34,15 @@ class NoVignetting(Unchanged):
     """No vignetting."""
 
     method: ClassVar = "none"
-    summary: ClassVar = "the corners are as bright as the middle"
+    summary: ClassVar = "no vignetting"
 
 
 class VignettingOfLens(FromLens):
     """Vignetting of the lens that ``--lens`` names, at the camera's f-number."""
 
-    summary: ClassVar = "that of the lens which --lens names, at --aperture; none without these"
+    summary: ClassVar = (
+        "vignetting of the lens that --lens names, at --aperture; none without these"
+    )
 
     def of_lens(self, lens: LensCalibration | None) -> Method:
         if lens is None or not lens.vignetting:
@@ -50,10 +52,10 @@ class VignettingOfLens(FromLens):
 
 
 class Pa(Method):
-    """v * (1 + k1 r^2 + k2 r^4 + k3 r^6), r = 1 at the last pixel of a corner: lensfun's pa.
+    """v * (1 + k1 r^2 + k2 r^4 + k3 r^6), with r = 1 at the corner pixel: lensfun's pa.
 
-    These are what lensfun's calibrations describe, the lens itself, so k1 is mostly below 0;
-    lensfun divides by it, to take it away. No light is below 0.
+    The coefficients describe the lens itself, like lensfun's calibrations, so k1 is usually
+    negative. lensfun divides by this factor to correct an image. Light is never below 0.
 
     >>> from clpipe.stage import run_reference
     >>> row = run_reference(Pa(k1=-0.5), np.ones((3, 3, 3), np.float32))[1, :, 0]
@@ -63,12 +65,12 @@ class Pa(Method):
 
     method: ClassVar = "pa"
     kernel: ClassVar = "vignetting"
-    summary: ClassVar = "lensfun's: 1 + k1 r^2 + k2 r^4 + k3 r^6"
+    summary: ClassVar = "lensfun's pa: 1 + k1 r^2 + k2 r^4 + k3 r^6"
     example: ClassVar = {"k1": -0.5, "k2": 0.1, "k3": -0.2}
 
-    k1: Coefficient = parameter(0.0, "Of r^2; below 0, the corners are darker.")
-    k2: Coefficient = parameter(0.0, "Of r^4.")
-    k3: Coefficient = parameter(0.0, "Of r^6.")
+    k1: Coefficient = parameter(0.0, "Coefficient of r^2; below 0, the corners are darker.")
+    k2: Coefficient = parameter(0.0, "Coefficient of r^4.")
+    k3: Coefficient = parameter(0.0, "Coefficient of r^6.")
 
     def passes(self) -> tuple[Pass, ...]:
         if self.k1 == self.k2 == self.k3 == 0:
@@ -91,8 +93,9 @@ class Pa(Method):
 class CosineFourth(InFocalLengths, AboutAxis):
     """v * cos^4 of the angle to the optical axis, which passes through the principal point.
 
-    What falls on a sensor behind a lens without vignetting of its own, cos^4 = 1 / (1 + r^2)^2 with
-    r in focal lengths (Reiss, "The cos^4 law of illumination", J. Opt. Soc. Am. 1945).
+    This is the illumination of a sensor by a lens without vignetting of its own. With r in focal
+    lengths, cos^4 is 1 / (1 + r^2)^2 (Reiss, "The cos^4 law of illumination", J. Opt. Soc. Am.
+    1945).
 
     >>> from clpipe.stage import run_reference
     >>> white = np.ones((1, 5, 3), np.float32)
@@ -110,7 +113,7 @@ class CosineFourth(InFocalLengths, AboutAxis):
     )
 
     def resolve(self, context: Context) -> Self:
-        """The method with the camera's focal length and principal point.
+        """Return the method with the camera's focal length and principal point.
 
         Raises:
             RequestError: the focal length is not known.
@@ -129,7 +132,7 @@ class CosineFourth(InFocalLengths, AboutAxis):
         return {"extent": CompileTime("e"), **places, "per_px": per_px, "per_side": per_side}
 
     def _units(self) -> tuple[np.float32, np.float32]:
-        """1 over the squared focal length in px, or in longer sides; the other is 0."""
+        """Return 1 over the squared focal length in px, or in longer sides; the other one is 0."""
         if self.fx:
             return float32(self.fx**-2), float32(0)
         assert self.focal_length and self.sensor_width
@@ -144,7 +147,7 @@ class CosineFourth(InFocalLengths, AboutAxis):
 
 
 def _squared_radius(image: Floats, cx: float | None = None, cy: float | None = None) -> Floats:
-    """The squared distance of each pixel to a place, in px; None is the middle of the image."""
+    """Return the squared distance of each pixel to a point, in px; None is the image centre."""
     height, width = image.shape[:2]
     places = (width, width / 2 if cx is None else cx), (height, height / 2 if cy is None else cy)
     dx, dy = (np.arange(n, dtype=np.float32) + np.float32(0.5) - np.float32(c) for n, c in places)
@@ -152,7 +155,7 @@ def _squared_radius(image: Floats, cx: float | None = None, cy: float | None = N
 
 
 def _place(centre: float | None, side: str) -> Argument:
-    """A coordinate of the principal point; None is the middle, which a kernel knows."""
+    """Return a coordinate of the principal point; None is the centre, which a kernel computes."""
     return CompileTime(f"0.5f * (float)e.{side}") if centre is None else float32(centre)
 
 
@@ -163,7 +166,7 @@ def _reciprocal(x: Floats) -> Floats:
 
 STAGE = Stage(
     "vignetting",
-    "Darken the corners as a lens does.",
+    "Darken the corners of the image, like a lens.",
     Kind.RGB,
     Kind.RGB,
     (VignettingOfLens, NoVignetting, Pa, CosineFourth),

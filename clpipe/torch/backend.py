@@ -1,7 +1,7 @@
 """The backend of :class:`clpipe.stage.SignalMethod` for PyTorch: a batch of samples at a time.
 
-Its functions do what NumPy's do, with the same operations in the same order, so bits are equal.
-What is fixed to a sensor comes from NumPy, once for each camera and size.
+Its functions perform the same operations as NumPy's, in the same order, so results are bit for bit
+equal. Patterns that are fixed to a sensor come from NumPy, once per camera and size.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,11 +22,11 @@ from clpipe.torch import numbers
 from clpipe.torch.numbers import Streams, f32
 from clpipe.torch.poisson import poisson_of
 
-MOST_MAPS = 256  # of sensors that are kept, of some MB each at most
+MOST_MAPS = 256  # of sensors that are cached, with some MB each at most
 
 
 def tapped(y: Tensor, dx: int, dy: int) -> Tensor:
-    """As :func:`clpipe.reference.image.tap`."""
+    """The counterpart of :func:`clpipe.reference.image.tap`."""
     if dx:
         columns = mirror(np.arange(y.shape[2]) + dx, y.shape[2])
         y = y[:, :, torch.from_numpy(columns).to(y.device)]
@@ -37,7 +37,7 @@ def tapped(y: Tensor, dx: int, dy: int) -> Tensor:
 
 
 def tukey_lambda_of(words: Tensor, shape: Tensor, scale: Tensor) -> Tensor:
-    """As :func:`clpipe.reference.tukey_lambda.tukey_lambda_of`."""
+    """The counterpart of :func:`clpipe.reference.tukey_lambda.tukey_lambda_of`."""
     p = numbers.tail_probability(words)
     low, high = (numbers.exponential_minus_1(numbers.negative_log(q) * -shape) for q in (p, 1 - p))
     z = (high - low) * scale
@@ -45,7 +45,7 @@ def tukey_lambda_of(words: Tensor, shape: Tensor, scale: Tensor) -> Tensor:
 
 
 class Photons(torch.autograd.Function):
-    """Poisson numbers; their derivative is taken as that of their mean."""
+    """Poisson numbers, with the derivative of their mean."""
 
     @staticmethod
     def forward(ctx: Any, mean: Tensor, words: Tensor) -> Tensor:
@@ -57,8 +57,9 @@ class Photons(torch.autograd.Function):
 
 
 class Rounded(torch.autograd.Function):
-    """Whole numbers, ties to even; the derivative is that of the number before (straight through:
-    Bengio et al., "Estimating or propagating gradients through stochastic neurons", 2013).
+    """Rounding to whole numbers, ties to even, with a straight-through derivative.
+
+    See Bengio et al., "Estimating or propagating gradients through stochastic neurons", 2013.
     """
 
     @staticmethod
@@ -72,7 +73,7 @@ class Rounded(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class TorchBackend(Backend):
-    """The backend of a batch: samples that have one method.
+    """The backend of a batch of samples with the same method.
 
     Args:
         steps: the step of each sample with the method.

@@ -1,9 +1,9 @@
-"""Random numbers and short polynomials on tensors, bit for bit as :mod:`clpipe.reference` has them.
+"""Random numbers and short polynomials on tensors, bit for bit equal to :mod:`clpipe.reference`.
 
-A tensor has no unsigned words of 32 bits that can be multiplied, so words are in ``int64``, where
-the product of two has its low 64 bits. Images are (sample, height, width), and each sample has a
-key of its own. All functions but :func:`square_root` and :func:`inverse_root` are of numbers that
-do not depend on an image, so nothing is differentiated through them.
+PyTorch cannot multiply unsigned 32-bit words, so words are stored in ``int64``, where a product
+keeps its low 64 bits. Images are (sample, height, width), and each sample has its own key. Apart
+from :func:`square_root` and :func:`inverse_root`, the arguments of all functions do not depend on
+an image, so they have no derivatives.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ Words: TypeAlias = Tensor | int
 
 @dataclass(frozen=True)
 class Streams:
-    """What :class:`clpipe.reference.random.Stream` is for one image, for each sample.
+    """The counterpart of :class:`clpipe.reference.random.Stream`, for each sample.
 
     Args:
         keys: (2, sample), int64 from 0 to 2^32 - 1.
@@ -36,12 +36,12 @@ class Streams:
 
 
 def f32(value: float | np.float32) -> float:
-    """A number of float32 as Python's, so that an operation on a tensor rounds it no further."""
+    """Convert a float32 to a Python number, so that an operation on a tensor does not round it."""
     return float(np.float32(value))
 
 
 def estrin(coefficients: Any, x: Tensor) -> Tensor:
-    """As :func:`clpipe.reference.math.estrin`."""
+    """The counterpart of :func:`clpipe.reference.math.estrin`."""
     own = [float(c) for c in coefficients]
     x2 = x * x
     x4 = x2 * x2
@@ -59,7 +59,7 @@ def estrin(coefficients: Any, x: Tensor) -> Tensor:
 
 
 def negative_log(t: Tensor) -> Tensor:
-    """As :func:`clpipe.reference.math.negative_log`."""
+    """The counterpart of :func:`clpipe.reference.math.negative_log`."""
     bits = t.view(torch.int32)
     exponent = (bits - 0x3F3504F3) >> 23
     y = (bits - (exponent << 23)).view(torch.float32).sub_(1)
@@ -68,13 +68,13 @@ def negative_log(t: Tensor) -> Tensor:
 
 
 def exponential_minus_1(x: Tensor) -> Tensor:
-    """As :func:`clpipe.reference.math.exponential_minus_1`."""
+    """The counterpart of :func:`clpipe.reference.math.exponential_minus_1`."""
     s, e = _power_of_two(x * f32(1.442695))
     return s * e + (s - 1)
 
 
 def exponential(x: Tensor) -> Tensor:
-    """As :func:`clpipe.reference.math.exponential`."""
+    """The counterpart of :func:`clpipe.reference.math.exponential`."""
     s, e = _power_of_two(x * f32(1.442695))
     return s + s * e
 
@@ -87,11 +87,11 @@ def _power_of_two(x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def raw_inverse_root(x: Tensor) -> Tensor:
-    """As :func:`clpipe.reference.math.inverse_root`, without a derivative."""
+    """The counterpart of :func:`clpipe.reference.math.inverse_root`, without a derivative."""
     half = x * 0.5
     r = (0x5F375A86 - (x.view(torch.int32) >> 1)).view(torch.float32)
     for _ in range(2):
-        # (half * r) * r, in the order in which the reference multiplies
+        # (half * r) * r, in the same order as in the reference
         r = r * (half * r).mul_(r).neg_().add_(1.5)
     return r
 
@@ -110,41 +110,42 @@ class _InverseRoot(torch.autograd.Function):
 
 
 def inverse_root(x: Tensor) -> Tensor:
-    """As :func:`clpipe.reference.math.inverse_root`, with its derivative."""
+    """The counterpart of :func:`clpipe.reference.math.inverse_root`, with its derivative."""
     result: Tensor = _InverseRoot.apply(x)
     return result
 
 
 def square_root(x: Tensor) -> Tensor:
-    """As :func:`clpipe.reference.math.square_root`; at 0 its derivative is finite."""
+    """The counterpart of :func:`clpipe.reference.math.square_root`, with a finite derivative."""
     return x * inverse_root(x)
 
 
 def _round(word: Words, factor: int, other: Words, key: Tensor) -> tuple[Words, Words]:
-    """One half of a round of Philox: the upper and the lower word of a product, the upper mixed."""
+    """Return half a round of Philox: the upper and lower word of a product, the upper mixed."""
     product = word * factor
     if isinstance(product, int):
         return (key ^ (product >> 32) ^ other), product & WORD
     low = product & WORD
     if not isinstance(other, int) and other.shape != product.shape:
         return (product >> 32 ^ other ^ key) & WORD, low
-    high = product.bitwise_right_shift_(32).bitwise_xor_(other)  # in place: memory is what it costs
+    # in place: it is limited by memory bandwidth
+    high = product.bitwise_right_shift_(32).bitwise_xor_(other)
     if key.dim() and key.numel() > 1 and len(high) == 1:
         return (high ^ key).bitwise_and_(WORD), low
     return high.bitwise_xor_(key).bitwise_and_(WORD), low
 
 
 def philox(c0: Words, c1: Words, draw: int, streams: Streams) -> tuple[Tensor, ...]:
-    """As :func:`clpipe.reference.random.philox`, with the stage as last counter: four words.
+    """The counterpart of :func:`clpipe.reference.random.philox`: four words.
 
     Args:
-        c0: the first counter, (1, height, width) or what is broadcast to it; int64.
-        c1: the second one, likewise, or a number.
-        draw: the third one.
-        streams: keys and stage.
+        c0: the first counter, int64, (1, height, width) or a shape that is broadcast to it.
+        c1: the second counter, likewise, or a number.
+        draw: the third counter.
+        streams: keys and stage; the stage is the last counter.
 
     Returns:
-        int32 of (sample, height, width), with the bits of the words.
+        Return int32 of (sample, height, width), with the bits of the words.
     """
     key0, key1 = streams.keys[:, :, None, None]
     w0, w1, w2, w3 = c0, c1, draw, streams.stage  # they grow to full size in the second round
@@ -158,12 +159,12 @@ def philox(c0: Words, c1: Words, draw: int, streams: Streams) -> tuple[Tensor, .
 
 
 def tail_probability(words: Tensor) -> Tensor:
-    """As :func:`clpipe.reference.random.tail_probability`."""
+    """The counterpart of :func:`clpipe.reference.random.tail_probability`."""
     return (words & LOW).float().add_(0.5).mul_(f32(2.3283064e-10))
 
 
 def normal_of(words: Tensor) -> Tensor:
-    """As :func:`clpipe.reference.random.normal_of`."""
+    """The counterpart of :func:`clpipe.reference.random.normal_of`."""
     p = tail_probability(words)
     w = negative_log(p * 4 * (1 - p))
     s = (w := w.clamp_(min=0)) * raw_inverse_root(w) - 2.25
@@ -172,7 +173,7 @@ def normal_of(words: Tensor) -> Tensor:
 
 
 def normals_of(distance: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """As :func:`clpipe.reference.random.normals_of`."""
+    """The counterpart of :func:`clpipe.reference.random.normals_of`."""
     u = (distance & LOW).float().add_(0.5).mul_(f32(4.6566129e-10))
     squared = negative_log(u).clamp_(min=0)
     radius = raw_inverse_root(squared).mul_(squared)
@@ -190,30 +191,30 @@ def normals_of(distance: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def words_at(height: int, width: int, draw: int, streams: Streams) -> tuple[Tensor, ...]:
-    """As :func:`clpipe.reference.random.words_at`: (sample, quarter of height, width)."""
+    """The counterpart of :func:`clpipe.reference.random.words_at`: (sample, height / 4, width)."""
     on = streams.keys.device
     quarter = torch.arange((height + 3) // 4, device=on)[None, :, None]
     return philox(torch.arange(width, device=on)[None, None], quarter, draw, streams)
 
 
 def _rows(of_four: tuple[Tensor, ...], height: int) -> Tensor:
-    """Four tensors of every fourth row each, as one of all rows."""
+    """Interleave four tensors of every fourth row each into one of all rows."""
     together = torch.stack(of_four, 2)
     return together.reshape(len(together), -1, together.shape[-1])[:, :height]
 
 
 def word_at(height: int, width: int, draw: int, streams: Streams) -> Tensor:
-    """As :func:`clpipe.reference.random.word_at`: (sample, height, width), int32."""
+    """The counterpart of :func:`clpipe.reference.random.word_at`: (sample, height, width)."""
     return _rows(words_at(height, width, draw, streams), height)
 
 
 def normal_at(height: int, width: int, draw: int, streams: Streams) -> Tensor:
-    """As :func:`clpipe.reference.random.normal_at`: (sample, height, width), float32."""
+    """The counterpart of :func:`clpipe.reference.random.normal_at`: (sample, height, width)."""
     word0, word1, word2, word3 = words_at(height, width, draw, streams)
     return _rows((*normals_of(word0, word1), *normals_of(word2, word3)), height)
 
 
 def normal_of_line(count: int, streams: Streams) -> Tensor:
-    """As :func:`clpipe.reference.random.normal_of_line`: (sample, count), float32."""
+    """The counterpart of :func:`clpipe.reference.random.normal_of_line`: (sample, count)."""
     places = torch.arange(count, device=streams.keys.device)[None, None]
     return normal_of(philox(places, 0, 0, streams)[0])[:, 0]

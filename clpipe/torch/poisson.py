@@ -1,4 +1,4 @@
-"""Poisson numbers on tensors, bit for bit as :mod:`clpipe.reference.poisson` has them."""
+"""Poisson numbers on tensors, bit for bit equal to :mod:`clpipe.reference.poisson`."""
 
 import torch
 from torch import Tensor
@@ -17,10 +17,11 @@ SUMMED = 11  # terms of the CDF below its middle, for a mean of 10
 
 
 def poisson_of(mean: Tensor, words: Tensor) -> Tensor:
-    """As :func:`clpipe.reference.poisson.poisson_of`; without a derivative."""
+    """The counterpart of :func:`clpipe.reference.poisson.poisson_of`, without a derivative."""
     result = _large(mean.clamp(min=float(LARGE)), words)
     small = mean < float(LARGE)
-    result[small] = _small(mean[small], words[small])  # only there: the sum takes most of the time
+    # only there, because the sum takes most of the time
+    result[small] = _small(mean[small], words[small])
     return result
 
 

@@ -1,4 +1,4 @@
-"""Many chains side by side: what each stage needs of each of them, as tensors."""
+"""Many chains in parallel: the values that each stage needs of each of them, as tensors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,19 +17,19 @@ from clpipe.stage.signal import numbers_in
 from clpipe.torch.backend import TorchBackend
 from clpipe.torch.numbers import Streams
 
-AT_ONCE = 1 << 17  # pixels on a CPU, whose cache holds them
+AT_ONCE = 1 << 17  # pixels on a CPU, which fit its cache
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """What is drawn for the samples of a batch.
+    """The drawn values for the samples of a batch.
 
     Args:
-        table: of chains.
-        chains: of each sample, the number of its chain; (sample,).
-        keys: of its noise, (2, sample).
-        places: of its upper left corner on the sensor: row, column.
-        area: height and width of the part of a sensor that the places are in.
+        table: the chains.
+        chains: the number of each sample's chain; (sample,).
+        keys: the keys of the noise, (2, sample).
+        places: row and column of the upper left corner on the sensor.
+        area: height and width of the part of a sensor that contains the places.
     """
 
     table: "Table"
@@ -45,9 +45,9 @@ class Variant:
 
     Args:
         method: the method.
-        steps: of each chain, its step; None where it has another method.
-        sensors: of each chain, the stream of what is fixed to its camera.
-        numbers: the kernel's arguments by name, (chain,); 0 where it has another method.
+        steps: the step of each chain; None if it has another method.
+        sensors: for each chain, the stream of values that are fixed to its camera.
+        numbers: the kernel's arguments by name, (chain,); 0 for chains with another method.
         stage: the stage's number in random streams.
     """
 
@@ -58,7 +58,7 @@ class Variant:
     stage: int
 
     def noisy(self, mosaics: Tensor, drawn: Drawn, samples: NDArray[np.intp]) -> Tensor:
-        """The mosaics of some samples of a batch behind this method; the others as they are."""
+        """Return the mosaics of a batch after this method, which changes those of its chains."""
         chains = drawn.chains[samples]
         has = np.array([self.steps[chain] is not None for chain in chains])
         if not has.any():
@@ -86,7 +86,7 @@ class Table:
     """Chains from a clean mosaic to the noisy one.
 
     Args:
-        chains: of which all have the same steps.
+        chains: the chains, all with the same steps.
 
     Raises:
         RequestError: a method does not run on tensors.
@@ -99,7 +99,7 @@ class Table:
             for position in range(len(chains[0].steps))
             for variant in _variants(chains, position)
         ]
-        # Of each chain, the plane (R, Gr, Gb, B) of each place of the filter array, by rows.
+        # For each chain, the plane (R, Gr, Gb, B) of each site of the filter array, by rows.
         orders = []
         for chain in chains:
             named = sites(chain.context_after.pattern).values()
@@ -108,7 +108,7 @@ class Table:
         self.planes = torch.from_numpy(np.stack(orders))
 
     def noisy(self, mosaics: Tensor, drawn: Drawn) -> Tensor:
-        """Mosaics with noise, (sample, height, width)."""
+        """Return mosaics with noise, (sample, height, width)."""
         at_once = len(mosaics)
         if mosaics.device.type == "cpu":
             at_once = max(1, AT_ONCE // (mosaics.shape[1] * mosaics.shape[2]))
@@ -123,10 +123,10 @@ class Table:
 
 
 def _variants(chains: Sequence[Chain], position: int) -> list[Variant]:
-    """The methods of a step that do something, each with the chains that have it.
+    """Return the methods of a step that are not empty, each with the chains that have it.
 
     Raises:
-        RequestError: one does not run on tensors.
+        RequestError: a method does not run on tensors.
     """
     found: dict[tuple[object, ...], dict[int, Step]] = {}
     for number, chain in enumerate(chains):
@@ -140,8 +140,8 @@ def _variants(chains: Sequence[Chain], position: int) -> list[Variant]:
         method = type(example.method)
         if not issubclass(method, SignalMethod) or not method.on_tensors():
             raise RequestError(
-                f"{example.name}.method={example.method.method}: clpipe.torch has no such method; "
-                "clpipe.RawNoise runs it"
+                f"{example.name}.method={example.method.method} is not available in "
+                "clpipe.torch; use clpipe.RawNoise"
             )
         arguments = {number: numbers_in(step.arguments) for number, step in steps.items()}
         numbers = {

@@ -1,6 +1,7 @@
-// The functions of OpenCL that the kernels call, declared one by one. PoCL 3 goes through a megabyte of
-// declarations before each program, four fifths of its time for one; clpipe/engine/programs.py has it
-// leave them out and defines DECLARED_HERE. Elsewhere the compiler knows them, and this file is empty.
+// The OpenCL functions that the kernels call, declared one by one. PoCL 3 parses a megabyte of
+// declarations before each program, which is four fifths of the time for one.
+// clpipe/engine/programs.py disables them and defines DECLARED_HERE. On other platforms the
+// compiler knows these functions, and this file is empty.
 #ifndef CLPIPE_BUILTINS_H
 #define CLPIPE_BUILTINS_H
 #ifdef DECLARED_HERE

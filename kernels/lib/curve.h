@@ -1,7 +1,7 @@
-// One-dimensional curves as tables. The index is the upper part of the float itself, so entries
-// are spaced evenly in ratio, not in difference: 20 octaves below 1 with CURVE_STEPS each, fine in
-// the shadows where a gamma curve is steep. A value takes the nearest entry. So two curves compose
-// into one table that gives, bit for bit, what two look-ups one after the other give.
+// One-dimensional curves as tables. The index is the upper part of the float itself, so entries are
+// spaced evenly in ratio instead of difference. There are 20 octaves below 1 with CURVE_STEPS each,
+// fine in the shadows where a gamma curve is steep. A value takes the nearest entry. Two curves can
+// therefore be composed to one table that gives the same bits as two look-ups in sequence.
 #ifndef CLPIPE_CURVE_H
 #define CLPIPE_CURVE_H
 

@@ -1,10 +1,11 @@
-// Parts that demosaicing methods share: values by site, and colours from colour differences.
+// Functions that demosaicing methods share: values by site, and colours from colour differences.
 #ifndef CLPIPE_DEMOSAIC_H
 #define CLPIPE_DEMOSAIC_H
 
 // Red and blue at any site, chosen from four values. At red and blue sites, `own` is for the site's
 // own colour and `across` for the other one (blue at red sites, red at blue sites). At green sites,
-// `in_row` is for the colour, red or blue, whose sites are in that row, and `in_column` for the other.
+// `in_row` is for the colour, red or blue, whose sites are in that row, and `in_column` for the
+// other.
 INLINE pair red_and_blue(site at, cfa pattern, vf own, vf in_row, vf in_column, vf across) {
     const vi red_column = in_red_column(at, pattern);
     pair v;
@@ -28,7 +29,7 @@ INLINE pair spread_differences(site at, image known, cfa pattern) {
     return red_and_blue(at, pattern, tap_mosaic(known, 0, 0), in_row, in_column, across);
 }
 
-// RGB from the sensor's sample, R-G and B-G. The sample stays as it is.
+// RGB from the sensor's sample, R-G and B-G. The sample does not change.
 INLINE rgb from_differences(site at, cfa pattern, vf sample, pair differences) {
     const vf red = differences.first, blue = differences.second;
     const vf green = by_site(at, pattern, sample - red, sample, sample - blue);

@@ -1,4 +1,4 @@
-// Interleaved pixels of eight bits, as image files have them.
+// Interleaved pixels of eight bits, the layout of image files.
 #ifndef CLPIPE_DISPLAY_H
 #define CLPIPE_DISPLAY_H
 
@@ -14,7 +14,8 @@ typedef struct { int r[LANES], g[LANES], b[LANES]; } levels;
 #if LANES == 1
 typedef int stored_int;
 #else
-// Volatile, because the compiler would else take each number out of a vector, which is slower.
+// Volatile, because the compiler would otherwise extract each number from a vector, which is
+// slower.
 typedef volatile int stored_int;
 #endif
 INLINE uchar level(const stored_int *number, __global const uchar *table, bool by_table) {
@@ -31,7 +32,7 @@ INLINE void store_levels(const levels *v, __global const uchar *table, bool by_t
     __global uchar *p = dst + 3 * pixel_number(at, e);
 #if LANES > 1
     if (x + LANES <= e.columns) {
-        // Eight bytes at once, because a store for each would take most of the time.
+        // Eight bytes at once, because separate stores would take most of the time.
         typedef uchar8 unaligned_uchar8 __attribute__((aligned(1)));
         __global unaligned_uchar8 *bytes = (__global unaligned_uchar8 *)p;
 #pragma unroll

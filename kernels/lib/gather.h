@@ -1,5 +1,5 @@
-// A channel of an image at places between its pixels, with a filter. Rows and lanes beyond an image or a
-// tile are gathered too; what they read is moved into it.
+// A channel of an image at positions between its pixels, with a filter. Rows and lanes outside an
+// image or a tile are gathered as well; their reads are clamped to it.
 #ifndef CLPIPE_GATHER_H
 #define CLPIPE_GATHER_H
 
@@ -15,7 +15,7 @@ INLINE void weights_of(vf fraction, __global const float *filter, int taps, int 
     }
 }
 
-// The pixel before a place, counted from `line` on, and the fraction beyond it.
+// The pixel before a position, counted from `line` on, and the remaining fraction.
 INLINE vi split(vf way, vi line, vf *fraction) {
     const vi cut = to_int(way);
     const vi whole = to_float(cut) > way ? cut - 1 : cut;
@@ -23,7 +23,7 @@ INLINE vi split(vf way, vi line, vf *fraction) {
     return line + whole;
 }
 
-// Whether a place is within the image, up to the edges of its pixels.
+// Whether a position is within the image, up to the edges of its pixels.
 INLINE vi is_inside(vi pixel, vf fraction, int size) {
     const vi low = (pixel >= 0) | ((pixel == -1) & (fraction >= 0.5f));
     return low & ((pixel < size - 1) | ((pixel == size - 1) & (fraction <= 0.5f)));
@@ -51,8 +51,8 @@ INLINE int greatest_lane(vi v) {
     return MORE(MORE(vq.x, vq.y), MORE(vq.z, vq.w));
 }
 
-// The sum over a window that is one pixel wider and higher than the filter: the taps of each lane begin
-// 0 or 1 after its corner, and all else has the weight 0, which leaves a sum as it is.
+// The sum over a window that is one pixel wider and higher than the filter. The taps of each lane
+// begin 0 or 1 after its corner, and all others have the weight 0, which does not change a sum.
 INLINE vf near_sum(__global const float *corner, uint pitch, vi column, vi row, const vf *of_column,
                    const vf *of_row, int taps) {
     const vf none = (vf)(0.0f);
@@ -72,7 +72,7 @@ INLINE vf near_sum(__global const float *corner, uint pitch, vi column, vi row, 
     return total;
 }
 
-// The weight that the lanes whose taps begin `start` after a window's corner have at a place in it.
+// The weight, at a position in the window, of lanes whose taps begin `start` after its corner.
 INLINE vf weight_at(int place, vi start, const vf *weights, int taps) {
     vf weight = (vf)(0.0f);
 #pragma unroll
@@ -80,7 +80,7 @@ INLINE vf weight_at(int place, vi start, const vf *weights, int taps) {
     return weight;
 }
 
-// The same over a window that is larger than the filter by `wide` and `high`.
+// The sum over a window that is larger than the filter by `wide` and `high`.
 INLINE vf window_sum(__global const float *corner, uint pitch, vi column, vi row, const vf *of_column,
                      const vf *of_row, int taps, int wide, int high) {
     vf columns[6 + FARTHEST], total = (vf)(0.0f);
@@ -120,8 +120,8 @@ INLINE vf bent(site at, __global const float *plane, extent from, vf across, vf 
     weights_of(u, filter, taps, powers, of_column);
     weights_of(v, filter, taps, powers, of_row);
 #if LANES > 1
-    // Lanes that are next to each other show pixels that nearly are: all are loaded side by side, and
-    // those that are not a lane's have the weight 0, which leaves its sum as it is.
+    // Adjacent lanes show pixels that are nearly adjacent. All of them are loaded together, and
+    // those that do not belong to a lane have the weight 0, which does not change its sum.
     const int left = least_lane(column), top = least_lane(row);
     const int wide = greatest_lane(column) - left, high = greatest_lane(row) - top;
     const int border = (int)from.border, first = (int)at.x + left;

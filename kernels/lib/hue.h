@@ -1,5 +1,5 @@
-// Curves that keep hues: they are applied to the largest and the smallest of the three colours, and the
-// one between keeps its relative place, as in Adobe's DNG software.
+// Curves that keep hues: they are applied to the largest and the smallest of the three colours. The
+// middle one keeps its relative position, like in Adobe's DNG software.
 #ifndef CLPIPE_HUE_H
 #define CLPIPE_HUE_H
 

@@ -1,9 +1,9 @@
-// Where a block of lanes stands, and how lanes are read from and written to images.
+// The position of a block of lanes, and how lanes are read from and written to images.
 //
-// A stored image is one to three planes of float32. Its rows are `pitch` apart, and it is surrounded
-// by a border of `border` pixels that mirrors the image (reflect-101: the edge pixel is not repeated,
-// so the Bayer pattern continues in the border). Whatever writes a pixel also writes its mirror
-// images in the border, so a stencil never has to check where it is.
+// A stored image is one to three planes of float32. Its rows are `pitch` apart, and it is
+// surrounded by a border of `border` pixels that mirrors the image (reflect-101: the edge pixel is
+// not repeated, so the Bayer pattern continues in the border). A function that writes a pixel also
+// writes its mirror images in the border, so a stencil never has to check its position.
 #ifndef CLPIPE_IMAGE_H
 #define CLPIPE_IMAGE_H
 
@@ -12,9 +12,9 @@ typedef struct {
     vi odd;     // -1 in the lanes whose column is odd, else 0
 } site;
 
-// Stored is the whole image or a tile of it with its halo. A site is a place in the image, and `left`,
-// `top` is where the planes begin in it. A tile has a border too; at edges that are not the image's it
-// mirrors pixels that nothing uses, because the halo is wide enough.
+// The stored part is the whole image, or a tile of it with its halo. A site is a position in the
+// image, and `left`, `top` is where the planes begin in it. A tile also has a border. At edges that
+// are not the image's, it mirrors pixels that are never used, because the halo is wide enough.
 typedef struct {
     uint width, height;  // of the image
     uint pitch;
@@ -30,9 +30,9 @@ typedef struct { vf r, g, b; } rgb;
 typedef struct { vf y, cb, cr; } ycbcr;
 typedef struct { vf first, second; } pair;
 
-// Planes of a stored image, each pointing at the first lane of the block's first row, and the current
-// row of the block. All rows tap from the same pointers, so that the compiler sees which taps of two
-// rows are the same, and loads them once.
+// Planes of a stored image, each pointing at the first lane of the block's first row, and the
+// current row of the block. All rows tap from the same pointers. The compiler therefore sees which
+// taps of two rows are the same, and loads them once.
 typedef struct {
     __global const float *plane0, *plane1, *plane2;
     uint pitch;
@@ -63,7 +63,7 @@ INLINE size_t plane_offset(site at, extent e) {
     return (size_t)(at.y - e.top + e.border) * e.pitch + border_left(e) + (at.x - e.left);
 }
 
-// The address that the image's first pixel would have, from which places in the image are counted.
+// The address that the image's first pixel would have. Positions in the image start from it.
 INLINE __global const float *image_origin(__global const float *plane, extent e) {
     return plane + ((long)e.border - (long)e.top) * (long)e.pitch + (long)border_left(e) -
            (long)e.left;
@@ -96,13 +96,13 @@ INLINE ycbcr tap_ycbcr(image i, int dx, int dy) {
 }
 #undef TAP
 
-// The place of a pixel's mirror image along a side of n, or its own if it has none. Pixels have more
-// than one where n <= 2 * border + 1; a launch of `fill_border` then follows the stores.
+// The position of a pixel's mirror image along a side of n, or its own if it has none. Pixels have
+// more than one if n <= 2 * border + 1; then a launch of `fill_border` follows the stores.
 INLINE int mirror_image(int place, int n, int border) {
     return place <= border ? -place : place + border >= n - 1 ? 2 * (n - 1) - place : place;
 }
 
-// `x` and `y` are counted from where the planes begin.
+// `x` and `y` start where the planes begin.
 INLINE void store_at_edge(vf v, __global float *dst, int x, int y, extent e) {
     const int border = (int)e.border, columns = (int)e.columns;
     __global float *origin = dst + (size_t)border * e.pitch + border_left(e);
@@ -123,21 +123,22 @@ INLINE void store_at_edge(vf v, __global float *dst, int x, int y, extent e) {
     }
 }
 
-// The pixel that reflect-101 shows at a place of a side of n, or of the border around it.
+// The pixel that reflect-101 shows at a position of a side of n, or of the border around it.
 INLINE int mirrored(int place, int n, int border) {
     const int period = n > 1 ? 2 * (n - 1) : 1, within = (place + border * period) % period;
     return within < n ? within : period - within;
 }
 
-// The pixel that stands at a place of a side of n, or of the border around it: the nearest one in whole periods
-// of a filter array, or, without a period, or on a side that is shorter, the mirrored one.
+// The pixel for a position of a side of n, or of the border around it: the nearest one in whole
+// periods of a filter array. Without a period, or on a side that is shorter, it is the mirrored
+// one.
 INLINE int stand_in(int place, int n, int border, int period) {
     if (!period || n < period) return mirrored(place, n, border);
     if (place < 0) return place + (period - 1 - place) / period * period;
     return place < n ? place : place - ((place - n) / period + 1) * period;
 }
 
-// One place of a plane and its border, `column` and `row` counted from the border's corner.
+// One position of a plane and its border; `column` and `row` start at the border's corner.
 INLINE void fill_border(__global float *plane, uint column, uint row, int down, int across, extent e) {
     const int border = (int)e.border, columns = (int)e.columns;
     const int x = (int)column - border, y = (int)row - border;

@@ -1,9 +1,9 @@
-// Lane vectors: every stage is written once on vf / vi / vu, LANES of them wide.
-// A CPU takes 8 or 16 lanes (one vector register), a GPU takes 1 (a plain scalar).
+// Lane vectors: every stage is written once with vf / vi / vu, LANES of them wide. A CPU uses 8 or
+// 16 lanes (one vector register), a GPU uses 1 (a plain scalar).
 #ifndef CLPIPE_LANES_H
 #define CLPIPE_LANES_H
 
-// The same arithmetic on every device: never contract a*b+c behind our back.
+// The same arithmetic on every device: never contract a*b+c implicitly.
 #pragma OPENCL FP_CONTRACT OFF
 
 #define INLINE static inline __attribute__((always_inline))
@@ -21,7 +21,7 @@ typedef ulong vh;
 typedef LANES_OF(float) vf;
 typedef LANES_OF(int) vi;
 typedef LANES_OF(uint) vu;
-// Half as many lanes of 64 bits: as wide as a vector register goes. PoCL 3.0 miscompiles wider ones.
+// Half as many lanes of 64 bits, the width of a vector register. PoCL 3.0 miscompiles wider ones.
 #if LANES == 8
 typedef ulong4 vh;
 #else
@@ -29,16 +29,16 @@ typedef ulong8 vh;
 #endif
 #endif
 
-// Before a loop over the rows of a window, which a GPU goes through one by one: all at once they take so
-// many registers that few work items find room.
+// Before a loop over the rows of a window, which a GPU executes one by one. All rows at once take
+// so many registers that only a few work items can run.
 #if LANES == 1
 #define UNROLL_ROWS _Pragma("unroll 1")
 #else
 #define UNROLL_ROWS _Pragma("unroll")
 #endif
 
-// Loads, stores, conversions, minimum and maximum are written without the OpenCL built-ins: on a CPU
-// that PoCL 3.0 does not know it does not inline those, and a call for each costs a factor of ten.
+// Loads, stores, conversions, minimum and maximum are written without the OpenCL built-ins. On a
+// CPU that PoCL 3.0 does not know, it does not inline them, and the calls cost a factor of ten.
 #if LANES == 1
 INLINE vf load(__global const float *p) { return *p; }
 INLINE void store(vf v, __global float *p) { *p = v; }
@@ -65,9 +65,10 @@ INLINE void spill_int(vi v, __private int *p) { *(__private unaligned_vi *)p = v
 INLINE vf to_float(vi v) { return __builtin_convertvector(v, vf); }
 INLINE vi to_int(vf v) { return __builtin_convertvector(v, vi); }
 
-// Halves by their bits: exponent and mantissa move into place, a subnormal half is what it adds to the smallest
-// normal one, and the largest exponent stays the largest. Not vload_half, a function of PoCL's library: where that
-// is compiled for another CPU than the kernel is, the two disagree about the registers of a vector.
+// Converts halves by their bits: exponent and mantissa move into place, a subnormal half is its
+// difference from the smallest normal one, and the largest exponent stays the largest. It does not
+// use vload_half, a function of PoCL's library. If the library is compiled for another CPU than the
+// kernel, the two disagree about the registers of a vector.
 INLINE vf load_half(__global const half *p) {
     const vi bits = __builtin_convertvector(*(__global const unaligned_vs *)p, vi);
     const vi moved = (bits & 0x7fff) << 13;

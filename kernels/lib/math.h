@@ -1,11 +1,11 @@
-// Short polynomials in place of the built-in log and exp, which are scalar calls on some CPU
-// runtimes and differ between devices. Coefficients: our own least-squares minimax fits.
+// Short polynomials instead of the built-in log and exp, which are scalar calls on some CPU
+// runtimes and differ between devices. The coefficients are our own least-squares minimax fits.
 #ifndef CLPIPE_MATH_H
 #define CLPIPE_MATH_H
 
-// -ln(t) for t > 0; error 4e-7, relative where |ln(t)| is above 1, else absolute. Only * and +, so
-// NumPy gives the same bits. Polynomials are summed in pairs (Estrin), not one power after the other,
-// because waiting for each sum is what takes the time.
+// -ln(t) for t > 0; error 4e-7, relative if |ln(t)| is above 1, else absolute. Only * and +, so
+// NumPy gives the same bits. Polynomials are summed in pairs (Estrin) and not one power after the
+// other, because the latency of dependent sums dominates the time.
 INLINE vf negative_log(vf t) {
     const vi bits = float_bits(t);
     const vi exponent = (bits - 0x3f3504f3) >> 23;  // mantissa in [sqrt(1/2), sqrt(2))
@@ -17,7 +17,7 @@ INLINE vf negative_log(vf t) {
 }
 
 // 1/sqrt(x) for x > 0; relative error 5e-6. Two Newton steps from the exponent halved by a shift
-// (Lomont, "Fast inverse square root", 2003). The built-in one is not exact on all devices.
+// (Lomont, "Fast inverse square root", 2003). The built-in function is not exact on all devices.
 INLINE vf inverse_root(vf x) {
     const vf half_x = x * 0.5f;
     vf r = bits_to_float((vi)(0x5f375a86) - (float_bits(x) >> 1));
@@ -28,7 +28,8 @@ INLINE vf inverse_root(vf x) {
 // sqrt(x) for x >= 0; relative error 5e-6.
 INLINE vf square_root(vf x) { return x * inverse_root(x); }
 
-// 2^x = s * (1 + e) for |x| < 126: s is a whole power of two, e is accurate near x = 0. Only * and +.
+// 2^x = s * (1 + e) for |x| < 126: s is an integer power of two, e is accurate near x = 0. Only *
+// and +.
 INLINE vf power_of_two(vf x, __private vf *e) {
     const vf whole = nearest(x);
     const vf f = x - whole;
@@ -38,8 +39,8 @@ INLINE vf power_of_two(vf x, __private vf *e) {
     return bits_to_float((to_int(whole) + 127) << 23);
 }
 
-// e^x and e^x - 1 for |x| < 87; relative error 1e-6 for |x| < 20 and 4e-6 beyond, for the latter also
-// near 0.
+// e^x and e^x - 1 for |x| < 87; relative error 1e-6 for |x| < 20, otherwise 4e-6, and for the
+// latter also near 0.
 INLINE vf exponential(vf x) {
     vf e;
     const vf s = power_of_two(x * 1.442695f, &e);
@@ -52,7 +53,7 @@ INLINE vf exponential_minus_1(vf x) {
     return s * e + (s - 1.0f);
 }
 
-// 2^x for x <= 0, at least 2^-30; relative error 8e-5. Filter weights below that do not matter, and
+// 2^x for x <= 0, at least 2^-30; relative error 8e-5. Smaller filter weights do not matter, and
 // denormals are slow.
 INLINE vf exp2_of_negative(vf x) {
 #pragma OPENCL FP_CONTRACT ON

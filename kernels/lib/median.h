@@ -1,9 +1,9 @@
 // Medians of the 3x3 and 5x5 pixels around a pixel, in one plane.
 //
-// Both sort the rows of the window first. A sorted row is the same for every window that holds it, and
-// the rows that the windows of lines 2n and 2n+1 share are sorted first and in the same order in both.
-// So the compiler computes them once for a work item, which does both lines. It also drops the halves
-// of exchanges that nothing uses.
+// Both first sort the rows of the window. A sorted row is the same for every window that contains
+// it. The rows that the windows of lines 2n and 2n+1 share are sorted first, in the same order in
+// both. The compiler therefore computes them once for a work item, which processes both lines. It
+// also drops the halves of exchanges that are not used.
 #ifndef CLPIPE_MEDIAN_H
 #define CLPIPE_MEDIAN_H
 
@@ -19,7 +19,7 @@ INLINE sorted3 sort3(vf a, vf b, vf c) {
     return s;
 }
 
-// Nine exchanges, the fewest that do (Knuth, The Art of Computer Programming 3, 5.3.4).
+// Nine exchanges, the minimum (Knuth, The Art of Computer Programming 3, 5.3.4).
 INLINE sorted5 sort5(vf a, vf b, vf c, vf d, vf e) {
     ORDER(a, d) ORDER(b, e)
     ORDER(a, c) ORDER(b, d)
@@ -49,11 +49,11 @@ INLINE vf median9(sorted3 p, sorted3 q, sorted3 r) {
                    vmin(vmin(p.c, q.c), r.c));
 }
 
-// The median of five sorted rows, in any order. With columns sorted too, 12 of the 25 values cannot be
-// the median: the value in row i and column j has i*j - 1 that are not larger and (6-i)*(6-j) - 1 that
-// are not smaller. Among the other 13, the search below drops whatever must lie on one side. It is
-// right for all 252 ways in which zeros and ones can be sorted by rows and columns, and so for all
-// values (Knuth's zero-one principle).
+// The median of five sorted rows, in any order. With columns sorted as well, 12 of the 25 values
+// cannot be the median. The value in row i and column j has i*j - 1 values that are not larger and
+// (6-i)*(6-j) - 1 that are not smaller. Among the other 13, the search below drops those that must
+// be on one side. It is right for all 252 ways in which zeros and ones can be sorted by rows and
+// columns, and so for all values (Knuth's zero-one principle).
 INLINE vf median25(sorted5 p, sorted5 q, sorted5 r, sorted5 s, sorted5 t) {
     const sorted5 column1 = sort4_and_insert(p.a, q.a, r.a, s.a, t.a);
     const sorted5 column2 = sort4_and_insert(p.b, q.b, r.b, s.b, t.b);

@@ -1,10 +1,10 @@
 // Poisson numbers by inverse CDF from one random word, with a fixed amount of work (after Giles,
 // "Algorithm 955: Approximation of the inverse Poisson cumulative distribution function", ACM TOMS
-// 42(1), 2016). Only * + comparisons and bit operations, so NumPy gives the same bits.
+// 42(1), 2016). Only *, +, comparisons and bit operations, so NumPy gives the same bits.
 #ifndef CLPIPE_POISSON_H
 #define CLPIPE_POISSON_H
 
-#define POISSON_LARGE 10.0f  // the mean from which on the expansion is used
+#define POISSON_LARGE 10.0f  // mean from which the expansion is used
 #define POISSON_TERMS 36     // a Poisson number of mean 10 exceeds this with a probability of 1e-10
 
 __constant float POISSON_INVERSES[POISSON_TERMS + 1] = {
@@ -16,9 +16,9 @@ __constant float POISSON_INVERSES[POISSON_TERMS + 1] = {
     1.0f / 30.0f, 1.0f / 31.0f, 1.0f / 32.0f, 1.0f / 33.0f, 1.0f / 34.0f, 1.0f / 35.0f,
     1.0f / 36.0f};
 
-// For a mean below POISSON_LARGE. The number is how many k have a CDF below u; for u above 1/2, how
-// many k have P(X >= k) above 1 - u. Both sums begin with their smallest terms, which keeps the tails
-// exact.
+// For a mean below POISSON_LARGE. The number is the count of k with a CDF below u. For u above 1/2,
+// it is the count of k with P(X >= k) above 1 - u. Both sums begin with their smallest terms, which
+// keeps the tails exact.
 INLINE vf poisson_small(vf mean, vu word) {
     const vf p = tail_probability(word);
     vf terms[POISSON_TERMS + 1];
@@ -41,11 +41,11 @@ INLINE vf poisson_small(vf mean, vu word) {
     return in_upper_half(word) ? upper : lower;
 }
 
-// For a mean from POISSON_LARGE on: the whole part of the continuous quantile
-// mean + sqrt(mean) w + w^2 A(s) + B(s) + C(s) / mean, with w the normal quantile and
-// s = w / sqrt(mean), the form of Temme's expansion. A, B and C are our own weighted least-squares
-// fits; the error is 3e-4 of a number within 3 sigma and 4e-3 within 5. The mean's whole part is added
-// last, so that large means lose no digits.
+// For a mean from POISSON_LARGE on: the integer part of the continuous quantile mean + sqrt(mean) w
+// + w^2 A(s) + B(s) + C(s) / mean. w is the normal quantile and s = w / sqrt(mean), the form of
+// Temme's expansion. A, B and C are our own weighted least-squares fits. The error is 3e-4 within 3
+// sigma and 4e-3 within 5. The mean's integer part is added last, so that large means lose no
+// digits.
 INLINE vf poisson_large(vf mean, vu word) {
     const vf w = normal_of(word);
     const vf r = inverse_root(mean);

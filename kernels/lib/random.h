@@ -1,19 +1,19 @@
 // Counter-based random numbers: Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as
-// 1, 2, 3", SC 2011), and normals from them. A number is a pure function of the key and of where the
-// pixel is, so nothing depends on order, lanes or device.
+// 1, 2, 3", SC 2011), and normals from them. A number is a pure function of the key and of the
+// pixel's position, so it does not depend on order, lanes or device.
 #ifndef CLPIPE_RANDOM_H
 #define CLPIPE_RANDOM_H
 
 typedef struct {
-    uint key0, key1;  // 64-bit hash of what the noise belongs to: image and seed, or camera
-    uint stage;       // keeps the draws of different stages apart
+    uint key0, key1;  // 64-bit hash of the noise's scope: image and seed, or camera
+    uint stage;       // separates the draws of different stages
 } stream;
 
 typedef struct { vu word0, word1, word2, word3; } words;
 
 typedef struct { vh c0, c1, c2, c3; } counters;
 
-// Ten rounds on 64-bit numbers whose upper halves are undefined; the multiplication ignores them.
+// Ten rounds on 64-bit numbers with undefined upper halves, which the multiplication ignores.
 INLINE counters philox_rounds(vh c0, vh c1, vh c2, vh c3, stream s) {
     const vh mask = (vh)(0xffffffffUL);
     uint k0 = s.key0, k1 = s.key1;
@@ -40,17 +40,18 @@ INLINE words philox(vu x, uint y, uint draw, stream s) {
     return w;
 }
 
-// A random word as a probability u: its lower 31 bits give the probability of the nearer tail, u or
-// 1 - u, in (0, 1/2]; its top bit gives the half of the distribution.
+// A random word as a probability u. Its lower 31 bits give the probability of the nearer tail, u or
+// 1 - u, in (0, 1/2]. Its top bit gives the half of the distribution.
 INLINE vf tail_probability(vu word) {
     return (to_float(signed_bits(word) & 0x7fffffff) + 0.5f) * 2.3283064e-10f;
 }
 
 INLINE vi in_upper_half(vu word) { return signed_bits(word) >= 0; }
 
-// Standard normal from one random word, by inverse CDF. Form after Giles ("Approximating the erfinv
-// function", GPU Computing Gems 2011), a polynomial in sqrt(w), w = -ln(4p(1-p)); our own fit,
-// relative error 8e-5, up to 6.3 sigma. Only * + and bit operations, so NumPy gives the same bits.
+// Standard normal from one random word, by inverse CDF. The form is after Giles ("Approximating the
+// erfinv function", GPU Computing Gems 2011), a polynomial in sqrt(w), w = -ln(4p(1-p)). The fit is
+// our own, with a relative error of 8e-5, up to 6.3 sigma. Only *, + and bit operations, so NumPy
+// gives the same bits.
 INLINE vf normal_of(vu word) {
     const vf p = tail_probability(word);
     const vf s = square_root(vmax(negative_log(4.0f * p * (1.0f - p)), (vf)(0.0f))) - 2.25f;
@@ -62,11 +63,11 @@ INLINE vf normal_of(vu word) {
     return bits_to_float(float_bits(z) ^ (signed_bits(word) & (int)0x80000000));
 }
 
-// Two independent standard normals from two words (Box and Muller, "A note on the generation of random
-// normal deviates", 1958): half the work of two inverse CDFs; up to 6.6 sigma. The radius is
-// sqrt(-ln u), since the polynomials for sine and cosine of an eighth of a turn to either side are fits
-// of sqrt(2) times these, to 2e-5. A sign and an exchange, of a bit each, make that a whole turn. Only
-// * + and bit operations, so NumPy gives the same bits.
+// Two independent standard normals from two words (Box and Muller, "A note on the generation of
+// random normal deviates", 1958): half the work of two inverse CDFs; up to 6.6 sigma. The radius is
+// sqrt(-ln u), since the polynomials for sine and cosine of an eighth of a turn to either side are
+// fits of sqrt(2) times these, to 2e-5. One bit for a sign and one for an exchange extend them to a
+// whole turn. Only *, + and bit operations, so NumPy gives the same bits.
 INLINE pair normals_of(vu distance, vu direction) {
     const vf u = (to_float(signed_bits(distance) & 0x7fffffff) + 0.5f) * 4.6566129e-10f;
     const vf radius = square_root(vmax(negative_log(u), (vf)(0.0f)));
@@ -81,7 +82,8 @@ INLINE pair normals_of(vu distance, vu direction) {
     return v;
 }
 
-// The random words of a pixel. Four rows share one Philox call; the compiler sees that by itself.
+// The random words of a pixel. Four rows share one Philox call, which the compiler detects by
+// itself.
 INLINE words words_at(site at, uint draw, stream s) {
     return philox(lane_indices(at.x), at.y >> 2, draw, s);
 }

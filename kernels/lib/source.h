@@ -1,6 +1,7 @@
-// Lanes out of an image, or a tile of it, as a file holds it: interleaved channels or planes, half or
-// float, no padding between rows. The buffer has room for whole blocks beyond its last pixel, so a block at the
-// right or lower edge may read beyond the image; what it reads there is never stored.
+// Lanes from an image, or a tile of it, in the layout of files: interleaved channels or planes,
+// half or float, no padding between rows. The buffer has space for whole blocks after its last
+// pixel, so a block at the right or lower edge may read outside the image. Those values are never
+// stored.
 #ifndef CLPIPE_SOURCE_H
 #define CLPIPE_SOURCE_H
 
@@ -35,7 +36,7 @@ INLINE rgb source_rgb_float(__global const float *src, site at, extent e) {
     return v;
 }
 
-// The same from planes one behind the other.
+// The same from consecutive planes.
 INLINE rgb source_rgb_half_planes(__global const half *src, site at, extent e) {
     __global const half *p = src + pixel_number(at, e);
     const size_t plane = (size_t)e.columns * e.rows;

@@ -1,11 +1,12 @@
-// A picture style: a rational curve from black to grey and another from grey to white, on the largest of
-// the three colours; see clpipe/stages/tone_curve/standard.py.
+// A picture style: a rational curve from black to grey and another from grey to white, on the
+// largest of the three colours; see clpipe/stages/tone_curve/standard.py.
 #ifndef CLPIPE_STYLE_H
 #define CLPIPE_STYLE_H
 
 #include "lib/hue.h"
 
-// How much of a colour's distance to the grey of its largest part stays, where that part is `high`.
+// The share of a colour's distance from the grey of its largest component that remains; `high` is
+// that component.
 INLINE vf colourfulness(vf high, float saturation) {
 #pragma OPENCL FP_CONTRACT ON
     const vf square = high * high;

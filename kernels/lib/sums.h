@@ -1,6 +1,6 @@
-// Sums over an image in integers: exact, so order, lanes, tiles and devices do not matter.
-// A block writes one int4 of partial sums, one for each site of the 2x2 cell of a mosaic:
-// (even x, even y), (odd x, even y), (even x, odd y), (odd x, odd y).
+// Sums over an image in integers: exact, so order, lanes, tiles and devices do not matter. A block
+// writes one int4 of partial sums, one for each site of the 2x2 cell of a mosaic: (even x, even y),
+// (odd x, even y), (even x, odd y), (odd x, odd y).
 #ifndef CLPIPE_SUMS_H
 #define CLPIPE_SUMS_H
 
@@ -24,7 +24,8 @@ INLINE int2 fold_columns(vi v, site at) {
 }
 
 #if LANES == 1
-// The sums of a work-group, a power of two of work items: on a GPU they would take long to add up.
+// Sums within a work-group, a power of two of work items, because on a GPU they would take long to
+// add up one by one.
 INLINE void store_group_sums(int4 own, __local int4 *group, __global int4 *sums) {
     const uint i = get_local_id(0);
     group[i] = own;
@@ -40,13 +41,13 @@ INLINE void store_sums(int4 own, __global int4 *sums, extent e) {
 }
 #endif
 
-// Work item i of n adds up its share of the blocks, on top of those of the tiles before.
+// Work item i of n adds its share of the blocks to the sums of earlier tiles.
 INLINE void add_up_blocks(__global const int4 *blocks, __global long4 *partials, uint count,
                           uint tile) {
     const uint n = get_global_size(0), i = get_global_id(0);
     long4 sum = tile ? partials[i] : (long4)(0);
     for (uint k = i; k < count; k += n) {
-        const int4 block = blocks[k];  // not convert_long4, for the reason that load_half has
+        const int4 block = blocks[k];  // not convert_long4, for the same reason as in load_half
         sum += (long4)(block.x, block.y, block.z, block.w);
     }
     partials[i] = sum;
@@ -58,8 +59,8 @@ INLINE long4 add_up_partials(__global const long4 *partials, uint count) {
     return sum;
 }
 
-// A histogram from partial ones, on top of those of the tiles before. Behind its bins stand the sums of
-// each RUN of them, with which a percentile is found in few steps.
+// Adds partial histograms to that of earlier tiles. After its bins follow the sums of each RUN of
+// them, with which a percentile is found in few steps.
 #if LANES == 1
 INLINE void add_up_counts(__global const uint *counts, __global uint *histogram, uint bins,
                           uint partials, uint tile, __local uint *group) {

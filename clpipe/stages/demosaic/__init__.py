@@ -1,4 +1,4 @@
-"""Demosaicing: three colours at every pixel from one; each algorithm has its own file."""
+"""Demosaicing: interpolates three colours at every pixel; each algorithm has its own file."""
 
 from clpipe.stage import Context, Kind, Method, Stage
 from clpipe.stages.demosaic.bilinear import Bilinear
@@ -19,7 +19,7 @@ def _of_array(context: Context) -> Method | None:
 
 STAGE = Stage(
     "demosaic",
-    "Give every pixel its two missing colours.",
+    "Interpolate the two missing colours of every pixel.",
     Kind.MOSAIC,
     Kind.RGB,
     (

@@ -18,9 +18,9 @@ from clpipe.stages.demosaic.common import (
 
 
 def bilinear(image: Floats, pattern: Pattern) -> Floats:
-    """RGB, (height, width, 3), from a (height, width) mosaic; missing colours are interpolated.
+    """Return RGB, (height, width, 3), from a (height, width) mosaic, by bilinear interpolation.
 
-    A missing colour is the mean of its nearest samples: two or four.
+    A missing colour is the mean of its two or four nearest samples.
 
     >>> bilinear(np.float32([[4, 1], [3, 8]]), "RGGB")[0, 0].tolist()
     [4.0, 2.0, 8.0]

@@ -1,4 +1,4 @@
-"""Demosaicing within bounds that the samples around set."""
+"""Demosaicing within bounds from the surrounding samples."""
 
 from typing import ClassVar, Self
 
@@ -34,13 +34,13 @@ from clpipe.stages.denoise.strength import (
     offset_parameter,
 )
 
-# The gradient, in roots of the signal, below which both directions are alike. Chosen: a hundredth
-# of white is less than the noise of most pictures, and no edge.
+# Both directions count as alike if the gradient, in roots of the signal, is below this value.
+# Chosen: a hundredth of white is less than the noise of most images, and is no edge.
 EVEN = np.float32(0.01**2)
 
 
 def between(values: Floats, *neighbours: Floats) -> Floats:
-    """Values, none below the least or above the greatest of its neighbours; all of one shape.
+    """Limit values to the range of their neighbours; all arrays have one shape.
 
     >>> between(np.float32([0, 5, 9]), np.float32([1, 1, 1]), np.float32([6, 6, 6])).tolist()
     [1.0, 5.0, 6.0]
@@ -49,12 +49,12 @@ def between(values: Floats, *neighbours: Floats) -> Floats:
 
 
 def green_or_difference(roots: Floats, pattern: Pattern) -> Floats:
-    """R-G at red sites, B-G at blue sites and 0 at green sites, (height, width), in roots.
+    """Return R-G at red sites, B-G at blue sites and 0 at green ones, (height, width), in roots.
 
-    At red and blue sites green is interpolated along the row and along the column as Hamilton and
-    Adams do (US patent 5,629,734, 1997), and kept between its two neighbours. Both are averaged,
-    each weighted by the squared gradient of the other: where noise decides between the directions,
-    a choice of one would flip from pixel to pixel.
+    At red and blue sites, green is interpolated along the row and along the column after Hamilton
+    and Adams (US patent 5,629,734, 1997). Both values are limited to the range of their two
+    neighbours. The result is their mean, each weighted by the squared gradient of the other. A
+    choice of one direction would flip from pixel to pixel where noise decides.
     """
     neighbours = {step: tap(roots, *step) for step in ((-1, 0), (1, 0), (0, -1), (0, 1))}
     west, east, north, south = neighbours.values()
@@ -78,19 +78,19 @@ SETS = (
 def bounds(
     roots: Floats, known: Floats, green: Floats, pattern: Pattern, doubt: np.float32
 ) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
-    """The least and the most that red and blue may be, (red, blue) each, (height, width), in roots.
+    """Return the limits of red and blue, (red, blue) each, (height, width), in roots.
 
-    As far as the nearest samples of that colour go, and beyond them by as much as green goes beyond
-    what it is there, less ``doubt``. A line narrower than the pattern is an extreme of green, too,
-    and red and blue must follow; where a colour ends, green only rises or falls, and they must not
-    overshoot.
+    The limits are those of the nearest samples of that colour, widened by the amount, minus
+    ``doubt``, by which green exceeds its own values at those samples. A line narrower than the
+    pattern is an extreme of green, and red and blue must follow it. At the edge of a colour, green
+    only rises or falls, and red and blue must not overshoot.
 
     Args:
         roots: the samples.
         known: :func:`green_or_difference` of them.
-        green: at every pixel.
+        green: green at every pixel.
         pattern: the CFA pattern.
-        doubt: what noise alone may do to green.
+        doubt: the change of green that noise alone may cause.
     """
     there = roots - known  # green at red and blue sites
     low, high = [], []
@@ -105,25 +105,25 @@ def bounds(
 
 
 class Bounded(Method):
-    """Edge-directed, on roots of the signal, within bounds that the samples around set.
+    """Edge-directed, on roots of the signal, within bounds from the surrounding samples.
 
-    Green follows edges (Hamilton and Adams, US patent 5,629,734, 1997), softly, and stays between
-    its two neighbours, as in AHD (Hirakawa and Parks, IEEE TIP 2005) and PPG. Red and blue follow
-    from bilinear colour differences, and stay between their neighbours where green does. In linear
-    light and without bounds, colour differences invent colours at the edges of saturated surfaces,
-    and pass the noise of a bright colour on to the dark ones beside it.
+    Green follows edges (Hamilton and Adams, US patent 5,629,734, 1997) with a soft decision. It
+    stays between its two neighbours, like in AHD (Hirakawa and Parks, IEEE TIP 2005) and PPG. Red
+    and blue follow from bilinear colour differences. They stay between their neighbours wherever
+    green does. In linear light and without bounds, colour differences create false colours at the
+    edges of saturated surfaces. They also carry the noise of a bright colour into the dark ones.
     """
 
     method: ClassVar = "bounded"
     kernel: ClassVar = "demosaic_bounded"
-    summary: ClassVar = "edge-directed, within the bounds of the samples around"
+    summary: ClassVar = "edge-directed, within bounds from the surrounding samples"
     tolerance: ClassVar = 5e-5  # the kernel's root is a short iteration
 
     noise: float | None = parameter(
         None,
         "Standard deviation of green's noise at mid grey.",
         "signal",
-        "from a and b, as sensor_noise used them",
+        "from the a and b of sensor_noise",
         ge=0,
     )
     offset: float | None = offset_parameter()
@@ -134,7 +134,7 @@ class Bounded(Method):
 
     @property
     def doubt(self) -> np.float32:
-        """The noise that green may have, in roots: three sigma, and what no eye would see."""
+        """The noise that green may have, in roots: three sigma plus an invisible difference."""
         assert self.noise is not None and self.offset is not None
         return float32(0.01 + 3 * noise_in_roots(self.noise, MID_GREY, self.offset))
 

@@ -1,4 +1,4 @@
-"""Parts that demosaicing methods share, as ``kernels/lib/demosaic.h`` has them.
+"""Functions that demosaicing methods share, like those of ``kernels/lib/demosaic.h``.
 
 Mosaics and planes are (height, width) in signal units; borders are mirrored.
 """
@@ -13,7 +13,7 @@ HALF, QUARTER, EIGHTH = np.float32(0.5), np.float32(0.25), np.float32(0.125)
 
 
 def mean_beside(image: Floats) -> Floats:
-    """Mean of the pixels to the left and right of each pixel.
+    """Return the mean of the pixels to the left and right of each pixel.
 
     >>> mean_beside(np.float32([[1, 2, 5]])).tolist()
     [[2.0, 3.0, 2.0]]
@@ -22,12 +22,12 @@ def mean_beside(image: Floats) -> Floats:
 
 
 def mean_above_below(image: Floats) -> Floats:
-    """Mean of the pixels above and below each pixel."""
+    """Return the mean of the pixels above and below each pixel."""
     return (tap(image, 0, -1) + tap(image, 0, 1)) * HALF
 
 
 def sum_of_corners(image: Floats) -> Floats:
-    """Sum of the four diagonal neighbours of each pixel."""
+    """Return the sum of the four diagonal neighbours of each pixel."""
     upper, lower = (tap(image, -1, dy) + tap(image, 1, dy) for dy in (-1, 1))
     return upper + lower
 
@@ -35,7 +35,7 @@ def sum_of_corners(image: Floats) -> Floats:
 def red_and_blue(
     pattern: Pattern, own: Floats, in_row: Floats, in_column: Floats, across: Floats
 ) -> tuple[Floats, Floats]:
-    """Red and blue at every pixel, (height, width) each, chosen from four images by site.
+    """Return red and blue at every pixel, (height, width) each, chosen from four images by site.
 
     Args:
         pattern: the CFA pattern.
@@ -58,7 +58,7 @@ def red_and_blue(
 
 
 def spread_differences(sparse: Floats, pattern: Pattern) -> tuple[Floats, Floats]:
-    """R-G and B-G at every pixel, (height, width) each, by bilinear interpolation.
+    """Return R-G and B-G at every pixel, (height, width) each, by bilinear interpolation.
 
     ``sparse`` is (height, width) and holds R-G at red sites and B-G at blue sites.
     """
@@ -69,9 +69,9 @@ def spread_differences(sparse: Floats, pattern: Pattern) -> tuple[Floats, Floats
 def from_differences(
     samples: Floats, pattern: Pattern, red_difference: Floats, blue_difference: Floats
 ) -> Floats:
-    """RGB, (height, width, 3), from the sensor's samples, R-G and B-G.
+    """Return RGB, (height, width, 3), from the sensor's samples, R-G and B-G.
 
-    The samples stay as they are; the missing colours follow from them and the differences.
+    The samples do not change; the missing colours are samples plus or minus the differences.
 
     >>> samples, one = np.float32([[5, 3], [3, 2]]), np.ones((2, 2), np.float32)
     >>> from_differences(samples, "RGGB", one, -one)[0].tolist()

@@ -1,4 +1,4 @@
-"""Demosaicing for any filter array, along edges."""
+"""Demosaicing along edges for any filter array."""
 
 from functools import lru_cache
 from typing import ClassVar
@@ -22,11 +22,11 @@ from clpipe.stage import (
 ERRORS = tuple(f"errors_{first}" for first in range(0, MODELS, 2))
 
 
-@lru_cache(maxsize=16)  # one object for the same array, so that it is uploaded once
+@lru_cache(maxsize=16)  # the same object for the same array, so that it is uploaded once
 def tables(array: FilterArray) -> tuple[Floats, Floats]:
-    """The filters of an array as kernels load them.
+    """Return the filters of an array in the layout that kernels read.
 
-    (row, tap, model, channel, column), and (row, tap, model, column).
+    The layouts are (row, tap, model, channel, column) and (row, tap, model, column).
     """
     colours, misses = models(array)
     return kernel_table(colours.transpose(0, 2, 3, 4, 1)), kernel_table(
@@ -35,16 +35,17 @@ def tables(array: FilterArray) -> tuple[Floats, Floats]:
 
 
 class DirectionalMmse(Method):
-    """Linear filters of 7x7 under eight models of images: longer along the row, the column or a
-    diagonal, with little colour or much. At each pixel each counts by how well it foretells the
-    samples around, so edges are interpolated along themselves. A sample of red, green or blue is
-    kept up to rounding.
+    """Linear 7x7 filters under eight image models, weighted by how well each one fits.
+
+    The models are longer along the row, the column or a diagonal, each with little or much colour.
+    At each pixel, a model is weighted by how well it predicts the surrounding samples, so
+    interpolation follows edges. Samples of red, green or blue keep their values up to rounding.
     """
 
     method: ClassVar = "directional_mmse"
     kernel: ClassVar = "demosaic_directional_mmse"
-    summary: ClassVar = "the best of linear filters along four directions, for any filter array"
-    tolerance: ClassVar = 1e-5  # fused sums of 49, squared, and to the power of four
+    summary: ClassVar = "mix of linear filters along four directions, for any filter array"
+    tolerance: ClassVar = 1e-5  # fused sums of 49 terms, squared, and to the power of four
     any_array: ClassVar = True
 
     def passes(self) -> tuple[Pass, ...]:

@@ -32,10 +32,10 @@ Classifier = typing.Literal["hamilton_adams", "laroche_prescott", "hibbard"]
 
 
 def green_or_difference(image: Floats, pattern: Pattern, classifier: Classifier) -> Floats:
-    """R-G at red sites, B-G at blue sites and 0 at green sites, (height, width), from a mosaic.
+    """Return R-G at red sites, B-G at blue sites and 0 at green ones, (height, width).
 
     At red and blue sites, green is the mean of its two neighbours in the direction with the smaller
-    gradient, or of all four where the gradients are equal. The classifier defines the gradient in a
+    gradient, or of all four if the gradients are equal. The classifier defines the gradient in a
     direction:
 
     - ``hibbard`` (US patent 5,382,976, 1995): the absolute difference of the two green neighbours;
@@ -80,7 +80,7 @@ class EdgeDirected(Method):
 
     classifier: Classifier = parameter(
         "hamilton_adams",
-        "The gradient that decides the direction of an edge; see the patents of these authors.",
+        "Gradient that decides the direction of an edge; see the patents of these authors.",
         structural=True,
     )
 

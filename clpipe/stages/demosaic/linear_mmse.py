@@ -1,4 +1,4 @@
-"""Demosaicing for any filter array."""
+"""Demosaicing with linear filters for any filter array."""
 
 from functools import lru_cache
 from typing import ClassVar, Self
@@ -22,15 +22,16 @@ from clpipe.stage import (
 )
 
 
-@lru_cache(maxsize=16)  # one object for the same array, so that it is uploaded once
+@lru_cache(maxsize=16)  # the same object for the same array, so that it is uploaded once
 def weights_table(array: FilterArray) -> Floats:
-    """The filters of an array as kernels load them: (row, tap, channel, column)."""
+    """Return the filters of an array in the layout of kernels: (row, tap, channel, column)."""
     return kernel_table(filters(array).transpose(0, 2, 3, 1))
 
 
 class LinearMmse(Method):
-    """For each place of the period, the linear filter of 7x7 that leaves the least mean square
-    error under a model of images (after Trussell and Hartley, ICIP 2002).
+    """Linear 7x7 filters with the least mean square error under a model of images.
+
+    Each position of the array's period has its own filter (after Trussell and Hartley, ICIP 2002).
 
     >>> from clpipe.stage import run_reference
     >>> run_reference(LinearMmse(), np.full((4, 4), 0.5, np.float32))[1, 2].round(6).tolist()
@@ -39,7 +40,7 @@ class LinearMmse(Method):
 
     method: ClassVar = "linear_mmse"
     kernel: ClassVar = "demosaic_linear_mmse"
-    summary: ClassVar = "the best linear filters of 7x7, for any filter array"
+    summary: ClassVar = "linear 7x7 filters with the least mean square error, for any filter array"
     any_array: ClassVar = True
 
     def passes(self) -> tuple[Pass, ...]:
@@ -54,7 +55,7 @@ class LinearMmse(Method):
 
 
 class Gray(Method):
-    """The mosaic in red, green and blue alike: for a sensor without filters.
+    """Copies the mosaic to red, green and blue, for a sensor without filters.
 
     >>> from clpipe.camera.profile import load_camera
     >>> from clpipe.reference.filter_array import parse_array
@@ -65,20 +66,20 @@ class Gray(Method):
 
     method: ClassVar = "gray"
     kernel: ClassVar = "demosaic_gray"
-    summary: ClassVar = "no colours: for a sensor without filters"
+    summary: ClassVar = "copy the mosaic to red, green and blue, for a sensor without filters"
     any_array: ClassVar = True
     only_arrays: ClassVar = ("mono",)
 
     def resolve(self, context: Context) -> Self:
-        """The method itself.
+        """Return the method itself.
 
         Raises:
-            RequestError: the sensor has filters of several kinds.
+            RequestError: the sensor has several kinds of filters.
         """
         if not context.filters.is_gray:
             raise RequestError(
-                f"demosaic.method=gray: it is for sensors of one channel, but the mosaic is "
-                f"{context.filters.name}; leave demosaic.method out, or choose another one"
+                "demosaic.method=gray is for sensors of one channel, but the mosaic is "
+                f"{context.filters.name}; remove demosaic.method, or choose another method"
             )
         return self
 

@@ -14,12 +14,12 @@ TWO, FOUR, FIVE, SIX = np.float32(2), np.float32(4), np.float32(5), np.float32(6
 
 
 def malvar2004(image: Floats, pattern: Pattern) -> Floats:
-    """RGB, (height, width, 3), from a mosaic, by linear 5x5 filters.
+    """Return RGB, (height, width, 3), from a mosaic, with linear 5x5 filters.
 
     H. S. Malvar, L. He, R. Cutler: "High-quality linear interpolation for demosaicing of
     Bayer-patterned color images", ICASSP 2004, figure 2. Each filter is the bilinear one plus the
-    Laplacian of the site's own colour times a gain: 1/2 for green, 5/8 for red and blue at green
-    sites, 3/4 for red at blue sites and blue at red sites.
+    Laplacian of the site's own colour times a gain. The gain is 1/2 for green, 5/8 for red and blue
+    at green sites, and 3/4 for red at blue sites and blue at red sites.
 
     >>> grey_ramp = np.arange(49, dtype=np.float32).reshape(7, 7)
     >>> malvar2004(grey_ramp, "GRBG")[3, 3].tolist()

@@ -1,4 +1,4 @@
-"""Freeman's median filter of the colour differences, after bilinear or edge-directed steps."""
+"""Freeman's median filter of colour differences, after bilinear or edge-directed interpolation."""
 
 import typing
 from typing import ClassVar
@@ -26,13 +26,13 @@ from clpipe.stages.demosaic.edge_directed import EdgeDirected, green_or_differen
 class Median(Method):
     """Bilinear interpolation, then a median filter on R-G and B-G (Freeman, 1988).
 
-    US patent 4,724,395. The sensor's samples stay as they are; the missing colours follow from them
+    US patent 4,724,395. The sensor's samples do not change. The missing colours follow from them
     and the filtered differences.
     """
 
     method: ClassVar = "median"
     kernel: ClassVar = "demosaic_median"
-    summary: ClassVar = "bilinear, then colour differences median filtered (Freeman)"
+    summary: ClassVar = "bilinear, then a median filter on the colour differences (Freeman)"
 
     size: typing.Literal[3, 5] = parameter(
         3, "Width and height of the median filter.", "px", structural=True
@@ -51,7 +51,7 @@ class Median(Method):
         )
 
     def median_pass(self) -> Pass:
-        """The pass that filters the colour differences, an image named "spread", and gives RGB."""
+        """The pass that filters the colour differences, named "spread", and returns RGB."""
         arguments, reads = ("pattern", "size"), ("src", "spread")
         return Pass("freeman", Stencil(self.size // 2), arguments, reads)
 
@@ -66,14 +66,14 @@ class Median(Method):
 
 
 class EdgeDirectedMedian(Median, EdgeDirected):
-    """``edge_directed`` with its colour differences median filtered, as ``median`` does.
+    """``edge_directed``, then the median filter of ``median`` on the colour differences.
 
-    The paper's own combination (Bielova et al., CVPR Workshops 2019).
+    The paper (Bielova et al., CVPR Workshops 2019) uses this combination.
     """
 
     method: ClassVar = "edge_directed_median"
     kernel: ClassVar = "demosaic_edge_directed_median"
-    summary: ClassVar = "green along edges, then colour differences median filtered"
+    summary: ClassVar = "green along edges, then a median filter on the colour differences"
 
     def passes(self) -> tuple[Pass, ...]:
         green, _ = EdgeDirected.passes(self)

@@ -2,7 +2,7 @@
 
 D. Menon, S. Andriani, G. Calvagno: "Demosaicing with directional filtering and a posteriori
 decision", IEEE Transactions on Image Processing 16(1), 2007. Below, "own" is the colour of a red or
-blue site, and "other" is blue at a red site and red at a blue site.
+blue site. "Other" is blue at a red site and red at a blue site.
 """
 
 from typing import ClassVar
@@ -19,9 +19,9 @@ THIRD = np.float32(1 / 3)
 
 
 def directional_differences(image: Floats, pattern: Pattern) -> tuple[Floats, Floats]:
-    """Own minus green, with green interpolated along the row and along the column.
+    """Return own minus green, with green interpolated along the row and along the column.
 
-    Two (height, width) images, 0 at green sites. Green is interpolated as by ``hamilton_adams``.
+    Two (height, width) images, 0 at green sites. ``hamilton_adams`` interpolates green.
 
     >>> ramp = np.tile(np.arange(8, dtype=np.float32) ** 2, (8, 1))
     >>> [abs(d[:, 2:6]).max().item() for d in directional_differences(ramp, "RGGB")]
@@ -39,10 +39,10 @@ def directional_differences(image: Floats, pattern: Pattern) -> tuple[Floats, Fl
 
 
 def change(differences: Floats) -> Floats:
-    """The change of horizontal differences around each red or blue site, (height, width).
+    """Return the change of horizontal differences around each red or blue site, (height, width).
 
-    The sum of absolute changes between next neighbours of one colour, 2 px apart, in the five rows
-    of a 5x5 window; the middle row counts three times.
+    The sum of absolute changes between adjacent samples of one colour, 2 px apart, in the five rows
+    of a 5x5 window. The middle row counts three times.
     """
     own = abs(tap(differences, -2, 0) - differences) + abs(differences - tap(differences, 2, 0))
     other = abs(tap(differences, -1, 0) - tap(differences, 1, 0))
@@ -52,7 +52,7 @@ def change(differences: Floats) -> Floats:
 
 
 def along(sparse: Floats, in_row: Mask) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
-    """Differences at the two green neighbours of each red or blue site, in its chosen direction.
+    """Return the differences at the two green neighbours, in the chosen direction of each site.
 
     Args:
         sparse: (height, width), own minus green at red and blue sites, 0 at green sites.
@@ -60,7 +60,7 @@ def along(sparse: Floats, in_row: Mask) -> tuple[tuple[Floats, Floats], tuple[Fl
 
     Returns:
         Own minus green and own minus other, each for the left or upper and for the right or lower
-        neighbour. A difference at a green site is the mean of those at the two sites beside it.
+        neighbour. The difference at a green site is the mean of those at its two adjacent sites.
     """
     beside, above_below = mean_beside(sparse), mean_above_below(sparse)
     own_green, own_other = [], []
@@ -73,24 +73,24 @@ def along(sparse: Floats, in_row: Mask) -> tuple[tuple[Floats, Floats], tuple[Fl
 
 
 def menon2007(image: Floats, pattern: Pattern) -> Floats:
-    """RGB, (height, width, 3), from a mosaic, with the paper's refining step.
+    """Return RGB, (height, width, 3), from a mosaic, with the paper's refinement step.
 
     >>> edge = np.repeat(np.float32([0.2, 0.7]), 5)[None].repeat(10, axis=0)
     >>> bool(np.allclose(menon2007(edge, "BGGR"), edge[..., None]))
     True
     """
-    # Directional green, and the decision for the direction in which colour differences change less.
+    # Directional green, and the choice of the direction in which colour differences change less.
     by_row, by_column = directional_differences(image, pattern)
     in_row = change(by_row) <= change(by_column.T).T
     chosen = np.where(in_row, by_row, by_column)
-    # A first estimate of own minus other; it is refined after green.
+    # A first estimate of own minus other, which is refined after green.
     (left, right), (left_other, right_other) = along(chosen, in_row)
     own_other = (left_other + right_other) * HALF
-    # Refine green: own minus green becomes the mean of three along the direction.
+    # Refine green: own minus green becomes the mean of three values along the direction.
     refined = (left + chosen + right) * THIRD
     refined = by_site(image.shape, pattern, refined, chosen, refined)
     green = image - refined
-    # Refine the other colour likewise; red and blue at green sites are bilinear.
+    # Refine the other colour in the same way; red and blue at green sites are bilinear.
     _, (left_other, right_other) = along(refined, in_row)
     other = image - (left_other + own_other + right_other) * THIRD
     red, blue = red_and_blue(
@@ -104,7 +104,9 @@ class Menon2007(Method):
 
     method: ClassVar = "menon2007"
     kernel: ClassVar = "demosaic_menon2007"
-    summary: ClassVar = "green in both directions, the better one chosen and refined (Menon et al.)"
+    summary: ClassVar = (
+        "green in both directions, then choice of the better one and refinement (Menon et al.)"
+    )
 
     def passes(self) -> tuple[Pass, ...]:
         given = ("pattern",)

@@ -11,14 +11,14 @@ METHODS = (Biweight, Bilateral, NonLocalMeans, Median, Mean)
 
 
 def explain(context: Context) -> str:
-    """Lines about how the strength follows from the noise, and its effect in each method."""
+    """Return lines that explain how the strength follows from the noise, and its effects."""
     effects = [f"  {m.method}: {m().resolve(context).effect}" for m in METHODS]
     return "\n".join([strength.explain(context), *effects])
 
 
 STAGE = Stage(
     "denoise",
-    "Reduce noise, as a camera does.",
+    "Reduce noise in luma and chroma, like a camera.",
     Kind.RGB,
     Kind.RGB,
     METHODS,

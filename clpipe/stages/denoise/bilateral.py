@@ -13,16 +13,17 @@ from clpipe.reference.image import tap
 from clpipe.stage import Context, ReferenceContext, parameter
 from clpipe.stages.denoise.strength import WindowDenoiser
 
-# Sigma of the range weight, in multiples of strength * noise. Chosen, not derived;
-# tools/pages/quality.py measures the PSNR that it gives, and no test holds it to be the best.
+# Sigma of the range weight, in multiples of strength * noise. Chosen, not derived.
+# tools/pages/quality.py measures its PSNR, and no test asserts that it is optimal.
 RANGE = 3.0
 
 
 class Bilateral(WindowDenoiser):
     """Bilateral filter (Tomasi and Manduchi, ICCV 1998) in YCbCr.
 
-    Luma is weighted by the distance in luma, both chroma planes by their common distance. The
-    weight is a Gaussian of sigma 3 * strength * noise: a difference of that size weighs 0.61.
+    The weight of luma depends on the distance in luma, and that of both chroma planes on their
+    common distance. It is a Gaussian with sigma 3 * strength * noise, so a difference of one sigma
+    has the weight 0.61.
     """
 
     method: ClassVar = "bilateral"
@@ -33,7 +34,7 @@ class Bilateral(WindowDenoiser):
     names: ClassVar = ("spatial_scale", "luma_scale", "chroma_scale")
 
     spatial_sigma: float = parameter(
-        1.5, "Sigma of the Gaussian weight of distance in the image.", "px", gt=0, le=100
+        1.5, "Sigma of the Gaussian weight of spatial distance.", "px", gt=0, le=100
     )
 
     @property
@@ -60,10 +61,10 @@ class Bilateral(WindowDenoiser):
 
 
 def bilateral(planes: Floats, reach: int, spatial_scale: np.float32, scale: np.float32) -> Floats:
-    """Bilateral filter of (height, width, plane) by the planes' common distance (eq. 5 and 6).
+    """Filter (height, width, plane) bilaterally by the planes' common distance (eq. 5 and 6).
 
-    A weight is 2^(spatial_scale * distance^2 + scale * difference^2), with the distance in px and
-    the difference in signal units; see :func:`gaussian_scale`.
+    A weight is 2^(spatial_scale * distance^2 + scale * difference^2). The distance is in px and the
+    difference in signal units; see :func:`gaussian_scale`.
 
     >>> step = np.float32([[[0], [0], [1], [1]]])
     >>> bilateral(step, 1, gaussian_scale(1.0), gaussian_scale(0.1))[0, :, 0].round(3).tolist()
@@ -82,5 +83,5 @@ def bilateral(planes: Floats, reach: int, spatial_scale: np.float32, scale: np.f
 
 
 def gaussian_scale(sigma: float) -> np.float32:
-    """The factor c for which exp(-x^2 / (2 sigma^2)) = 2^(c * x^2)."""
+    """Return the factor c for which exp(-x^2 / (2 sigma^2)) = 2^(c * x^2)."""
     return float32(-log2(e) / (2 * max(sigma, 1e-6) ** 2))

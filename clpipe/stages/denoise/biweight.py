@@ -1,4 +1,4 @@
-"""Means weighted by Tukey's biweight, which leave grain as a camera does."""
+"""Means weighted by Tukey's biweight, which leave grain like that of a camera."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Self
@@ -23,18 +23,18 @@ from clpipe.stage import (
 )
 from clpipe.stages.denoise.strength import MID_GREY, Denoiser, offset_of_roots, offset_parameter
 
-# The difference that weighs nothing, in multiples of strength * noise. Found by trying: at 6 in
-# luma, noise that happens to be large stays alone and makes the tails of the noise longer than a
-# camera's; above 16 edges become softer.
+# The difference with weight 0, in multiples of strength * noise. Found by experiment. At 6 in luma,
+# large noise values remain alone and make the tails of the noise longer than a camera's. Above 16,
+# edges become softer.
 RANGE_LUMA, RANGE_CHROMA = 16.0, 2.5
-# The least noise that luma is filtered for, in roots, less than a level of 255. Found by trying: at
-# 0.006 a picture of ISO 100 is further from the truth than without denoising.
+# The least noise that luma is filtered for, in roots: less than one level of 255. Found by
+# experiment: at 0.006, an image at ISO 100 is further from the ground truth than without denoising.
 LEAST_NOISE = 0.0025
 
-GRAIN = 0.35  # share of luma's noise that stays at a strength of 1, where there is little of it
+GRAIN = 0.35  # share of luma's noise that remains at strength 1, at low noise
 
-# Weights by squared distance, px: for luma a binomial window, for chroma a wider one of pixels
-# that demosaicing made of other samples than the centre's.
+# Weights by squared distance, px. Luma has a binomial window. Chroma has a wider one, of pixels
+# that demosaicing interpolated from other samples than the centre's.
 LUMA_WINDOW = {1: 0.5, 2: 0.25}
 CHROMA_WINDOW = {2: 0.4, 4: 0.25}
 
@@ -42,10 +42,10 @@ CHROMA_WINDOW = {2: 0.4, 4: 0.25}
 def window_offsets(
     window: Mapping[int, float], scale: int = 1
 ) -> list[tuple[int, int, np.float32]]:
-    """The offsets in px, right and down, and weights of a window's pixels but for its centre.
+    """Return the offsets (right, down) in px and weights of a window's pixels but its centre.
 
-    At a larger scale a pixel at a distance of (1, 1) is one at (scale, scale), and one at (2, 0)
-    is at (scale + 1, 0): so the eight pixels of chroma stay on a ring.
+    At a larger scale, a pixel at a distance of (1, 1) moves to (scale, scale), and one at (2, 0) to
+    (scale + 1, 0). The eight pixels of chroma stay on a ring.
 
     >>> len(window_offsets(LUMA_WINDOW)), len(window_offsets(CHROMA_WINDOW))
     (8, 8)
@@ -64,10 +64,11 @@ def window_offsets(
 def biweight(
     planes: Floats, window: Mapping[int, float], reach: np.float32, scale: int = 1
 ) -> Floats:
-    """The weighted mean about each pixel, (height, width, plane) in and out.
+    """Return the weighted mean around each pixel, (height, width, plane) in and out.
 
-    A pixel weighs (1 - d^2 / reach^2)^2, d its difference from the centre in all planes, or 0 where
-    d is above the reach (Tukey's biweight; Mosteller and Tukey 1977), times the window's weight.
+    The weight of a pixel is Tukey's biweight times the window's weight (Mosteller and Tukey 1977).
+    The biweight is (1 - d^2 / reach^2)^2, or 0 if d is above the reach. d is the pixel's difference
+    from the centre in all planes.
 
     >>> step = np.float32([[[0], [0], [1], [1]]])
     >>> biweight(step, LUMA_WINDOW, np.float32(1))[0, :, 0].tolist()
@@ -87,31 +88,31 @@ def biweight(
 class Biweight(Denoiser):
     """Means weighted by Tukey's biweight of the difference, on roots of luma and chroma.
 
-    In roots of the signal noise has one size at all levels, and a dark colour does not take the
-    noise of a bright one. The mean reaches one pixel in luma and two in chroma. A share of luma's
-    grain stays, as cameras leave it: the noise of a finished picture is fine-grained in luma, and
-    coarser in chroma.
+    In roots of the signal, noise has the same size at all levels, and a dark colour does not pick
+    up the noise of a bright one. The mean extends over one pixel in luma and two in chroma. A share
+    of luma's grain remains, like in cameras. The noise of a finished image is therefore
+    fine-grained in luma, and coarser in chroma.
     """
 
     method: ClassVar = "biweight"
     kernel: ClassVar = "denoise_biweight"
-    summary: ClassVar = "weighted mean of near pixels, as light as a camera's; keeps grain"
+    summary: ClassVar = "weighted mean of near pixels, as mild as a camera's; keeps grain"
     tolerance: ClassVar = 5e-5  # the kernel's root is a short iteration
 
     luma_strength: float = parameter(
-        0.5, "Strength on luma, relative to luma_noise; 0 is off.", ge=0, le=100
+        0.5, "Strength on luma, relative to luma_noise; 0 disables it.", ge=0, le=100
     )
     grain: float | None = parameter(
         None,
-        "Share of luma's noise that stays as it is.",
+        "Share of luma's noise that is kept.",
         "",
-        "0.35 of the strength, at most 0.35; less where there is much noise",
+        "0.35 of the strength, at most 0.35; less if there is much noise",
         ge=0,
         le=1,
     )
     chroma_scale: int = parameter(
         2,
-        "Scale at which chroma is filtered: how far the pixels of its mean are, along both axes.",
+        "Scale at which chroma is filtered: distance of the averaged pixels along both axes.",
         "px",
         structural=True,
         ge=1,
@@ -140,7 +141,7 @@ class Biweight(Denoiser):
 
     @property
     def ranges(self) -> tuple[float, float]:
-        """The differences of luma and of chroma that weigh nothing, in roots of the signal."""
+        """The differences of luma and of chroma that have the weight 0, in roots of the signal."""
         luma, chroma = self.roots
         ranges = (
             RANGE_LUMA * self.luma_strength * hypot(luma, LEAST_NOISE),
@@ -150,7 +151,7 @@ class Biweight(Denoiser):
 
     @property
     def is_off(self) -> bool:
-        """Whether the image stays as it is, below -offset as well."""
+        """Whether the image stays unchanged, even below -offset."""
         return not (self.luma_strength or self.chroma_strength)
 
     def passes(self) -> tuple[Pass, ...]:

@@ -1,4 +1,4 @@
-"""Mean and median: filters that ignore the noise, blended with the image by it."""
+"""Mean and median: filters that ignore the noise, blended with the image according to it."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -13,16 +13,16 @@ from clpipe.reference.median import median_filter
 from clpipe.stage import Context, ReferenceContext
 from clpipe.stages.denoise.strength import WindowDenoiser, size_parameter
 
-# Assumed standard deviation of detail against its neighbours, signal units. Chosen, not derived;
-# tools/pages/quality.py measures the PSNR that it gives, and no test holds it to be the best.
+# Assumed standard deviation of detail against its neighbours, signal units. Chosen, not derived.
+# tools/pages/quality.py measures its PSNR, and no test asserts that it is optimal.
 DETAIL = 0.02
 
 
 def blend_share(amount: float) -> np.float32:
-    """The share of the filtered image in the result: s^2 / (s^2 + t^2).
+    """Return the share of the filtered image in the result: s^2 / (s^2 + t^2).
 
-    Wiener's shrinkage (Lee, IEEE PAMI 1980) with one standard deviation of detail, t = 0.02, for
-    all pictures; s is ``amount``, strength * noise, both in signal units.
+    Wiener's shrinkage (Lee, IEEE PAMI 1980) with the same standard deviation of detail, t = 0.02,
+    for all images. s is ``amount``, strength * noise. Both are in signal units.
 
     >>> [round(float(blend_share(s)), 2) for s in (0, 0.002, 0.01, 0.05)]
     [0.0, 0.01, 0.2, 0.86]
@@ -36,7 +36,7 @@ class BlendedFilter(WindowDenoiser):
     names: ClassVar = ("luma_share", "chroma_share")
 
     def window(self, image: Floats, reach: int) -> Floats:
-        """The filter over windows 2*reach + 1 px wide; (height, width, plane) in and out."""
+        """Filter windows 2*reach + 1 px wide; (height, width, plane) in and out."""
         raise NotImplementedError(type(self).__name__)
 
     @property
@@ -61,13 +61,13 @@ class BlendedFilter(WindowDenoiser):
 class Mean(BlendedFilter):
     """Mean of a square window, blended with the image.
 
-    It blurs edges as much as noise; it is a baseline to compare with.
+    It blurs edges as much as noise, and serves as a baseline.
     """
 
     method: ClassVar = "mean"
     kernel: ClassVar = "denoise_mean"
-    summary: ClassVar = "mean of a window, blended in more strongly where there is more noise"
-    tolerance: ClassVar = 2e-6  # sums come in another order
+    summary: ClassVar = "mean of a window, with more weight if there is more noise"
+    tolerance: ClassVar = 2e-6  # sums in another order
     function: ClassVar = "mean_filter"
     vectors_per_row: ClassVar = 1
 
@@ -79,7 +79,7 @@ class Mean(BlendedFilter):
 
 
 def box(image: Floats, reach: int) -> Floats:
-    """Mean of the (2*reach + 1)^2 pixels around each pixel.
+    """Return the mean of the (2*reach + 1)^2 pixels around each pixel.
 
     >>> box(np.float32([[1, 1, 4, 1]]), 1).tolist()
     [[1.0, 2.0, 2.0, 3.0]]
@@ -93,12 +93,12 @@ def box(image: Floats, reach: int) -> Floats:
 class Median(BlendedFilter):
     """Median of a square window (Tukey, Exploratory Data Analysis, 1977), blended with the image.
 
-    Each plane is filtered by itself.
+    Each plane is filtered separately.
     """
 
     method: ClassVar = "median"
     kernel: ClassVar = "denoise_median"
-    summary: ClassVar = "median of a window, blended in more strongly where there is more noise"
+    summary: ClassVar = "median of a window, with more weight if there is more noise"
     tolerance: ClassVar = 1e-6  # luma and chroma are not exact
     function: ClassVar = "median_filter"
     largest_size: ClassVar = 5

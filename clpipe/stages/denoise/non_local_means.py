@@ -19,8 +19,9 @@ from clpipe.stages.denoise.strength import (
     size_parameter,
 )
 
-# h = FACTOR * strength * noise. Found by trying: at strength 1 it is within 0.1 dB of the highest
-# PSNR of the picture in tests/data, ISO 1600 to 12800. tools/pages/quality.py measures that PSNR.
+# h = FACTOR * strength * noise. Found by experiment: at strength 1 it is within 0.1 dB of the
+# highest PSNR for the image in tests/data, ISO 1600 to 12800. tools/pages/quality.py measures that
+# PSNR.
 FACTOR = 1.1
 PATCH = 9  # pixels of a patch
 
@@ -28,15 +29,15 @@ PATCH = 9  # pixels of a patch
 class NonLocalMeans(WindowDenoiser):
     """Non-local means (Buades, Coll and Morel, CVPR 2005; IPOL 2011) in YCbCr, 3x3 patches.
 
-    A pixel becomes a weighted mean of the pixels in its window. The weight is
-    exp(-max(d^2 - 2 sigma^2, 0) / h^2), with d the distance of the two patches in luma and chroma
-    together, and h = 1.1 * strength * noise. Since noise grows with the light, d^2 is divided by
-    the variance that a, b and the gains predict at the patch's level, relative to mid grey.
+    A pixel becomes a weighted mean of the pixels in its window. The weight is ``exp(-max(d^2 - 2
+    sigma^2, 0) / h^2)``, with h = 1.1 * strength * noise. d is the distance of the two patches in
+    luma and chroma together. Noise grows with the light, so d^2 is divided by a relative variance.
+    This is the one that a, b and the gains predict at the patch's level, over that at mid grey.
     """
 
     method: ClassVar = "non_local_means"
     kernel: ClassVar = "denoise_non_local_means"
-    summary: ClassVar = "mean of the pixels that have similar surroundings; the best, and slow"
+    summary: ClassVar = "mean of pixels with similar surroundings; the best, and slow"
     tolerance: ClassVar = 2e-4  # the kernel's exp is a short polynomial
     function: ClassVar = "non_local_means"
     names: ClassVar = (
@@ -69,8 +70,8 @@ class NonLocalMeans(WindowDenoiser):
 
     def numbers(self, context: Context) -> Mapping[str, np.float32]:
         assert self.luma_noise is not None and self.chroma_noise is not None
-        # The distance of two patches is the mean of d^2 / sigma^2 over luma, chroma and the patch.
-        # In these units it is a plain sum of squares.
+        # The squared distance of two patches is the mean of d^2 / sigma^2 over luma, chroma and the
+        # patch. In these units it is a plain sum of squares.
         luma_unit = max(self.luma_noise, 1e-6) * sqrt(2 * PATCH)
         chroma_unit = max(self.chroma_noise, 1e-6) * sqrt(2 * PATCH)
         # The variance relative to mid grey, linear in luma in noise units.
@@ -106,9 +107,10 @@ def non_local_means(
     biases: tuple[np.float32, np.float32],
     scales: tuple[np.float32, np.float32],
 ) -> Floats:
-    """Non-local means of luma and chroma in noise units (IPOL 2011, eq. 1 to 3).
+    """Filter luma and chroma in noise units with non-local means (IPOL 2011, eq. 1 to 3).
 
-    A weight is 2^(scale * max(d^2 / variance - bias, 0)), d^2 the squared distance of two patches.
+    A weight is 2^(scale * max(d^2 / variance - bias, 0)), with d^2 the squared distance of two
+    patches.
 
     Args:
         planes: (height, width, 3), Y, Cb and Cr, scaled so that d^2 is a plain sum of squares.

@@ -1,10 +1,10 @@
-"""The strength of denoising, which follows the noise, and the parameters that every method has.
+"""The strength of denoising, which follows the noise, and the parameters of all methods.
 
-A sensor's noise has the variance a*y + b (Foi et al., IEEE TIP 2008, eq. 2), with a and b as
-``sensor_noise`` used them, else from the camera at the ISO. White balance gains amplify it. Luma
-and chroma are weighted sums of the three colours, whose noise is independent. So the variance of
-luma noise in a grey of level v is linear in v. Its value at mid grey, one number, sets the strength
-of every method; chroma likewise.
+The noise of a sensor has the variance a*y + b (Foi et al., IEEE TIP 2008, eq. 2). The values of a
+and b are those of ``sensor_noise``, else those of the camera at the ISO. White balance gains
+amplify the noise. Luma and chroma are weighted sums of the three colours, whose noise is
+independent. The variance of luma noise in a grey of level v is therefore linear in v. Its value at
+mid grey sets the strength of every method, and the strength on chroma follows in the same way.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,7 +46,7 @@ class Variance:
     offset: float
 
     def at(self, level: float) -> float:
-        """The variance in a grey of this level.
+        """Return the variance in a grey of this level.
 
         >>> Variance(2.0, 1.0).at(0.5)
         2.0
@@ -55,10 +55,11 @@ class Variance:
 
 
 def noise_of_colours(context: Context) -> tuple[Variance, Variance, Variance]:
-    """The variances of red, green and blue in a grey after white balance, in signal units squared.
+    """Return the variances of red, green and blue in a grey after white balance, signal squared.
 
     In a colour with gain k, a grey of level v has the signal v/k and the variance a*v/k + b before
-    the gain, so a*v*k + b*k^2 after it. Noise that demosaicing averages out is not deducted.
+    the gain. After the gain, the variance is a*v*k + b*k^2. The reduction of noise by demosaicing
+    is not included.
     """
     a, b = context.noise_parameters()
     red, blue = context.applied_gains
@@ -67,7 +68,7 @@ def noise_of_colours(context: Context) -> tuple[Variance, Variance, Variance]:
 
 
 def noise_of_luma_and_chroma(context: Context) -> tuple[Variance, Variance]:
-    """The variances of luma and of Cb + Cr together in a grey, in signal units squared."""
+    """Return the variances of luma and of Cb + Cr together in a grey, in signal units squared."""
     colours = noise_of_colours(context)
 
     def mixed(squares: Sequence[float]) -> Variance:
@@ -79,17 +80,17 @@ def noise_of_luma_and_chroma(context: Context) -> tuple[Variance, Variance]:
 
 
 def predicted_noise(context: Context) -> tuple[float, float]:
-    """Standard deviations of luma and chroma noise at mid grey (0.18), in signal units."""
+    """Return the standard deviations of luma and chroma noise at mid grey (0.18), signal units."""
     luma, chroma = noise_of_luma_and_chroma(context)
     return sqrt(luma.at(MID_GREY)), sqrt(chroma.at(MID_GREY))
 
 
 def offset_of_roots(context: Context) -> float:
-    """The offset of roots of the signal, see :mod:`clpipe.reference.roots`, that suits the noise.
+    """Return the offset for roots of the signal, see :mod:`clpipe.reference.roots`, from the noise.
 
-    Twice the noise of the noisiest colour at black, so that little is cut, and 0.003, a tenth of a
-    level of 255 more than none. Found by trying: a larger one lets dark colours take the noise of
-    luma, which shows as dots on saturated surfaces.
+    It is twice the noise of the noisiest colour at black, so that few values are clipped, plus
+    0.003, a tenth of one level of 255. Found by experiment: with a larger offset, dark colours pick
+    up the noise of luma, which appears as dots on saturated surfaces.
 
     >>> from clpipe.camera.profile import load_camera
     >>> round(offset_of_roots(Context(load_camera("sony-a7r2"), 25600)), 4)
@@ -102,7 +103,7 @@ def offset_parameter() -> Any:
     """Declare the offset of a method that works on roots of the signal."""
     return parameter(
         None,
-        "What is added to the signal before its root is taken.",
+        "Offset added to the signal before the root is taken.",
         "signal",
         "0.003 plus twice the noise at black",
         gt=0,
@@ -111,25 +112,24 @@ def offset_parameter() -> Any:
 
 
 def explain(context: Context) -> str:
-    """The steps from a and b to luma and chroma noise, in a few lines, with a context's numbers."""
+    """Return the steps from a and b to luma and chroma noise, in a few lines, with their values."""
     a, b = context.noise_parameters()
     red, blue = context.applied_gains
     sigmas = [sqrt(colour.at(MID_GREY)) for colour in noise_of_colours(context)]
     luma, chroma = predicted_noise(context)
     source = "as sensor_noise used them" if context.noise else "from the camera"
-    return (
-        f"The strength follows the noise that is predicted at mid grey (v = {MID_GREY:g}):\n"
-        f"  {context.camera.name}, ISO {context.iso:g}: a = {a:.4g}, b = {b:.4g} ({source})\n"
-        f"  white balance gains k: red {red:.4g}, green 1, blue {blue:.4g}\n"
+    lines = (
+        f"The strength follows the noise predicted at mid grey (v = {MID_GREY:g}):",
+        f"  {context.camera.name}, ISO {context.iso:g}: a = {a:.4g}, b = {b:.4g} ({source})",
+        f"  white balance gains k: red {red:.4g}, green 1, blue {blue:.4g}",
         "  sigma of a colour after its gain = sqrt(k*a*v + k^2*b):"
-        f" R {sigmas[0]:.3g}, G {sigmas[1]:.3g}, B {sigmas[2]:.3g}\n"
-        "  luma_noise = sqrt(sum of (.299, .587, .114)^2 * sigma^2)"
-        f" = {luma:.3g}\n"
-        "  chroma_noise = the same for Cb and Cr together"
-        f" = {chroma:.3g}\n"
-        "  Methods filter luma by luma_strength * luma_noise, chroma by chroma_strength *"
-        " chroma_noise."
+        f" R {sigmas[0]:.3g}, G {sigmas[1]:.3g}, B {sigmas[2]:.3g}",
+        f"  luma_noise = sqrt(sum of (0.299, 0.587, 0.114)^2 * sigma^2) = {luma:.3g}",
+        f"  chroma_noise = the same for Cb and Cr together = {chroma:.3g}",
+        "  Methods filter luma by luma_strength * luma_noise,"
+        " and chroma by chroma_strength * chroma_noise.",
     )
+    return "\n".join(lines)
 
 
 def size_parameter(plane: str, default: int, largest: int) -> Any:
@@ -142,10 +142,10 @@ class Denoiser(Method):
     """The base of all methods: luma and chroma, each with a strength and its noise."""
 
     luma_strength: float = parameter(
-        1.0, "Strength on luma, relative to luma_noise; 0 is off.", ge=0, le=100
+        1.0, "Strength on luma, relative to luma_noise; 0 disables it.", ge=0, le=100
     )
     chroma_strength: float = parameter(
-        2.0, "Strength on chroma, relative to chroma_noise; 0 is off.", ge=0, le=100
+        2.0, "Strength on chroma, relative to chroma_noise; 0 disables it.", ge=0, le=100
     )
     luma_noise: float | None = parameter(
         None,
@@ -177,14 +177,14 @@ class Denoiser(Method):
 
     @property
     def effect(self) -> str:
-        """The effect of the (resolved) strengths and noises, in a few words."""
+        """Return the effect of the (resolved) strengths and noises, in a few words."""
         raise NotImplementedError(type(self).__name__)
 
 
 class WindowDenoiser(Denoiser):
-    """The base of the methods whose windows have any size.
+    """The base of the methods with windows of any size.
 
-    Subclasses name the stencil of their kernel file; the passes into and out of YCbCr are shared.
+    Subclasses name the stencil in their kernel file. They share the passes to and from YCbCr.
     """
 
     largest_size: ClassVar[int] = 15
@@ -192,8 +192,8 @@ class WindowDenoiser(Denoiser):
     names: ClassVar[tuple[str, ...]]  # the stencil's run-time arguments, after the two reaches
     enter: ClassVar[Pass] = Pass("to_luma_chroma", writes="planes", kind=Kind.YCBCR)
     leave: ClassVar[Pass] = Pass("from_luma_chroma", reads=("filtered",))
-    extra_reach: ClassVar[int] = 0  # px that the stencil reads beyond its window
-    vectors_per_row: ClassVar[int] = 0  # as in Stencil
+    extra_reach: ClassVar[int] = 0  # px that the stencil reads outside its window
+    vectors_per_row: ClassVar[int] = 0  # like in Stencil
 
     luma_size: int = size_parameter("luma", 5, 15)
     chroma_size: int = size_parameter("chroma", 5, 15)
@@ -209,7 +209,7 @@ class WindowDenoiser(Denoiser):
         return self.luma_size // 2, self.chroma_size // 2
 
     def numbers(self, context: Context) -> Mapping[str, np.float32]:
-        """The run-time arguments of all passes, by name."""
+        """Return the run-time arguments of all passes, by name."""
         raise NotImplementedError(type(self).__name__)
 
     def passes(self) -> tuple[Pass, ...]:

@@ -1,4 +1,4 @@
-"""Exposure: how much light of the scene the sensor gets, by a number, by metering or by physics."""
+"""Exposure: the light that the sensor gets, set by a number, by metering or by physics."""
 
 from clpipe.stage import Kind, Stage, StageRole
 from clpipe.stages.exposure.auto import Auto
@@ -7,7 +7,7 @@ from clpipe.stages.exposure.photometric import Photometric
 
 STAGE = Stage(
     "exposure",
-    "Brighten or darken the scene.",
+    "Scale the light that the sensor gets.",
     Kind.RGB,
     Kind.RGB,
     (Gain, Auto, Photometric),

@@ -1,4 +1,4 @@
-"""Exposure by metering: the gain follows from the luminance of the image itself."""
+"""Exposure by metering: the gain follows from the luminance of the image."""
 
 from typing import ClassVar, Literal, Self
 
@@ -19,7 +19,7 @@ from clpipe.stage import (
 )
 from clpipe.stages.exposure.gain import Gain
 
-STEPS = 4096  # of the logarithm to base 2, in which it is an integer
+STEPS = 4096  # per unit of the logarithm to base 2, which is stored as an integer
 _PER_NEPER = np.float32(-STEPS * 1.4426950408889634)
 
 OCTAVES = 36  # of the histogram, from 2^-18 on; each has 256 bins
@@ -27,15 +27,15 @@ BINS = OCTAVES * 256
 _LOWEST = np.float32(2.0**-18)
 _FIRST = int(_LOWEST.view(np.int32))
 
-# The shorter side of the image over the diameter of the circle that is metered; 0 is no circle.
+# Shorter side of the image over the diameter of the metered circle; 0 means no circle.
 CIRCLES = {"average": 0, "centre_weighted": 2, "spot": 6}
-# How often a pixel counts inside and outside of it.
+# Weights of a pixel inside and outside the circle.
 WEIGHTS = {"average": (1, 0), "centre_weighted": (20, 1), "spot": (1, 0)}
 TARGETS = {"log_average": 0.18, "percentile": 1.0}
 
 
 def luminance(image: Floats) -> Floats:
-    """Luminance of linear sRGB (ITU-R BT.709); (height, width, 3) to (height, width).
+    """Return the luminance of linear sRGB (BT.709); (height, width, 3) to (height, width).
 
     >>> luminance(np.float32([[[1, 1, 1], [0, 1, 0]]])).round(4).tolist()
     [[1.0, 0.7152000069618225]]
@@ -45,9 +45,10 @@ def luminance(image: Floats) -> Floats:
 
 
 def in_circle(height: int, width: int, share: int) -> Mask:
-    """The mask of the pixels in the circle around an image's middle, (height, width).
+    """Return the mask of the pixels in the circle around an image's centre, (height, width).
 
-    ``share`` is the shorter side over its diameter, which is 2 px at least; with 0 all are inside.
+    ``share`` is the shorter side over the circle's diameter, which is at least 2 px. With 0, all
+    pixels are inside.
 
     >>> in_circle(4, 5, 2).astype(int).tolist()
     [[0, 0, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 0, 0]]
@@ -60,21 +61,21 @@ def in_circle(height: int, width: int, share: int) -> Mask:
 
 
 def steps_of(level: Floats) -> NDArray[np.int64]:
-    """log2 of levels above 0, in whole steps of 1/4096; int64."""
+    """Return log2 of levels above 0, in whole steps of 1/4096; int64."""
     return np.rint(negative_log(level) * _PER_NEPER).astype(np.int64)
 
 
 class Auto(Gain):
     """A gain that brings the luminance of the image to a target, times 2^(ev - headroom).
 
-    log_average is exp(mean(log(delta + L))) to a key of 0.18 (Reinhard et al., SIGGRAPH 2002, eq. 1
-    and 2), as SyB3R exposes; percentile brings a percentile of L to white. Both are integers: sums
-    of log2 in steps of 1/4096, or a histogram of 256 bins an octave. So the gain is the same on
-    every device and in tiles. An image without light is left as it is.
+    log_average brings ``exp(mean(log(delta + L)))`` to a key of 0.18, like SyB3R (Reinhard et al.,
+    SIGGRAPH 2002, eq. 1 and 2). percentile brings a percentile of L to white. Both use integers:
+    sums of log2 in steps of 1/4096, or a histogram of 256 bins per octave. The gain is therefore
+    the same on every device and in tiles. An image without light does not change.
 
-    Metering is of the whole image (average); with three quarters of the weight, at 3:2, on a circle
-    of half the image's shorter side in diameter (centre_weighted, as 12 mm are on a 35 mm film);
-    or of a circle of a sixth of it alone (spot).
+    With average, metering weights all pixels equally. With spot, it only meters a circle, whose
+    diameter is a sixth of the image's shorter side. With centre_weighted, a circle of half the
+    shorter side gets three quarters of the weight in a 3:2 image, like 12 mm on 35 mm film.
 
     >>> from clpipe.stage import run_reference
     >>> grey = np.full((2, 3, 3), 0.045, np.float32)
@@ -84,42 +85,40 @@ class Auto(Gain):
 
     method: ClassVar = "auto"
     kernel: ClassVar = "exposure_auto"
-    overscan: ClassVar = False  # it meters the picture
+    overscan: ClassVar = False  # it meters the finished image
     summary: ClassVar = "meter the image, and bring its luminance to a target"
     example: ClassVar = {"metering": "centre_weighted"}
 
     rule: Literal["log_average", "percentile"] = parameter(
-        "log_average", "Which luminance is brought to the target.", structural=True
+        "log_average", "Luminance that is brought to the target.", structural=True
     )
     target: float | None = parameter(
         None,
-        "Where that luminance comes to, before ev and headroom.",
+        "Level that this luminance gets, before ev and headroom.",
         "1 = white",
         "0.18 for log_average, 1 for percentile",
         ge=1e-6,
         le=1e6,
     )
     metering: Literal["average", "centre_weighted", "spot"] = parameter(
-        "average", "Which places of the image count."
+        "average", "Metered area of the image."
     )
     percentile: float = parameter(
         99.0,
-        "With percentile: the share of pixels that are darker than what is metered.",
+        "For percentile: share of the pixels that are darker than the metered level.",
         "%",
         gt=0,
         le=100,
     )
     delta: float = parameter(
         1e-4,
-        "With log_average: added to each pixel's luminance, so that no black one decides alone.",
+        "For log_average: added to each pixel's luminance to limit the effect of black pixels.",
         "1 = white",
         ge=1e-9,
         le=1,
     )
-    min_ev: float = parameter(
-        -20.0, "The least that metering gives, before ev.", "EV", ge=-20, le=20
-    )
-    max_ev: float = parameter(20.0, "The most that metering gives, before ev.", "EV", ge=-20, le=20)
+    min_ev: float = parameter(-20.0, "Lowest result of metering, before ev.", "EV", ge=-20, le=20)
+    max_ev: float = parameter(20.0, "Highest result of metering, before ev.", "EV", ge=-20, le=20)
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -191,7 +190,7 @@ class Auto(Gain):
         return in_circle(image.shape[0], image.shape[1], CIRCLES[self.metering])
 
     def _log_average(self, image: Floats) -> int | None:
-        """log2 of the image's log-average luminance, in steps; None without light."""
+        """Return log2 of the image's log-average luminance, in steps; None without light."""
         inside, outside = WEIGHTS[self.metering]
         circle = self._circle(image)
         delta = np.float32(self.delta)
@@ -202,7 +201,7 @@ class Auto(Gain):
         return None if total == black * weight else (2 * total + weight) // (2 * weight)
 
     def _percentile(self, image: Floats) -> int | None:
-        """log2 of a percentile of the image's luminance, in steps; None without light."""
+        """Return log2 of a percentile of the image's luminance, in steps; None without light."""
         inside, outside = WEIGHTS[self.metering]
         circle = self._circle(image)
         level = np.maximum(luminance(image), _LOWEST)

@@ -12,8 +12,8 @@ from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, par
 class Gain(Method):
     """Linear light times 2^(ev - headroom).
 
-    A camera exposes so that a white surface lies well below what its sensor can hold, and its tone
-    curve brings it back; highlights above 1.0 then roll off where they would be cut.
+    A camera's exposure puts a white surface well below saturation, and its tone curve restores the
+    brightness. Highlights above 1.0 then roll off instead of clipping.
 
     >>> from clpipe.stage import run_reference
     >>> run_reference(Gain(ev=-1.0), np.float32([[[0.5, 1, 4]]])).tolist()
@@ -29,8 +29,8 @@ class Gain(Method):
     ev: float = parameter(0.0, "Exposure compensation; +1 doubles the light.", "EV", ge=-20, le=20)
     headroom: float = parameter(
         1.0,
-        "How far the sensor's white lies above a render's 1.0, for highlights; "
-        "the tone curve neutral gives one stop of it back, linear all.",
+        "Distance of the sensor's white above a render's 1.0, for highlights. The tone curve "
+        "neutral gives one stop of it back, and linear all of it.",
         "EV",
         ge=0,
         le=10,
@@ -41,16 +41,16 @@ class Gain(Method):
         return context.but(headroom=context.headroom + self.headroom, exposure_time=time)
 
     def time(self, exposure_time: float | None) -> float | None:
-        """How long the shutter is open, s: EVs are its doing, as in a camera's bracket."""
+        """The exposure time, s: EVs change it, like in a camera's bracket."""
         return exposure_time and exposure_time * 2.0**self.ev
 
     def gain_at(self, iso: float) -> float:
-        """What a render's 1.0 is over the sensor's full scale, but for what is metered."""
+        """The value of a render's 1.0 over the sensor's full scale, without gain from metering."""
         return float(self.gain)
 
     @property
     def gain(self) -> np.float32:
-        """The factor."""
+        """The gain."""
         return float32(2.0 ** (self.ev - self.headroom))
 
     def passes(self) -> tuple[Pass, ...]:

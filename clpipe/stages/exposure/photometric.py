@@ -1,4 +1,4 @@
-"""Exposure by physics: what a camera's settings make of a scene in cd/m2."""
+"""Exposure by physics: from a camera's settings and a scene in cd/m2."""
 
 import math
 from typing import ClassVar, Self
@@ -11,20 +11,20 @@ from clpipe.camera.optics import USUAL_TIME
 from clpipe.stage import Arguments, Context, ReferenceContext, parameter
 from clpipe.stages.exposure.gain import Gain
 
-SATURATION = 78.0  # lx s, over the ISO: the exposure that fills the sensor
-GREY = 10.0  # lx s, over the ISO: the exposure of an 18 % grey that is exposed right
-WHITE = GREY / 0.18 / SATURATION  # where a white surface then lies, over the sensor's full scale
+SATURATION = 78.0  # lx s, over the ISO: the exposure that saturates the sensor
+GREY = 10.0  # lx s, over the ISO: the exposure of a correctly exposed 18 % grey
+WHITE = GREY / 0.18 / SATURATION  # level of a white surface, over the sensor's full scale
 
 
 class Photometric(Gain):
-    """The focal-plane exposure H = q L t / N^2 over that which fills the sensor, 78 lx s / ISO.
+    """The focal-plane exposure H = q L t / N^2 over the saturation exposure, 78 lx s / ISO.
 
-    L is the luminance of the scene, t the exposure time, N the f-number, and q what the lens and
-    its geometry take: pi/4 T v cos^4 = 0.65 for a transmittance T of 0.9, a vignetting v of 0.98
-    and 10 degrees off the axis (ISO 12232:2019, ISO 2720:1974). The speed is the saturation-based
-    one, S_sat = 78 / H_sat (ISO 12232:2019). At H = 10 / S an 18 % grey lies at 12.8 % of full
-    scale, and a white surface at 71 %; that half a stop is headroom, which tone_curve gives back.
-    A meter of K = 12.5 (ISO 2720), N^2 / t = L S / K, exposes with q K / S = 8.1 / S.
+    L is the luminance of the scene, t the exposure time and N the f-number. q is the loss in the
+    lens and its geometry: pi/4 T v cos^4 = 0.65. It assumes a transmittance T of 0.9, a vignetting
+    v of 0.98 and 10 degrees off the axis (ISO 12232:2019, ISO 2720:1974). The speed is the
+    saturation-based one, S_sat = 78 / H_sat (ISO 12232:2019). At H = 10 / S, an 18 % grey is at
+    12.8 % of full scale and a white surface at 71 %. This half a stop is headroom, which tone_curve
+    gives back. A meter with K = 12.5 (ISO 2720), N^2 / t = L S / K, exposes with q K / S = 8.1 / S.
 
     >>> from clpipe.stage import run_reference
     >>> metered = Photometric(exposure_time=0.01, f_number=8.0)  # for L = 800 at ISO 100
@@ -33,12 +33,12 @@ class Photometric(Gain):
     """
 
     method: ClassVar = "photometric"
-    summary: ClassVar = "exposure time, f-number and ISO on a render in cd/m2 (ISO 12232)"
+    summary: ClassVar = "exposure time, f-number and ISO, for a render in cd/m2 (ISO 12232)"
     example: ClassVar = {"exposure_time": 1.0, "f_number": 1.0, "scale": 100.0}
 
     headroom: float = parameter(
         0.0,
-        "How far the sensor's full scale lies above that of ISO 12232, 78 lx s / ISO; the tone "
+        "Distance of the sensor's full scale above that of ISO 12232, 78 lx s / ISO. The tone "
         "curve linear gives it back.",
         "EV",
         ge=0,
@@ -48,15 +48,16 @@ class Photometric(Gain):
         None, "Exposure time, t.", "s", "the camera's, else 0.01", optics=True, gt=0, le=86400
     )
     f_number: float | None = parameter(
-        None, "F-number of the lens, N.", "", "aperture, else 8", optics=True, gt=0, le=1000
+        None, "f-number of the lens, N.", "", "the camera's, else 8", optics=True, gt=0, le=1000
     )
     q: float = parameter(
-        0.65, "What the lens and its geometry leave of the light.", gt=0, le=math.pi / 4
+        0.65, "Share of the light that the lens and its geometry pass.", gt=0, le=math.pi / 4
     )
     scale: float = parameter(
         1.0,
-        "Luminance of a render's 1.0: 1 for a render in cd/m2; for one in W/(sr m2) 683, if its "
-        "channels are weighted for the eye, or 179, a renderer's white light (Radiance).",
+        "Luminance of a render's 1.0. Use 1 for a render in cd/m2. For a render in W/(sr m2), "
+        "use 683 if its channels are weighted for the eye, or 179 for a renderer's white light "
+        "(Radiance).",
         "cd/m2",
         gt=0,
         le=1e9,
@@ -70,7 +71,7 @@ class Photometric(Gain):
         return context.but(headroom=headroom, exposure_time=self.time(self.exposure_time))
 
     def factor(self, iso: float) -> np.float32:
-        """The value of a render's unit, over the sensor's full scale, at an ISO."""
+        """Return the value of one unit of a render, over the sensor's full scale, at an ISO."""
         assert self.f_number and self.exposure_time
         exposure = self.q * self.scale * self.exposure_time / self.f_number**2  # lx s
         return float32(exposure * iso / SATURATION * 2.0 ** (self.ev - self.headroom))

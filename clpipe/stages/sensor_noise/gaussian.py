@@ -14,8 +14,8 @@ from clpipe.stages.sensor_noise.no_noise import NEVER_FULL, or_default
 class Gaussian(SensorNoise):
     """Heteroscedastic Gaussian noise, Var[y] = a*y + b (Foi et al., IEEE TIP 2008, eq. 2).
 
-    The noisy signal is limited to the full well. With ``tukey_lambda`` the read noise, of variance
-    b, is drawn from a Tukey lambda distribution instead and added after the full well.
+    The noisy signal is limited to the full well. With ``tukey_lambda``, the read noise, of variance
+    b, is drawn from a Tukey lambda distribution instead and added after this limit.
 
     >>> from clpipe.stage import run_reference
     >>> noisy = run_reference(Gaussian(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
@@ -57,5 +57,5 @@ class Gaussian(SensorNoise):
 
     @staticmethod
     def noise(normals: Signal, y: Signal, a: Any, b: Any, backend: Backend) -> Signal:
-        """Return the noise in a signal y that standard normals make."""
+        """Return the noise of a signal y from standard normals."""
         return normals * backend.square_root((a * y + b).clip(min=0))

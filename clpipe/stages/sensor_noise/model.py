@@ -97,14 +97,14 @@ class SensorNoise(SignalMethod):
     )
     full_well: float | None = parameter(
         None,
-        "The largest number of electrons that a pixel holds.",
+        "Largest number of electrons that a pixel holds.",
         "e-",
         "from the camera; else no limit",
         gt=0,
     )
     tukey_lambda: float | None = parameter(
         None,
-        "Shape of the read noise: 0.14 is nearly Gaussian, lower values have heavier tails.",
+        "Shape of the read noise: 0.14 is nearly Gaussian, and lower values have heavier tails.",
         "",
         "from the camera; else Gaussian",
         gt=-0.5,
@@ -116,13 +116,13 @@ class SensorNoise(SignalMethod):
         emva, paper = self._set_names(EMVA), self._set_names(PAPER)
         if emva and paper:
             raise ValueError(
-                "set the noise in one parametrisation, EMVA 1288's or that of Bielova et al. 2019; "
-                f"found {', '.join(emva)} and {', '.join(paper)}"
+                "set the noise in one parametrisation, EMVA 1288's or that of Bielova et al. "
+                f"2019; both are set: {', '.join(emva)} and {', '.join(paper)}"
             )
         if paper and (self.chi is None or self.theta is None):
             raise ValueError(
-                "the parameters of Bielova et al. 2019 need both chi and theta; "
-                f"found {', '.join(paper)} only"
+                "the parameters of Bielova et al. 2019 need both chi and theta; only "
+                f"{', '.join(paper)} is set"
             )
         return self
 
@@ -130,11 +130,11 @@ class SensorNoise(SignalMethod):
         return [name for name in names if getattr(self, name) is not None]
 
     def model(self, context: Context) -> NoiseModel:
-        """The noise model: the parameters that are set, the others from the camera at the ISO.
+        """Return the noise model: the parameters that are set, else the camera's at the ISO.
 
         Raises:
-            RequestError: a or b is set and does not agree with another parametrisation that is set,
-                or b comes out negative, or the ISO is outside the camera's range.
+            RequestError: a or b is set and contradicts another parametrisation that is set, or b
+                becomes negative, or the ISO is outside the camera's range.
         """
         camera = context.camera.noise(context.iso)
         unit = camera.signal_range
@@ -162,8 +162,8 @@ class SensorNoise(SignalMethod):
         for name, own, derived in (("a", self.a, model.a), ("b", self.b, model.b)):
             if own is not None and not isclose(own, derived, rel_tol=1e-6):
                 raise RequestError(
-                    f"sensor_noise: set the noise in one parametrisation; found {name} = {own:g} "
-                    f"beside {', '.join(names)}, which make {name} = {derived:g}"
+                    f"sensor_noise: set the noise in one parametrisation; {name} = {own:g} "
+                    f"contradicts {', '.join(names)}, which give {name} = {derived:g}"
                 )
         return model
 
@@ -183,11 +183,11 @@ class SensorNoise(SignalMethod):
 
     @property
     def full_signal(self) -> float | None:
-        """The signal at which the well is full; None without a full well, or where a is 0."""
+        """The signal at which the well is full; None without a full well, or if a is 0."""
         return self.full_well * self.a if self.full_well and self.a else None
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
-        """a*y + b, y clipped to 0..full well; that a full well cuts the noise is not modelled."""
+        """The variance a*y + b, with y clipped to 0..full well, without the cut of noise there."""
         return self.own_variance(np.maximum(signal, np.float32(0))) + before
 
     def own_variance(self, signal: Floats) -> Floats:
@@ -196,14 +196,14 @@ class SensorNoise(SignalMethod):
         return y * np.float32(self.a) + np.float32(self.b)
 
     def numbers(self) -> dict[str, np.float32]:
-        """The kernel's arguments, by name."""
+        """Return the kernel's arguments, by name."""
         raise NotImplementedError(type(self).__name__)
 
     def arguments(self, context: Context) -> Arguments:
         return self.numbers()
 
     def read_noise_numbers(self) -> dict[str, np.float32]:
-        """The kernel's arguments for read noise: sigma and, unless Gaussian, shape and scale."""
+        """Return the kernel's arguments for read noise: sigma and, if not Gaussian, its shape."""
         assert self.b is not None
         sigma = {"read_noise": float32(self.b**0.5)}
         if self.tukey_lambda is None:
@@ -213,7 +213,7 @@ class SensorNoise(SignalMethod):
 
 
 def unit_read_noise(n: Numbers, backend: Backend) -> Signal:
-    """Return read noise of variance 1 for each pixel: Gaussian, or of a Tukey lambda law."""
+    """Return read noise of variance 1 for each pixel: Gaussian, or Tukey lambda."""
     if "shape" not in n:
         return backend.normals(1)
     return backend.tukey_lambda(backend.words(1), n["shape"], n["scale"])

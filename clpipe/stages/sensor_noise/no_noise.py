@@ -9,7 +9,7 @@ NEVER_FULL = 1e30  # stands for no full well, in electrons or in signal units
 
 
 def or_default(value: float | None, default: float) -> float:
-    """The value, or the default for None."""
+    """Return the value, or the default for None."""
     return default if value is None else value
 
 
@@ -29,7 +29,7 @@ class NoNoise(SignalMethod):
 
     full_signal: float | None = parameter(
         None,
-        "The signal at which the well is full.",
+        "Signal at which the well is full.",
         "signal",
         "from the camera and ISO; else no limit",
         gt=0,

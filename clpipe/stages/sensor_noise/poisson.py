@@ -14,8 +14,8 @@ from clpipe.stages.sensor_noise.no_noise import NEVER_FULL
 class Poisson(SensorNoise):
     """Whole photo-electrons: a * min(Poisson(max(y, 0) / a), full well) + read noise (EMVA 1288).
 
-    Poisson numbers come by inverse CDF (Giles, ACM TOMS 42(1), 2016); the read noise has the
-    variance b and is Gaussian or, with ``tukey_lambda``, of a Tukey lambda distribution.
+    Poisson numbers come from the inverse CDF (Giles, ACM TOMS 42(1), 2016). The read noise has the
+    variance b and a Gaussian or, with ``tukey_lambda``, a Tukey lambda distribution.
 
     >>> from clpipe.stage import run_reference
     >>> noisy = run_reference(Poisson(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
@@ -35,7 +35,8 @@ class Poisson(SensorNoise):
         resolved = super().resolve(context)
         if not resolved.a:
             raise RequestError(
-                "sensor_noise: poisson needs an a above 0; without shot noise use method gaussian"
+                "sensor_noise: poisson needs an a above 0; use method gaussian for noise "
+                "without shot noise"
             )
         return resolved
 

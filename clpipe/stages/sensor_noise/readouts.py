@@ -25,19 +25,19 @@ from clpipe.stage import (
 from clpipe.stages.sensor_noise.model import SensorNoise
 from clpipe.stages.sensor_noise.no_noise import NEVER_FULL, NoNoise, or_default
 
-RATIO = 16.0  # of a sensor that does not say its own
+RATIO = 16.0  # of a sensor whose profile has no ratio
 MOST = 4  # readouts
-ENDS, STEEP = np.float32(0.95), np.float32(10.0)  # of a hand-over, which begins at 0.85
+ENDS, STEEP = np.float32(0.95), np.float32(10.0)  # of a transition, which begins at 0.85
 
 
 class Readout(NamedTuple):
-    """One reading of an exposure.
+    """One readout of an exposure.
 
     Args:
-        photodiode: its number; readings of one have the same charge.
-        share: of the light that it sees, over the first one's, as the merging takes it.
-        gain: over the first reading's.
-        leak: what leaks into it of the first one's light, which the merging knows nothing of.
+        photodiode: its number; readouts of one photodiode have the same charge.
+        share: its light over that of the first one, which merging assumes.
+        gain: its gain over that of the first readout.
+        leak: share of the first photodiode's light that leaks into it, which merging ignores.
     """
 
     photodiode: int
@@ -47,25 +47,26 @@ class Readout(NamedTuple):
 
     @property
     def sensitivity(self) -> float:
-        """Its signal over the first reading's, as the merging takes it."""
+        """Its signal over the first readout's, which merging assumes."""
         return self.share * self.gain
 
 
 class Readouts(SensorNoise):
-    """Several readouts of an exposure, each with noise, rounding and a white level of its own.
+    """Several readouts of an exposure, each with its own noise, rounding and white level.
 
-    The first one is the camera's at its ISO: a and b are its. The last one has its white at the
-    signal ``full_scale``, which ``quantize`` takes for the white level; behind ``normalize`` 1 is
-    the first one's white, and what is brighter is above 1. The merged signal is that of the first
-    readout that is below 0.85 of its white; from there to 0.95 it goes over linearly to the next
-    one. There the signal-to-noise ratio dips, since that has collected or amplified less.
+    The first readout is the camera's at its ISO, with its a and b. The last one has its white at
+    the signal ``full_scale``, which ``quantize`` uses as the white level. After ``normalize``, 1 is
+    the white of the first readout, and brighter light is above 1. The merged signal is that of the
+    first readout that is below 0.85 of its white. From there to 0.95 it changes linearly to the
+    next readout. The signal-to-noise ratio drops there, because the next readout has collected or
+    amplified less.
     """
 
     kernel: ClassVar = "sensor_noise_readouts"
 
     ratio: float | None = parameter(
         None,
-        "How much less sensitive each readout is than the one before.",
+        "Ratio of sensitivity between each readout and the next one.",
         auto="from the camera; else 16",
         gt=1,
         le=1024,
@@ -79,7 +80,7 @@ class Readouts(SensorNoise):
     )
     part: int | None = parameter(
         None,
-        "The number of the readout that is looked at alone, from 0 on.",
+        "Number of a single readout to return, from 0, instead of the merged signal.",
         auto="merged",
         structural=True,
         ge=0,
@@ -92,7 +93,7 @@ class Readouts(SensorNoise):
 
     @property
     def readouts(self) -> tuple[Readout, ...]:
-        """The (resolved) readouts, the most sensitive first, those of a photodiode together."""
+        """The (resolved) readouts, the most sensitive first, those of one photodiode together."""
         raise NotImplementedError(type(self).__name__)
 
     @property
@@ -101,7 +102,7 @@ class Readouts(SensorNoise):
         return 1 / self.readouts[-1].sensitivity
 
     def with_camera(self, camera: Camera) -> Self:
-        """A copy in which what a camera says of its readouts replaces what is not set."""
+        """Return a copy with the camera's values for everything that is not set."""
         own = self.with_defaults(ratio=camera.readout_ratio, later_noise=camera.readout_noise)
         return own.with_defaults(ratio=RATIO, later_noise=1.0)
 
@@ -109,7 +110,9 @@ class Readouts(SensorNoise):
         own = super().resolve(context).with_camera(context.camera)
         last = len(own.readouts) - 1
         if own.part is not None and own.part > last:
-            raise RequestError(f"sensor_noise.part: found {own.part}; there are 0 to {last}")
+            raise RequestError(
+                f"sensor_noise.part: readout {own.part} does not exist; choose 0 to {last}"
+            )
         own._range = context.camera.signal_range
         return own
 
@@ -126,16 +129,16 @@ class Readouts(SensorNoise):
 
     @property
     def function(self) -> tuple[str, ...]:
-        """The kernel function, and what it takes beside the readouts."""
+        """The kernel function, and its arguments besides the readouts."""
         return ("readouts",)
 
     def seen(self, image: Floats, photodiode: int) -> Floats:
-        """What one of the photodiodes sees of an image, over the light of the first one."""
+        """Return the light of one photodiode for an image, over the light of the first one."""
         return image
 
     @property
     def is_exact(self) -> bool:
-        """Whether readouts without noise, merged, are the light up to the last one's white."""
+        """Whether merged readouts without noise equal the light up to the last one's white."""
         return self.part is None and not any(each.leak for each in self.readouts)
 
     def without_noise(self) -> Method | None:
@@ -161,7 +164,7 @@ class Readouts(SensorNoise):
 
     @property
     def table(self) -> Floats:
-        """The readouts as the kernel has them: (readout, 5)."""
+        """The readouts in the layout of the kernel: (readout, 5)."""
         assert self.b is not None and self.later_noise is not None
         return _table(self.readouts, self.b, self.b * self.later_noise**2)
 
@@ -190,7 +193,7 @@ class Readouts(SensorNoise):
 
     @staticmethod
     def _weight(read: Floats) -> Floats:
-        """How much of the merged signal is a readout's, by what it says."""
+        """Return the weight of a readout in the merged signal, from its own signal."""
         return np.minimum(np.maximum((ENDS - read) * STEEP, np.float32(0)), np.float32(1))
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
@@ -223,7 +226,7 @@ class Readouts(SensorNoise):
         return merged
 
 
-@lru_cache(maxsize=256)  # one object for the same readouts, so that it is uploaded once
+@lru_cache(maxsize=256)  # the same object for the same readouts, so that it is uploaded once
 def _table(readouts: tuple[Readout, ...], first: float, later: float) -> Floats:
     rows = [
         (
@@ -241,8 +244,8 @@ def _table(readouts: tuple[Readout, ...], first: float, later: float) -> Floats:
 class DualGain(Readouts):
     """Dual conversion gain: one charge is read at a high and at a low gain, ``ratio`` apart.
 
-    Its shot noise is the same in both. LOFIC sensors are like it, with a larger ratio: the second
-    reading is that of a capacitor into which a full photodiode overflows.
+    The shot noise of both readouts is the same. LOFIC sensors are similar, with a larger ratio: the
+    second readout is that of a capacitor into which a full photodiode overflows.
 
     >>> from clpipe.stage import run_reference
     >>> noisy = run_reference(DualGain(a=1e-4, b=1e-6), np.full((200, 200), 8.0, np.float32))

@@ -1,4 +1,4 @@
-"""Sensor noise as a Gaussian that is skewed as shot noise is."""
+"""Sensor noise as a Gaussian with the skew of shot noise."""
 
 from typing import Any, ClassVar
 
@@ -13,14 +13,14 @@ SMALLEST, SIXTH = float(np.float32(1e-30)), float(np.float32(1 / 6))
 class SkewedGaussian(Gaussian):
     """Noise of variance a*y + b with the third moment of shot noise, a^2 y.
 
-    A Poisson number of mean m is m + sqrt(m) z + (z^2 - 1)/6 + ..., z a standard normal (Cornish
-    and Fisher, Rev. Int. Stat. Inst. 1938). So the noise is s z + c (z^2 - 1), with
-    c = a^2 y / (6 (a*y + b)) and s^2 = a*y + b - 2 c^2, to 1 % of it above 0.3 electrons. In
-    shadows it has few bright outliers and no dark ones, as a camera's; it costs what a Gaussian
-    does.
+    A Poisson number of mean m is m + sqrt(m) z + (z^2 - 1)/6 + ..., with z a standard normal
+    (Cornish and Fisher, Rev. Int. Stat. Inst. 1938). The noise is therefore s z + c (z^2 - 1). Its
+    factors are c = a^2 y / (6 (a*y + b)) and s^2 = a*y + b - 2 c^2. Above 0.3 electrons it is
+    accurate to 1 %. In shadows it has few bright outliers and no dark ones, like a camera's noise.
+    It costs as much as a Gaussian.
 
-    The noisy signal is limited to the full well. With ``tukey_lambda`` the read noise, of variance
-    b, is drawn from a Tukey lambda distribution instead and added after the full well.
+    The noisy signal is limited to the full well. With ``tukey_lambda``, the read noise, of variance
+    b, is drawn from a Tukey lambda distribution instead and added after this limit.
 
     >>> from clpipe.stage import run_reference
     >>> noisy = run_reference(SkewedGaussian(a=0.02, b=1e-4), np.full((600, 600), 0.1, np.float32))
@@ -31,7 +31,7 @@ class SkewedGaussian(Gaussian):
 
     method: ClassVar = "skewed_gaussian"
     kernel: ClassVar = "sensor_noise_skewed_gaussian"
-    summary: ClassVar = "add Gaussian noise of variance a*y + b that is skewed as shot noise is"
+    summary: ClassVar = "add Gaussian noise of variance a*y + b with the skew of shot noise"
 
     functions: ClassVar = ("skewed_noise", "skewed_noise_tukey")
 

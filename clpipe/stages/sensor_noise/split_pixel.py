@@ -7,16 +7,16 @@ from clpipe.camera.profile import Camera
 from clpipe.stage import parameter
 from clpipe.stages.sensor_noise.readouts import Readout, Readouts
 
-LIGHT_RATIO = 100.0  # of a sensor that does not say its own
+LIGHT_RATIO = 100.0  # of a sensor whose profile has no ratio
 
 
 class Split(Readouts):
-    """Pixels of a large and a small photodiode, side by side.
+    """Pixels with a large and a small photodiode, side by side.
 
-    Of the light under the large one a share ``crosstalk`` makes charge in the small one, which then
-    collects 1/ratio + crosstalk of what the large one does. The merging multiplies by the ratio all
-    the same, so a ramp of light steps up by the factor 1 + crosstalk * ratio where the small one
-    takes over. What the large one loses is in its figures already.
+    A share ``crosstalk`` of the light under the large photodiode makes charge in the small one. The
+    small one then collects 1/ratio + crosstalk of the large one's charge. Merging multiplies by the
+    ratio regardless, so a ramp of light steps up by the factor 1 + crosstalk * ratio where the
+    small one takes over. The figures of the large one already include its loss.
     """
 
     crosstalk: float | None = parameter(
@@ -34,7 +34,7 @@ class Split(Readouts):
 
 
 class SplitPixel(Split):
-    """Split pixels: a large and a small photodiode, of which the small one sees 1/``ratio``.
+    """Split pixels: a large and a small photodiode; the small one sees 1/``ratio`` of the light.
 
     >>> import numpy as np
     >>> from clpipe.stage import run_reference
@@ -56,8 +56,8 @@ class SplitPixel(Split):
 class SplitDualGain(Split):
     """Split pixels whose photodiodes are both read at two gains, ``ratio`` apart: four readouts.
 
-    The least sensitive reading of the large photodiode is to reach further than the most sensitive
-    one of the small, so ``light_ratio`` is above ``ratio``.
+    The least sensitive readout of the large photodiode must extend beyond the most sensitive one of
+    the small photodiode, so ``light_ratio`` is above ``ratio``.
     """
 
     method: ClassVar = "split_dual_gain"
@@ -65,7 +65,7 @@ class SplitDualGain(Split):
 
     light_ratio: float | None = parameter(
         None,
-        "The light that the large photodiode sees over that of the small.",
+        "Light that the large photodiode sees over that of the small one.",
         auto="from the camera; else 100",
         gt=1,
         le=10_000,
@@ -77,8 +77,8 @@ class SplitDualGain(Split):
         assert own.light_ratio is not None and own.ratio is not None
         if own.light_ratio <= own.ratio:
             raise RequestError(
-                f"sensor_noise.light_ratio: found {own.light_ratio:g}; it is above that of the "
-                f"gains, {own.ratio:g}"
+                f"sensor_noise.light_ratio must be above the ratio of the gains, {own.ratio:g}; "
+                f"it is {own.light_ratio:g}"
             )
         return own
 

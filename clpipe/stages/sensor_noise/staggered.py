@@ -1,4 +1,4 @@
-"""Staggered exposures: several in a row, each with its own span of time."""
+"""Staggered exposures: several in sequence, each with its own time span."""
 
 from itertools import accumulate
 from typing import ClassVar, Self
@@ -11,25 +11,26 @@ from clpipe.reference.filter_array import LANES
 from clpipe.stage import Arguments, Context, Span, parameter
 from clpipe.stages.sensor_noise.readouts import MOST, Readout, Readouts
 
-NOTHING = np.zeros((MOST - 1, 1, 1), np.float32)  # is there before there is an image
+NOTHING = np.zeros((MOST - 1, 1, 1), np.float32)  # exists before there is an image
 
 
 class Staggered(Readouts):
-    """Staggered exposures (DOL): 2 to 4 in a row, each ``ratio`` times shorter than the one before.
+    """Staggered exposures (DOL): 2 to 4 in sequence, each ``ratio`` times shorter than the last.
 
-    In each row the longest comes first, and the next begins where it ends. Where the light changes
-    meanwhile, by sub-frames or flicker of ``shutter``, each sees its own span of time, and they are
-    merged as by a sensor that does not look for what moves.
+    In each row the longest exposure comes first, and the next begins when it ends. If sub-frames or
+    the flicker of ``shutter`` change the light, each exposure sees its own time span. They are
+    merged like in a sensor without motion detection.
     """
 
     method: ClassVar = "staggered"
     summary: ClassVar = "two to four exposures, each shorter than the one before, merged"
     other_examples: ClassVar = ({"count": 4},)
 
-    count: int = parameter(3, "How many exposures there are.", structural=True, ge=2, le=MOST)
+    count: int = parameter(3, "Number of exposures.", structural=True, ge=2, le=MOST)
 
-    _is_apart: bool = PrivateAttr(False)  # each exposure sees something else
-    _later: Floats | None = PrivateAttr(None)  # what all but the first see, of an image
+    _is_apart: bool = PrivateAttr(False)  # each exposure sees different light
+    # the light of all exposures but the first, of an image
+    _later: Floats | None = PrivateAttr(None)
 
     @property
     def readouts(self) -> tuple[Readout, ...]:
@@ -43,17 +44,17 @@ class Staggered(Readouts):
 
     @property
     def spans(self) -> tuple[Span, ...]:
-        """Of the exposures that the (resolved) method is to get; one where all see the same."""
+        """Return how many exposures the (resolved) method needs; 1 if all see the same light."""
         lengths = [each.share for each in self.readouts]
         starts = accumulate(lengths, initial=0.0)
         is_open = self._is_apart and self._later is None
         return tuple(map(Span, starts, lengths)) if is_open else (Span(),)
 
     def with_later(self, images: Floats) -> Self:
-        """The (resolved) method with what all exposures but the first see.
+        """Return the (resolved) method with the light of all exposures but the first.
 
         Args:
-            images: of its kind, (exposure, height, width).
+            images: of the method's kind, (exposure, height, width).
         """
         other = self.model_copy()
         other._later = images

@@ -31,7 +31,7 @@ class CameraRaw(Curve):
     """The default curve of Adobe Camera Raw, on each channel of linear RGB, 0..1.
 
     The knots are from the DNG SDK (reference [15] of Bielova et al. 2019), with a monotone cubic
-    between them. On each channel it turns hues: orange becomes yellow.
+    between them. Applied to each channel, the curve changes hues: orange becomes yellow.
     """
 
     method: ClassVar = "camera_raw"
@@ -42,11 +42,11 @@ class CameraRaw(Curve):
 
 
 class Linear(Method):
-    """No curve: the picture as sRGB shows the render; the headroom is given back."""
+    """No curve: keeps the render's sRGB look. The headroom is given back."""
 
     method: ClassVar = "linear"
     kernel: ClassVar = "exposure"
-    summary: ClassVar = "no curve: the picture as sRGB shows the render"
+    summary: ClassVar = "no curve: keeps the render's sRGB look"
     example: ClassVar = {"headroom": 1.0}
 
     headroom: float | None = parameter(
@@ -58,7 +58,7 @@ class Linear(Method):
 
     @property
     def gain(self) -> np.float32:
-        """The factor."""
+        """The gain."""
         assert self.headroom is not None
         return float32(2.0**self.headroom)
 
@@ -82,7 +82,7 @@ class File(Curve):
 
     path: str = parameter(
         CAMERA_RAW,
-        "The file of the curve; a configuration gives it relative to itself.",
+        "File of the curve; in a configuration, the path is relative to that file.",
         auto="camera_raw.csv",
         file=True,
     )
@@ -99,7 +99,7 @@ class File(Curve):
 
 STAGE = Stage(
     "tone_curve",
-    "Give the image the contrast of a photograph.",
+    "Apply a tone curve with the contrast of a photograph.",
     Kind.RGB,
     Kind.RGB,
     (Standard, Neutral, CameraRaw, Linear, File),

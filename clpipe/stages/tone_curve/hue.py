@@ -1,4 +1,4 @@
-"""Tone curves that keep hues, the twin of kernels/lib/hue.h."""
+"""Tone curves that keep hues, the counterpart of kernels/lib/hue.h."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ from clpipe.base.types import Floats
 
 
 def inside_of(image: Floats) -> Floats:
-    """An image clipped to 0..1, of any shape; what is no number is 0.
+    """Return an image clipped to 0..1, of any shape; NaN becomes 0.
 
     >>> inside_of(np.float32([-0.25, np.nan, 0.5, 2])).tolist()
     [0.0, 0.0, 0.5, 1.0]
@@ -17,14 +17,14 @@ def inside_of(image: Floats) -> Floats:
 
 
 def keep_hue(image: Floats, curve: Callable[[Floats], Floats]) -> Floats:
-    """A curve on the largest and smallest of the three colours; the third keeps its relative place.
+    """Apply a curve to the largest and smallest colour; the third keeps its relative position.
 
-    So Adobe's DNG software applies its tone curves. Hue in HSV stays, and on each channel alone it
-    would not: orange would become yellow.
+    Adobe's DNG software applies its tone curves in this way. Hue in HSV does not change. A curve on
+    each channel alone would turn orange into yellow.
 
     Args:
         image: (height, width, 3), clipped to 0..1.
-        curve: on an array of values 0..1.
+        curve: a function of an array of values 0..1.
 
     >>> keep_hue(np.float32([[[0.25, 0.5, 1]]]), np.sqrt).round(3).tolist()
     [[[0.5, 0.6669999957084656, 1.0]]]

@@ -8,15 +8,15 @@ from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext
 from clpipe.stages.tone_curve.hue import keep_hue
 
-# y = x (a x + b) / (x (c x + d) + 1); a + b = c + d + 1, so that 1 stays 1. Fitted (in roots of y)
-# to three fifths of Camera Raw's default curve and two fifths of the render's own light, which is
-# 2 x up to 0.25 and rolls off from there. 0.09, which is 18 % grey with a stop of headroom, becomes
-# 0.173, and what was 1.0 becomes 0.8.
+# y = x (a x + b) / (x (c x + d) + 1), with a + b = c + d + 1, so that 1 stays 1. It is fitted (in
+# roots of y) to three fifths of Camera Raw's default curve and two fifths of the render's own
+# light. That light is 2 x up to 0.25 and rolls off from there. 0.09, which is 18 % grey with a stop
+# of headroom, becomes 0.173. A render's 1.0 becomes 0.8.
 A, B, C, D = (np.float32(value) for value in (13.5, 1.27, 11.6, 2.17))
 
 
 def neutral(x: Floats) -> Floats:
-    """The curve on values 0..1 of any shape.
+    """Apply the curve to values 0..1 of any shape.
 
     >>> neutral(np.float32([0, 0.09, 0.5, 1])).astype(float).round(3).tolist()
     [0.0, 0.173, 0.804, 1.0]
@@ -26,7 +26,7 @@ def neutral(x: Floats) -> Floats:
 
 
 def inverse_neutral(y: Floats) -> Floats:
-    """The inverse of :func:`neutral`: the root of (a - c y) x^2 + (b - d y) x - y = 0 in 0..1.
+    """Invert :func:`neutral`: the root of (a - c y) x^2 + (b - d y) x - y = 0 in 0..1.
 
     >>> inverse_neutral(neutral(np.float32([0, 0.09, 0.5, 1]))).round(5).tolist()
     [0.0, 0.09000000357627869, 0.5, 1.0]
@@ -37,10 +37,11 @@ def inverse_neutral(y: Floats) -> Floats:
 
 
 class Neutral(Method):
-    """A curve of low contrast: as bright as the render looks in sRGB, with highlights rolled off.
+    """A curve of low contrast: as bright as the render in sRGB, with highlights rolled off.
 
-    It is meant for a raw with one stop of headroom, as ``exposure`` leaves it. Hues stay: the curve
-    is applied to the largest and the smallest colour, and the third keeps its place between them.
+    It expects a raw image with one stop of headroom, the default of ``exposure``. Hues do not
+    change: the curve is applied to the largest and the smallest colour, and the third keeps its
+    relative position between them.
     """
 
     method: ClassVar = "neutral"

@@ -10,10 +10,10 @@ from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, parameter
 from clpipe.stages.tone_curve.hue import inside_of
 
-# 18 % grey with one stop of headroom, and what it becomes: as bright as sRGB shows it, nearly.
+# 18 % grey with one stop of headroom, and its result, which is nearly as bright as in sRGB.
 GREY, GREY_OUT = 0.09, 0.173
 NAMES = ("grey", "a", "b", "c", "d", "bright_a", "bright_b", "bright_c", "bright_d")
-WHITER = 0.5  # by which colourfulness falls up to the brightest highlights, which turn white
+WHITER = 0.5  # loss of colourfulness towards the brightest highlights, which turn white
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Piece:
 
     @classmethod
     def between(cls, width: float, height: float, first: float, last: float) -> Self:
-        """The monotone curve from (0, 0) to (width, height) of two slopes at its ends.
+        """Return the monotone curve from (0, 0) to (width, height) with these slopes at its ends.
 
         It is the rational quadratic of Gregory and Delbourgo (IMA J. Numer. Anal. 1982, eq. 2.3).
         """
@@ -36,12 +36,12 @@ class Piece:
         return cls((chord - first) / width, first, -bend / width, bend)
 
     def at(self, v: Floats) -> Floats:
-        """The curve."""
+        """Apply the curve."""
         a, b, c, d = (np.float32(each) for each in (self.a, self.b, self.c, self.d))
         return np.asarray(v * (a * v + b) / (v * (c * v + d) + np.float32(1)))
 
     def inverse(self, y: Floats) -> Floats:
-        """The root of (a - c y) v^2 + (b - d y) v - y = 0 that is not negative."""
+        """Return the nonnegative root of (a - c y) v^2 + (b - d y) v - y = 0."""
         a, b, c, d = (np.float32(each) for each in (self.a, self.b, self.c, self.d))
         quadratic, linear = a - c * y, b - d * y
         root = np.sqrt(np.maximum(linear * linear + np.float32(4) * quadratic * y, np.float32(0)))
@@ -52,16 +52,18 @@ class Piece:
 
 
 class Standard(Method):
-    """An S-curve as cameras' standard picture styles have it, which keeps grey and hues.
+    """An S-curve like cameras' standard picture styles, which keeps grey and hues.
 
-    It is meant for a raw with one stop of headroom, as ``exposure`` leaves it: 0.09, which is then
-    18 % grey, becomes 0.173. From black to grey and from grey to white goes a rational quadratic
-    each (Gregory and Delbourgo, IMA J. Numer. Anal. 1982), and the parameters are their slopes. The
-    toe takes the noise of shadows down, the shoulder that of highlights, as in a camera.
+    It expects a raw image with one stop of headroom, the default of ``exposure``. There, 18 % grey
+    is 0.09, and it becomes 0.173. One rational quadratic leads from black to grey and another from
+    grey to white (Gregory and Delbourgo, IMA J. Numer. Anal. 1982). The parameters set their
+    slopes. The toe reduces the noise of shadows and the shoulder that of highlights, like in a
+    camera.
 
-    The largest of the three colours takes the curve's value, and the others keep their ratio to it,
-    so hue and saturation stay, in CIELAB as well. Then all move from the grey of the largest, or
-    towards it: ``saturation`` says how far, and the brightest highlights turn whiter.
+    The largest of the three colours takes the curve's value, and the others keep their ratio to it.
+    Hue and saturation therefore do not change, in CIELAB either. Then all colours move away from
+    the grey of the largest, or towards it. ``saturation`` sets how far, and the brightest
+    highlights turn whiter.
 
     >>> from clpipe.stage import run_reference
     >>> greys = np.float32([0, 0.01, 0.09, 0.5, 1])[:, None, None].repeat(3, 2)
@@ -77,21 +79,21 @@ class Standard(Method):
 
     contrast: float = parameter(
         2.2,
-        "Slope at grey: by how many stops the picture changes for one of light.",
+        "Slope at grey: stops of output per stop of light.",
         ge=0.1,
         le=10,
     )
     toe: float = parameter(
         0.85,
-        "How much darker shadows are: what the slope at black lacks to that of the line from black "
-        "to grey; 1 begins level.",
+        "Darkening of shadows: how much the slope at black is below that of the line from black "
+        "to grey. 1 starts level.",
         ge=0,
         le=1,
     )
     shoulder: float = parameter(
         0.95,
-        "How softly highlights end: what the slope at white lacks to that of the line from grey to "
-        "white; 1 ends level.",
+        "Softness of highlights: how much the slope at white is below that of the line from "
+        "grey to white. 1 ends level.",
         ge=0,
         le=1,
     )
@@ -102,7 +104,7 @@ class Standard(Method):
 
     @property
     def pieces(self) -> tuple[Piece, Piece]:
-        """From black to grey, and from white back to grey."""
+        """The curves from black to grey, and from white back to grey."""
         dark, bright = GREY_OUT / GREY, (1 - GREY_OUT) / (1 - GREY)
         slope = self.contrast * dark
         return (
@@ -114,7 +116,7 @@ class Standard(Method):
         return (Pass("standard", arguments=(*NAMES, "saturation")),)
 
     def numbers(self, grey: float) -> Arguments:
-        """The kernel's arguments; ``grey`` is where the pieces meet, before or after the curve."""
+        """Return the kernel's arguments; ``grey`` is where the pieces meet, before or after it."""
         numbers = (grey, *(x for p in self.pieces for x in (p.a, p.b, p.c, p.d)))
         named = dict(zip(NAMES, map(float32, numbers), strict=True))
         return {**named, "saturation": float32(self.saturation)}
@@ -123,13 +125,13 @@ class Standard(Method):
         return self.numbers(GREY)
 
     def curve(self, x: Floats) -> Floats:
-        """The curve on values 0..1 of any shape."""
+        """Apply the curve to values 0..1 of any shape."""
         dark, bright = self.pieces
         one = np.float32(1)
         return np.asarray(np.where(x < np.float32(GREY), dark.at(x), one - bright.at(one - x)))
 
     def inverse(self, y: Floats) -> Floats:
-        """The inverse of :meth:`curve`.
+        """Apply the inverse of :meth:`curve`.
 
         >>> style = Standard(toe=1.0)
         >>> style.inverse(style.curve(np.float32([0, 0.02, 0.09, 0.5, 1]))).round(3).tolist()
@@ -140,7 +142,7 @@ class Standard(Method):
         return np.asarray(np.where(is_dark, dark.inverse(y), one - bright.inverse(one - y)))
 
     def colourfulness(self, high: Floats) -> Floats:
-        """How much of the distance from the grey of the largest colour stays, by its light."""
+        """Return the share of the distance from grey that remains, by the largest colour."""
         return np.asarray(np.float32(self.saturation) - np.float32(WHITER) * np.square(high * high))
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

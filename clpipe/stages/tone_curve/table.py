@@ -17,10 +17,10 @@ Knots = Doubles
 
 
 def monotone_cubic(knots: Knots, x: Doubles) -> Doubles:
-    """The monotone cubic through knots (Fritsch and Butland, SIAM J. Sci. Stat. Comput. 1984).
+    """Evaluate a monotone cubic (Fritsch and Butland, SIAM J. Sci. Stat. Comput. 1984).
 
-    The slope at an inner knot is the harmonic mean of its two chords' slopes, at an end knot that
-    of its chord; beyond the ends the curve is level.
+    The slope at an inner knot is the harmonic mean of the slopes of its two chords. The slope at an
+    end knot is that of its chord. Outside the ends, the curve is level.
 
     >>> monotone_cubic(np.array([(0, 0), (1, 1), (2, 1)]), np.array([0.0, 1.0, 1.5])).tolist()
     [0.0, 1.0, 1.0]
@@ -43,7 +43,7 @@ def monotone_cubic(knots: Knots, x: Doubles) -> Doubles:
 
 
 def linear(knots: Knots, x: Doubles) -> Doubles:
-    """Straight lines between knots, level beyond the ends.
+    """Interpolate linearly between knots, level outside the ends.
 
     >>> linear(np.array([(0, 0), (1, 4)]), np.array([0.25, 3.0])).tolist()
     [1.0, 4.0]
@@ -52,13 +52,13 @@ def linear(knots: Knots, x: Doubles) -> Doubles:
 
 
 def parse_csv(text: str) -> Knots:
-    """Knots (n, 2) from lines of ``x,y``, both 0..1, x ascending; comments with #, one header line.
+    """Return knots (n, 2) from lines of ``x,y``, 0..1, x ascending; # comments, one header line.
 
     >>> parse_csv("x,y\\n0,0\\n1,1\\n").tolist()
     [[0.0, 0.0], [1.0, 1.0]]
 
     Raises:
-        ValueError: a line is not such a pair, and the message has its number; or there are fewer
+        ValueError: a line is not such a pair (the message contains its number), or there are fewer
             than two knots.
     """
     knots: list[tuple[float, float]] = []
@@ -71,32 +71,34 @@ def parse_csv(text: str) -> Knots:
             pair = [float(field) for field in fields]
         except ValueError:
             if not header:
-                raise ValueError(f"line {number}: found {line!r}, but expected x,y") from None
+                raise ValueError(f"line {number}: {line!r} is not of the form x,y") from None
             header = False
             continue
         header = False
         if len(pair) != 2:
-            raise ValueError(f"line {number}: found {len(pair)} columns, but expected two: x,y")
+            raise ValueError(f"line {number}: expected two columns, x,y; this line has {len(pair)}")
         if not all(0 <= value <= 1 for value in pair):
-            raise ValueError(f"line {number}: found {line!r}, but x and y go from 0 to 1")
+            raise ValueError(
+                f"line {number}: x and y must be within 0 and 1; this line is {line!r}"
+            )
         if knots and pair[0] < knots[-1][0] + 1e-12:  # so that no slope is infinite
             before = knots[-1][0]
             raise ValueError(f"line {number}: x is {pair[0]:g} after {before:g}; x must ascend")
         knots.append((pair[0], pair[1]))
     if len(knots) < 2:
-        raise ValueError(f"found {len(knots)} points; a curve has at least two lines of x,y")
+        raise ValueError(f"a curve has at least two lines of x,y; this file has {len(knots)}")
     return np.array(knots)
 
 
 def parse_cube(text: str) -> Knots:
-    """Knots (n, 2) from a one-dimensional .cube file (Adobe Cube LUT Specification 1.0, 2013).
+    """Return knots (n, 2) from a 1D .cube file (Adobe Cube LUT Specification 1.0, 2013).
 
     >>> parse_cube("LUT_1D_SIZE 2\\n0 0 0\\n1 1 1").tolist()
     [[0.0, 0.0], [1.0, 1.0]]
 
     Raises:
-        ValueError: the table has three dimensions, or red, green and blue differ, or its size is
-            not LUT_1D_SIZE, or a line is not in the format, and the message has its number.
+        ValueError: the table has three dimensions, or red, green and blue differ. Or its size is
+            not LUT_1D_SIZE, or a line is not in the format (the message contains its number).
     """
     low, high = 0.0, 1.0
     size: float | None = None
@@ -108,10 +110,12 @@ def parse_cube(text: str) -> Knots:
         try:
             values = [float(field) for field in fields[1 if fields[0][0].isalpha() else 0 :]]
         except ValueError:
-            raise ValueError(f"line {number}: found {line!r}, but expected numbers") from None
+            raise ValueError(f"line {number}: {line!r} does not consist of numbers") from None
         match fields[0]:
             case "LUT_3D_SIZE":
-                raise ValueError(f"line {number}: a table of three dimensions; give one of one")
+                raise ValueError(
+                    f"line {number}: the table has three dimensions; use a one-dimensional table"
+                )
             case "LUT_1D_SIZE":
                 size = values[0] if values else 0
             case "LUT_1D_INPUT_RANGE" if len(values) == 2:
@@ -120,10 +124,12 @@ def parse_cube(text: str) -> Knots:
                 low, high = (values[0], high) if fields[0][-1] == "N" else (low, values[0])
             case word if word[0].isalpha():
                 raise ValueError(
-                    f"line {number}: {line!r} is not understood in a one-dimensional .cube file"
+                    f"line {number}: {line!r} is not valid in a one-dimensional .cube file"
                 )
             case _ if len(values) != 3:
-                raise ValueError(f"line {number}: found {len(values)} numbers, but expected three")
+                raise ValueError(
+                    f"line {number}: expected three numbers; this line has {len(values)}"
+                )
             case _ if not np.allclose(values, values[0], rtol=0, atol=1e-6):
                 raise ValueError(
                     f"line {number}: red, green and blue differ; they must share one tone curve"
@@ -135,12 +141,12 @@ def parse_cube(text: str) -> Knots:
         raise ValueError(f"{declared}, but {len(rows)} rows; they must agree, and be at least 2")
     if not low < high or not np.isfinite([low, high, *rows]).all():
         raise ValueError(
-            f"its domain goes from {low:g} to {high:g}; it must ascend, and every number be finite"
+            f"its domain is {low:g} to {high:g}; it must ascend, and every number must be finite"
         )
     return np.stack([np.linspace(low, high, len(rows)), rows], axis=1)
 
 
-# By a file's ending: how it is parsed, and how its knots are interpolated.
+# By file extension: the parser, and the interpolation of the knots.
 FORMATS: dict[str, tuple[Callable[[str], Knots], Callable[[Knots, Doubles], Doubles]]] = {
     ".csv": (parse_csv, monotone_cubic),
     ".cube": (parse_cube, linear),
@@ -148,12 +154,12 @@ FORMATS: dict[str, tuple[Callable[[str], Knots], Callable[[Knots, Doubles], Doub
 
 
 def table_of(path: str) -> Floats:
-    """The table of a file's curve, see :mod:`clpipe.reference.curve`.
+    """Return the table of a file's curve, see :mod:`clpipe.reference.curve`.
 
-    The file is read again when it changes.
+    A changed file is read again.
 
     Raises:
-        ValueError: the file cannot be read, has an unknown format, or holds no curve.
+        ValueError: the file cannot be read, has an unknown format, or contains no curve.
     """
     try:
         return _table_of(path)
@@ -167,7 +173,7 @@ def table_of(path: str) -> Floats:
 def _table_of(path: str) -> Floats:
     ending = Path(path).suffix.lower()
     if ending not in FORMATS:
-        raise ValueError(f"expected a file that ends in {' or '.join(FORMATS)}")
+        raise ValueError(f"expected a file with the extension {' or '.join(FORMATS)}")
     parse, interpolate = FORMATS[ending]
     knots = parse(read_text(Path(path)))
     return tabulate(lambda x: interpolate(knots, x))

@@ -1,4 +1,4 @@
-"""White balance on the mosaic. Results above 1 are clipped, so burnt-out highlights are white."""
+"""White balance on the mosaic. Results above 1 are clipped, so clipped highlights are white."""
 
 from clpipe.stage import Kind, Stage, StageRole
 from clpipe.stages.white_balance.gains import AsShot, Gains, Unbalanced
@@ -7,7 +7,7 @@ from clpipe.stages.white_balance.white_patch import WhitePatch
 
 STAGE = Stage(
     "white_balance",
-    "Multiply red and blue so that white looks white.",
+    "Apply white balance gains to red and blue.",
     Kind.MOSAIC,
     Kind.MOSAIC,
     (AsShot, GrayWorld, WhitePatch, Gains, Unbalanced),

@@ -1,4 +1,4 @@
-"""White balance with gains that do not depend on the image, and the base of those that do."""
+"""White balance with fixed gains, and the base of the methods that estimate gains."""
 
 from dataclasses import replace
 from typing import Any, ClassVar, Self
@@ -24,7 +24,7 @@ from clpipe.stage import (
     period_of,
 )
 
-ALIKE = parse_array("G")  # a filter array whose pixels are all of one level
+ALIKE = parse_array("G")  # a filter array whose pixels all have the same level
 
 
 def apply_gains(image: Floats, context: Context, red: np.float32, blue: np.float32) -> Floats:
@@ -37,12 +37,13 @@ APPLY = Pass("white_balance", Pointwise(inline_at_taps=True), ("pattern", "red_g
 
 
 class EstimatedGains(Method):
-    """Gains that are estimated from the image itself. Subclasses say how."""
+    """Gains that are estimated from the image; subclasses define how."""
 
     tolerance: ClassVar = 1e-6  # division is not exact on every device
 
     def next_context(self, context: Context) -> Context:
-        # The estimates are known only when the image is processed; the as-shot gains stand in.
+        # The estimates are known only when the image is processed; the as-shot gains replace them
+        # here.
         return context.but(applied_gains=context.gains, full_scale=1.0)
 
     def search(self) -> Pass:
@@ -50,7 +51,7 @@ class EstimatedGains(Method):
         raise NotImplementedError(type(self).__name__)
 
     def gains(self, image: Floats, pattern: Pattern) -> tuple[np.float32, np.float32]:
-        """The gains of red and blue (green = 1) for a (height, width) mosaic."""
+        """Return the gains of red and blue (green = 1) for a (height, width) mosaic."""
         raise NotImplementedError(type(self).__name__)
 
     def passes(self) -> tuple[Pass, ...]:
@@ -69,7 +70,7 @@ def gain_parameter(colour: str, text: str = "Gain", auto: str = "from the camera
 
 
 class CameraGains(Method):
-    """Gains of red and blue, from the camera where they are not set. A subclass says what for."""
+    """Gains of red and blue, from the camera if they are not set; subclasses define their use."""
 
     red_gain: float | None = gain_parameter("red", "White balance gain")
     blue_gain: float | None = gain_parameter("blue", "White balance gain")
@@ -113,7 +114,7 @@ class OfArray(CameraGains):
         return {"factors": table, **period_of(self._array.period)}
 
     def factors_at(self, shape: tuple[int, ...]) -> Floats:
-        """The factor of each pixel of a mosaic, (height, width)."""
+        """Return the factor of each pixel of a mosaic, (height, width)."""
         rows, columns = self._array.period
         return tiled(levels_table(self._array, self.inverse)[:rows, :columns], shape)
 
@@ -122,7 +123,7 @@ class OfArray(CameraGains):
 
 
 class Gains(CameraGains):
-    """min(y * gain, 1), with fixed gains: the user's, else the camera's.
+    """min(y * gain, 1), with fixed gains: yours, else the camera's.
 
     >>> from clpipe.stage import run_reference
     >>> gains = Gains(red_gain=2.0, blue_gain=4.0)
@@ -154,7 +155,7 @@ class Gains(CameraGains):
 
 
 class ArrayGains(OfArray, Gains):
-    """The same, on any filter array."""
+    """Fixed gains on any filter array."""
 
 
 class AsShot(Gains):
@@ -163,8 +164,8 @@ class AsShot(Gains):
     method: ClassVar = "as_shot"
     summary: ClassVar = "the gains that inverse_white_balance divided by"
 
-    red_gain: float | None = gain_parameter("red", auto="as inverse_white_balance used it")
-    blue_gain: float | None = gain_parameter("blue", auto="as inverse_white_balance used it")
+    red_gain: float | None = gain_parameter("red", auto="the gain of inverse_white_balance")
+    blue_gain: float | None = gain_parameter("blue", auto="the gain of inverse_white_balance")
 
     def resolve(self, context: Context) -> CameraGains:
         red, blue = context.gains
@@ -176,7 +177,7 @@ class AsShot(Gains):
 
 
 class ArrayAsShot(OfArray, AsShot):
-    """The same, on any filter array; of a mosaic in which white is 1, no channel changes."""
+    """As-shot gains on any filter array; if white is 1 in the mosaic, no channel changes."""
 
     def next_context(self, context: Context) -> Context:
         after = super().next_context(context)

@@ -33,9 +33,9 @@ class GrayWorld(EstimatedGains):
 
 
 def gray_world_gains(image: Floats, pattern: Pattern) -> tuple[np.float32, np.float32]:
-    """mean(G) / mean(R) and mean(G) / mean(B) of a (height, width) mosaic.
+    """Return mean(G) / mean(R) and mean(G) / mean(B) of a (height, width) mosaic.
 
-    A gain is 1 where the mean of its colour or of green is not above 0.
+    A gain is 1 if the mean of its colour or of green is not above 0.
 
     >>> gray_world_gains(np.float32([[0.125, 0.25], [0.5, 0.75]]), "RGGB")
     (np.float32(3.0), np.float32(0.5))

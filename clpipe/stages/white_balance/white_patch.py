@@ -1,4 +1,4 @@
-"""White balance by white patch: the brightest place of a scene is white."""
+"""White balance by white patch: the brightest area of a scene is white."""
 
 from typing import ClassVar
 
@@ -14,7 +14,7 @@ _FIRST = int(np.float32(2.0**-12).view(np.int32))
 
 
 def cell_maximum(image: Floats) -> Floats:
-    """At each pixel, the largest sample of its 2x2 cell; (height, width) in and out.
+    """Return the largest sample of each pixel's 2x2 cell; (height, width) in and out.
 
     >>> cell_maximum(np.float32([[1, 2, 9], [3, 4, 0]])).tolist()
     [[4.0, 4.0, 9.0], [4.0, 4.0, 9.0]]
@@ -26,7 +26,7 @@ def cell_maximum(image: Floats) -> Floats:
 
 
 def percentile_level(samples: Floats, millionths: int) -> np.float32:
-    """The middle of the histogram bin that holds a percentile; 0 where there are no samples.
+    """Return the middle of the histogram bin that contains a percentile; 0 without samples.
 
     ``millionths`` is the percentile as a share of the samples, in millionths.
 
@@ -45,8 +45,8 @@ def percentile_level(samples: Floats, millionths: int) -> np.float32:
 class WhitePatch(EstimatedGains):
     """The gain of a colour c is max(G) / max(c) (Land and McCann, J. Opt. Soc. Am. 1971).
 
-    The maximum is a percentile. A 2x2 cell with a clipped sample is left out, because the colour of
-    a burnt-out light is unknown. Levels are resolved in steps of 1/512 of an octave's lower end.
+    The maximum is a percentile. A 2x2 cell with a clipped sample is excluded, because the colour of
+    a clipped light is unknown. Levels are resolved in steps of 1/512 of an octave's lower end.
     """
 
     method: ClassVar = "white_patch"
@@ -58,7 +58,7 @@ class WhitePatch(EstimatedGains):
     )
     clip: float = parameter(
         0.99,
-        "Level from which a sample counts as clipped; its 2x2 cell is then left out.",
+        "Level from which a sample counts as clipped; its 2x2 cell is then excluded.",
         "signal",
         gt=0,
         le=1,
@@ -89,9 +89,9 @@ class WhitePatch(EstimatedGains):
 def white_patch_gains(
     image: Floats, pattern: Pattern, clip: np.float32, millionths: int
 ) -> tuple[np.float32, np.float32]:
-    """The gains of red and blue of a (height, width) mosaic: the level of G over that of R and B.
+    """Return the gains of red and blue of a (height, width) mosaic, from the levels of its colours.
 
-    A gain is 1 where the level of its colour or of green is not above 0.
+    A gain is 1 if the level of its colour or of green is not above 0.
 
     >>> cells = np.float32([[0.2, 0.4, 1.0, 1.0], [0.4, 0.1, 1.0, 0.3]])
     >>> [gain.item() for gain in white_patch_gains(cells, "RGGB", np.float32(0.99), 1_000_000)]
