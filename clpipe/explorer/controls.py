@@ -1,6 +1,6 @@
 """What a page can set: the stages of a chain with their methods and parameters, as declared."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from clpipe.chain.keys import KEYS, LENS
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
+from clpipe.stage import Kind, Stage
 
 HIDDEN = {"title", "description"}  # of a parameter's schema; the description is sent as "text"
 
@@ -91,7 +92,30 @@ def camera_controls(others: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def steps_of(settings: Settings) -> list[dict[str, Any]]:
-    """All steps of settings in their order, those that are skipped as well, with their stages."""
+    """Return all steps of settings in order, including skipped ones, with stage and group."""
     on = set(settings.step_names)
     every = Settings(stages=settings.stages).step_names
-    return [{"name": name, "stage": base_name(name), "on": name in on} for name in every]
+    stages = [base_name(name) for name in every]
+    groups = groups_of([all_stages()[stage] for stage in stages])
+    return [
+        {"name": name, "stage": stage, "group": group, "on": name in on}
+        for name, stage, group in zip(every, stages, groups, strict=True)
+    ]
+
+
+def groups_of(stages: Sequence[Stage]) -> Iterator[str]:
+    """Yield the group of each stage of a chain: Optics, Sensor or Development.
+
+    Without a mosaic there is no sensor, and all stages are Development.
+
+    >>> list(groups_of([all_stages()[n] for n in ("vignetting", "mosaic", "quantize", "demosaic")]))
+    ['Optics', 'Sensor', 'Sensor', 'Development']
+    """
+    ends = [(stage.reads, stage.writes) for stage in stages]
+    group = "Optics" if (Kind.RGB, Kind.MOSAIC) in ends else "Development"
+    for reads, writes in ends:
+        if (reads, writes) == (Kind.RGB, Kind.MOSAIC):
+            group = "Sensor"
+        elif reads is Kind.RAW or (reads, writes) == (Kind.MOSAIC, Kind.RGB):
+            group = "Development"
+        yield group
