@@ -36,7 +36,7 @@ class Session:
     def state(self) -> str:
         """How it ended, in a word."""
         if not self.end:
-            return "cut off, or still going"
+            return "killed, or still running"
         return "interrupted" if self.end.get("interrupted") else "finished"
 
     def count(self, status: str) -> int:
@@ -144,20 +144,20 @@ def totals(run: Run, found: Sequence[Session]) -> list[tuple[str, str]]:
     megapixels = sum(number(p.value("width")) * number(p.value("height")) for p in pictures) / 1e6
     last = next((session for session in reversed(found) if session.count(DONE)), None)
     rows = [
-        ("pictures", f"{len(pictures):,}"),
-        ("truths, frames, baselines", f"{others:,}"),
-        ("megapixels", f"{megapixels:,.1f}"),
-        ("failed", f"{len(last_failures(found)):,}"),
+        ("Images", f"{len(pictures):,}"),
+        ("Truths, frames, baselines", f"{others:,}"),
+        ("Megapixels", f"{megapixels:,.1f}"),
+        ("Failed", f"{len(last_failures(found)):,}"),
     ]
     if last:
         left_out = last.count(LEFT_OUT)
-        rows += [("left out", f"{left_out:,}")] if left_out else []
+        rows += [("Left out", f"{left_out:,}")] if left_out else []
         if last.seconds > 0:
-            rows.append(("time of the last run", duration(last.seconds)))
+            rows.append(("Time of the last run", duration(last.seconds)))
         if last.speed:
-            rows.append(("speed of the last run", f"{last.speed:.3g} MP/s"))
+            rows.append(("Speed of the last run", f"{last.speed:.3g} MP/s"))
         if peak := number(last.end.get("peak_memory")):
-            rows.append(("most memory", in_words(peak)))
+            rows.append(("Peak memory", in_words(peak)))
     return rows
 
 

@@ -74,12 +74,12 @@ def html(runs: Sequence[Run], tell: Callable[[str], None] = lambda _: None) -> s
     steps = [figures.steps_of(run.pictures) for run in runs]
     drawn = figures.drawn(first.pictures, steps[0]) if not others else []
     problems = [text for run in runs for text in run.problems]
-    tell("noise of raws")
+    tell("noise of raw mosaics")
     judged = [law for run in runs for law in laws(run, problems)]
     picked = chosen(first, {law.name for law in judged if law.leaves})
     typical = sorted(picked, key=lambda made: bool(figures.oddities(made)))
     budget = Budget(BUDGET)
-    tell("noise of pictures")
+    tell("noise of images")
     noise = [
         (label, each)
         for label, run in zip(labels, runs, strict=True)
@@ -97,7 +97,7 @@ def html(runs: Sequence[Run], tell: Callable[[str], None] = lambda _: None) -> s
     entries = [entry for sheet in sheets for entry in sheet.entries]
     found_large = []
     for i, made in enumerate(picked, 1):
-        tell(f"large picture {i} of {len(picked)}")
+        tell(f"comparison {i} of {len(picked)}")
         found_large.append((made, large(runs, labels, made, budget, problems)))
     tell("figures")
     shown = [each for _, each in found_large if each]
@@ -237,10 +237,10 @@ def pace_drawings(found: Sequence[Session]) -> list[str]:
         told = [row for row in rows if STEPS[0] in row]
         told_x = [row["seconds"] for row in told]
         shares = {step: [row[step] for row in told] for step in STEPS}
-        label = "seconds since the start"
+        label = "time since the start, s"
         return [
-            lines_svg(x, speed, (label, "MP/s"), "Speed over the time of the run"),
-            shares_svg(told_x, shares, label, "Shares of the steps over the time of the run"),
+            lines_svg(x, speed, (label, "MP/s"), "Speed during the run"),
+            shares_svg(told_x, shares, label, "Time shares of the steps during the run"),
         ]
     return []
 
@@ -252,7 +252,7 @@ def machine_facts(pictures: Sequence[Made]) -> list[tuple[str, str]]:
         device = made.value("device")
         if isinstance(device, Mapping):
             text = f"{device.get('name')}, {device.get('version')}"
-            rows.setdefault("device", {})[text] = None
+            rows.setdefault("Device", {})[text] = None
         versions = made.value("versions")
         said = versions if isinstance(versions, Mapping) else {}
         for name, version in {"clpipe": made.value("clpipe"), **said}.items():

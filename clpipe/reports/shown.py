@@ -30,7 +30,7 @@ CHOSEN = 8  # images that are shown large
 LARGE = 1_200_000  # px, of a picture that is shown large; one that has more is reduced
 CROP = 320, 240  # px, width and height of what is kept as it is of a picture that is reduced
 TRUE_QUALITY, REDUCED_QUALITY = 93, 85  # of JPEGs of pixels as they are, and reduced
-PICTURE = "picture"  # its label, beside truths and baselines
+PICTURE = "image"  # its label in the comparison
 SHOWN = ("jpg", "png", "tif", "tif16", "exr", "npy")
 
 
@@ -109,7 +109,7 @@ def contact_sheet(
         if not budget.take(json.dumps(entry)):
             break
         entries[i] = entry
-        tell(f"small picture {len(entries)} of {len(order)}")
+        tell(f"thumbnail {len(entries)} of {len(order)}")
         sheet.problems += [problem] if problem else []
     sheet.entries = [entries[i] for i in sorted(entries)]
     return sheet
@@ -376,7 +376,7 @@ def _strip(made: Made, budget: Budget, problems: list[str]) -> list[dict[str, st
 def _facts(made: Made) -> str:
     """A line about a picture."""
     a, b = (number(made.value("noise", "signal", key)) for key in "ab")
-    law = f"; variance {a:.3g} y + {b:.3g}"
+    law = f", noise variance {a:.3g} y + {b:.3g} (in squared signal, y from 0 to 1)"
     size = f"{number(made.value('width')):.0f} x {number(made.value('height')):.0f} px"
     iso, clipped = number(made.value("iso")), number(made.value("clipped"))
     lens = f" with {made.value('lens')}" if made.value("lens") else ""
