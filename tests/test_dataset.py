@@ -374,7 +374,7 @@ def test_tars_are_streamed(renders, monkeypatch):
 
 
 def test_tars_that_cannot_be_streamed(renders):
-    with pytest.raises(RequestError, match=r"no\*.tar: there is no such tar"):
+    with pytest.raises(RequestError, match=r"no\*.tar: no such tar exists"):
         api.StreamingDataset("no*.tar")
     with pytest.raises(RequestError, match="each pass over a StreamingDataset is an epoch"):
         api.StreamingDataset("no*.tar", epochs=2)

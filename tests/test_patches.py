@@ -264,7 +264,7 @@ def test_training_goes_on_where_it_was(renders):
         dataset(patch=api.Patches(16, 5)),
         first.shard(0, 2),
     ):
-        with pytest.raises(RequestError, match="of other images, or of other patches"):
+        with pytest.raises(RequestError, match="other images or patches"):
             other.load_state_dict(state)
 
 

@@ -64,6 +64,10 @@ class Paper:
 class NoiseModel:
     """The strength of shot and read noise, convertible to all three parametrisations.
 
+    >>> noise = NoiseModel(a=0.002, b=3.6e-05, signal_range=1000)  # Var[y] = a*y + b
+    >>> noise.emva()
+    Emva(system_gain=2.0, read_noise=3.0, adc_noise=0.0)
+
     ``a`` and ``b`` are in signal units and signal units squared; ``signal_range`` is the white
     level minus the black level in DN. ``after`` is the part of b that arises after the gain, and
     ``theta`` is the analogue gain relative to the camera's lowest. Neither follows from a and b;

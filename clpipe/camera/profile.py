@@ -48,10 +48,14 @@ NEEDED = {
 
 
 class Camera(BaseModel):
-    """A camera profile. Levels are in DN, white balance gains relative to green = 1.
+    """A camera profile. Levels are in DN, and white balance gains are relative to green = 1.
 
-    A value of None or 0 is either a fact or unknown; ``sources`` says which, and names the source
-    of each figure.
+    Use :func:`load_camera` to load one. A value of None or 0 is either a fact or unknown:
+    ``sources`` states which, and gives the source of each figure.
+
+    >>> camera = load_camera("sony-a7r2")
+    >>> camera.bits, camera.black_level, camera.white_level, camera.iso_range
+    (14, 512.0, 16383.0, (100.0, 25600.0))
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -251,7 +255,11 @@ class Camera(BaseModel):
 
 @cache
 def built_in_cameras() -> dict[str, Path]:
-    """The paths of the profiles inside the package, by name."""
+    """The paths of the profiles inside the package, by name.
+
+    >>> built_in_cameras()["sony-a7r2"].name
+    'sony-a7r2.toml'
+    """
     folder = Path(str(resources.files("clpipe.camera") / "profiles"))
     return {path.stem: path for path in sorted(folder.glob("*.toml"), key=lambda path: path.stem)}
 
@@ -335,6 +343,9 @@ def _cameras_beyond(camera: Camera, iso: float) -> str:
 
 def load_camera(name: str) -> Camera:
     """Load a built-in camera by :func:`built_in_name`, or a file by its path (ending in .toml).
+
+    >>> load_camera("sony-a7r2")
+    Camera(sony-a7r2, ISO 100 to 25600)
 
     Raises:
         RequestError: there is no such camera or file, or the file is not a valid profile.
