@@ -193,7 +193,7 @@ def test_what_was_made_is_kept_as_far_as_memory_goes(explorer, monkeypatch):
     monkeypatch.setattr("clpipe.explorer.explorer.KEPT", 0)
     explorer.develop(0, {"seed": 5}, View())
     assert explorer.sample(numbers[-2]).facts["seed"] == 3
-    with pytest.raises(RequestError, match="not kept any more"):
+    with pytest.raises(RequestError, match="no longer kept"):
         explorer.sample(numbers[-3])
 
 
@@ -313,4 +313,4 @@ def test_a_manifest_is_refused(two_renders, tmp_path):
     manifest.write_text(f"path,iso\n{two_renders / 'a.exr'},800\n")
     result = CliRunner().invoke(main, ["explore", str(manifest), "--device", "numpy"])
     assert result.exit_code == 2
-    assert "rows may have settings of their own" in result.output
+    assert "rows of a manifest may have their own settings" in result.output

@@ -112,8 +112,8 @@ def test_the_page_may_load_nothing_from_elsewhere(served):
 @pytest.mark.parametrize(
     ("name", "question", "says"),
     [
-        ("develop", [], "no JSON"),
-        ("develop", {"image": 0, "values": {"\ud800": 1}}, "no JSON"),
+        ("develop", [], "not valid JSON"),
+        ("develop", {"image": 0, "values": {"\ud800": 1}}, "not valid JSON"),
         ("develop", b"[" * 100_000, "nested too deeply"),
         ("develop", {"image": 0, "values": {"\udc80": 1}}, "unknown key"),
         ("develop", {}, "whole numbers image"),

@@ -1,4 +1,4 @@
-"""What a page can set: the stages of a chain with their methods and parameters, as declared."""
+"""The controls of the page: stages, methods and parameters, from their declarations."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,14 +15,14 @@ from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.stage import Kind, Stage
 
-HIDDEN = {"title", "description"}  # of a parameter's schema; the description is sent as "text"
+HIDDEN = {"title", "description"}  # keys of a schema; the description is sent as "text"
 
 
 def stage_controls() -> dict[str, Any]:
-    """Every stage by its name: what it does, and its methods with their parameters.
+    """Return every stage by its name, with its summary, methods and parameters.
 
-    A parameter is its JSON schema, which has its type, limits, unit and default; "text" says what
-    it is, "auto" where its value comes from when it is not set.
+    A parameter is a JSON schema with type, limits, unit and default. Its "text" describes it, and
+    its "auto" states the source of a value that is not set.
     """
     return {
         name: {
@@ -42,7 +42,7 @@ def stage_controls() -> dict[str, Any]:
 
 
 def parameters_of(model: type[BaseModel]) -> dict[str, Any]:
-    """The parameters that a class declares, each as its JSON schema with a text.
+    """Return the parameters that a class declares, each as a JSON schema with a text.
 
     >>> from clpipe.stages.gamma import STAGE
     >>> list(parameters_of(STAGE.methods[0]))
@@ -57,9 +57,9 @@ def parameters_of(model: type[BaseModel]) -> dict[str, Any]:
 
 
 def key_controls() -> dict[str, Any]:
-    """The values that stand in no table, each as a JSON schema with a text.
+    """Return the settings outside tables, each as a JSON schema with a text.
 
-    That of "lens" has all names as "suggested", or says what to install for them.
+    The schema of "lens" lists all names as "suggested", or states what to install for them.
     """
     names = {int: "integer", str: "string", float: "number"}
     controls: dict[str, dict[str, Any]] = {}
@@ -75,10 +75,10 @@ def key_controls() -> dict[str, Any]:
 
 
 def camera_controls(others: Sequence[str]) -> list[dict[str, Any]]:
-    """The cameras that can be chosen, with their ISOs: the built-in ones, and files that are named.
+    """Return the built-in cameras and those of given files, with their ISO ranges.
 
     Raises:
-        RequestError: a file is no camera profile.
+        RequestError: a file is not a camera profile.
     """
     cameras = [(name, load_camera(name)) for name in (*sorted(built_in_cameras()), *others)]
     return [
