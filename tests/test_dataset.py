@@ -235,7 +235,7 @@ def test_what_is_refused(renders):
         api.Dataset(5)
     with pytest.raises(RequestError, match="no file matches"):
         api.Dataset("in/*.png")
-    with pytest.raises(RequestError, match=r"are both called r0\.exr"):
+    with pytest.raises(RequestError, match=r"have the same name r0\.exr"):
         api.Dataset(["in/r0.exr", Path("in")])
 
 

@@ -176,7 +176,7 @@ def test_files_that_are_gone_or_changed_are_named(out):
     (out / "b.jpg").write_bytes(changed)
     (out / "b.normalize.exr").write_bytes(b"short")
     page = report(out)
-    assert "a.jpg: is gone" in page.said
+    assert "a.jpg: is missing" in page.said
     assert "b.jpg: was changed since; its SHA-256" in page.said
     assert "b.normalize.exr: has 5 bytes, not the " in page.said
     by_name = {entry["name"]: entry for entry in page.data["sheet-data"]}
@@ -342,7 +342,7 @@ def test_many_pictures_are_sampled_within_the_budget(out, monkeypatch):
     ("arguments", "message"),
     [
         (["nowhere"], "nowhere: there is no such file or folder"),
-        (["."], "has no picture of clpipe's with its sidecar"),
+        (["."], "has no picture of clpipe with its sidecar"),
         ([".", "-o", "x.pdf"], "-o: found x.pdf; expected a name that ends in .html"),
         ([".", ".", "."], "found 3 folders; one is reported on, or two are compared"),
     ],

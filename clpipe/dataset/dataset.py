@@ -58,9 +58,9 @@ class Dataset(ReadOnly):
     - "key": the path of the render relative to the input directory. "epoch", "seed".
     - "camera", "iso". "a" and "b" state the sensor noise, Var[y] = a*y + b in signal units (1 is
       the white level). They are 0 without noise.
-    - With a raw in the chain: "cfa", such as "RGGB"; "black_level" and "white_level" in DN;
-      "gains", the white balance of red, green and blue; "xyz_to_camera", 3x3, from CIE XYZ (D65) to
-      the colours of the raw, like ColorMatrix of a DNG.
+    - With a raw in the chain, "cfa", such as "RGGB", and "black_level" and "white_level" in DN.
+      "gains" is the white balance of red, green and blue. "xyz_to_camera", 3x3, maps CIE XYZ (D65)
+      to the colours of the raw, like ColorMatrix of a DNG.
     - With ``patch``, "place": its first column and row in the picture, and "turn": its EXIF
       orientation after augmentation (1 is unchanged).
 
@@ -117,8 +117,8 @@ class Dataset(ReadOnly):
 
     Raises:
         RequestError: a name or value is not allowed, an input is missing, a directory has no
-            images, two images have the same name, the chain has no noise, raw or variance that is
-            requested, or a type cannot hold the values.
+            images, or two images have the same name. It is also raised if the chain has no noise,
+            raw or variance that is requested, or if a type cannot hold the values.
     """
 
     @typed

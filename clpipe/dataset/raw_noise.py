@@ -82,9 +82,9 @@ class RawNoise(ReadOnly):
 
         Args:
             mosaic: linear signal, where 0 is black and 1 is white, in float16, float32 or float64.
-                It is (height, width) or (1, height, width) with the camera's CFA pattern, or its
-                planes R, Gr, Gb, B, (4, height / 2, width / 2), where Gr is green in the rows of
-                red. A batch has another axis in front.
+                It is (height, width) or (1, height, width) with the camera's CFA pattern. Or it is
+                packed as planes R, Gr, Gb, B, (4, height / 2, width / 2). Gr is green in the rows
+                of red. A batch has another axis in front.
             key: a name for repeatable noise. Pass another one in each epoch. Mosaics of a batch
                 differ by their index. None, or a generator, draws a new name.
 

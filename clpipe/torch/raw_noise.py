@@ -89,9 +89,9 @@ class RawNoise(ReadOnly):
 
         Args:
             mosaic: linear signal, where 0 is black and 1 is white, float32. It is (batch, 1,
-                height, width) with the camera's CFA pattern, or its planes R, Gr, Gb, B, (batch, 4,
-                height / 2, width / 2), where Gr is green in the rows of red. The batch axis may be
-                absent.
+                height, width) with the camera's CFA pattern. Or it is packed as planes R, Gr, Gb,
+                B, (batch, 4, height / 2, width / 2). Gr is green in the rows of red. The batch axis
+                may be absent.
             key: a name for each mosaic of the batch, for repeatable noise. Pass others in each
                 epoch. Fixed patterns are then those of the upper left corner of the sensor. None
                 draws new noise and a position on the sensor for each mosaic.
