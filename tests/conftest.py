@@ -1,5 +1,9 @@
+import itertools
+import os
 import resource
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -9,12 +13,16 @@ from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
+import pyopencl as cl
 import pytest
 from click.testing import CliRunner
 from click.testing import Result as ClickResult
 
 from clpipe.batch.run_log import read_log
+from clpipe.batch.sinks import Folder
+from clpipe.batch.work import ImageWorker
 from clpipe.chain.making import make_chain
+from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
 from clpipe.commands.main import main
 from clpipe.engine import programs
@@ -22,7 +30,10 @@ from clpipe.engine.device import Device
 from clpipe.engine.discovery import choose, find_devices
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.write import write_exr as write_file
+from clpipe.inputs.find import Job, find_jobs
+from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.sidecar import SEAL, sealed
+from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -79,6 +90,32 @@ def cli_output(*arguments: object, status: int = 0) -> str:
     return run_cli(*arguments, status=status).output
 
 
+def run_python(
+    *words: object, cwd: str | Path | None = None, status: int | None = 0, **environment: object
+) -> "subprocess.CompletedProcess[str]":
+    """Run Python in a process of its own that finds this clpipe, and check its status.
+
+    Args:
+        words: what stands behind ``python`` on its command line.
+        cwd: its working directory; this one if not given.
+        status: the exit status that is expected; any if None.
+        environment: variables that it has besides those of this process.
+    """
+    done = subprocess.run(
+        [sys.executable, *map(str, words)],
+        cwd=cwd,
+        env={
+            **os.environ,
+            "PYTHONPATH": str(ROOT),
+            **{k: str(v) for k, v in environment.items()},
+        },
+        capture_output=True,
+        text=True,
+    )
+    assert status in (done.returncode, None), done.stdout[-2000:] + done.stderr
+    return done
+
+
 def noise_report(*sigmas: float, **changes: Any) -> dict[str, Any]:
     """What clpipe measure --json says of a picture whose R, G, B have these sigmas; with changes.
 
@@ -107,6 +144,15 @@ def reseal(path: Path, values: Mapping[str, Any]) -> None:
     path.write_bytes(sealed({key: value for key, value in values.items() if key != SEAL}))
 
 
+def worker_of(folder: Path, out: str = "out", **options: Any) -> tuple[ImageWorker, list[Job]]:
+    """A worker that makes PNGs of the renders in "in" of a folder, and its jobs."""
+    request, made = Request.from_options(formats=("png",), **options), folder / out
+    made.mkdir(exist_ok=True)
+    loader, jobs = ImageLoader(request), find_jobs([str(folder / "in")], made)
+    chain = loader.first_chain(jobs)
+    return ImageWorker(loader, Folder(OutputWriter(made, request.with_outputs(chain))), chain), jobs
+
+
 @contextmanager
 def file_limit(size: int) -> Iterator[None]:
     """Let no file grow beyond a size in bytes, as a full disk does."""
@@ -116,6 +162,31 @@ def file_limit(size: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def fail_launches(monkeypatch: pytest.MonkeyPatch, error: BaseException, *numbers: int) -> None:
+    """Have launches of kernels fail, by their numbers from now on."""
+    launch, count = cl.enqueue_nd_range_kernel, itertools.count()
+
+    def launched(*arguments: Any, **options: Any) -> cl.Event:
+        if next(count) in numbers:
+            raise error
+        return launch(*arguments, **options)
+
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
+
+
+@pytest.fixture
+def launches(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
+    """The global sizes of the launches from now on."""
+    seen, launch = [], cl.enqueue_nd_range_kernel
+
+    def launched(queue: Any, kernel: Any, size: Any, *rest: Any, **options: Any) -> cl.Event:
+        seen.append(tuple(size))
+        return launch(queue, kernel, size, *rest, **options)
+
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
+    return seen
 
 
 @pytest.fixture(scope="session", autouse=True)

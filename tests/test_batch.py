@@ -26,7 +26,6 @@ from clpipe.batch.job_state import JobState
 from clpipe.batch.memory_budget import MemoryBudget, host_bytes
 from clpipe.batch.outcome import DONE, Outcome, Span
 from clpipe.batch.run_log import read_log
-from clpipe.batch.sinks import Folder
 from clpipe.batch.threads import Batch
 from clpipe.batch.trace import Trace
 from clpipe.batch.work import ImageWorker
@@ -35,13 +34,13 @@ from clpipe.chain.request import Request
 from clpipe.commands.progress import Reporter
 from clpipe.engine.runner import Runner
 from clpipe.images import write
-from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
+from clpipe.inputs.find import Job, Shard, parse_shard
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs import folder as output_folders
 from clpipe.outputs import record
 from clpipe.outputs.folder import LOCK, output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
-from tests.conftest import ROOT, contents, reseal, statuses, written
+from tests.conftest import ROOT, contents, reseal, statuses, worker_of, written
 from tests.held import (
     GO,
     GUARD,
@@ -56,15 +55,6 @@ from tests.held import (
 
 # A chain that other tests compile too.
 RUN = ("-o", "out", "--iso", 3200)
-
-
-def worker_of(folder):
-    """A worker that makes PNGs of the renders in a folder, and its jobs."""
-    loader = ImageLoader(Request.from_options(formats=("png",)))
-    jobs = find_jobs([str(folder / "in")], folder / "out")
-    chain = loader.first_chain(jobs)
-    writer = OutputWriter(folder / "out", loader.request.with_outputs(chain))
-    return ImageWorker(loader, Folder(writer), chain), jobs
 
 
 def stamps(folder):

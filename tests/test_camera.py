@@ -300,6 +300,9 @@ def test_what_arises_after_the_gain_is_what_the_fit_says(own):
         ("iso_range = [100, 6400]", "iso_range = [10, 50]", "before the first gain stage"),
         ("white_level = 1023", "white_level = 70000", "white_level: .*65535"),
         ("[sources]", "[source]", "sources: missing"),
+        ("white_level = 1023", "white_level = 64", "white_level must be above black_level"),
+        ("iso = [800, 1600]", "iso = [1600, 800]", "iso must ascend"),
+        ('name = "mine"', "name = ", "not valid TOML"),
     ],
 )
 def test_a_profile_that_cannot_be_is_refused(own, old, new, message):

@@ -13,10 +13,10 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
+from clpipe.base.errors import DeviceError
 from clpipe.commands.main import COMMANDS, main
 from clpipe.engine import discovery
-from clpipe.stages import DEFAULT_CHAIN
-from tests.conftest import ROOT, STILL_LIFE, written
+from tests.conftest import ROOT, STILL_LIFE, run_python, written
 
 
 @pytest.fixture
@@ -64,21 +64,9 @@ def test_the_main_job(clpipe, tmp_path):
 
 
 def test_numpy_gives_the_same_picture(clpipe, small, tmp_path):
-    clpipe("run", small, "-o", "a", "--iso", 3200, "--format", "png", "--keep", "quantize")
-    clpipe(
-        "run",
-        small,
-        "-o",
-        "b",
-        "--iso",
-        3200,
-        "--format",
-        "png",
-        "--keep",
-        "quantize",
-        "--device",
-        "numpy",
-    )
+    run = ("run", small, "--iso", 3200, "--format", "png", "--keep", "quantize")
+    clpipe(*run, "-o", "a")
+    clpipe(*run, "-o", "b", "--device", "numpy")
     assert written(tmp_path / "a") == ["small.json", "small.png", "small.quantize.exr"]
     one, two = (read_png(f"{f}/small.png").astype(int) for f in "ab")
     assert np.abs(one - two).max() <= 1
@@ -86,44 +74,11 @@ def test_numpy_gives_the_same_picture(clpipe, small, tmp_path):
     assert json.loads((tmp_path / "b" / "small.json").read_text())["device"]["name"] == "numpy"
 
 
-def test_a_second_run_makes_the_same_bytes(clpipe, small, tmp_path):
-    for folder in "ab":
-        clpipe(
-            "run",
-            small,
-            "-o",
-            folder,
-            "--iso",
-            3200,
-            "--format",
-            "jpg",
-            "--format",
-            "exr",
-            "--keep",
-            "all",
-        )
-    assert written(tmp_path / "a") == written(tmp_path / "b")
-    assert len(written(tmp_path / "a")) == 3 + len(DEFAULT_CHAIN)
-    for name in written(tmp_path / "a"):
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
-
-
 @pytest.mark.slow
 def test_float_exr_of_the_last_stage(clpipe, small):
-    clpipe(
-        "run",
-        small,
-        "-o",
-        "out",
-        "--stages",
-        "mosaic,sensor_noise",
-        "--format",
-        "exr",
-        "--set",
-        "sensor_noise.a=0",
-        "--set",
-        "sensor_noise.b=0",
-    )
+    quiet = ("--set", "sensor_noise.a=0", "--set", "sensor_noise.b=0")
+    stages = ("--stages", "mosaic,sensor_noise", *quiet)
+    clpipe("run", small, "-o", "out", "--format", "exr", *stages)
     pixels, spec = read_exr("out/small.exr")
     source, _ = read_exr(small)
     assert spec.channelnames == ("Y",)
@@ -144,20 +99,8 @@ def test_a_configuration_with_options_over_it(clpipe, small, tmp_path):
     (tmp_path / "p.toml").write_text(
         'iso = 200\nskip = ["denoise"]\n[mosaic]\npattern = "GBRG"\n[exposure]\nev = 1\n'
     )
-    clpipe(
-        "run",
-        small,
-        "-o",
-        "out",
-        "-c",
-        "p.toml",
-        "--iso",
-        400,
-        "--set",
-        "exposure.ev=-1",
-        "--skip",
-        "row_noise",
-    )
+    over = ("--iso", 400, "--set", "exposure.ev=-1", "--skip", "row_noise")
+    clpipe("run", small, "-o", "out", "-c", "p.toml", *over)
     sidecar = json.loads((tmp_path / "out" / "small.json").read_text())
     stages = {s["name"]: s["parameters"] for s in sidecar["stages"]}
     assert sidecar["iso"] == 400
@@ -185,31 +128,16 @@ def test_a_folder_keeps_its_structure_and_a_bad_file_stops_nobody(clpipe, write_
 @pytest.mark.parametrize(
     ("arguments", "status", "message"),
     [
-        (["--set", "demosaic.method=bilinaer"], 2, "did you mean 'bilinear'"),
-        (["--set", "denois.grain=0"], 2, "did you mean 'denoise'"),
         (["--set", "denoise.grian=0"], 2, "did you mean 'grain'"),
         (["--set", "denoise.luma_size=5"], 2, "'luma_size' is a parameter of bilateral and non"),
-        (
-            ["--set", "denoise.method=mean", "--set", "denoise.luma_size=4"],
-            2,
-            "denoise.luma_size: found 4: it must be odd, 1 to 15",
-        ),
-        (["--set", "denoise"], 2, "expected stage.parameter=value"),
-        (["--stages", "mosaic,gamma"], 2, "gamma reads rgb, but mosaic gives mosaic"),
         (["--set", "denoise.method=[1]"], 2, "denoise.method: unknown method"),
         (["--set", "sensor_noise_2.a=1"], 2, "unknown stage in this chain 'sensor_noise_2'"),
         (["--set", "denoise.grain=0", "--skip", "denoise"], 2, "in this chain 'denoise'"),
-        (["--set", "sensor_noise.a=1e300"], 2, "sensor_noise.a: found 1e+300"),
         (["--set", "denoise.grain=true"], 2, "denoise.grain: found True"),
         (["--device", ""], 3, "unknown device ''"),
-        (["--skip", "nois"], 2, "unknown stage 'nois'"),
         (["--keep", "noise"], 2, "unknown stage in this chain 'noise'"),
-        (["-c", "missing.toml"], 2, "missing.toml: there is no such file"),
-        (["--camera", "leica"], 2, "unknown camera 'leica'"),
-        (["--iso", "1"], 2, "from 100 to 25600"),
         (["--stages", "mosaic,quantize"], 2, "ends in DN, which jpg cannot hold"),
         (["--device", "quantum"], 3, "unknown device 'quantum'"),
-        (["--device", "99"], 3, "unknown device '99'"),
         (["--format", "bmp"], 2, "bmp"),
     ],
 )
@@ -224,11 +152,6 @@ def test_inputs_that_cannot_be(clpipe, small, tmp_path):
     (tmp_path / "empty").mkdir()
     assert "this folder has no images" in clpipe("run", "empty", "-o", "out", status=2).stderr
     assert "no file matches" in clpipe("run", "*.nothing", "-o", "out", status=2).stderr
-    other = tmp_path / "other"
-    other.mkdir()
-    (other / "small.exr").write_bytes(small.read_bytes())
-    result = clpipe("run", small, other / "small.exr", "-o", "out", status=2)
-    assert "would both write out/small.json" in result.stderr
     result = clpipe("run", small, "-o", small.parent, "--format", "exr", status=2)
     assert "is an input and would be overwritten" in result.stderr
 
@@ -281,12 +204,6 @@ def test_odd_names(clpipe, write_exr, tmp_path):
     assert written(tmp_path / "out") == ["sp ace \u00e9\u4e2d.jpg", "sp ace \u00e9\u4e2d.json"]
     assert "File name too long" in clpipe("run", "a" * 300, "-o", "out", status=1).stderr
     assert "an input is empty" in clpipe("run", "", "-o", "out", status=2).stderr
-
-
-def test_an_output_folder_that_cannot_be_written(clpipe, small, tmp_path):
-    (tmp_path / "file").write_text("in the way")
-    result = clpipe("run", small, "-o", "file/out", status=2)
-    assert "file is a file; name a folder to write to" in result.stderr
 
 
 def test_nothing_is_left_half_written(clpipe, small, tmp_path, monkeypatch):
@@ -475,40 +392,21 @@ def test_a_chain_printed_as_toml_makes_the_same_picture(clpipe, small, tmp_path)
     assert one == two
 
 
-def python(code, **environment):
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
-    )
-
-
 @pytest.mark.slow
 def test_no_platform_at_all(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "clpipe", "run", STILL_LIFE, "-o", tmp_path / "out"],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "OCL_ICD_VENDORS": str(tmp_path)},
-    )
+    command = ("-m", "clpipe", "run", STILL_LIFE, "-o", tmp_path / "out")
+    done = run_python(*command, status=None, OCL_ICD_VENDORS=tmp_path)
     if "no OpenCL platform was found" not in done.stderr:
         # The pip loader may bring its own PoCL whatever OCL_ICD_VENDORS says.
-        from clpipe.base.errors import DeviceError
-        from clpipe.engine.discovery import choose
-
         with pytest.raises(DeviceError, match="no OpenCL platform was found"):
-            choose(None, [])
+            discovery.choose(None, [])
     else:
         assert done.returncode == 3
 
 
 @pytest.mark.slow
 def test_a_missing_linker_is_said_before_it_aborts_the_process(tmp_path):
-    done = python(
-        "from clpipe.commands.main import main; main(['check', '--small'])", PATH=str(tmp_path)
-    )
-    assert done.returncode == 3
+    done = run_python("-m", "clpipe", "check", "--small", status=3, PATH=tmp_path)
     assert "PoCL needs a linker" in done.stderr
 
 

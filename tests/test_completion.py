@@ -1,16 +1,13 @@
 """What the shell completes, and that listing and completing commands stays light."""
 
 import ast
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 from click.shell_completion import ShellComplete
 
 from clpipe.commands.main import COMMANDS, main, summary
 from clpipe.stages import DEFAULT_CHAIN
-from tests.conftest import ROOT
+from tests.conftest import run_python
 
 pytestmark = pytest.mark.slow
 
@@ -27,21 +24,11 @@ def values(*words):
     return [value for _, value in completed(*words)]
 
 
-def test_commands():
-    assert values("c") == ["compare", "cameras", "calibrate", "check"]
-
-
 @pytest.mark.parametrize("words", [("run", "--camera"), ("cameras",), ("stages", "--camera")])
 def test_cameras(words):
     assert values(*words, "nikon-d8") == ["nikon-d800", "nikon-d850"]
     assert values(*words, "Nikon D8") == ["nikon-d800", "nikon-d850"]
     assert values(*words, "A7 II") == ["sony-a7m2"]
-
-
-def test_configurations_and_files():
-    assert values("run", "-c", "brooks") == ["brooks2019"]
-    assert completed("run", "-c", "mine") == [("file", "mine")]
-    assert completed("run", "--camera", "./") == [("file", "./")]
 
 
 @pytest.mark.parametrize(
@@ -60,30 +47,32 @@ def test_stages(words):
     assert set(DEFAULT_CHAIN) <= set(values(*words, ""))
 
 
-def test_lists_of_stages():
-    assert values("run", "--stages", "exposure,mosaic,dem") == ["exposure,mosaic,demosaic"]
+NUMBERS = ("method", "bits", "black_level", "white_level", "result_bits", "knots")
 
 
-def test_keep_takes_all():
-    assert values("plan", "--keep", "a") == ["all"]
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (("c",), ["compare", "cameras", "calibrate", "check"]),
+        (("run", "-c", "brooks"), ["brooks2019"]),
+        (("run", "--stages", "exposure,mosaic,dem"), ["exposure,mosaic,demosaic"]),
+        (("plan", "--keep", "a"), ["all"]),
+        (("bench", "--methods", "den"), ["denoise"]),
+        (("bench", "--methods", "prn"), []),  # has one method
+        (("run", "--set", "expo"), ["exposure."]),
+        (("run", "--set", "quantize."), [f"quantize.{name}=" for name in NUMBERS]),
+        (("run", "--set", "gamma.method=s"), ["gamma.method=srgb"]),
+        (("run", "--set", "nothing."), []),
+        (("run", "--stage-file", "/gone.py", "--skip", "dem"), []),  # and no traceback
+    ],
+)
+def test_names(words, found):
+    assert values(*words) == found
 
 
-def test_only_stages_with_several_methods_have_methods_to_time():
-    assert "prnu" not in values("bench", "--methods", "")
-    assert values("bench", "--methods", "den") == ["denoise"]
-
-
-def test_parameters():
-    assert values("run", "--set", "expo") == ["exposure."]
-    names = ["bits", "black_level", "white_level", "result_bits", "knots"]
-    assert values("run", "--set", "quantize.") == [f"quantize.{n}=" for n in ["method", *names]]
-    assert values("run", "--set", "gamma.method=s") == ["gamma.method=srgb"]
-    assert values("run", "--set", "nothing.") == []
-
-
-def test_a_stage_of_the_users_own(tmp_path):
-    file = tmp_path / "gone.py"
-    assert values("run", "--stage-file", str(file), "--skip", "dem") == []  # and no traceback
+def test_files():
+    assert completed("run", "-c", "mine") == [("file", "mine")]
+    assert completed("run", "--camera", "./") == [("file", "./")]
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -99,7 +88,7 @@ HEAVY = ("numpy", "pydantic", "pyopencl", "OpenImageIO", "rich", "scipy", "matpl
 
 # In this order, in one process: each may need what those before it need.
 IMPORTS = {
-    "import clpipe": (),
+    "import clpipe.__main__": (),
     "from clpipe.commands.main import main; main(['--help'], standalone_mode=False)": (),
     "import clpipe.commands.cameras": ("numpy", "pydantic"),
     "import clpipe.commands.stages": ("numpy", "pydantic"),
@@ -113,8 +102,7 @@ IMPORTS = {
 def test_what_is_not_needed_is_not_imported():
     told = f"print('found', [m for m in {HEAVY} if m in sys.modules])"
     program = "\n".join(["import sys", *(line for code in IMPORTS for line in (code, told))])
-    command = [sys.executable, "-c", program]
-    run = subprocess.run(command, cwd=Path(ROOT), capture_output=True, text=True, check=True)
-    found = [line[6:] for line in run.stdout.splitlines() if line.startswith("found ")]
+    lines = run_python("-c", program).stdout.splitlines()
+    found = [line[6:] for line in lines if line.startswith("found ")]
     for (code, allowed), modules in zip(IMPORTS.items(), found, strict=True):
         assert set(ast.literal_eval(modules)) <= set(allowed), code

@@ -1,20 +1,17 @@
 """Requests: what is wrong with one is said in one message that names it."""
 
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from clpipe.base.errors import RequestError
-from clpipe.camera.profile import load_camera
 from clpipe.chain.assignments import parse_assignment
 from clpipe.chain.files import built_in_configs, load_settings, toml_text
 from clpipe.chain.making import make_chain
-from clpipe.chain.methods import default_method
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import overlay, settings_from
-from clpipe.stage import Kind, Method
+from clpipe.stage import Kind
 from clpipe.stages import DEFAULT_CHAIN
 
 
@@ -227,79 +224,7 @@ def test_a_chain_as_toml_is_the_chain_again(tmp_path):
     assert "\na = 0.001" in path.read_text()
 
 
-def test_a_camera_of_ones_own(tmp_path):
-    from clpipe.camera.profile import built_in_cameras
-
-    text = built_in_cameras()["sony-a7r2"].read_text()
-    own = tmp_path / "own.toml"
-    own.write_text(text.replace('name = "sony-a7r2"', 'name = "mine"'))
-    assert load_camera(str(own)).name == "mine"
-    own.write_text(text.replace("black_level = 512", "black_level = -3"))
-    with pytest.raises(RequestError, match=r"own.toml: black_level: .*greater"):
-        load_camera(str(own))
-    for old, new, message in (
-        (
-            "read_noise = [1.413, ",
-            "read_noise = [",
-            "gain_stages.0.: read_noise must be as long as iso; found 7 and 8",
-        ),
-        ("iso = [100, 125,", "iso = [125, 100,", "gain_stages.0.: iso must ascend"),
-        ("white_level = 16383", "white_level = 512", "white_level must be above black_level"),
-    ):
-        own.write_text(text.replace(old, new))
-        with pytest.raises(RequestError, match=rf"own.toml: {message}"):
-            load_camera(str(own))
-    own.write_text("name = ")
-    with pytest.raises(RequestError, match=r"own.toml: not valid TOML"):
-        load_camera(str(own))
-
-
-# quantize and normalize validate a second time, what they have from the camera.
-STEPS = ["exposure", "mosaic", "sensor_noise", "demosaic", "denoise", "gamma"]
-
-
-@pytest.fixture
-def validated(monkeypatch):
-    """How often a method's parameters were validated, by its class."""
-    counts = Counter()
-    validate, make = Method.model_validate.__func__, Method.__init__
-
-    def counted_validate(cls, values, **options):
-        counts[cls] += 1
-        return validate(cls, values, **options)
-
-    def counted_make(self, **values):
-        counts[type(self)] += 1
-        make(self, **values)
-
-    monkeypatch.setattr(Method, "model_validate", classmethod(counted_validate))
-    monkeypatch.setattr(Method, "__init__", counted_make)
-    default_method.cache_clear()
-    yield counts
-    default_method.cache_clear()
-
-
-def test_parameters_are_validated_once_and_the_model_is_kept(validated):
-    values = {"exposure": {"ev": 1}, "denoise": {"method": "mean"}}
-    settings = settings_from({"stages": STEPS, **values})
-    steps = make_chain(settings).steps
-    assert set(validated.values()) == {1}
-    assert len(validated) == len(steps)
-    brighter = overlay(settings, {"iso": 800, "exposure": {"ev": 2}})
-    assert [s.name for s in make_chain(brighter).steps] == [s.name for s in steps]
-    assert [cls for cls, count in validated.items() if count > 1] == [type(steps[0].method)]
-
-
 def test_a_model_is_that_of_its_table():
     settings = settings_from({"exposure": {"ev": 1}})
     other = replace(settings, parameters={"exposure": {"ev": 2}})
     assert (settings.method("exposure").ev, other.method("exposure").ev) == (1, 2)
-
-
-def test_a_draw_validates_its_own_step_alone(validated):
-    values = {"exposure": {"ev": {"uniform": [-1, 1]}}, "denoise": {"method": "mean"}}
-    settings = settings_from({"stages": STEPS, **values})
-    make_chain(settings.drawn("a"))
-    before = validated.copy()
-    make_chain(settings.drawn("b"))
-    assert list(validated - before) == [all_stages()["exposure"].methods[0]]

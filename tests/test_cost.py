@@ -6,8 +6,6 @@ what was measured when they were last lowered. Lower them with the cost.
 
 import itertools
 import json
-import os
-import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -23,7 +21,7 @@ import clpipe
 from clpipe.batch.threads import Batch
 from clpipe.engine.device import open_devices
 from clpipe.images.write import write_exr
-from tests.conftest import ROOT
+from tests.conftest import ROOT, run_python
 
 CAMERAS = ["sony-a7r2", "canon-5d2", "canon-6d", "nikon-d850"]
 SLACK = 1.05  # for other versions of Python and of libraries
@@ -111,11 +109,8 @@ def measured(folder: Path) -> dict[str, tuple[float, float]]:
 
 @pytest.fixture(scope="module")
 def costs(device, tmp_path_factory):
-    command = [sys.executable, "-m", "tests.test_cost", str(tmp_path_factory.mktemp("cost"))]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    folder = tmp_path_factory.mktemp("cost")
+    return json.loads(run_python("-m", "tests.test_cost", folder, cwd=ROOT).stdout)
 
 
 @pytest.mark.slow

@@ -1,9 +1,6 @@
 """Which CPU PoCL compiles for."""
 
-import os
 import re
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,7 +19,7 @@ from clpipe.engine.cpu_target import (
     row_of,
     target_for,
 )
-from tests.conftest import ROOT
+from tests.conftest import ROOT, run_python
 
 pytestmark = pytest.mark.slow
 
@@ -199,11 +196,7 @@ RAW = """if True:
 
 def raw_for(target, device="pocl"):
     """The digest of a raw in a process of its own, and the target that it was made for."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), cpu_target.VARIABLE: target}
-    done = subprocess.run(
-        [sys.executable, "-c", RAW, device], env=environment, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
+    done = run_python("-c", RAW, device, **{cpu_target.VARIABLE: target})
     assert done.stderr == ""  # the compiler's own "30 warnings generated." neither
     return done.stdout.split()
 

@@ -11,7 +11,6 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
-import pyopencl as cl
 import pytest
 from PIL import Image
 
@@ -137,7 +136,9 @@ def test_only_a_few_are_ahead(dataset, monkeypatch):
         next(samples)
     assert len(read) <= 3 + 2 + 2
     samples.close()
-    assert before.issuperset(threading.enumerate())
+    for thread in {*threading.enumerate()} - before:
+        thread.join(1)  # one that would have announced slow compiling may still be ending
+        assert not thread.is_alive()
 
 
 def test_samples_do_not_share_memory(dataset):
@@ -177,29 +178,23 @@ def test_a_damaged_image_is_skipped_where_that_is_asked_for(renders):
 
 
 @pytest.mark.slow
-def test_samples_of_a_batch_go_through_together_and_are_the_same(renders, monkeypatch):
+def test_samples_of_a_batch_go_through_together_and_are_the_same(renders, monkeypatch, launches):
     drawn = {"iso": {"log_uniform": [400, ISO]}, "patch": api.Patches(16, 4), "raw": "packed"}
     samples = api.Dataset(renders, **drawn, on_error="skip")
     numbers = [0, 7, 5, 18, 2, 13, 8]  # of two sizes of renders, each with an ISO of its own
     alone = [samples[number] for number in numbers]
-    sizes, launch = [], cl.enqueue_nd_range_kernel
-
-    def launched(queue, kernel, size, *rest, **options):
-        sizes.append(tuple(size))
-        return launch(queue, kernel, size, *rest, **options)
-
-    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
+    launches.clear()
     for one, two in zip(samples.__getitems__(numbers), alone, strict=True):
         same(one, two)
-    assert {size[2:] for size in sizes} == {(7,)}
+    assert {size[2:] for size in launches} == {(7,)}
     in_order = list(samples)
     for number, one in zip(numbers, alone, strict=True):
         same(in_order[number], one)
     monkeypatch.setattr(ahead, "MOST_PIXELS", 300)  # two patches
-    sizes.clear()
+    launches.clear()
     for one, two in zip(samples.__getitems__(numbers), alone, strict=True):
         same(one, two)
-    assert {size[2:] for size in sizes} <= {(2,), (1,)}
+    assert {size[2:] for size in launches} <= {(2,), (1,)}
     data = Path("in/r1.exr").read_bytes()
     Path("in/r1.exr").write_bytes(data[: len(data) // 2])
     again = api.Dataset(renders, **drawn, on_error="skip")
@@ -216,6 +211,7 @@ def test_what_is_refused(renders):
         ({"keep": "demosiac"}, "demosaic"),
         ({"truth": True, "skip": ["sensor_noise", "row_noise", "column_noise"]}, "adds noise"),
         ({"epoch": -1}, "found epoch -1"),
+        *(({"epochs": epochs}, "found epochs") for epochs in (0, -1, 1.5)),
         ({"truth": "mosaic"}, "expected true or false, 'development', 'clean' or None"),
         ({"keep": 5}, "found keep 5; expected a text, a list of texts or None"),
         ({"start_at": 5}, "found start_at 5; expected a text or None"),
@@ -321,25 +317,6 @@ def test_copies_in_other_processes_read_what_one_has_decoded(renders, monkeypatc
     assert not folder.exists()
 
 
-def test_renders_beyond_the_cache_are_decoded_each_time(renders, monkeypatch):
-    some, none = (api.Dataset(renders, iso=ISO, cache=size) for size in (2 * 17 * 40 * 3 * 2, 0))
-    decoded, read = [], ImageLoader.read
-
-    def counted(loader, job):
-        decoded.append(job.key)
-        return read(loader, job)
-
-    monkeypatch.setattr(ImageLoader, "read", counted)
-    for samples, expected in ((some, 3), (none, 5)):
-        for number in range(5):
-            assert samples[number]["key"] == f"r{number}.exr"
-        decoded.clear()
-        for number in range(5):
-            assert samples[number]["key"] == f"r{number}.exr"
-        assert len(decoded) == expected
-    assert some._loader.renders.taken <= 2 * 17 * 40 * 3 * 2
-
-
 def test_a_render_in_planes_stays_in_planes(tmp_path):
     planes = np.arange(24, dtype=np.float16).reshape(3, 2, 4)
     image = SourceImage(planes.transpose(1, 2, 0), "", "", (), {})
@@ -381,14 +358,3 @@ def test_tars_that_cannot_be_streamed(renders):
     Path("bad.tar").write_bytes(b"no tar at all")
     with pytest.raises(ImageError, match=r"bad\.tar: cannot be read as a tar"):
         list(api.StreamingDataset("bad.tar"))
-
-
-def test_an_iso_that_is_drawn(renders):
-    samples = api.Dataset(renders, device="numpy", iso={"choice": [100, 400]}, epochs=4)
-    assert {sample["iso"] for sample in samples} == {100, 400}
-
-
-@pytest.mark.parametrize("epochs", [0, -1, 1.5])
-def test_epochs_that_cannot_be(renders, epochs):
-    with pytest.raises(RequestError, match="found epochs"):
-        api.Dataset(renders, epochs=epochs)

@@ -13,20 +13,18 @@ import pytest
 
 from clpipe.base.errors import DeviceError, ImageError
 from clpipe.chain.making import make_chain
-from clpipe.chain.settings import Settings, settings_from
+from clpipe.chain.settings import settings_from
 from clpipe.commands.devices import device_rows
 from clpipe.engine import hardware
-from clpipe.engine.check import example
+from clpipe.engine.buffers import Pool
 from clpipe.engine.cpu_target import Target
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.discovery import choose, choose_all, find_devices
-from clpipe.engine.extents import Extent
 from clpipe.engine.flow import Flow
 from clpipe.engine.hardware import Hardware, hardware_of
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Runner
 from clpipe.engine.runtimes import lanes_for
-from clpipe.stage import Kind
 
 
 @pytest.fixture
@@ -143,6 +141,18 @@ class FakeDevice:
         return self.values[name]
 
 
+def test_buffers_are_used_again_and_go_when_memory_is_short():
+    pool = Pool(lambda size: SimpleNamespace(size=size, release=lambda: None))
+    pool.reserve({"one": 60, "two": 30}, 100)
+    held = dict(pool.buffers)
+    pool.reserve({"one": 20, "three": 10}, 100)
+    assert pool.buffers == {**held, "three": pool.buffers["three"]}
+    pool.reserve({"one": 60, "four": 20}, 100)
+    assert pool.buffers.keys() == {"one", "four"} and pool.buffers["one"] is held["one"]
+    pool.reserve({"one": 20, "five": 50}, 100)  # the large one has to go, too
+    assert pool.bytes == 70
+
+
 def test_what_drivers_say_of_hardware(device, monkeypatch):
     told = {}
     monkeypatch.setattr(hardware, "queried", lambda _, name: told.get(name))
@@ -234,52 +244,6 @@ def test_after_an_image_that_is_too_large_the_next_one_works(device):
     assert np.array_equal(runner.run(image, "k").encoded, expected)
 
 
-def test_a_second_run_compiles_nothing(device, monkeypatch):
-    fresh = Device(device.info)
-    runner = Runner(make_chain(settings_from({})), fresh)
-    image = np.zeros((20, 30, 3), np.float16)
-    runner.run(image, "k")
-
-    def compile_again(kernel):
-        raise AssertionError(f"{kernel.name} is compiled again")
-
-    monkeypatch.setattr(fresh._programs, "_compile", compile_again)
-    runner.run(image, "other")
-    runner.run(np.zeros((50, 10, 3), np.float16), "k")
-    changed = make_chain(settings_from({"iso": 3200, "exposure": {"ev": 1}, "seed": 4}))
-    Runner(changed, fresh).run(image, "k")
-
-
-@pytest.mark.slow
-def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
-    fresh = Device(device.info)
-    runner = Runner(make_chain(settings_from({})), fresh)
-    runner.compile()
-    made = []
-    make = fresh.flow.pool._make
-    monkeypatch.setattr(fresh.flow.pool, "_make", lambda size: made.append(size) or make(size))
-    images = [
-        np.full((h, w, 3), 0.4, np.float16) for h, w in ((60, 50), (20, 90), (7, 8), (60, 50))
-    ]
-    alone = [Runner(runner.chain, device).run(image, "k").encoded for image in images]
-    assert [runner.run(image, "k").encoded.tobytes() for image in images] == [
-        pixels.tobytes() for pixels in alone
-    ]
-    most = max(made)
-    assert (
-        len(made) == len(fresh.flow.pool.buffers) + 1
-    )  # a line table, for the width of the second one
-    # What is held for others goes when it would take more than is allowed.
-    fresh.memory = fresh.bytes_held
-    other = Runner(make_chain(settings_from({"stages": ["exposure", "gamma"]})), fresh, final=True)
-    other.run(np.zeros((90, 100, 3), np.float16), "k")
-    assert fresh.bytes_held <= fresh.memory
-    fresh.memory = 8 * most
-    runner.run(images[0], "k")
-    other.run(images[0], "k")
-    assert len(fresh.flow.pool.buffers) > 4
-
-
 @pytest.mark.parametrize("byte", [0xFF, 0x7F])  # NaN, and numbers near the largest
 def test_what_memory_held_before_does_not_matter(device, monkeypatch, byte):
     chain = make_chain(settings_from({}))
@@ -308,49 +272,3 @@ def test_pixels_into_an_array_that_is_there(device):
     assert np.array_equal(room, runner.run(image, "k").encoded)
     with pytest.raises(ValueError, match=r"into is \(20, 30\)"):
         runner.run(image, "k", RunOptions(into=room[..., 0]))
-
-
-@pytest.mark.parametrize("lanes", [1, 8, 16])
-@pytest.mark.parametrize("width", [1, 7, 8, 1000, 1008])
-def test_extents(lanes, width):
-    extent = Extent.whole(width, 5, lanes, 3)
-    assert extent.padded_height == 8
-    assert extent.padded_width >= width
-    assert extent.padded_width % lanes == 0
-    assert extent.pitch >= extent.padded_width + 6
-    assert extent.pitch % 1024
-
-
-def test_another_chain_of_the_same_structure_is_not_planned_again(device, monkeypatch):
-    runner = Runner(make_chain(settings_from({})), device)
-    image = np.full((20, 30, 3), 0.5, np.float16)
-    runner.run(image, "k")
-    values = {"iso": 3200, "exposure": {"ev": 1}, "seed": 4, "sharpen": {"amount": 0.5}}
-    changed = make_chain(settings_from(values))
-    alone = Runner(changed, device).run(image, "k").encoded
-    other = make_chain(settings_from({"mosaic": {"pattern": "BGGR"}}))
-    assert runner.for_chain(other).plan() is not runner.plan()
-    assert runner.for_chain(changed).plan(fold=False) is not runner.plan()
-
-    def plan_again(*_):
-        raise AssertionError("planned again")
-
-    monkeypatch.setattr("clpipe.engine.runner.make_plan", plan_again)
-    assert np.array_equal(runner.for_chain(changed).run(image, "k").encoded, alone)
-    assert np.array_equal(runner.for_chain(changed).run(image, "k").encoded, alone)
-
-
-@pytest.mark.slow
-def test_a_device_keeps_the_kernels_of_so_many_plans(device, monkeypatch):
-    monkeypatch.setattr("clpipe.engine.plan_kernels.PLANS", 2)
-    fresh, image = Device(device.info), example(Kind.RGB, (9, 20))
-    stages = (("exposure",), ("gamma",), ("exposure", "gamma"), ("exposure",))
-    runners = [
-        Runner(make_chain(Settings(stages=each)), fresh, encode=False, final=True)
-        for each in stages
-    ]
-    for runner in runners:
-        expected = Runner(runner.chain, None, encode=False, final=True).run(image, "k").final
-        assert np.abs(runner.run(image, "k").final - expected).max() < 1e-6
-    compiled = [fresh.is_compiled(runner.plan_for(image)) for runner in runners]
-    assert compiled == [True, False, True, True]  # the first and the last have one plan

@@ -8,20 +8,15 @@ import pyopencl as cl
 import pytest
 
 from clpipe.base.errors import DeviceError, DeviceFailedError
-from clpipe.batch.sinks import Folder
 from clpipe.batch.threads import Batch
-from clpipe.batch.work import ImageWorker
 from clpipe.chain.making import make_chain
-from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
 from clpipe.engine import programs
 from clpipe.engine.device import Device
 from clpipe.engine.programs import programs_of
 from clpipe.engine.recovery import FAILURES
 from clpipe.engine.runner import Runner
-from clpipe.inputs.find import find_jobs
-from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.writer import OutputWriter
+from tests.conftest import fail_launches, worker_of
 
 IMAGE = np.full((20, 30, 3), 0.5, np.float16)
 
@@ -114,34 +109,14 @@ def test_a_device_that_fails_at_everything_is_given_up(device, monkeypatch):
         Runner(runner.chain, Device(device.info)).compile()
 
 
-def test_a_lack_of_memory_needs_no_new_context(device, monkeypatch):
+@pytest.mark.parametrize(
+    "error", [cl.MemoryError("OUT_OF_RESOURCES"), cl.RuntimeError("INVALID_OPERATION")]
+)
+def test_a_launch_that_fails_once_is_tried_again_in_the_same_context(device, monkeypatch, error):
     runner = runner_on(device)
     expected = runner.run(IMAGE, "k").encoded
-    before, launch, errors = programs_of(device.info), cl.enqueue_nd_range_kernel, [1]
-
-    def launched(*arguments, **options):
-        if errors:
-            errors.pop()
-            raise cl.MemoryError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES")
-        return launch(*arguments, **options)
-
-    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
-    assert np.array_equal(runner.run(IMAGE, "k").encoded, expected)
-    assert programs_of(device.info) is before
-
-
-def test_a_launch_that_fails_once_is_tried_again_in_the_same_context(device, monkeypatch):
-    runner = runner_on(device)
-    expected = runner.run(IMAGE, "k").encoded
-    before, launch = programs_of(device.info), cl.enqueue_nd_range_kernel
-    errors = [cl.RuntimeError("clEnqueueNDRangeKernel failed: INVALID_OPERATION")]
-
-    def launched(*arguments, **options):
-        if errors:
-            raise errors.pop()
-        return launch(*arguments, **options)
-
-    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
+    before = programs_of(device.info)
+    fail_launches(monkeypatch, error, 0)
     assert np.array_equal(runner.run(IMAGE, "k").encoded, expected)
     assert programs_of(device.info) is before
 
@@ -150,16 +125,9 @@ def test_kernels_that_fail_in_a_batch_change_no_byte(device, write_exr, tmp_path
     for i in range(12):
         pixels = np.random.default_rng(i).random((20, 30, 3)).astype(np.float32)
         write_exr(f"in/{i:02}.exr", pixels)
-    loader = ImageLoader(
-        Request.from_options(values={"stages": ["exposure", "gamma"]}, formats=("png",))
-    )
-    jobs = find_jobs([str(tmp_path / "in")], tmp_path)
 
     def made(name):
-        (tmp_path / name).mkdir()
-        chain = loader.first_chain(jobs)
-        writer = OutputWriter(tmp_path / name, loader.request.with_outputs(chain))
-        worker = ImageWorker(loader, Folder(writer), chain)
+        worker, jobs = worker_of(tmp_path, name, values={"stages": ["exposure", "gamma"]})
         # Both have one context, as two on one device have: what breaks it for one does for both.
         batch = Batch(worker, [Device(device.info), Device(device.info)])
         statuses = [outcome.status for outcome in batch.run(jobs)]

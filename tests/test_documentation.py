@@ -11,13 +11,14 @@ from importlib.util import find_spec, module_from_spec, spec_from_file_location
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from PIL import Image
 
 import clpipe as package
 from clpipe.reference.panorama import CUBE
 from tests.conftest import ROOT, STILL_LIFE, WRITTEN, written
 from tests.dng import write_dng
 from tests.markdown import RUN, PageRunner, blocks
-from tools.pages import architecture
+from tools.pages import architecture, screens
 
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
@@ -181,7 +182,7 @@ def test_slurm_in_the_recipe_is_the_one_in_the_tools():
 
 
 def test_the_readme_is_short():
-    assert (ROOT / "README.md").stat().st_size <= 7000
+    assert (ROOT / "README.md").stat().st_size <= 6500
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -252,6 +253,12 @@ def anchors(text):
 def test_the_pictures_of_the_architecture_are_those_of_the_code(name):
     drawn = architecture.PAGES[name]()
     assert (DOCS / name).read_text("utf-8") == drawn, "run tools/run pages architecture"
+
+
+@pytest.mark.parametrize("name", ["report", "explore"])
+def test_screenshots_show_the_present_pages(name):
+    with Image.open(DOCS / f"screen_{name}.webp") as picture:
+        assert picture.info["xmp"].decode() == screens.pages_digest(), "run tools/run pages screens"
 
 
 def test_the_architecture_counts_its_rooms():

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
 from clpipe.base.errors import ClpipeError, ImageError, KeyedError, RequestError
@@ -19,8 +18,7 @@ from clpipe.commands.main import main
 from clpipe.engine.device import open_device
 from clpipe.images.write import write_exr as write
 from clpipe.inputs.find import find_jobs
-from tests.conftest import ROOT
-from tests.conftest import cli_output as clpipe
+from tests.conftest import ROOT, cli_output
 
 pytest.importorskip("starlette", reason="needs Starlette, in the extra explore")
 
@@ -51,44 +49,32 @@ def explorer(two_renders):
     return explorer_of(two_renders)
 
 
+def commands_of(explorer, image, values) -> dict[str, list[str]]:
+    """Save values as a configuration; the words of its commands, by their names."""
+    texts = exported(explorer, image, values)
+    Path("camera.toml").write_text(texts["config"], "utf-8")
+    return {name: shlex.split(texts[name])[1:] for name in ("folder", "command")}
+
+
 @pytest.mark.parametrize("image", [0, 1])
 def test_what_is_seen_is_what_run_makes_of_the_configuration_and_of_the_command(
-    explorer, two_renders, tmp_path, monkeypatch, image
+    clpipe, explorer, image
 ):
-    monkeypatch.chdir(tmp_path)
     seen = explorer.develop(image, NOISY, View())
-    texts = exported(explorer, image, NOISY)
-    Path("camera.toml").write_text(texts["config"], "utf-8")
-    for name in ("folder", "command"):
-        _, *command = shlex.split(texts[name])
-        clpipe(*command, "--format", "png", "--quiet")
-        made = np.asarray(Image.open(f"out/{('a', 'left/b')[image]}.png"))
-        np.testing.assert_array_equal(made, seen.shown)
-        shutil.rmtree("out")
-
-
-def test_the_jpeg_of_a_saved_configuration_is_that_of_its_command_byte_for_byte(
-    explorer, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    texts = exported(explorer, 0, NOISY)
-    Path("camera.toml").write_text(texts["config"], "utf-8")
     jpegs = []
-    for name in ("folder", "command"):
-        _, *command = shlex.split(texts[name])
-        clpipe(*command, "--quiet")
-        jpegs.append(Path("out/a.jpg").read_bytes())
+    for command in commands_of(explorer, image, NOISY).values():
+        clpipe(*command, "--format", "png", "--format", "jpg", "--quiet")
+        path = Path("out", ("a", "left/b")[image])
+        np.testing.assert_array_equal(np.asarray(Image.open(f"{path}.png")), seen.shown)
+        jpegs.append(Path(f"{path}.jpg").read_bytes())
         shutil.rmtree("out")
     assert jpegs[0] == jpegs[1]
 
 
-def test_a_command_leaves_out_what_is_set_of_stages_that_are_switched_off(
-    explorer, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    texts = exported(explorer, 0, {"skip": ["denoise"], "denoise": {"luma_strength": 0.5}})
-    assert "luma_strength" in texts["config"]
-    _, *command = shlex.split(texts["command"])
+def test_a_command_leaves_out_what_is_set_of_stages_that_are_switched_off(clpipe, explorer):
+    values = {"skip": ["denoise"], "denoise": {"luma_strength": 0.5}}
+    command = commands_of(explorer, 0, values)["command"]
+    assert "luma_strength" in Path("camera.toml").read_text("utf-8")
     clpipe(*command, "--quiet", "--device", "numpy")  # which refuses them
 
 
@@ -107,10 +93,7 @@ def test_options_are_the_same_settings(two_renders):
     assert given.settings() == overlay(Settings(), NOISY)
 
 
-def test_what_is_drawn_is_saved_as_a_draw_and_seen_as_run_draws_it(
-    two_renders, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
+def test_what_is_drawn_is_saved_as_a_draw_and_seen_as_run_draws_it(clpipe, two_renders):
     drawn = {"iso": {"choice": [400, 3200]}, "denoise": {"luma_strength": {"uniform": [0, 1]}}}
     Path("own.toml").write_text(
         "iso = { choice = [400, 3200] }\n[denoise]\nluma_strength = { uniform = [0, 1] }\n"
@@ -118,25 +101,20 @@ def test_what_is_drawn_is_saved_as_a_draw_and_seen_as_run_draws_it(
     explorer = explorer_of(two_renders / "a.exr", config="own.toml", device="numpy")
     assert explorer.initial == drawn
     seen = explorer.develop(0, explorer.initial, View())
-    texts = exported(explorer, 0, explorer.initial)
-    Path("camera.toml").write_text(texts["config"], "utf-8")
-    _, *command = shlex.split(texts["command"])
+    command = commands_of(explorer, 0, explorer.initial)["command"]
     assert "-c" in command
     clpipe(*command, "--format", "png", "--quiet", "--device", "numpy")
     np.testing.assert_array_equal(np.asarray(Image.open("out/a.png")), seen.shown)
 
 
-def test_what_a_kept_image_carries_holds_where_nothing_is_set(two_renders, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_what_a_kept_image_carries_holds_where_nothing_is_set(clpipe, two_renders):
     keep = ["--iso", 3200, "--skip", "sharpen", "--keep", "normalize", "--quiet"]
     clpipe("run", two_renders / "a.exr", "-o", "kept", *keep, "--device", "numpy")
     explorer = explorer_of("kept/a.normalize.exr", start_at="white_balance", device="numpy")
     values = {"denoise": {"luma_strength": 0.5}}
     seen = explorer.develop(0, values, View())
     assert seen.facts["iso"] == 3200
-    texts = exported(explorer, 0, values)
-    Path("camera.toml").write_text(texts["config"], "utf-8")
-    _, *command = shlex.split(texts["command"])
+    command = commands_of(explorer, 0, values)["command"]
     saved = ["run", "kept/a.normalize.exr", "-o", "out", "--start-at", "white_balance"]
     for each in (command, [*saved, "-c", "camera.toml"]):
         clpipe(*each, "--format", "png", "--quiet", "--device", "numpy")
@@ -154,15 +132,15 @@ def test_several_inputs_are_applied_to_as_they_were_given(two_renders):
 
 
 @pytest.mark.slow
-def test_noise_of_all_of_a_picture_is_that_of_measure(explorer, two_renders, tmp_path):
-    out = tmp_path / "out"
+def test_noise_of_all_of_a_picture_is_that_of_measure(clpipe, explorer, two_renders):
+    out = Path("out")
     options = ["--iso", 6400, "--truth", "development", "--truth", "mosaic", "--format", "png"]
     clpipe("run", two_renders / "a.exr", "-o", out, *options, "--keep", "normalize", "--quiet")
     pairs = {"": ("a.png", "a.truth.png"), "normalize": ("a.normalize.exr", "a.truth_mosaic.exr")}
     for step, (picture, truth) in pairs.items():
         box = (0, 0, 96, 63)
         report = explorer.noise(0, {"iso": 6400}, View(step), box)
-        said = json.loads(clpipe("measure", out / picture, "--truth", out / truth, "--json"))
+        said = json.loads(clpipe("measure", out / picture, "--truth", out / truth, "--json").output)
         own = report.record()
         assert own["channels"].keys() == said["channels"].keys()
         for name, channel in own["channels"].items():
@@ -311,6 +289,5 @@ def test_a_rectangle_that_is_not_in_the_picture_is_refused(explorer, box, says):
 def test_a_manifest_is_refused(two_renders, tmp_path):
     manifest = tmp_path / "list.csv"
     manifest.write_text(f"path,iso\n{two_renders / 'a.exr'},800\n")
-    result = CliRunner().invoke(main, ["explore", str(manifest), "--device", "numpy"])
-    assert result.exit_code == 2
-    assert "rows of a manifest may have their own settings" in result.output
+    said = cli_output("explore", manifest, "--device", "numpy", status=2)
+    assert "rows of a manifest may have their own settings" in said

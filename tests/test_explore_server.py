@@ -10,15 +10,13 @@ import socket
 import subprocess
 import sys
 import threading
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
-from clpipe.commands.main import main
 from tests.conftest import cli_output as clpipe
 from tests.held import GUARD
 
@@ -35,15 +33,24 @@ def explorer(two_renders):
     return explorer_of(two_renders)
 
 
-@pytest.fixture(scope="module")
-def served(explorer):
+@contextmanager
+def serving(explorer):
+    """The address of a server that runs within this."""
     server = Server(explorer)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
-    yield server.address
-    server.stop()
-    thread.join(GUARD)
+    try:
+        yield server.address
+    finally:
+        server.stop()
+        thread.join(GUARD)
     assert not thread.is_alive()
+
+
+@pytest.fixture(scope="module")
+def served(explorer):
+    with serving(explorer) as address:
+        yield address
 
 
 def answer(address, name, question=None, host=None, token=None):
@@ -189,27 +196,15 @@ def test_a_question_may_take_longer_to_answer_than_to_ask(explorer, monkeypatch)
     monkeypatch.setattr(patience, "PATIENCE", GUARD)
     monkeypatch.setattr(asyncio.BaseEventLoop, "call_later", noted)
     monkeypatch.setattr(Server, "_start", answering)
-    server = Server(explorer)
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    try:
-        assert answer(server.address, "start", {})[0] == 200
-    finally:
-        server.stop()
-        thread.join(GUARD)
+    with serving(explorer) as address:
+        assert answer(address, "start", {})[0] == 200
     assert cancelled and all(cancelled)  # while the answer is being made, no limit is left
 
 
 def test_two_explorers_at_once(served, two_renders):
-    other = Server(explorer_of(two_renders / "a.exr", device="numpy"))
-    thread = threading.Thread(target=other.run, daemon=True)
-    thread.start()
-    try:
-        for address, count in ((served, 2), (other.address, 1)):
+    with serving(explorer_of(two_renders / "a.exr", device="numpy")) as other:
+        for address, count in ((served, 2), (other, 1)):
             assert len(json.loads(answer(address, "start", {})[2])["images"]) == count
-    finally:
-        other.stop()
-        thread.join(GUARD)
 
 
 def test_a_port_in_use_is_said(two_renders):
@@ -217,10 +212,8 @@ def test_a_port_in_use_is_said(two_renders):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = str(taken.getsockname()[1])
-        command = ["explore", str(two_renders), "--device", "numpy", "--port", port]
-        result = CliRunner().invoke(main, command)
-    assert result.exit_code == 2
-    assert f"--port {port}: cannot be used: Address already in use" in result.output
+        said = clpipe("explore", two_renders, "--device", "numpy", "--port", port, status=2)
+    assert f"--port {port}: cannot be used: Address already in use" in said
 
 
 @pytest.mark.slow

@@ -3,8 +3,6 @@
 import json
 import os
 import re
-import subprocess
-import sys
 import tarfile
 from pathlib import Path
 
@@ -23,7 +21,7 @@ from clpipe.inputs.find import parse_shard
 from clpipe.inputs.kept import embedded_settings
 from clpipe.inputs.manifest import read_manifest
 from clpipe.scenes.view_request import parse_frames, parse_resolution
-from tests.conftest import ROOT, reseal
+from tests.conftest import reseal, run_python
 
 
 def test_a_member_that_is_in_a_tar_twice_is_packed_once(clpipe, write_exr):
@@ -94,11 +92,9 @@ def test_a_working_directory_that_has_gone(tmp_path):
     gone = tmp_path / "gone"
     gone.mkdir()
     code = "import os, sys; os.rmdir(os.getcwd()); from clpipe.commands.main import main; main()"
-    command = [sys.executable, "-c", code, "run", "a.exr", "-o", "out", "--device", "numpy"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    result = subprocess.run(command, cwd=gone, env=environment, capture_output=True, text=True)
-    assert result.stderr == ("clpipe: the working directory has gone; change to one that exists\n")
-    assert result.returncode == 2
+    run = ("run", "a.exr", "-o", "out", "--device", "numpy")
+    result = run_python("-c", code, *run, cwd=gone, status=2)
+    assert result.stderr == "clpipe: the working directory has gone; change to one that exists\n"
 
 
 def test_a_replay_that_cannot_be_names_its_sidecar(clpipe, write_exr):

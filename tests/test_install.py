@@ -1,9 +1,7 @@
 """The package as a user gets it: installed from another folder, kernels inside."""
 
-import os
 import re
 import subprocess
-import sys
 import tomllib
 
 import pytest
@@ -13,7 +11,7 @@ from packaging.utils import canonicalize_name
 
 from clpipe import __version__
 from clpipe.base import extras
-from tests.conftest import ROOT, STILL_LIFE
+from tests.conftest import ROOT, STILL_LIFE, run_python
 
 pytestmark = pytest.mark.slow
 
@@ -21,25 +19,15 @@ pytestmark = pytest.mark.slow
 def test_the_installed_package_works_from_anywhere(tmp_path):
     target = tmp_path / "site"
     options = ["--no-deps", "--no-build-isolation", "--quiet", "--disable-pip-version-check"]
-    subprocess.run(
-        [sys.executable, "-m", "pip", "install", *options, "--target", target, ROOT],
-        check=True,
-        cwd=tmp_path,
-    )
+    run_python("-m", "pip", "install", *options, "--target", target, ROOT, cwd=tmp_path)
     assert (target / "clpipe" / "kernels" / "lib" / "lanes.h").is_file()
     assert (target / "clpipe" / "camera" / "profiles" / "sony-a7r2.toml").is_file()
     code = (
         "import clpipe.engine.sources as c; print(c.kernel_folder()); "
         "from clpipe.commands.main import main; main()"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, "run", STILL_LIFE, "-o", "out"],
-        check=True,
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(target)},
-        capture_output=True,
-        text=True,
-    )
+    run = ("run", STILL_LIFE, "-o", "out")
+    done = run_python("-c", code, *run, cwd=tmp_path, PYTHONPATH=target)
     assert done.stdout.startswith(str(target))
     assert (tmp_path / "out" / "still_life.jpg").is_file()
 

@@ -17,6 +17,7 @@ from clpipe.base.memory import Left
 from clpipe.engine import builders, cache_folder
 from clpipe.engine.builders import BinaryBuilder, PoclBuilder
 from clpipe.engine.store import Store
+from tests.conftest import run_python
 from tests.test_programs import DEVELOP, python
 
 TEXT = "__kernel void f(__global int *a) { a[get_global_id(0)] = 7; }"
@@ -202,13 +203,7 @@ def test_kernels_are_not_kept_there_and_that_is_said_once(device, tmp_path):
     shared = tmp_path / "shared"
     shared.mkdir()
     shared.chmod(0o777)
-    done = subprocess.run(
-        [sys.executable, "-c", DEVELOP],
-        env={**os.environ, "CLPIPE_CACHE_DIR": str(shared), "POCL_CACHE_DIR": str(shared)},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0
+    done = run_python("-c", DEVELOP, CLPIPE_CACHE_DIR=shared, POCL_CACHE_DIR=shared)
     assert done.stderr.count("others may write to it (mode 0777)") == 1
     assert list(shared.iterdir()) == []
 
@@ -232,13 +227,12 @@ needs_locks = pytest.mark.skipif(not system.fcntl, reason="needs file locks (Lin
 @needs_locks
 def test_folders_of_killed_processes_are_removed_and_others_stay(tmp_path):
     kill = f"{FOLDER_OF_A_PROCESS}; import os; os.kill(os.getpid(), 9)"
-    environment = {**os.environ, "TMPDIR": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-c", kill], env=environment, capture_output=True)
-    killed = Path(done.stdout.decode().strip())
+    killed = Path(run_python("-c", kill, status=-9, TMPDIR=tmp_path).stdout.strip())
     assert killed.is_dir() and tmp_path in killed.parents
     foreign = killed.with_name("mine")
     foreign.mkdir()
     wait = f"{FOLDER_OF_A_PROCESS}; import sys; sys.stdin.read()"
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
     streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", wait], env=environment, **streams) as process:
         used = Path(process.stdout.readline().strip())

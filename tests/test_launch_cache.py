@@ -1,9 +1,6 @@
 """Launches that are left out because their results are on the device: which, and the same bits."""
 
-from contextlib import contextmanager
 from dataclasses import replace
-from itertools import count
-from types import SimpleNamespace
 
 import numpy as np
 import pyopencl as cl
@@ -12,15 +9,13 @@ import pytest
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.check import example
-from clpipe.engine.codegen import write_kernel
 from clpipe.engine.device import Device
-from clpipe.engine.extents import Box, Extent
-from clpipe.engine.launch_cache import LaunchCache
+from clpipe.engine.extents import Box
 from clpipe.engine.options import RunOptions
 from clpipe.engine.plan import make_plan
 from clpipe.engine.runner import Runner
-from clpipe.engine.stack import Call
 from clpipe.stage import Kind
+from tests.conftest import fail_launches
 from tests.test_tiles import same
 
 GRAY_WORLD = {"white_balance": {"method": "gray_world"}}
@@ -97,58 +92,13 @@ def test_launches_before_a_method_that_is_switched_are_left_out(device):
     assert developer.launches(image) == AFTER[1:]
 
 
-@contextmanager
-def failing(monkeypatch, after, error):
-    """Have a launch fail, after so many that do not."""
-    enqueue, launches = cl.enqueue_nd_range_kernel, count()
-
-    def fails(*args, **options):
-        if next(launches) == after:
-            raise error
-        return enqueue(*args, **options)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(cl, "enqueue_nd_range_kernel", fails)
-        yield
-
-
 def test_nothing_is_left_out_after_an_image_that_was_interrupted(device, monkeypatch):
     developer, image = Developer(device.info), example(Kind.RGB, (50, 70), half=True)
     every = developer.launches(image)
-    with failing(monkeypatch, 3, KeyboardInterrupt()), pytest.raises(KeyboardInterrupt):
+    fail_launches(monkeypatch, KeyboardInterrupt(), 3)
+    with pytest.raises(KeyboardInterrupt):
         developer.launches(image, "another")
     assert developer.launches(image) == every
-
-
-def a_call(kernel, reads, writes, *values):
-    """What is known of a call that reads the source, if it reads no buffer."""
-    named = SimpleNamespace(name=kernel, launch=SimpleNamespace(level=0))
-    return SimpleNamespace(
-        kernel=named, reads_source=not reads, reads=reads, writes=writes, values=values
-    )
-
-
-def test_a_launch_is_left_out_if_all_that_it_writes_is_there():
-    source, extents = np.zeros((4, 4)), (Extent.whole(4, 4, 8, 0),)
-    pool = SimpleNamespace(buffers={name: object() for name in ("one", "two", "three")})
-    first, second = a_call("load", [], ["one", "two"], np.float32(1)), ("blur", ["two"], ["three"])
-    calls = [first, a_call(*second, np.ones(3)), a_call("end", ["three"], [])]
-
-    def launches(cache, first=first, second=calls[1]):
-        own = [first, second, calls[2]]
-        return cache.next(own, pool, source, True, extents, list)[0]
-
-    numbers, cache = LaunchCache().next(calls, pool, source, True, extents, list)
-    assert numbers == (0, 1, 2)
-    assert launches(cache) == (2,)
-    assert launches(cache, second=a_call(*second, np.ones(3))) == (2,)
-    assert launches(cache, second=a_call(*second, np.zeros(3))) == (1, 2)
-    assert launches(cache, second=a_call("mean", *second[1:], np.ones(3))) == (1, 2)
-    assert launches(cache, a_call("load", [], ["one", "two"], np.float32(2))) == (0, 1, 2)
-    pool.buffers["three"] = object()
-    assert launches(cache) == (1, 2)
-    pool.buffers["one"] = object()  # the next launch reads the other one
-    assert launches(cache) == (0, 1, 2)
 
 
 def test_planes_lie_alike_where_stencils_differ_a_little():
@@ -223,7 +173,8 @@ class Walk:
                 device.memory = memory
             case "failure":
                 runner = self.developer.runner(plain.chain)
-                with failing(self.patch, self.choice(0, 2), cl.RuntimeError("the driver died")):
+                with self.patch.context() as patch:
+                    fail_launches(patch, cl.RuntimeError("the driver died"), self.choice(0, 2))
                     runner.submit(self.image, "other", RunOptions(unchanged=True))()
 
     def compare(self, unchanged):
@@ -247,17 +198,3 @@ def test_the_same_bits_after_any_changes(device, kind, monkeypatch):
     for _ in range(60):
         left_out += walk.compare(unchanged=walk.change())
     assert left_out > 100
-
-
-@pytest.mark.parametrize("white_balance", ["gray_world", "white_patch"])
-def test_a_plan_that_holds_its_images_writes_each_buffer_once(white_balance):
-    settings = {"exposure": {"method": "auto"}, "white_balance": {"method": white_balance}}
-    plan = make_plan(chain_of(**settings), keep=("mosaic",), final=True, incremental=True)
-    calls = [Call(write_kernel(plan, launch, 8), None) for launch in plan.launches]
-    written = [name for call in calls for name in call.writes]
-    assert len(written) == len(set(written)) > 20
-    images = {name for name in written if name.startswith("slot")}
-    assert images == {f"slot{number}" for number in range(plan.slot_count)}
-    read = {name for call in calls for name in call.reads}
-    assert read <= set(written)
-    assert [call.reads_source for call in calls].count(True) == 1

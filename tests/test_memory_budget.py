@@ -17,7 +17,7 @@ from clpipe.batch.memory_budget import LEAST, STARTING, MemoryBudget, needed
 from clpipe.batch.threads import Batch
 from clpipe.engine.discovery import find_devices
 from clpipe.images.claims import claim_of
-from tests.conftest import ROOT
+from tests.conftest import ROOT, run_python
 from tests.held import GUARD
 
 MIB = 2**20
@@ -278,9 +278,7 @@ print(held - _listed(Path("/proc/self/status"), "VmSize") > 100 << 20)
 def test_where_memory_ends_tiles_become_smaller(device):
     if device is None or not device.info.in_place:
         pytest.skip("needs an OpenCL device for CPUs, such as PoCL")
-    command = [sys.executable, "-c", WITHOUT_ROOM]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (0, "True\nTrue True\nTrue\n"), done.stderr[-500:]
+    assert run_python("-c", WITHOUT_ROOM).stdout == "True\nTrue True\nTrue\n"
 
 
 HEAPS = """

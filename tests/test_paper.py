@@ -56,7 +56,7 @@ def test_the_figures_are_made(clpipe, tmp_path, write_exr, monkeypatch):
 
 def rows_of_the_table():
     """The cells of the table of what stands for what: element, what is here, tests."""
-    table = PAGE.read_text("utf-8").partition("## What stands for what")[2]
+    table = PAGE.read_text("utf-8").partition("## From the paper to clpipe")[2]
     rows = [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("|")]
     return rows[2:]
 

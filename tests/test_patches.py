@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 
 import clpipe as api
-from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.dataset.arrays import packed
-from clpipe.dataset.numbering import Numbering
 from clpipe.engine.buffers import Pool
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
@@ -173,17 +171,6 @@ def test_a_grid_over_images_of_several_sizes(renders):
     assert places[23] == ("r1.exr", 40, 24)  # where 57x41 ends, at an even place
 
 
-def test_numbers_of_samples():
-    numbering = Numbering([3, 1, 130])
-    listed = [
-        (epoch, image, n)
-        for epoch, image, numbers in itertools.islice(numbering.groups(2), 8)
-        for n in numbers
-    ]
-    assert listed == [numbering.place(2 + i) for i in range(len(listed))]
-    assert len(listed) == 1 + 1 + (64 + 64 + 2) + 3 + 1 + 64
-
-
 def test_samples_do_not_depend_on_order_shards_and_epochs(renders):
     made = api.Dataset(renders, iso=ISO, patch=api.Patches(16, 3), epochs=2)
     assert len(made) == 18
@@ -295,14 +282,6 @@ def test_decoded_renders_are_kept_while_they_fit(renders, write_exr, monkeypatch
     before = made[0]["image"]
     write_exr("in/r0.exr", np.ones((48, 64, 3), np.float32))
     assert not np.array_equal(made[0]["image"], before)  # the file has changed
-
-
-def test_what_is_larger_than_the_room_is_not_kept():
-    kept = BoundedCache(3, len)
-    assert [kept.get(text, lambda text=text: text) for text in ("ab", "long", "c")]
-    assert kept.taken == 3
-    kept.get("de", lambda: "de")
-    assert kept.taken == 3 and kept.get("ab", lambda: "new") == "new"
 
 
 def test_types_and_orders(renders):

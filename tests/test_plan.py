@@ -2,7 +2,6 @@
 
 import pytest
 
-from clpipe.base.errors import RequestError
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.bindings import EncodedCurves
@@ -10,7 +9,6 @@ from clpipe.engine.codegen import write_kernel
 from clpipe.engine.ir import Finalize, Launch, Lines, Reduce
 from clpipe.engine.plan import make_plan
 from clpipe.engine.traffic import bytes_per_pixel
-from clpipe.stage import Kind
 
 GRAY_WORLD = {"white_balance": {"method": "gray_world"}}
 
@@ -81,34 +79,6 @@ def test_demosaicing_takes_so_many_launches(method, launches):
     assert len(own) == launches
 
 
-def test_keeping_all():
-    chain = make_chain(settings_from(GRAY_WORLD))
-    steps = tuple(step.name for step in chain.steps)
-    plan = make_plan(chain, keep=steps)
-    assert tuple(name for name, _ in plan.kept) == steps
-
-
-@pytest.mark.parametrize("keep", [(), ("mosaic",), ("demosaic", "denoise"), ("normalize", "gamma")])
-@pytest.mark.parametrize("method", ["as_shot", "gray_world"])
-def test_no_launch_writes_a_slot_that_is_still_needed(keep, method):
-    plan = plan_of(keep=keep, final=True, white_balance={"method": method})
-    holder: dict[int, int] = {}
-    for launch in plan.launches:
-        if not isinstance(launch, Launch):
-            continue
-        for read in launch.reads:
-            for slot in plan.slots[read.image.number]:
-                assert holder[slot] == read.image.number
-        if launch.writes:
-            read_slots = {s for r in launch.reads for s in plan.slots[r.image.number]}
-            for slot in plan.slots[launch.writes.number]:
-                assert slot not in read_slots
-                holder[slot] = launch.writes.number
-    for image in [image for _, image in plan.kept] + [plan.final]:
-        for slot in plan.slots[image.number]:
-            assert holder[slot] == image.number
-
-
 def functions(plan):
     return [op.pass_.function for x in plan.launches if isinstance(x, Launch) for op in x.ops]
 
@@ -118,16 +88,6 @@ def test_denoising_goes_on_from_the_roots_that_demosaicing_has():
     apart = functions(plan_of(denoise={"offset": 0.02}))
     assert apart.index("light_to_roots") == apart.index("roots_to_light") + 1
     assert functions(plan_of(keep=("demosaic",))) == apart
-
-
-def test_every_image_is_written_before_it_is_read():
-    plan = plan_of(keep=("demosaic",), **GRAY_WORLD)
-    written: set[int] = set()
-    for launch in plan.launches:
-        if isinstance(launch, Launch):
-            assert {read.image.number for read in launch.reads} <= written
-            if launch.writes:
-                written.add(launch.writes.number)
 
 
 def test_a_plan_depends_on_structure_alone():
@@ -159,17 +119,6 @@ def test_curves_before_eight_bits_become_one_table():
     kept = plan_of(keep=("tone_curve",), **curve)
     kernel = write_kernel(kept, kept.launches[-1], 8)
     assert curves_of(kernel) == [("gamma",)]
-
-
-def test_a_stage_that_is_not_in_the_chain_cannot_be_kept():
-    with pytest.raises(RequestError, match=r"'denoize'.*did you mean 'denoise'"):
-        plan_of(keep=("denoize",))
-
-
-def test_a_chain_may_begin_with_a_stencil():
-    bilinear = {"stages": ["demosaic"], "demosaic": {"method": "bilinear"}}
-    chain = make_chain(settings_from(bilinear), Kind.MOSAIC)
-    assert names(make_plan(chain))[0] == "load"
 
 
 def texts(plan):

@@ -2,9 +2,6 @@
 
 import io
 import logging
-import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,7 +23,7 @@ from clpipe.engine import cache_folder, programs
 from clpipe.engine.device import Device
 from clpipe.engine.discovery import choose, find_devices
 from clpipe.engine.runner import Runner
-from tests.conftest import STILL_LIFE
+from tests.conftest import STILL_LIFE, run_python
 
 SMALL = {"stages": ["exposure", "gamma"]}
 FOLDER = (
@@ -41,14 +38,10 @@ DEVELOP = (
 
 def python(code, **environment):
     """What a fresh process prints, in an environment without a cache folder of its own."""
-    names = ("CLPIPE_CACHE_DIR", "XDG_CACHE_HOME", "POCL_CACHE_DIR", "HOME")
-    plain = {k: v for k, v in os.environ.items() if k not in names}
-    given = {k: str(v) for k, v in environment.items()}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=plain | given, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("CLPIPE_CACHE_DIR", "XDG_CACHE_HOME", "POCL_CACHE_DIR", "HOME"):
+            patch.delenv(name, raising=False)
+        return run_python("-c", code, **environment).stdout.strip()
 
 
 def test_the_cache_folder_is_the_users_or_a_named_one(tmp_path):
@@ -138,12 +131,12 @@ def test_a_pocl_with_other_headers_declares_the_functions_itself(device, monkeyp
 
 
 def test_devices_and_chains_share_programs(device):
-    image = np.zeros((8, 8, 3), np.float32)
-    Runner(make_chain(settings_from(SMALL)), device).run(image, "a")
+    Runner(make_chain(settings_from(SMALL)), device).run(np.zeros((8, 8, 3), np.float32), "a")
     before = len(programs.programs_of(device.info))
-    for own in (device, Device(device.info)):
-        for values in ({}, {"iso": 1600}, {"exposure": {"ev": 2}}):
-            Runner(make_chain(settings_from({**SMALL, **values})), own).run(image, "a")
+    for own, size in ((device, (8, 8, 3)), (Device(device.info), (50, 10, 3))):
+        for values in ({}, {"iso": 1600}, {"exposure": {"ev": 2}}, {"seed": 4}):
+            runner = Runner(make_chain(settings_from({**SMALL, **values})), own)
+            runner.run(np.zeros(size, np.float32), "a")
     assert len(programs.programs_of(device.info)) == before
 
 

@@ -61,7 +61,7 @@ def test_the_tables(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(quality, "read_image", lambda path: type("S", (), {"pixels": crop}))
     assert quality.main() == 0
     out = capsys.readouterr().out
-    assert "Kodak pictures are not there; skipped" in out
+    assert "does not contain the Kodak pictures; skipped" in out
     for name in (*quality.DEMOSAIC, *quality.DENOISE, *quality.SHARPNESS):
         assert name in out
 

@@ -2,16 +2,12 @@
 
 import ast
 import re
-import subprocess
-import sys
 
 import pytest
-from click.testing import CliRunner
 
 from clpipe.chain import registry
 from clpipe.chain.registry import all_stages
-from clpipe.commands.main import main
-from tests.conftest import ROOT, STILL_LIFE
+from tests.conftest import ROOT, STILL_LIFE, cli_output, run_python
 from tests.test_contributing import block
 
 PYTHON, OPENCL = block("python"), block("c")
@@ -21,13 +17,7 @@ PYTHON, OPENCL = block("python"), block("c")
 def clpipe(monkeypatch):
     """Run clpipe with no stage file loaded yet."""
     monkeypatch.setattr(registry, "_from_files", {})
-
-    def call(*arguments, status=0):
-        result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
-        assert result.exit_code == status, result.output
-        return result.output
-
-    return call
+    return cli_output
 
 
 @pytest.fixture
@@ -159,10 +149,7 @@ def install(folder, python=PYTHON):
 
 
 def run_with_package(folder, *arguments):
-    program = f"import sys; sys.path[:0] = [{str(folder)!r}, {str(ROOT)!r}]\n"
-    program += "from clpipe.commands.main import main; main()"
-    command = [sys.executable, "-c", program, *arguments]
-    return subprocess.run(command, capture_output=True, text=True)
+    return run_python("-m", "clpipe", *arguments, status=None, PYTHONPATH=f"{folder}:{ROOT}")
 
 
 @pytest.mark.slow

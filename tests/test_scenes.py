@@ -13,6 +13,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
+from clpipe.base.files import sha256_of
 from clpipe.scenes.members import split_of
 from tests.conftest import ROOT, contents, written
 
@@ -105,10 +106,10 @@ def test_it_goes_on_where_it_was_and_makes_the_same(clpipe, scene, blender, tmp_
     assert "2 of 4 images done, 0 failed, 2 not begun" in said
     assert not (tmp_path / "set/README.md").exists()
     record = tmp_path / "set/dataset.json"
-    record.write_text(record.read_text().replace(_sha256(scene), "0" * 64))
+    record.write_text(record.read_text().replace(sha256_of(scene)[0], "0" * 64))
     assert "holds a dataset with sha256" in clpipe(*command, "-o", "set", status=2).stderr
     scene.write_text("a room")
-    record.write_text(record.read_text().replace("0" * 64, _sha256(scene)))
+    record.write_text(record.read_text().replace("0" * 64, sha256_of(scene)[0]))
     assert (
         "4 of 4 images done (2 of them were there already)" in clpipe(*command, "-o", "set").stderr
     )
@@ -120,12 +121,6 @@ def test_it_goes_on_where_it_was_and_makes_the_same(clpipe, scene, blender, tmp_
     gone = ("--blender", tmp_path / "gone")
     clpipe(*command[:2], *gone, *command[4:-1], "100,800", "-o", "set")
     assert (tmp_path / "set/iso100/view_003.jpg").exists()
-
-
-def _sha256(path):
-    import hashlib
-
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @pytest.mark.slow

@@ -1,16 +1,14 @@
 """Stacks: what goes through a device in common launches has the bits that it has alone."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pyopencl as cl
 import pytest
 
-from clpipe.batch.sinks import Folder
 from clpipe.batch.threads import Batch
-from clpipe.batch.work import ImageWorker
 from clpipe.chain.making import make_chain
-from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
 from clpipe.engine import stack
 from clpipe.engine.check import check_stack, example
@@ -18,10 +16,8 @@ from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.options import DEFAULTS, RunOptions
 from clpipe.engine.runner import Result, Runner, cut_out, submit_together
-from clpipe.inputs.find import find_jobs
-from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
+from tests.conftest import worker_of
 
 # Of each kind of launch: lines and stencils; a resampling, sums, a mosaic with a period.
 CHAINS = {
@@ -56,32 +52,13 @@ def on(device, request):
     return Device(replace(device.info, type=request.param))
 
 
-@pytest.fixture
-def launches(monkeypatch):
-    """The sizes of launches from now on."""
-    seen, launch = [], cl.enqueue_nd_range_kernel
-
-    def launched(queue, kernel, size, *rest, **options):
-        seen.append(tuple(size))
-        return launch(queue, kernel, size, *rest, **options)
-
-    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
-    return seen
-
-
-@dataclass(frozen=True)
-class Asked:
+class Asked(NamedTuple):
     """An image that is to go through a runner."""
 
     runner: Runner
     image: np.ndarray
     noise_key: str
     options: RunOptions = DEFAULTS
-
-
-def submit(asked):
-    """Submit images together, and return what waits for the result of each."""
-    return submit_together([(e.runner, e.image, e.noise_key, e.options) for e in asked])
 
 
 def submissions(device, stages, sizes=SIZES):
@@ -101,7 +78,7 @@ def test_members_have_the_bits_that_they_have_alone(on, launches, name):
     asked = submissions(on, CHAINS[name])
     alone = [each.runner.run(each.image, each.noise_key) for each in asked]
     launches.clear()
-    for wait, expected in zip(submit(asked), alone, strict=True):
+    for wait, expected in zip(submit_together(asked), alone, strict=True):
         equal(wait(), expected)
     assert {size[2:] for size in launches} == {(3,)}
     assert len(launches) < 20
@@ -111,9 +88,9 @@ def test_patches_of_one_image_and_of_others_go_together(on, launches):
     asked = submissions(on, CHAINS["default"])
     wholes = [each.runner.run(each.image, each.noise_key) for each in asked]
     boxes = [Box(0, 0, 16, 20), Box(7, 3, 23, 23), Box(16, 1, 32, 21)]
-    cut = [replace(each, options=RunOptions(boxes=boxes)) for each in asked]
+    cut = [each._replace(options=RunOptions(boxes=boxes)) for each in asked]
     launches.clear()
-    for wait, whole in zip(submit(cut), wholes, strict=True):
+    for wait, whole in zip(submit_together(cut), wholes, strict=True):
         found = wait()
         np.testing.assert_equal(found.encoded, cut_out(whole.encoded, boxes))
         np.testing.assert_equal(found.kept["normalize"], cut_out(whole.kept["normalize"], boxes))
@@ -134,7 +111,7 @@ def test_lines_of_pixels(on, sizes):
     for runner in runners:
         runner.keep = ()
     alone = [each.runner.run(each.image, each.noise_key) for each in asked]
-    for wait, expected in zip(submit(asked), alone, strict=True):
+    for wait, expected in zip(submit_together(asked), alone, strict=True):
         equal(wait(), expected)
 
 
@@ -146,7 +123,7 @@ def test_more_than_one_stack_where_memory_is_short(on, launches, monkeypatch):
     def depths():
         """Submit the images and return how many of them each launch covers."""
         launches.clear()
-        for wait, expected in zip(submit(asked), alone, strict=True):
+        for wait, expected in zip(submit_together(asked), alone, strict=True):
             equal(wait(), expected)
         return {size[2:] for size in launches}
 
@@ -164,10 +141,10 @@ def test_more_than_one_stack_where_memory_is_short(on, launches, monkeypatch):
 def test_what_takes_other_kernels_goes_by_itself(on, launches):
     asked = submissions(on, CHAINS["default"])
     chain = make_chain(settings_from({"stages": ["exposure", "gamma"]}))
-    other = replace(asked[0], runner=Runner(chain, on))
+    other = asked[0]._replace(runner=Runner(chain, on))
     alone = [each.runner.run(each.image, each.noise_key) for each in (*asked, other)]
     launches.clear()
-    waits = submit([asked[0], other, *asked[1:]])
+    waits = submit_together([asked[0], other, *asked[1:]])
     found = [wait() for wait in waits]
     for result, expected in zip([found[0], *found[2:], found[1]], alone, strict=True):
         equal(result, expected)
@@ -178,7 +155,7 @@ def test_what_takes_other_kernels_goes_by_itself(on, launches):
 def test_a_stack_that_fails_is_done_image_by_image(on, monkeypatch, error):
     asked = submissions(on, CHAINS["default"])
     alone = [each.runner.run(each.image, each.noise_key) for each in asked]
-    before = submit(asked)
+    before = submit_together(asked)
     launch = cl.enqueue_nd_range_kernel
 
     def launched(queue, kernel, size, *rest, **options):
@@ -187,7 +164,7 @@ def test_a_stack_that_fails_is_done_image_by_image(on, monkeypatch, error):
         return launch(queue, kernel, size, *rest, **options)
 
     monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
-    for wait, expected in zip([*before, *submit(asked)], alone * 2, strict=True):
+    for wait, expected in zip([*before, *submit_together(asked)], alone * 2, strict=True):
         equal(wait(), expected)
 
 
@@ -209,15 +186,10 @@ def test_small_images_of_a_run_share_launches(
         write_exr(tmp_path / f"in/r{number}.exr", pixels)
     asked = {"a burst and its truth": {"frames": 3, "truth": ("clean",)}}
     asked["patches"] = {"patch": 16, "patches_per_image": 2}
-    request = Request.from_options(formats=("png",), values={"iso": 3200}, **asked.get(what, {}))
 
     def made(name):
-        (tmp_path / name).mkdir()
-        loader = ImageLoader(request)
-        jobs = find_jobs([str(tmp_path / "in")], tmp_path / name)
-        chain = loader.first_chain(jobs)
-        writer = OutputWriter(tmp_path / name, request.with_outputs(chain))
-        outcomes = list(WAYS[way](ImageWorker(loader, Folder(writer), chain), device).run(jobs))
+        worker, jobs = worker_of(tmp_path, name, values={"iso": 3200}, **asked.get(what, {}))
+        outcomes = list(WAYS[way](worker, device).run(jobs))
         assert [outcome.status for outcome in outcomes] == ["done"] * 7
         files = (tmp_path / name).rglob("*.png")
         return {file.name: file.read_bytes() for file in files}
@@ -237,11 +209,7 @@ def test_a_small_image_that_fails_fails_alone(device, write_exr, tmp_path, monke
     for number in range(6):
         grey = 0.5 if number == 2 else 0.2
         write_exr(tmp_path / f"in/r{number}.exr", np.full((16, 16, 3), grey, np.float32))
-    loader = ImageLoader(Request.from_options(formats=("png",)))
-    jobs = find_jobs([str(tmp_path / "in")], tmp_path / "out")
-    (tmp_path / "out").mkdir()
-    chain = loader.first_chain(jobs)
-    writer = OutputWriter(tmp_path / "out", loader.request.with_outputs(chain))
+    worker, jobs = worker_of(tmp_path)
     work = Runner.work
 
     def planted(runner, image, *given):
@@ -250,8 +218,6 @@ def test_a_small_image_that_fails_fails_alone(device, write_exr, tmp_path, monke
         return work(runner, image, *given)
 
     monkeypatch.setattr(Runner, "work", planted)
-    outcomes = list(
-        Batch(ImageWorker(loader, Folder(writer), chain), [device], in_flight=1).run(jobs)
-    )
+    outcomes = list(Batch(worker, [device], in_flight=1).run(jobs))
     assert [outcome.status for outcome in outcomes] == ["done"] * 2 + ["failed"] + ["done"] * 3
     assert outcomes[2].error.endswith("r2.exr: unexpected ValueError: a mistake")

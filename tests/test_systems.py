@@ -3,8 +3,6 @@
 import errno
 import os
 import shutil
-import subprocess
-import sys
 from collections import namedtuple
 from pathlib import Path
 
@@ -18,7 +16,7 @@ from clpipe.images.write import write_grey_png
 from clpipe.inputs.find import Shard
 from clpipe.outputs import folder as output_folders
 from clpipe.outputs.folder import LOCK, output_folder, write_problem
-from tests.conftest import ROOT, written
+from tests.conftest import ROOT, run_python, written
 
 pytestmark = pytest.mark.slow
 
@@ -79,21 +77,9 @@ FOR_POCL = TAKE_AWAY.replace(" pread pwrite ", " ")
 RUN = "from clpipe.commands.main import main; main()"
 
 
-def python(code, *arguments, cwd):
-    done = subprocess.run(
-        [sys.executable, "-c", code, *map(str, arguments)],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
-    assert done.returncode == 0, done.stderr
-    return done
-
-
 def test_every_module_loads(tmp_path):
     modules = [p for p in (ROOT / "clpipe").rglob("*.py") if not p.name.startswith("blender_")]
-    done = python(TAKE_AWAY + LOAD, cwd=tmp_path)
+    done = run_python("-c", TAKE_AWAY + LOAD, cwd=tmp_path)
     assert int(done.stdout) == len(modules) - 1  # the package itself
 
 
@@ -112,8 +98,8 @@ def test_a_batch_runs_resumes_and_has_the_same_bytes(
     run = ("run", "in", *noise, *files, "--format", "png", *device, "-o")
     clpipe(*run, "usual")
     for shard in shards:
-        python(taken + RUN, *run, "out", "--shard", shard, cwd=tmp_path)
-    again = python(taken + RUN, *run, "out", cwd=tmp_path)
+        run_python("-c", taken + RUN, *run, "out", "--shard", shard, cwd=tmp_path)
+    again = run_python("-c", taken + RUN, *run, "out", cwd=tmp_path)
     assert "2 of them were there already" in again.stderr
     usual = written(tmp_path / "usual")
     made = [name for name in written(tmp_path / "out") if not name.endswith(".jsonl")]

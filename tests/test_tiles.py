@@ -19,9 +19,7 @@ from clpipe.engine.runner import Result, Runner, cut_out
 from clpipe.engine.tiles import (
     LARGEST_TILE,
     buffer_sizes,
-    divisions,
     halos_of,
-    phases_of,
     tiling_of,
 )
 from clpipe.stage import Kind, StageRole
@@ -280,28 +278,6 @@ def test_full_rows_come_before_narrow_tiles():
         assert tiling.bytes < LARGEST_TILE
 
 
-def test_the_halo_is_what_all_stencils_reach_together():
-    assert halos_of(plan_of()) == (1 + 2 + 1 + 3 + 2,)  # optical_blur, demosaic, denoise, sharpen
-    assert halos_of(plan_of(stages=["exposure", "gamma"])) == (0,)
-    bilinear = {"stages": ["mosaic", "demosaic"], "demosaic": {"method": "bilinear"}}
-    assert halos_of(plan_of(**bilinear)) == (1,)
-
-
-def test_phases_end_with_what_is_found():
-    plan = plan_of(**GRAY_WORLD)
-    first, second = phases_of(plan)
-    names = [launch.name for launch in plan.launches]
-    assert [names[i] for i in first.first] == ["lines"]
-    assert [names[i] for i in first.each] == [
-        "inverse_color_matrix",
-        "optical_blur.blur..normalize",
-        "white_balance.add_up",
-    ]
-    assert [names[i] for i in first.last] == ["white_balance.gray_world"]
-    assert second.first == second.last == ()
-    assert len(second.each) == 7
-
-
 def test_memory_that_is_too_small_for_any_tile(device, monkeypatch):
     runner = Runner(make_chain(settings_from({})), device)
     monkeypatch.setattr(device, "memory", 1000)
@@ -366,25 +342,3 @@ def test_buffers_that_cannot_be_made(device, monkeypatch):
         same(whole, runner.run(image, "k"))
     assert max(sizes) > 100_000
     assert max(b.size for b in pool.buffers.values()) <= 40_000
-
-
-def test_a_device_that_fails_is_an_error_of_the_image(device, monkeypatch):
-    runner = Runner(make_chain(settings_from({"iso": 3200, **GRAY_WORLD})), device)
-    image = example(Kind.RGB, (150, 203), half=True)
-    whole = runner.run(image, "k")
-
-    def dies(*_, **__):
-        raise cl.RuntimeError("the driver died")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(cl, "enqueue_nd_range_kernel", dies)
-        with pytest.raises(ImageError, match="failed: the driver died"):
-            runner.run(image, "k")
-    same(whole, runner.run(image, "k"))
-
-
-def test_numbers_of_tiles_to_try():
-    tried = list(divisions(10_000))
-    assert tried[:20] == list(range(1, 21))
-    assert tried[-1] == 10_000
-    assert len(tried) < 100

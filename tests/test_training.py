@@ -1,15 +1,12 @@
 """tools/training: denoisers that are trained on what clpipe makes, and how they are judged."""
 
 import json
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from tests.conftest import ROOT, STILL_LIFE
+from tests.conftest import STILL_LIFE, run_python
 
 pytestmark = pytest.mark.slow
 torch = pytest.importorskip("torch", reason="needs PyTorch, in the extra train")
@@ -22,15 +19,7 @@ def tool(tmp_path):
     (tmp_path / "renders/a.exr").write_bytes(STILL_LIFE.read_bytes())
 
     def run(name, *words, status=0):
-        command = [sys.executable, "-m", f"tools.training.{name}", *map(str, words)]
-        done = subprocess.run(
-            command,
-            cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == status, done.stderr
+        done = run_python("-m", f"tools.training.{name}", *words, cwd=tmp_path, status=status)
         return done.stdout + done.stderr
 
     return run

@@ -1,6 +1,5 @@
 """Pixels on their way to a device and back: where they lie, or through staging buffers."""
 
-import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +17,7 @@ from clpipe.engine.extents import Box
 from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.runner import Runner, cut_out
 from clpipe.stage import Kind
+from tests.conftest import fail_launches
 
 IMAGES = [example(Kind.RGB, (40, 48), half=True, seed=seed) for seed in range(5)]
 
@@ -193,15 +193,8 @@ def test_a_source_that_is_there_is_not_sent_again(gpu_runner):
 def test_an_error_of_one_image_leaves_the_others_whole(gpu_runner, monkeypatch, fails):
     monkeypatch.setattr(programs, "_by_device", {})
     expected = [gpu_runner.run(image, "k").encoded for image in IMAGES]
-    launch, numbers = cl.enqueue_nd_range_kernel, itertools.count()
-    failing = {fails, 2}  # and when that image is tried again
-
-    def launched(*arguments: Any, **options: Any) -> cl.Event:
-        if next(numbers) in failing:
-            raise cl.RuntimeError("clEnqueueNDRangeKernel failed: INVALID_OPERATION")
-        return launch(*arguments, **options)
-
-    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
+    # And when that image is tried again.
+    fail_launches(monkeypatch, cl.RuntimeError("INVALID_OPERATION"), fails, 2)
     begun = [gpu_runner.submit(image, "k") for image in IMAGES[:2]]
     for number, wait in enumerate(begun):
         if number == fails:

@@ -158,7 +158,7 @@ def test_the_page(monkeypatch, capsys, tmp_path, jpegs):
     assert status == 0, out
     assert "| sony-a7r2 | 3200 | " in out
     for heading in (
-        "Known noise in",
+        "Calibration of known noise",
         "Photo-electrons",
         "A real camera's finished",
         "Real cameras",

@@ -5,7 +5,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 import tarfile
 from importlib.util import module_from_spec, spec_from_file_location
 
@@ -13,7 +12,7 @@ import pytest
 
 from clpipe import __version__
 from clpipe.base.about import full_version
-from tests.conftest import ROOT, STILL_LIFE
+from tests.conftest import ROOT, STILL_LIFE, run_python
 
 ABOUT = "clpipe/base/about.py"
 
@@ -138,7 +137,4 @@ def test_both_versions_are_where_they_belong(clpipe, tmp_path, monkeypatch):
 
 def test_importing_runs_no_git():
     code = "import sys, clpipe; print('subprocess' in sys.modules, 'pathlib' in sys.modules)"
-    command = [sys.executable, "-S", "-c", code]
-    env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=env)
-    assert done.stdout == "False False\n"
+    assert run_python("-S", "-c", code).stdout == "False False\n"

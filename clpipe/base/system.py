@@ -202,17 +202,19 @@ def passing_file(size: int) -> Iterator[str]:
 
 def largest_file() -> int | None:
     """The most bytes that a file of this process may have (``ulimit -f``); None without a limit."""
-    if not resource:
-        return None
-    limit = int(resource.getrlimit(resource.RLIMIT_FSIZE)[0])
-    return None if limit == resource.RLIM_INFINITY else limit
+    return _limit("RLIMIT_FSIZE")
 
 
 def address_space() -> int | None:
     """The most bytes of addresses of this process (``ulimit -v``); None without a limit."""
+    return _limit("RLIMIT_AS")
+
+
+def _limit(name: str) -> int | None:
+    """The limit that the system sets this process; None where it sets none."""
     if not resource:
         return None
-    limit = int(resource.getrlimit(resource.RLIMIT_AS)[0])
+    limit = int(resource.getrlimit(getattr(resource, name))[0])
     return None if limit == resource.RLIM_INFINITY else limit
 
 
@@ -299,11 +301,8 @@ def file_to_disk(path: Path) -> None:
     Raises:
         OSError: they cannot be brought to the disk.
     """
-    descriptor = os.open(path, os.O_RDWR)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    with open(path, "r+b", buffering=0) as file:
+        os.fsync(file.fileno())
 
 
 def begin_writing(path: Path) -> None:
@@ -313,11 +312,9 @@ def begin_writing(path: Path) -> None:
     """
     with contextlib.suppress(OSError, TypeError, AttributeError):  # another C library
         begin = _libc().sync_file_range
-        descriptor = os.open(path, os.O_RDWR)
-        try:
-            begin(descriptor, ctypes.c_int64(0), ctypes.c_int64(0), _SYNC_FILE_RANGE_WRITE)
-        finally:
-            os.close(descriptor)
+        with open(path, "r+b", buffering=0) as file:
+            whole = ctypes.c_int64(0), ctypes.c_int64(0)
+            begin(file.fileno(), *whole, _SYNC_FILE_RANGE_WRITE)
 
 
 def processors() -> int:

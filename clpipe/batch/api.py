@@ -120,12 +120,12 @@ def run(
             depth in metres or object numbers, and also writes a PNG with 16 bits,
             OUT/NAME.LAYER.png, with depth in millimetres. FILE is the path from the image's
             directory, as in 'Depth=../depth/{name}.exr'. None is {name}_LAYER.exr or similar.
-        truth: write next to each picture its ground truth: without noise (development), without
-            noise and denoising (clean), the mosaic without noise (mosaic), or the variance of the
-            mosaic's noise (variance). Or write the clean picture with independent noise of the same
-            strength, equal everywhere (iid) or by intensity (intensity). These two also write the
-            ground truth from which they are made. The choices are "development", "clean", "mosaic",
-            "variance", "iid", "intensity".
+        truth: write the picture without noise (development), without noise and denoising (clean),
+            the clean mosaic (mosaic), its noise variance (variance), or the clean picture with
+            uniform (iid) or intensity-dependent (intensity) noise. The noise of iid and intensity
+            is independent and as strong as the picture's. These two also write the ground truth
+            from which they are made. The choices are "development", "clean", "mosaic", "variance",
+            "iid", "intensity".
         truth_at: the moment of an exposure of several files whose pose and layers go with the
             picture. all has the layers of its start and end as well. The choices are "start",
             "middle", "end", "all". None is middle.
@@ -147,10 +147,10 @@ def run(
             choices are "srgb", "linear".
         max_pixels: the most pixels of an image. Larger images are rejected before memory is
             allocated. None is 200000000.
-        redo: which existing pictures to make again: none (missing), those of another version of
-            clpipe (old), also damaged ones (damaged), or all, even files of other programs (all).
-            Pictures that are missing or whose request has changed are always made. damaged reads
-            all files. The choices are "missing", "old", "damaged", "all". None is old.
+        redo: recompute no existing picture (missing), those of another version of clpipe (old),
+            also damaged ones (damaged), or all, even files of other programs (all). Pictures that
+            are missing or whose request has changed are always made. damaged reads all files. The
+            choices are "missing", "old", "damaged", "all". None is old.
         webdataset: the number of images per tar for WebDataset, OUT/000000.tar and so on.
         shard: the part of the images to make, such as 2/8, for job arrays.
         device: an index or part of a name from 'clpipe devices', or numpy. None is the first GPU

@@ -84,7 +84,9 @@ class Developers:
         self._budget = budget
         self._tell = compiled
         self._fail = fail
-        self._orders: queue.SimpleQueue[Order | None] = queue.SimpleQueue()
+        self._orders: queue.SimpleQueue[list[Order] | None] = (
+            queue.SimpleQueue()
+        )  # small ones together
         self._encoders = ThreadPoolExecutor(threads, "encode")
         self._is_needed = threading.Event()  # set by the first image to be made, and at the end
         self._is_closing = False
@@ -117,18 +119,32 @@ class Developers:
         """Make all renditions of jobs, some at a time, and wait. Returns them by job."""
         made: list[list[Order]] = [[] for _ in states]
         asked: deque[Order] = deque()
+        small: list[Order] = []
         for state, orders in zip(states, made, strict=True):
-            most = TOGETHER if self.is_small(state) else self.most
+            is_small = self.is_small(state)
+            if not is_small:
+                self._put(small)
+            most = TOGETHER if is_small else self.most
             for recipe in state.recipes:
                 # Baselines take their noise from the renditions before them.
                 while asked and (len(asked) >= most or recipe.spread):
+                    self._put(small)
                     asked.popleft().written.exception()
                 orders.append(Order(state, recipe))
                 asked.append(orders[-1])
-                self._orders.put(orders[-1])
+                small.append(orders[-1])
+                if not is_small:
+                    self._put(small)
+        self._put(small)
         for order in reversed(asked):  # the last one first, so as to wait once
             order.written.exception()
         return made
+
+    def _put(self, orders: list[Order]) -> None:
+        """Queue orders, if there are any, and empty the list."""
+        if orders:
+            self._orders.put(orders.copy())
+            orders.clear()
 
     def develop_all(self, device: Device | None) -> None:
         """Develop orders until there are no more, or the device fails."""
@@ -156,10 +172,10 @@ class Developers:
             if isinstance(error, DeviceError) and not is_last:
                 log.warning("%s; the other devices go on", error)
                 for order in (*left, *asked):
-                    self._orders.put(order)
+                    self._orders.put([order])
                 return
             self._fail(error)
-            for order in chain(left, asked, iter(self._orders.get, None)):
+            for order in chain(left, asked, chain.from_iterable(iter(self._orders.get, None))):
                 order.written.set_exception(error)
         finally:
             if device:
@@ -177,23 +193,23 @@ class Developers:
         is_waiting = not started
         while len(taken) < TOGETHER:
             try:
-                order = self._orders.get(is_waiting)
+                orders = self._orders.get(is_waiting)
             except queue.Empty:
                 if taken:
                     break
                 self._finish(started, device)
                 is_waiting = not started
                 continue
-            if order is None:
+            if orders is None:
                 if taken:
                     self._orders.put(None)  # for the next call
                     break
                 while started:
                     self._finish(started, device)
                 return []
-            taken.append(order)
+            taken += orders
             is_waiting = False
-            if not self.is_small(order.state):
+            if not self.is_small(orders[-1].state):
                 break
         return taken
 

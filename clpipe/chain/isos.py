@@ -20,7 +20,8 @@ def check_cameras(settings: Settings) -> None:
         RequestError: a camera cannot be loaded, an ISO is outside the range of every camera, or
             a camera has no ISO that can be drawn.
     """
-    cameras, draw = [load_camera(name) for name in settings.cameras()], settings.draws.get("iso")
+    cameras = [load_camera(name) for name in settings.names_of("camera")]
+    draw = settings.draws.get("iso")
     if draw is None or draw.follows:
         isos: Sequence[float] = [settings.iso]
         if draw:
@@ -56,7 +57,7 @@ def draw_note(settings: Settings) -> str:
             f"iso: drawn beyond {high:g}, where those of {camera.name} end: from there on "
             "noise grows with the ISO as if the picture were pushed"
         )
-    for camera in map(load_camera, settings.cameras()) if draw else ():
+    for camera in map(load_camera, settings.names_of("camera")) if draw else ():
         own = draw and draw.within(Limits(*camera.iso_range))
         if own != draw and not isinstance(own, Truncated):  # of a normal, tails are left out
             parts.append("{} from {:g} to {:g}".format(camera.name, *camera.iso_range))

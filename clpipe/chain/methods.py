@@ -75,22 +75,37 @@ def chosen_method(name: str, table: Mapping[str, Any]) -> Any:
     return table.get("method", stage.methods[0].method if stage else None)
 
 
-def make_method(stage: Stage, name: str, table: Mapping[str, Any]) -> Method:
-    """A stage's method from a table of its parameters, validated.
-
-    Args:
-        stage: the stage.
-        name: of the step, for messages.
-        table: values by parameter; "method" chooses the method, else it is the default.
+def stage_of(step: str) -> Stage:
+    """Return the stage of a step, which may be a repeated one.
 
     Raises:
-        KeyedError: an unknown method or parameter, or a value that is not allowed.
+        KeyedError: there is no such stage.
     """
-    if not table:
-        return default_method(stage.methods[0], name)
-    method = method_named(stage, name, table.get("method", stage.methods[0].method))
-    with validation_errors(name, method):
-        return method.model_validate({k: v for k, v in table.items() if k != "method"})
+    return stage_named(step, base_name(step))
+
+
+def make_model(name: str, table: Mapping[str, Any]) -> Any:
+    """Validate a table.
+
+    Args:
+        name: of a step, or of a table that belongs to no stage, see :data:`TABLE_MODELS`.
+        table: values by name. In a step's table, "method" chooses the method.
+
+    Returns:
+        The method of the step, or the model of the other table.
+
+    Raises:
+        KeyedError: an unknown stage, method or name, or a value that is not allowed.
+    """
+    if name in TABLE_MODELS:
+        model = TABLE_MODELS[name]
+    elif table:
+        model = method_named(stage_of(name), name, chosen_method(name, table))
+        table = {k: v for k, v in table.items() if k != "method"}
+    else:
+        return default_method(stage_of(name).methods[0], name)
+    with validation_errors(name, model):
+        return model.model_validate(dict(table))
 
 
 @lru_cache(maxsize=1024)
@@ -118,16 +133,6 @@ def method_named(stage: Stage, name: str, chosen: Any) -> type[Method]:
 
 # The models of the tables that belong to no stage.
 TABLE_MODELS: dict[str, type[BaseModel]] = {OUTPUT: Encoding, RENDER: RenderCamera}
-
-
-def make_table(name: str, table: Mapping[str, Any]) -> Any:
-    """The model of a table that belongs to no stage, one of :data:`TABLE_MODELS`.
-
-    Raises:
-        KeyedError: an unknown key, or a value that is not allowed.
-    """
-    with validation_errors(name, model := TABLE_MODELS[name]):
-        return model.model_validate(dict(table))
 
 
 @contextmanager

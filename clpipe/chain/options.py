@@ -35,9 +35,8 @@ DEVICE = Key(
 TRUTH = Key(
     "truth",
     list,
-    "Write next to each picture its ground truth: without noise (development), without noise and "
-    "denoising (clean), the mosaic without noise (mosaic), or the variance of the mosaic's noise "
-    "(variance).",
+    "Write the picture without noise (development), without noise and denoising (clean), the clean "
+    "mosaic (mosaic), or its noise variance (variance).",
     usual=CLEAN,
     choices=TRUTHS,
 )
@@ -96,9 +95,11 @@ _ALL = (
         "{name}_LAYER.exr or similar",
     ),
     TRUTH._replace(
-        text=f"{TRUTH.text} Or write the clean picture with independent noise of the same "
-        "strength, equal everywhere (iid) or by intensity (intensity). These two also write the "
-        "ground truth from which they are made.",
+        text="Write the picture without noise (development), without noise and denoising (clean), "
+        "the clean mosaic (mosaic), its noise variance (variance), or the clean picture with "
+        "uniform (iid) or intensity-dependent (intensity) noise. The noise of iid and intensity is "
+        "independent and as strong as the picture's. These two also write the ground truth from "
+        "which they are made.",
         usual="",
         choices=(*TRUTHS, *BASELINES),
     ),
@@ -186,9 +187,9 @@ _ALL = (
     Key(
         "redo",
         str,
-        "Which existing pictures to make again: none (missing), those of another version of clpipe "
-        "(old), also damaged ones (damaged), or all, even files of other programs (all). Pictures "
-        "that are missing or whose request has changed are always made. damaged reads all files.",
+        "Recompute no existing picture (missing), those of another version of clpipe (old), also "
+        "damaged ones (damaged), or all, even files of other programs (all). Pictures that are "
+        "missing or whose request has changed are always made. damaged reads all files.",
         usual="old",
         choices=get_args(RedoName),
     ),

@@ -83,8 +83,7 @@ def photometry_of(chain: Chain, estimates: Estimates) -> dict[str, Any] | None:
 
 def _gains(chain: Chain, estimates: Estimates) -> dict[str, list[float]]:
     """The gains of red, green and blue that the light lacks, and those by which it is balanced."""
-    last = chain.steps[-1]
-    context = last.method.next_context(last.context)
+    context = chain.context_after
     step = chain.step_in(StageRole.BALANCE)
     found = estimates.get(step.name, {}) if step else {}
     red, blue = context.applied_gains

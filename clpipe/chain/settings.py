@@ -34,11 +34,11 @@ from clpipe.chain.methods import (
     TABLE_MODELS,
     base_name,
     chosen_method,
-    make_method,
-    make_table,
+    make_model,
     method_named,
     parameter_names,
     stage_named,
+    stage_of,
     step_names,
     unknown_parameter,
 )
@@ -157,7 +157,7 @@ class Settings:
         table = self.parameters.get(step, {})
         validated, model = self.validated.get(step, (None, None))
         if model is None or validated is not table:
-            model = make_method(stage_named(step, base_name(step)), step, table)
+            model = make_model(step, table)
         return model
 
     @property
@@ -178,7 +178,7 @@ class Settings:
         """The files that the settings name, whose contents are so a part of them."""
         files = [self.camera] if self.camera.endswith(".toml") else []
         for step, table in self.parameters.items():
-            for name in sorted(file_parameters(stage_named(step, base_name(step)))):
+            for name in sorted(file_parameters(stage_of(step))):
                 if isinstance(value := table.get(name), str) and value:
                     files.append(value)
         return files
@@ -191,7 +191,7 @@ class Settings:
         """
         if step in TABLE_MODELS:
             return [TABLE_MODELS[step]]
-        stage, draw = stage_named(step, base_name(step)), self.draws.get(f"{step}.method")
+        stage, draw = stage_of(step), self.draws.get(f"{step}.method")
         chosen = chosen_method(step, self.parameters.get(step, {}))
         names = draw.choice if isinstance(draw, Choice) else [chosen]
         return [method_named(stage, step, name) for name in names]
@@ -209,23 +209,18 @@ class Settings:
             return isos if key == "iso" else None
         return limits_of(self.models(step)[0], name)
 
-    def cameras(self) -> list[str]:
-        """The camera, or all that it is drawn from."""
-        draw = self.draws.get("camera")
-        return list(draw.choice) if isinstance(draw, Choice) else [self.camera]
-
-    def lenses(self) -> list[str]:
-        """The lens that is named, or all that it is drawn from; none where there is none."""
-        draw = self.draws.get("lens")
-        return list(draw.choice) if isinstance(draw, Choice) else [self.lens] * bool(self.lens)
+    def names_of(self, key: str) -> list[str]:
+        """Return the camera or the lens, or all that it is drawn from. Without a lens, none."""
+        draw, name = self.draws.get(key), getattr(self, key)
+        return list(draw.choice) if isinstance(draw, Choice) else [name] * bool(name)
 
     def isos(self) -> Limits:
-        """The ISOs that all :meth:`cameras` have.
+        """The ISOs that the camera has, or that all cameras have which it is drawn from.
 
         Raises:
             RequestError: a camera cannot be loaded.
         """
-        ranges = [load_camera(name).iso_range for name in self.cameras()]
+        ranges = [load_camera(name).iso_range for name in self.names_of("camera")]
         return Limits(max(low for low, _ in ranges), min(high for _, high in ranges))
 
     def drawn_isos(self, camera: Camera) -> Limits:
@@ -271,17 +266,16 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
     draws |= {key: draw_of(key, tables.pop(key)) for key in KEYS if key in tables}
     parameters, validated = dict(settings.parameters), dict(settings.validated)
     for step, table in tables.items():
-        stage = None if step in TABLES else stage_named(step, base_name(step))
         merged = _merged(settings, step, table)
         step_draws = {f"{step}.{k}": v for k, v in merged.items() if isinstance(v, Draw)}
         draws |= step_draws
         constants = {k: v for k, v in merged.items() if not isinstance(v, Draw)}
-        if stage is None:
-            plain[step] = make_table(step, constants)
+        if step in TABLES:
+            plain[step] = make_model(step, constants)
             continue
         parameters[step] = constants
         if not step_draws:
-            validated[step] = constants, make_method(stage, step, constants)
+            validated[step] = constants, make_model(step, constants)
     tables_now = {"parameters": parameters, "validated": validated, "draws": draws}
     changed = altered(settings, {**plain, **tables_now})
     if draws:
@@ -349,14 +343,14 @@ def _merged(settings: Settings, step: str, table: Mapping[str, Any]) -> dict[str
     """The values and draws of a step with a table over them.
 
     Raises:
-        KeyedError: a table within the table is no draw.
+        KeyedError: there is no such stage, or a table within the table is no draw.
     """
+    methods = () if step in TABLES else stage_of(step).methods
     own = {k: draw_of(f"{step}.{k}", v) if isinstance(v, Mapping) else v for k, v in table.items()}
     before = settings.table(step)
     if "method" in own and own["method"] != chosen_method(step, before):
         return own
-    stage = all_stages().get(base_name(step))
-    for method in stage.methods if stage else ():
+    for method in methods:
         if own.keys() & method.alternatives:
             before = {k: v for k, v in before.items() if k not in method.alternatives}
     return {**before, **own}
@@ -391,11 +385,7 @@ def _check_draws(settings: Settings, changed: Container[str]) -> None:
     for step, drawn in by_step.items():
         constants = {k: v for k, v in settings.table(step).items() if not isinstance(v, Draw)}
         for example in _examples(drawn):
-            table = {**constants, **example}
-            if step in TABLES:
-                make_table(step, table)
-            else:
-                make_method(stage_named(step, base_name(step)), step, table)
+            make_model(step, {**constants, **example})
 
 
 def _examples(drawn: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:

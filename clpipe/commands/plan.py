@@ -16,7 +16,7 @@ from clpipe.engine.codegen import write_kernel
 from clpipe.engine.ir import AnyLaunch, Launch, Lines, Plan, reads_of
 from clpipe.engine.plan import make_plan
 from clpipe.engine.traffic import bytes_per_pixel, launch_bytes
-from clpipe.outputs.plan import results_of
+from clpipe.outputs.recipes import results_of
 
 LANES = 8  # of a CPU, for which sources and bytes are given
 

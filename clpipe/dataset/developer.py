@@ -76,20 +76,18 @@ def raw_step(chain: Chain, arrays: ArrayFormat) -> str:
     """
     if not arrays.is_in_dn:
         return noisy_mosaic(chain).steps[-1].name
-    steps = [step for step in chain.steps if step.stage.writes is Kind.RAW]
-    names = [step.name for step in steps]
-    if not names:
+    maker, after = chain.maker_of_raw, chain.context_of_raw
+    if maker is None:
         raise RequestError(
             f"the chain {chain.label} makes no raw in DN. Add the stage quantize, or use "
             "dtype='float32' for a raw scaled to signal"
         )
-    after = steps[-1].method.next_context(steps[-1].context)
     if not after.knots and (after.white_level or 0) > HIGHEST:
         raise RequestError(
             f"the raw has values to {after.white_level:.0f} DN, more than uint16 holds. Use "
-            f"dtype='float32' for a raw scaled to signal, or {steps[-1].name}.method=pwl"
+            f"dtype='float32' for a raw scaled to signal, or {maker}.method=pwl"
         )
-    return names[-1]
+    return maker
 
 
 @dataclass(frozen=True)

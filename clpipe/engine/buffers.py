@@ -10,7 +10,7 @@ import numpy as np
 from clpipe.base.types import Array
 from clpipe.engine.extents import Box, Extent
 from clpipe.engine.ir import Plan
-from clpipe.engine.work_items import border_left
+from clpipe.engine.work_items import round_up
 from clpipe.stage import Kind
 
 
@@ -103,7 +103,7 @@ def copy_plane(extent: Extent, plane: Array, room: Array, channel: int) -> None:
     core, stored, border = extent.core, extent.stored, extent.border
     height = extent.padded_height + 2 * border
     top = border + core.top - stored.top
-    left = border_left(border, extent.lanes) + core.left - stored.left
+    left = round_up(border, extent.lanes) + core.left - stored.left
     rows = plane[: height * extent.pitch].reshape(height, extent.pitch)
     image = room if room.ndim == 2 else room[..., channel]
     image[:] = rows[top : top + core.height, left : left + core.width]

@@ -86,10 +86,6 @@ class Device:
         """Whether the kernels of a plan are compiled."""
         return plan in self._kernels
 
-    def keep_programs(self) -> None:
-        """Keep for later processes what was compiled, and launched once, since the last time."""
-        self._programs.keep()
-
     def submit(self, works: Sequence[Work[R]]) -> list[Callable[[], R]]:
         """Enqueue images, in tiles where they do not fit, and small ones of a plan in stacks.
 
@@ -137,7 +133,7 @@ class Device:
                 flight = self._enqueued(works, memory)
                 if is_new:
                     self.drain()  # PoCL is done with a kernel when it has been launched
-                    self.keep_programs()
+                    self._programs.keep()
             return flight
         except (self._cl.Error, MemoryError) as error:
             return error

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from clpipe.engine.ir import Plan
-from clpipe.engine.work_items import border_left, round_up, summed_together
+from clpipe.engine.work_items import round_up, summed_together
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Extent:
     @cached_property
     def pitch(self) -> int:
         """Floats from one row of a plane to the next."""
-        pitch = self.padded_width + 2 * border_left(self.border, self.lanes)
+        pitch = self.padded_width + 2 * round_up(self.border, self.lanes)
         # Rows a multiple of 4 KiB apart would fall into the same cache sets.
         return pitch + self.lanes * (pitch % 1024 == 0)
 

@@ -130,7 +130,7 @@ class KernelBuilder:
     def arguments(self, op: Op, names: Sequence[str] | None = None) -> list[str]:
         """The actual arguments of a pass, or those ``names``, after the pixel and its site."""
         pass_, types, literals = op.pass_, dict(op.types), dict(op.literals)
-        estimates = estimates_of(self.plan, op.step)
+        estimates = self.plan.estimates.get(op.step, ())
         texts = [self.stream(op, pass_.random)] if pass_.random else []
         for item in pass_.arguments if names is None else names:
             if item in literals:
@@ -147,11 +147,6 @@ class KernelBuilder:
             else:
                 texts.append(self.lines(op.step, item, written=False))
         return texts
-
-
-def estimates_of(plan: Plan, step: str) -> tuple[str, ...]:
-    """The names of the numbers that a step estimates from the image, in their buffer's order."""
-    return plan.estimates.get(step, ())
 
 
 def in_order(parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:

@@ -2,43 +2,20 @@
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.engine.buffers import HostImages
-from clpipe.engine.discovery import DeviceInfo
-from clpipe.engine.flow import Flight, Flow
+from clpipe.engine.flow import Flight
 from clpipe.engine.options import Timing
-from clpipe.engine.tiles import Tiling
 from clpipe.engine.work import R, Work
 
+if TYPE_CHECKING:
+    from clpipe.engine.device import Device
+
 FAILURES = 3  # images in a row that a device fails at, before it is given up
-
-
-class Recoverable(Protocol):
-    """A device, as recovery sees it."""
-
-    info: DeviceInfo
-    memory: int
-    flow: Flow
-
-    def enqueue(self, works: Sequence[Work[Any]], memory: int) -> Flight | Exception:
-        """Enqueue images within so many bytes; what the device raises is returned."""
-        ...
-
-    def tiling(self, work: Work[Any], memory: int) -> Tiling:
-        """Return the tiles of an image within so many bytes."""
-        ...
-
-    def reopen(self) -> None:
-        """Open the device in a new context.
-
-        Raises:
-            DeviceError: it cannot be opened.
-        """
-        ...
 
 
 class Recovery:
@@ -51,7 +28,7 @@ class Recovery:
         generation: counts up when everything on the device is lost.
     """
 
-    def __init__(self, device: Recoverable) -> None:
+    def __init__(self, device: "Device") -> None:
         import pyopencl as cl
 
         self.generation = 0

@@ -11,11 +11,6 @@ def round_up(value: int, step: int) -> int:
     return -(-value // step) * step
 
 
-def border_left(border: int, lanes: int) -> int:
-    """Columns before the first pixel of a plane's row: the border, in whole blocks of lanes."""
-    return round_up(border, lanes)
-
-
 def local_size(lanes: int) -> int:
     """Work items of a work-group. On a GPU, 64 would not fill a multiprocessor."""
     return 128 if lanes == 1 else 64

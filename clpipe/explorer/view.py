@@ -13,7 +13,7 @@ from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain
 from clpipe.engine.runner import Result
 from clpipe.images.preview import encoded_light
-from clpipe.stage import Context, Kind
+from clpipe.stage import Kind
 
 
 @dataclass(frozen=True)
@@ -57,15 +57,9 @@ def shown_of(chain: Chain, result: Result) -> Array:
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
 
-def context_of(chain: Chain) -> Context:
-    """Return the context of the image that a chain produces."""
-    last = chain.steps[-1]
-    return last.method.next_context(last.context)
-
-
 def signal_of(image: Floats, chain: Chain) -> Floats:
     """Return a result scaled to 0 at black and 1 at white. Only raws need scaling."""
-    context = context_of(chain)
+    context = chain.context_after
     black, white = context.black_level, context.white_level
     if chain.result is not Kind.RAW or black is None or white is None:
         return image
@@ -97,7 +91,7 @@ def cut(image: Array, box: tuple[int, int, int, int]) -> Array:
 
 def part_as_read(name: str, part: Array, chain: Chain) -> Picture:
     """Return a part of a result to measure, as if read from a file."""
-    path, kind, context = Path(name), chain.result, context_of(chain)
+    path, kind, context = Path(name), chain.result, chain.context_after
     if kind is Kind.DISPLAY:
         step = 1 / 255
         pixels = part.astype(np.float32) * np.float32(step)

@@ -13,6 +13,6 @@ def lens_notes(settings: Settings, jobs: Sequence[Job]) -> list[str]:
     Raises:
         KeyedError: as :func:`clpipe.camera.lens.name_note`.
     """
-    named = [*settings.lenses(), *(job.values.get("lens") for job in jobs if job.values)]
+    named = [*settings.names_of("lens"), *(job.values.get("lens") for job in jobs if job.values)]
     names = dict.fromkeys(name for name in named if isinstance(name, str) and name)
     return list(filter(None, map(name_note, names)))

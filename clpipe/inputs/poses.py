@@ -12,7 +12,7 @@ import numpy as np
 
 from clpipe.base.errors import RequestError
 from clpipe.chain.keys import RENDER
-from clpipe.chain.methods import make_table
+from clpipe.chain.methods import make_model
 from clpipe.chain.options import Moments
 from clpipe.chain.render_camera import RenderCamera
 from clpipe.inputs.find import Job
@@ -76,7 +76,7 @@ def _with_view(job: Job, view: View, settings: RenderCamera) -> Job:
     try:
         if view.problem:
             raise RequestError(view.problem)
-        checked = make_table(RENDER, view.values)
+        checked = make_model(RENDER, view.values)
     except RequestError as error:
         raise RequestError(f"view {view.name}: {error}") from None
     own = job.values.get(RENDER, {})

@@ -43,30 +43,6 @@ class RenditionFiles(NamedTuple):
     others: Sequence[Path] = ()
 
 
-def results_of(
-    chain: Chain, formats: Sequence[str], keep: Sequence[str]
-) -> tuple[tuple[str, ...], bool, bool]:
-    """Return the results that files need of a chain, so that nothing else is computed.
-
-    Args:
-        chain: the chain.
-        formats: of the last image, and of the raw.
-        keep: names of steps; those that the chain does not have are ignored.
-
-    Returns:
-        The steps whose images are needed, and whether the last image is needed in 8 bits and in
-        floats.
-
-    Raises:
-        RequestError: a DNG is needed, and the chain has no raw for one.
-    """
-    last = [FORMATS[name].bits for name in formats if name != DNG]
-    steps = [step.name for step in chain.steps if step.name in keep]
-    if DNG in formats and (raw := dng_of(chain).step):
-        steps.append(raw)
-    return tuple(dict.fromkeys(steps)), 8 in last, any(bits > 8 for bits in last)
-
-
 def ending_behind(ending: str, rendition: Rendition, patch: int | None = None) -> str:
     """Return all that follows a job's stem in the name of a file.
 

@@ -1,12 +1,13 @@
 """Which pictures are made of an image, and how: with which chain and which noise."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.chain.baseline import baseline_of, matching_of
 from clpipe.chain.chain import Chain, Step
+from clpipe.chain.formats import DNG, FORMATS
 from clpipe.chain.identity import noise_key, of_bracket
 from clpipe.chain.registry import stage_in
 from clpipe.chain.rendition import (
@@ -24,7 +25,32 @@ from clpipe.chain.rendition import (
 from clpipe.chain.settings import overlay
 from clpipe.chain.truth import noisy_mosaic, picture_without_noise, signal_and_noise
 from clpipe.outputs.baseline_noise import Spread
+from clpipe.outputs.negative import dng_of
 from clpipe.stage import StageRole
+
+
+def results_of(
+    chain: Chain, formats: Sequence[str], keep: Sequence[str]
+) -> tuple[tuple[str, ...], bool, bool]:
+    """Return the results that files need of a chain, so that nothing else is computed.
+
+    Args:
+        chain: the chain.
+        formats: of the last image, and of the raw.
+        keep: names of steps; those that the chain does not have are ignored.
+
+    Returns:
+        The steps whose images are needed, and whether the last image is needed in 8 bits and in
+        floats.
+
+    Raises:
+        RequestError: a DNG is needed, and the chain has no raw for one.
+    """
+    last = [FORMATS[name].bits for name in formats if name != DNG]
+    steps = [step.name for step in chain.steps if step.name in keep]
+    if DNG in formats and (raw := dng_of(chain).step):
+        steps.append(raw)
+    return tuple(dict.fromkeys(steps)), 8 in last, any(bits > 8 for bits in last)
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ from clpipe.outputs.carried import write_carried
 from clpipe.outputs.folder import RESUMABLE, write_problem
 from clpipe.outputs.negative import negative_of
 from clpipe.outputs.patches import Patch, variance_at
-from clpipe.outputs.plan import OutputPlan, results_of
-from clpipe.outputs.recipes import Recipe
+from clpipe.outputs.plan import OutputPlan
+from clpipe.outputs.recipes import Recipe, results_of
 from clpipe.outputs.shot import kept_tags, shown_tags, tags_of
 from clpipe.outputs.sidecar import SIDECAR, remove_sidecar
 from clpipe.reference.curve import to_16_bit

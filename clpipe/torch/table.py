@@ -102,8 +102,7 @@ class Table:
         # Of each chain, the plane (R, Gr, Gb, B) of each place of the filter array, by rows.
         orders = []
         for chain in chains:
-            last = chain.steps[-1]
-            named = sites(last.method.next_context(last.context).pattern).values()
+            named = sites(chain.context_after.pattern).values()
             places = [2 * row.start + column.start for row, column in named]
             orders.append(np.argsort(places))
         self.planes = torch.from_numpy(np.stack(orders))

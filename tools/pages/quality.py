@@ -1,11 +1,11 @@
-"""Measure how good demosaicing and denoising are: CPSNR against pictures whose truth is known.
+"""Measure the quality of demosaicing, denoising and sharpening, for docs/quality.md.
 
-Demosaicing: eight of the Kodak pictures (kodim01.png and so on, in a folder that is named or lies
-beside the checkout; skipped where there is none) and the project's own render go through mosaic and
-demosaic. RGGB, eight-bit rounding, a border of 10 pixels left out, the mean over the pictures. The
+Demosaicing: CPSNR of eight Kodak pictures and of the project's own render after mosaic and
+demosaic: RGGB, rounded to 8 bits, without a border of 10 pixels. The Kodak pictures are kodim01.png
+and so on, in a folder that is named or next to the checkout; without them they are skipped. The
 exit status is 1 if a figure is missed by more than 0.05 dB.
 
-Denoising: the project's own render at several ISOs, developed to eight bits with each method,
+Denoising: CPSNR of the project's own render at several ISOs, developed to 8 bits with each method,
 against the same development without noise and without denoising.
 
 Sharpness: a slanted edge (ISO 12233) without noise, through whole chains, in linear light.
@@ -40,7 +40,7 @@ ISOS = (400, 1600, 6400)
 Choice = Mapping[str, str | int]
 
 KODAK_NUMBERS = (1, 5, 8, 13, 19, 20, 23, 24)
-# What each method should reach on these: figures of independent implementations (for the last two,
+# The target of each method on these pictures: figures of independent implementations (the last two:
 # colour-demosaicing 0.2.7).
 DEMOSAIC: dict[str, tuple[Choice, float | None]] = {
     "bounded": ({"method": "bounded"}, None),
@@ -100,13 +100,13 @@ NOISE = ("sensor_noise", "row_noise", "column_noise", "quantize", "normalize")
 
 
 def cpsnr(one: Array, two: Array) -> float:
-    """Colour peak signal-to-noise ratio of two (height, width, 3) eight-bit images, in dB."""
+    """Return the colour peak signal-to-noise ratio of two uint8 RGB images, in dB."""
     inside = slice(BORDER, -BORDER)
     return psnr(one[inside, inside], two[inside, inside])
 
 
 def kodak(folder: Path) -> list[Array]:
-    """The eight Kodak pictures of a folder, (height, width, 3) uint8; none if one is missing."""
+    """Return the Kodak pictures of a folder, (height, width, 3) uint8; [] if one is missing."""
     paths = [folder / f"kodim{number:02}.png" for number in KODAK_NUMBERS]
     if not all(path.is_file() for path in paths):
         return []
@@ -114,14 +114,14 @@ def kodak(folder: Path) -> list[Array]:
 
 
 def camera_of(choice: Choice) -> clpipe.Pipeline:
-    """A mosaic, of an "array" or RGGB, and a method of demosaicing."""
+    """Return a pipeline of mosaic (an "array", or RGGB) and demosaic."""
     own = {key: value for key, value in choice.items() if key != "array"}
     laid = {"method": "array", "array": choice["array"]} if "array" in choice else {}
     return clpipe.Pipeline(stages=["mosaic", "demosaic"], demosaic=own, mosaic=laid)
 
 
 def demosaicing(truths: Sequence[Array], choice: Choice) -> float:
-    """The mean CPSNR of a method over eight-bit pictures."""
+    """Return the mean CPSNR of a method over uint8 pictures, in dB."""
     camera = camera_of(choice)
     results = camera.process_many(truth / np.float32(255) for truth in truths)
     pairs = zip(results, truths, strict=True)
@@ -129,7 +129,7 @@ def demosaicing(truths: Sequence[Array], choice: Choice) -> float:
 
 
 def denoising(render: Array, iso: int, method: str) -> float:
-    """The CPSNR of the finished picture at an ISO against one without noise."""
+    """Return the CPSNR of the finished picture at an ISO against one without noise, in dB."""
     part = DENOISE[method]
     noisy = clpipe.Pipeline(iso=iso, **part).process(render, "quality")
     clean = clpipe.Pipeline(iso=iso, skip=[*NOISE, "denoise"]).process(render, "quality")
@@ -137,11 +137,11 @@ def denoising(render: Array, iso: int, method: str) -> float:
 
 
 def measure_demosaicing(folder: Path, render: Array, console: Console) -> bool:
-    """Print the table of demosaicing methods; whether every figure is as it should be."""
+    """Print the table of demosaicing methods; return whether each target is met."""
     photographs = kodak(folder)
     own = [clpipe.Pipeline(stages=["gamma"]).process(render, "").image]
     table = Table("demosaic", box=None, pad_edge=False)
-    for heading in ("Kodak, 8", "should be", "own render"):
+    for heading in ("Kodak, 8", "target", "own render"):
         table.add_column(heading, justify="right")
     right = True
     for name, (choice, expected) in DEMOSAIC.items():
@@ -154,7 +154,7 @@ def measure_demosaicing(folder: Path, render: Array, console: Console) -> bool:
             row = [f"{found:.2f}", f"{should} MISSED" if missed else should]
         table.add_row(name, *row, f"{demosaicing(own, choice):.2f}")
     if not photographs:
-        console.print(f"{folder}: the Kodak pictures are not there; skipped")
+        console.print(f"{folder} does not contain the Kodak pictures; skipped")
     console.print("CPSNR in dB", table, sep="\n")
     return right
 
@@ -183,7 +183,7 @@ def measure_sharpness(console: Console) -> None:
 
 
 def main() -> int:
-    """Measure, print the tables."""
+    """Measure and print the tables."""
     parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
     parser.add_argument("--pictures", type=Path, default=KODAK, metavar="DIR")
     folder: Path = parser.parse_args().pictures

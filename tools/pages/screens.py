@@ -5,6 +5,7 @@
 It needs a Chromium, and Playwright: .venv/bin/python -m pip install playwright
 """
 
+import hashlib
 import shutil
 import sys
 import threading
@@ -28,10 +29,20 @@ from tools import RENDER, ROOT
 SIZE = {"width": 1366, "height": 768}
 
 
+def pages_digest() -> str:
+    """Return a digest of the pages' files. Pictures store it, so a test finds old ones."""
+    digest = hashlib.sha256()
+    for room in ("analysis", "explorer", "reports"):
+        for path in sorted((ROOT / "clpipe" / room / "page").iterdir()):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
 def taken(page: Any, name: str) -> None:
     """Write what a page shows."""
     path = ROOT / "docs" / f"screen_{name}.webp"
-    Image.open(BytesIO(page.screenshot())).convert("RGB").save(path, quality=86, method=6)
+    picture = Image.open(BytesIO(page.screenshot())).convert("RGB")
+    picture.save(path, quality=86, method=6, xmp=pages_digest().encode())
     print(path.relative_to(ROOT))
 
 

@@ -1,17 +1,17 @@
-"""Put known noise in, measure it again, and print the page docs/validation.md.
+"""Simulate known noise, measure it, and print the page docs/validation.md.
 
     tools/run pages validate --real FOLDER > docs/validation.md
     tools/run pages validate --only cameras [RENDER ...]
 
-The closed loop: frames with known parameters are made, for every camera, ISO and pattern, and
-calibrated as if nothing were known of them. Poisson numbers against their exact law. Finished
-pictures against what was measured on those of real cameras. The exit status is 1 if a figure
-misses its target.
+It has these sections. In a closed loop, frames with known parameters are simulated for every camera,
+ISO and pattern, and calibrated without knowing them. Poisson numbers are compared with their exact
+distribution. Finished pictures are compared with figures measured on those of real cameras. The
+exit status is 1 if a figure misses its target.
 
-FOLDER has real cameras' pictures, which are not shipped, as pairs NAME_1_real.png and the mean of
-many of the same scene, NAME_1_mean.png: they are measured, too, their curves are drawn into
-docs/real_cameras.svg, and their crops go to the output folder. docs/real_cameras_crops.png shows
-clpipe's.
+FOLDER contains pictures of real cameras, which are not part of the repository, as pairs
+NAME_1_real.png and NAME_1_mean.png, the mean of many pictures of the same scene. They are measured,
+their curves are drawn into docs/real_cameras.svg, and their crops go to the output directory.
+docs/real_cameras_crops.png shows those of clpipe.
 """
 
 import argparse
@@ -48,8 +48,8 @@ FRAMES = 8
 MEANS = (0.1, 1, 5, 9.9, 10.1, 50, 1000, 1e5)
 NOISE = ("prnu", "defect_pixels", "sensor_noise", "dsnu", "row_noise", "column_noise")
 
-# A Canon EOS 5D Mark II's own JPEGs at ISO 3200 and 6400: 11 pairs, noise = one frame less the mean
-# of many, flat places. Autocorrelation one to the right, one below, diagonally, two to the right.
+# JPEGs of a Canon EOS 5D Mark II at ISO 3200 and 6400: 11 pairs; noise is one frame minus the mean
+# of many, in flat areas. Autocorrelation one to the right, one below, diagonally, two to the right.
 REAL = {
     "luma, 1 right": 0.30,
     "luma, 1 below": 0.26,
@@ -69,7 +69,7 @@ ALLOWED = 0.1
 
 @dataclass(frozen=True)
 class Loop:
-    """What a closed loop gave: relative errors, and those of a and b in standard errors too."""
+    """The result of a closed loop: relative errors, and those of a and b in standard errors."""
 
     a: float
     a_in_errors: float
@@ -77,7 +77,7 @@ class Loop:
     b_in_errors: float
     row: float
     column: float
-    hot: int  # pixels found and not there, or there and not found
+    hot: int  # pixels that were invented or missed
 
     @property
     def good(self) -> bool:
@@ -89,7 +89,7 @@ class Loop:
 def close_loop(
     name: str, iso: float, pattern: Pattern, height: int, width: int, method: str = "poisson"
 ) -> Loop:
-    """Make FRAMES frames of a scene and as many dark ones, and calibrate them."""
+    """Simulate FRAMES frames of a scene and as many dark ones, and calibrate them."""
     camera = load_camera(name)
     model, row = camera.noise(iso), camera.row_noise(iso) or 0.1 * camera.noise(iso).b ** 0.5
     column, level = 0.3 * model.b**0.5, 0.1 + 20 * model.b**0.5
@@ -118,7 +118,7 @@ def close_loop(
     black = pipeline.process(dark, "d0").kept
     hot = black["defect_pixels"] > level / 2
     columns = (black["column_noise"] - black["dsnu"]).astype(np.float64)
-    columns -= columns.mean(1, keepdims=True)  # less the row's offset
+    columns -= columns.mean(1, keepdims=True)  # minus the row's offset
     realised = float(columns.mean(0).std())
     sensor = Sensor(pattern, camera.black_level, camera.white_level)
     found = calibrate(iso, frames(scene, "s"), frames(dark, "d"), sensor)
@@ -139,7 +139,7 @@ def close_loop(
 
 
 def loops(height: int, width: int) -> Iterator[tuple[str, float, list[Loop]]]:
-    """Every camera at every ISO that it has, with all patterns."""
+    """Yield the loops of all patterns for each camera at each of its ISOs."""
     for name in CAMERAS:
         for iso in ISOS:
             if iso <= load_camera(name).iso_range[1]:
@@ -147,7 +147,7 @@ def loops(height: int, width: int) -> Iterator[tuple[str, float, list[Loop]]]:
 
 
 def poisson_p(mean: float, count: int) -> float:
-    """The p-value of a chi-square test of ``count`` Poisson numbers against the exact law."""
+    """Return the p-value of a chi-square test of ``count`` Poisson numbers."""
     random = np.random.default_rng(1)
     least, most = int(poisson.ppf(1e-6, mean)), int(poisson.isf(1e-6, mean))
     observed = np.zeros(most - least + 2)
@@ -160,20 +160,20 @@ def poisson_p(mean: float, count: int) -> float:
     exact = float(np.float32(mean))
     law = np.r_[poisson.cdf(least, exact), poisson.pmf(inner, exact), poisson.sf(most, exact)]
     expected = law * count
-    cell = (np.cumsum(expected) - 1e-9) // 10  # cells with few in them are joined
+    cell = (np.cumsum(expected) - 1e-9) // 10  # cells with few numbers are merged
     e, o = (np.bincount(np.unique(cell, return_inverse=True)[1], v) for v in (expected, observed))
     return float(chi2.sf(np.sum((o - e) ** 2 / e), len(e) - 1))
 
 
 def as_jpeg(pixels: np.ndarray) -> Floats:
-    """A picture as clpipe's JPEG gives it back, 0..1."""
+    """Return a picture after encoding as clpipe's JPEG and decoding, 0..1."""
     with io.BytesIO() as buffer:
         Image.fromarray(pixels).save(buffer, "JPEG", quality=97, subsampling="4:2:2")
         return np.asarray(Image.open(buffer), np.float32) / 255
 
 
 def finished(config: str, iso: float) -> dict[str, float]:
-    """The figures of REAL, of the render's JPEG with a configuration."""
+    """Return the figures of REAL for the render's JPEG with a configuration."""
     render = read_image(RENDER).pixels
     whole = clpipe.Pipeline(config, iso=iso)
     clean = clpipe.Pipeline(config, iso=iso, skip=[*NOISE])
@@ -205,14 +205,15 @@ def finished(config: str, iso: float) -> dict[str, float]:
 
 
 def closed_loop(given: argparse.Namespace) -> bool:
-    """Print the section of the closed loop; whether all is within its targets."""
+    """Print the section of the closed loop; return whether all targets are met."""
     width, height = map(int, given.size.split("x"))
-    good = True
+    missed = []
     print(LOOP.format(frames=FRAMES, width=width, height=height))
     print("| camera | ISO | a, % | in s.e. | b, % | in s.e. | rows, % | columns, % | hot wrong |")
     print("|---|---|---|---|---|---|---|---|---|")
     for name, iso, found in loops(height, width):
-        good &= all(loop.good for loop in found)
+        if not all(loop.good for loop in found):
+            missed.append(f"{name} at ISO {iso}")
         worst = [max((getattr(loop, f.name) for loop in found), key=abs) for f in fields(Loop)]
         a, a_errors, b, b_errors, row, column, hot = worst
         print(
@@ -220,11 +221,13 @@ def closed_loop(given: argparse.Namespace) -> bool:
             f"| {row:+.2%} | {column:+.2%} | {hot} |".replace("%", ""),
             flush=True,
         )
-    return good
+    if missed:
+        print(f"\nRows that miss a target: {', '.join(missed)}.")
+    return not missed
 
 
 def photo_electrons(given: argparse.Namespace) -> bool:
-    """Print the section of Poisson numbers; whether they follow the law."""
+    """Print the section of Poisson numbers; return whether the target is met."""
     print(POISSON.format(draws=given.draws))
     print("| mean, e- | " + " | ".join(f"{mean:g}" for mean in MEANS) + " |")
     print("|---" * (len(MEANS) + 1) + "|")
@@ -234,7 +237,7 @@ def photo_electrons(given: argparse.Namespace) -> bool:
 
 
 def canon(given: argparse.Namespace) -> bool:
-    """Print the section of canon-5d2-jpeg; whether it is like the camera's pictures."""
+    """Print the section of canon-5d2-jpeg; return whether all targets are met."""
     good = True
     print(CANON)
     print("| | real camera | canon-5d2-jpeg, ISO 3200 | ISO 6400 | default chain, sony-a7r2 |")
@@ -248,7 +251,7 @@ def canon(given: argparse.Namespace) -> bool:
 
 
 def cameras(given: argparse.Namespace) -> bool:
-    """Print the section of real cameras; whether the default chain is in the ranges."""
+    """Print the section of real cameras; return whether the default chain meets the targets."""
     renders = [read_image(path).pixels for path in (RENDER, *given.renders)]
     real = real_cameras.read_pairs(given.real) if given.real else {}
     ours = {
@@ -277,7 +280,7 @@ def cameras(given: argparse.Namespace) -> bool:
         given.output.mkdir(parents=True, exist_ok=True)
         written = given.output / "real_cameras_crops.png"
         real_cameras.crops(first_real | first_ours).save(written)
-        print(f"crops beside the real ones: {written}", file=sys.stderr)
+        print(f"crops next to the real ones: {written}", file=sys.stderr)
     return good
 
 
@@ -293,13 +296,17 @@ def main() -> int:
     """Print the page, or some of its sections."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
-        "renders", nargs="*", type=Path, metavar="RENDER", help="for cameras, beside the still life"
+        "renders",
+        nargs="*",
+        type=Path,
+        metavar="RENDER",
+        help="for cameras, in addition to the still life",
     )
     parser.add_argument(
-        "--only", action="append", choices=SECTIONS, help="a section alone; may be repeated"
+        "--only", action="append", choices=SECTIONS, help="print only this section; may be repeated"
     )
     parser.add_argument("--size", default="2400x1600", help="of the frames, WxH [%(default)s]")
-    parser.add_argument("--draws", type=int, default=10_000_000, help="Poisson numbers a mean")
+    parser.add_argument("--draws", type=int, default=10_000_000, help="Poisson numbers per mean")
     parser.add_argument("--real", type=Path, metavar="FOLDER", help="pairs of real cameras")
     parser.add_argument(
         "-o",
@@ -322,45 +329,57 @@ def main() -> int:
 
 PAGE = """# Validation
 
-Made by `tools/run pages validate`; run it to see these figures on your machine.
+This page compares simulated noise with its model and with real cameras. `tools/run pages validate` measures the figures and makes the page. For
+comparisons with other programs, see [Quality](quality.md). To measure your own images, see [Measuring and calibrating](measuring.md).
 """
 
-LOOP = """## Known noise in, the same figures out
+LOOP = """## Calibration of known noise
 
-{frames} frames of a scene and {frames} dark ones, {width}x{height}, are made with a camera's noise at an ISO: Poisson
-photo-electrons, read, row and column noise, PRNU, DSNU, hot pixels, whole DN. `clpipe calibrate` is told the levels and the
-pattern and finds the rest. Each row is the worst of the four patterns: relative errors in %, those of a and b also in their standard errors
-(by chance, one row in three has one beyond 2); columns against those that were drawn; hot pixels missed or invented.
-Asked for: a and b within 1 % and 3 standard errors, rows and columns within 3 %, hot pixels exactly.
+The tool simulates {frames} frames of a scene and {frames} dark frames, {width}x{height}, with a camera's noise at an ISO. This noise consists of Poisson
+photo-electrons, read, row and column noise, PRNU, DSNU, hot pixels and rounding to whole DN. Then `clpipe calibrate` receives the levels and the
+pattern, and estimates everything else.
+
+Each row lists the worst of the four Bayer patterns. Errors are relative, in %. Errors of a and b are also listed in their standard errors; by chance,
+one row in three has one above 2. Column noise is compared with the drawn values. The last column counts hot pixels that were missed or invented.
+The targets are 1 % and 3 standard errors for a and b, 3 % for rows and columns, and no wrong hot pixel.
 """
 
 POISSON = """
 ## Photo-electrons
 
-Chi-square of {draws} Poisson numbers against the exact law, cells of 10 and more (asked for: p above 0.001).
-The test suite also holds the tails, to 1e-6, against the exact probabilities.
+Chi-square test of {draws} Poisson numbers against the exact distribution, in cells of 10 and more. The target is p above 0.001. The test suite
+also compares the tails, to 1e-6, with the exact probabilities.
 """
 
 CANON = """
 ## A real camera's finished pictures
 
-How the noise of a Canon EOS 5D Mark II's own small JPEGs (2784x1856, half of its 5616x3744) is correlated (ISO 3200 and 6400, 11 pairs,
-one frame less the mean of many, flat places) and that of `clpipe run -c canon-5d2-jpeg` on the project's render. What the camera does inside is not known; the configuration has
-its colour matrix, the noise of its sensor, and the half size; the strengths of denoising and sharpening were fitted to these figures, on this render. Asked for: within 0.1 at ISO 3200. Independent
-noise has 0 everywhere, and 0.25 left after averaging 2x2.
+This table compares the correlation of noise in small JPEGs of a Canon EOS 5D Mark II with `clpipe run -c canon-5d2-jpeg` on the project's render.
+The JPEGs have 2784x1856 pixels, half of 5616x3744. There are 11 pairs at ISO 3200 and 6400; noise is one frame minus the mean of many, in flat areas.
+
+The camera's processing is unknown. The configuration has its colour matrix, the noise of its sensor and the half size. The strengths of denoising and
+sharpening were fitted to these figures on this render. The target is a difference below 0.1 at ISO 3200. Independent noise has 0 everywhere, and
+0.25 after averaging 2x2.
 """
 
 BESIDE = """
 ## Real cameras beside ours
 
-Cameras' own JPEGs in their native size, each less the mean of many of the same scene, and the default chain's picture ({renders}), less
-its development without noise. Light that drifted is taken off (a Gaussian of 12 px), and what counts is flat in the mean: below the 60th
-percentile of the gradient, luma of 30 to 225. Medians over pictures. The rms is of eight-bit luma; kurtosis and what lies beyond 4
-sigma are of luma over the sigma of its intensity (Gaussian: 3.0 and 0.6); right, below, diagonal and 2 right are autocorrelations of luma; half is the
-share of its variance that 2x2 averaging leaves (independent: .25); chroma right is the autocorrelation of Cb and Cr, R-G the correlation of red and
-green. The first rows are of the pictures of Nam, Hwang, Matsushita and Kim ("A holistic approach to cross-channel image noise modeling and its
-application to image denoising", CVPR 2016), measured by `clpipe.analysis.matching.columns`. **Bold** is outside what is asked
-for. The rms is not asked for: it is the sensor's, the exposure's and the scene's.
+This section compares cameras' own JPEGs in their native size with pictures of the default chain ({renders}). Noise is one picture minus the mean of many
+of the same scene. For the default chain, it is the picture minus its development without noise. Drifting light is removed (a Gaussian of 12 px).
+Only areas that are flat in the mean count: below the 60th percentile of the gradient, with luma of 30 to 225. All figures are medians over pictures.
+
+| column | meaning |
+|---|---|
+| rms | of 8-bit luma; without a target, because it depends on sensor, exposure and scene |
+| kurtosis, beyond 4 sigma | of luma over the sigma of its intensity (Gaussian: 3.0 and 0.6) |
+| right, below, diagonal, 2 right | autocorrelation of luma |
+| half | share of luma's variance that averaging 2x2 leaves (independent noise: 0.25) |
+| chroma right | autocorrelation of Cb and Cr |
+| R-G | correlation of red and green |
+
+The first rows are measured with `clpipe.analysis.matching.columns` on the pictures of Nam, Hwang, Matsushita and Kim. Their paper is "A holistic
+approach to cross-channel image noise modeling and its application to image denoising" (CVPR 2016). **Bold** figures miss the target.
 """
 
 PICTURES = """
@@ -368,7 +387,7 @@ Luma noise by spatial frequency and by intensity; cameras are dashed:
 
 ![Power spectra of luma noise, and its sigma by intensity](real_cameras.svg)
 
-The default chain at 400 %:
+The default chain, enlarged to 400 %:
 
 ![Crops of the still life at four ISOs](real_cameras_crops.png)
 """

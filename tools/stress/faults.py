@@ -393,10 +393,9 @@ def drive(name: str, arguments: list[str]) -> None:
         import pyopencl as cl
 
         from clpipe.engine import runner
-        from clpipe.engine.device import Device
 
-        lost = cl.RuntimeError("clWaitForEvents failed: OUT_OF_RESOURCES", -5, "clWaitForEvents")
-        Device._run = failing(Device._run, lost)
+        lost = cl.RuntimeError("clEnqueue failed: OUT_OF_RESOURCES", -5, "clEnqueue")
+        cl.enqueue_nd_range_kernel = failing(cl.enqueue_nd_range_kernel, lost)
         runner.Runner._run_numpy = failing(runner.Runner._run_numpy, MemoryError())
     elif name == "decoder":
         from clpipe.inputs.loader import ImageLoader
