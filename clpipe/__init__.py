@@ -1,7 +1,6 @@
-"""clpipe puts a clean, linear render through a camera: mosaic, sensor noise, development.
+"""Simulate a camera for linear renders: optics, mosaic, sensor noise and development.
 
-What is exported here is the Python API. Names are imported on first use, so that ``import clpipe``
-takes as long as an empty module.
+This package exports the Python API. Names are imported on first use, so ``import clpipe`` is fast.
 """
 
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""The Python API: a chain as an object that takes NumPy images."""
+"""The Python API: a chain of stages as a callable object."""
 
 import itertools
 import threading
@@ -38,21 +38,31 @@ if TYPE_CHECKING:
 
 
 class Pipeline(ReadOnly):
-    """A chain of stages on a device, ready for images.
+    """A chain of stages on a device. Call it with an image, see :meth:`process`.
+
+    >>> import numpy as np
+    >>> import clpipe
+    >>> camera = clpipe.Pipeline(iso=3200, device="numpy", denoise={"luma_strength": 0.3})
+    >>> render = np.full((24, 32, 3), 0.2, np.float32)  # linear light
+    >>> shot = camera(render, "frame_0001")
+    >>> shot.image.shape, shot.image.dtype
+    ((24, 32, 3), dtype('uint8'))
 
     Args:
-        config: a built-in configuration ("default", "paper") or a TOML file, or several, each over
-            those before it: of a second one with ``stages``, the development.
-        device: an index or a part of a name as ``clpipe devices`` lists them, or "numpy"; None
-            takes the first GPU, else the CPU.
-        keep: steps whose image is returned beside the last one, or "all".
-        start_at: the first step to run; images are then of the kind that it reads.
+        config: a built-in configuration, such as "default" or "paper", or a TOML file. If you name
+            several, each overrides those before it, and one with ``stages`` replaces their
+            development.
+        device: an index or part of a name from ``clpipe devices``, or "numpy". None is the first
+            GPU, else the CPU.
+        keep: steps whose images are also returned, or "all".
+        start_at: the first step to run. Images must be of the kind that it reads.
         until: the last step to run.
-        **settings: what a configuration file may hold, over ``config``: ``iso=3200``,
-            ``denoise={"method": "mean"}``, ``iso={"choice": [100, 800]}`` (drawn by image key).
+        **settings: any value of a configuration file, which overrides ``config``: ``iso=3200``,
+            ``denoise={"method": "mean"}``. A draw, such as ``iso={"choice": [100, 800]}``, depends
+            on the key of the image.
 
     Raises:
-        RequestError: a name or value that is not allowed.
+        RequestError: a name or value is not allowed.
         DeviceError: there is no usable device.
     """
 
@@ -88,48 +98,64 @@ class Pipeline(ReadOnly):
 
     @property
     def chain(self) -> Chain:
-        """The steps, each with its resolved parameters."""
+        """The steps of the chain, each with its resolved parameters."""
         return self._runner.chain
 
     def process(
         self,
         image: Array,
-        key: str,
+        key: str = "",
         depth: Array | None = None,
         overscan: tuple[int, int, int, int] = NO_MARGINS,
         **settings: "Unpack[Keywords]",
     ) -> Result:
-        """Run the chain on one image.
+        """Run the chain on one image. ``camera(image)`` is the same as ``camera.process(image)``.
+
+        Noise is deterministic: the same image, key, seed and ISO give the same noise. To get other
+        noise, pass another key.
+
+        >>> import numpy as np
+        >>> import clpipe
+        >>> camera = clpipe.Pipeline(iso=3200, device="numpy", keep="quantize")
+        >>> render = np.full((24, 32, 3), 0.2, np.float32)
+        >>> shot = camera.process(render, "frame_0001")
+        >>> shot.kept["quantize"].shape  # the raw, in DN
+        (24, 32)
+        >>> again = camera.process(render, "frame_0001")
+        >>> other = camera.process(render, "frame_0002", iso=6400)
+        >>> bool((again.image == shot.image).all()), bool((other.image == shot.image).all())
+        (True, False)
 
         Args:
-            image: (height, width, 3) linear RGB, 1 = full scale of the sensor, of float16, float32
-                or float64; or (height, width) where the chain starts on a mosaic, also of uint16;
-                or a finished picture, also of uint8, where it starts on one. A NumPy array, or a
-                tensor of any library with DLPack that is on the CPU.
-            key: the image's name. Draws depend on it and on the seed alone; noise on both, on what
-                the image holds, and on the ISO. Who wants the same noise in several images, or in
-                one at several ISOs, gives them one ``noise_key``, which replaces these; that of a
-                picture of ``clpipe run`` stands in its sidecar, and repeats its noise.
-            depth: (height, width), for a chain with depth of field: in the unit that defocus says;
-                infinite, 1e9 or more or 0 where there is nothing.
-            overscan: how far, in px, image and depth go on beyond the picture: to the left, at the
-                top, to the right and at the bottom. A lens shows what it sees of that.
-            **settings: values for this image alone, as for the class. Another ISO, gain or noise
-                parameter costs nothing; for another method or size, kernels are compiled.
+            image: a NumPy array, or a CPU tensor of any library with DLPack. If the chain starts on
+                RGB, it is (height, width, 3), linear, and 1 is full scale of the sensor. If the
+                chain starts on a mosaic or a raw, it is (height, width). The type is float16,
+                float32 or float64, also uint16 for raws and uint8 for display values.
+            key: the name of the image. Draws depend on the key and the seed. Noise also depends on
+                the pixels and the ISO. To give several images or ISOs the same noise, pass them one
+                ``noise_key``, which replaces all of these. To repeat the noise of a picture of
+                ``clpipe run``, pass the ``noise_key`` of its sidecar.
+            depth: (height, width), for depth of field, in the unit that the stage defocus states.
+                The background is infinite, 0, or 1e9 and more.
+            overscan: the margins of image and depth outside the picture, in px: left, top, right
+                and bottom. A lens with distortion shows a part of them.
+            **settings: values for this image only, as for the class. Another ISO, gain or noise
+                parameter costs nothing. For another method or size, kernels are compiled.
 
         Returns:
-            ``image`` is (height, width, 3) uint8 where the chain ends in display values, else
-            float32; ``kept`` has the images of ``keep``, float32, by their names.
+            A :class:`~clpipe.Result`. Its ``image`` is (height, width, 3) uint8 if the chain ends
+            in display values, else float32. Its ``kept`` contains the images of ``keep`` by step,
+            float32.
 
         Raises:
-            ImageError: an image of the wrong shape or type, not finite, or too large.
-            RequestError: a name or value that is not allowed.
+            ImageError: the image has a wrong shape or type, is not finite, or is too large.
+            RequestError: a name or value is not allowed.
         """
         runner = self._runner_for(key, settings)
         for name in runner.chain.lit_by_layers:
             raise RequestError(
-                f"{name}: found a layer of the light that flickers, which an array has "
-                "not; clpipe run takes it from the render's file"
+                f"{name}: it needs a layer of flickering light, which an array does not have. "
+                "Use clpipe run, which reads the layer from the render's file"
             )
         try:
             checked = as_image(image, runner.chain.source)
@@ -144,7 +170,7 @@ class Pipeline(ReadOnly):
 
         own = enter(runner.chain, checked, margins, depth_of)
         if depth is not None and own.depth is None:
-            unread = "depth is given, but no step reads it; defocus.method=thin_lens does"
+            unread = "no step reads the depth. Set defocus.method=thin_lens to use it"
             warnings.warn(f"{key}: {unread}", stacklevel=2)
         for warning in own.warnings:
             warnings.warn(f"{key}: {warning}", stacklevel=2)
@@ -154,9 +180,11 @@ class Pipeline(ReadOnly):
         with self._lock:
             result = runner.run(pixels, noise_key(chain.settings, own_key))
         share = clipped_share(result, chain) or 0.0
-        if share >= MUCH and chain.source is not Kind.DISPLAY:  # a photograph was clipped before
+        if share >= MUCH and chain.source is not Kind.DISPLAY:  # photographs are clipped already
             warnings.warn(f"{key}: {clipping_text(share)}", stacklevel=2)
         return result
+
+    __call__ = process
 
     def carry(
         self,
@@ -166,25 +194,35 @@ class Pipeline(ReadOnly):
         overscan: tuple[int, int, int, int] = NO_MARGINS,
         **settings: "Unpack[Keywords]",
     ) -> tuple[Array, Array]:
-        """Move a layer that goes along with an image as :meth:`process` moves its pixels.
+        """Warp a ground-truth layer of an image like :meth:`process` warps its pixels.
+
+        >>> import numpy as np
+        >>> import clpipe
+        >>> camera = clpipe.Pipeline(
+        ...     device="numpy", distortion={"method": "brown_conrady", "fx": 30, "k1": 0.2}
+        ... )
+        >>> depth, valid = camera.carry(np.full((24, 32), 2.5, np.float32), "depth")
+        >>> depth.shape, valid.shape
+        ((24, 32), (24, 32))
 
         Args:
             layer: (height, width[, channel]) of any type, as large as the image.
-            kind: "depth" is interpolated linearly in 1/depth within a surface, a "normal"
-                bilinearly and then as long as 1, and so is a "flow", whose vectors in px to the
-                right and down are mapped at both ends. Between two surfaces these are taken from
-                the nearest pixel. A "label" always is; a "colour" is blended.
-            key: the image's name, on which draws depend.
+            kind: selects the interpolation. "depth" is interpolated linearly in 1/depth. "normal"
+                is interpolated bilinearly and normalised to length 1. "flow" contains vectors in
+                px, to the right and down; they are interpolated bilinearly, and both ends are
+                warped. At edges between surfaces, these three take the nearest pixel. "label"
+                always takes the nearest pixel. "colour" is blended.
+            key: the name of the image, on which draws depend.
             overscan: as for :meth:`process`.
             **settings: as for :meth:`process`.
 
         Returns:
-            The layer as it is in the picture, 0 where the image has nothing, and a mask of (height,
-            width) that is 0 there, else 1.
+            The warped layer, and a mask of (height, width). Both are 0 where the image has no
+            content, and the mask is 1 elsewhere.
 
         Raises:
-            ImageError: it is no layer of that kind.
-            RequestError: a name or value that is not allowed.
+            ImageError: the layer does not fit its kind.
+            RequestError: a name or value is not allowed.
         """
         if kind not in RESAMPLING:
             raise RequestError(one_of("kind", str(kind), RESAMPLING))
@@ -202,7 +240,7 @@ class Pipeline(ReadOnly):
         return moved if layer.ndim == 3 else moved[..., 0], valid
 
     def _runner_for(self, key: str, settings: Mapping[str, Any]) -> Runner:
-        """The runner for an image, with what is drawn and set for it alone."""
+        """Return the runner of an image, with its own draws and settings."""
         own = overlay(self._settings, plain(settings)) if settings else self._settings
         return (
             self._runner.for_chain(self._chain(own.drawn(key)))
@@ -213,12 +251,20 @@ class Pipeline(ReadOnly):
     def process_many(
         self, images: Iterable[Array | tuple[Array, str | Mapping[str, Any]]]
     ) -> Iterator[Result]:
-        """Run the chain on images, each when its result is taken from the iterator.
+        """Run the chain on several images. An image is processed when you take its result.
+
+        >>> import numpy as np
+        >>> import clpipe
+        >>> camera = clpipe.Pipeline(iso=800, device="numpy")
+        >>> render = np.full((24, 32, 3), 0.2, np.float32)
+        >>> images = [(render, "a"), (render, {"key": "b", "iso": 3200})]
+        >>> [shot.image.shape for shot in camera.process_many(images)]
+        [(24, 32, 3), (24, 32, 3)]
 
         Args:
-            images: each is an image, whose key is then its number ("0", "1", ..., counted on from
-                call to call), or an image with its key, or an image with a dict of further
-                arguments of :meth:`process`, such as ``{"key": "a", "iso": 800}``.
+            images: images, or pairs of an image and its key, or pairs of an image and a dict of
+                arguments of :meth:`process`, such as ``{"key": "a", "iso": 800}``. The default key
+                is the number of the image ("0", "1", ...), which continues in further calls.
         """
         for item in images:
             image, arguments = item if isinstance(item, tuple) else (item, {})
@@ -227,5 +273,5 @@ class Pipeline(ReadOnly):
 
 
 def digest_of(image: Array) -> str:
-    """A digest of an image's samples that takes little time."""
+    """Return a fast digest of the samples of an image."""
     return xxh3_64_hexdigest(np.ascontiguousarray(image).data)

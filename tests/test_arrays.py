@@ -96,7 +96,7 @@ def test_what_is_not_finite_is_counted_and_placed():
 
 
 def test_depth_that_nothing_reads_is_a_warning():
-    with pytest.warns(UserWarning, match="a: depth is given, but no step reads it; defocus.method"):
+    with pytest.warns(UserWarning, match="a: no step reads the depth. Set defocus.method"):
         Pipeline(**CHAIN).process(IMAGE, "a", depth=np.ones((6, 8)))
 
 

@@ -171,7 +171,7 @@ def test_what_was_made_is_kept_as_far_as_memory_goes(explorer, monkeypatch):
     monkeypatch.setattr("clpipe.explorer.explorer.KEPT", 0)
     explorer.develop(0, {"seed": 5}, View())
     assert explorer.sample(numbers[-2]).facts["seed"] == 3
-    with pytest.raises(RequestError, match="not kept any more"):
+    with pytest.raises(RequestError, match="no longer kept"):
         explorer.sample(numbers[-3])
 
 
@@ -290,4 +290,4 @@ def test_a_manifest_is_refused(two_renders, tmp_path):
     manifest = tmp_path / "list.csv"
     manifest.write_text(f"path,iso\n{two_renders / 'a.exr'},800\n")
     said = cli_output("explore", manifest, "--device", "numpy", status=2)
-    assert "rows may have settings of their own" in said
+    assert "rows of a manifest may have their own settings" in said

@@ -119,8 +119,8 @@ def test_the_page_may_load_nothing_from_elsewhere(served):
 @pytest.mark.parametrize(
     ("name", "question", "says"),
     [
-        ("develop", [], "no JSON"),
-        ("develop", {"image": 0, "values": {"\ud800": 1}}, "no JSON"),
+        ("develop", [], "not valid JSON"),
+        ("develop", {"image": 0, "values": {"\ud800": 1}}, "not valid JSON"),
         ("develop", b"[" * 100_000, "nested too deeply"),
         ("develop", {"image": 0, "values": {"\udc80": 1}}, "unknown key"),
         ("develop", {}, "whole numbers image"),
@@ -359,6 +359,7 @@ def test_a_mistake_is_said_and_marked_and_the_picture_stays(page):
 
 
 def test_a_method_that_needs_a_value_can_be_chosen_and_given_it(page):
+    page.locator('[data-group="Development"] .inactive > summary').click()
     page.locator('.step[data-step="picture_noise"] summary').click()
     page.select_option('.row[data-key="picture_noise.method"] select', "iid_gaussian")
     settle(page)
@@ -413,8 +414,12 @@ def test_stages_that_do_nothing_are_neither_on_nor_off(page):
     assert not step.evaluate(mixed)
     put(page, "sharpen.amount", "0")
     assert step.evaluate(mixed)
-    assert "does nothing (unsharp)" in step.locator("summary").inner_text()
-    assert "does nothing" in step.locator("input").first.get_attribute("aria-label")
+    assert "inactive (unsharp)" in step.locator("summary").inner_text()
+    assert "inactive" in step.locator("input").first.get_attribute("aria-label")
+    step.locator("summary").click()
+    page.wait_for_selector('.inactive [data-step="sharpen"]', state="attached")
+    assert step.is_hidden()
+    page.locator('[data-group="Development"] .inactive > summary').click()
     step.locator("input").first.click()
     settle(page)
     assert step.locator("summary").inner_text() == "sharpen off"
@@ -428,7 +433,7 @@ def test_sliders_have_the_limits_of_their_texts(page):
     )
     assert len(sliders) > 20
     for low, high, text in sliders:
-        said = re.search(r"The slider: (\S+) to (\S+)\.(?= |$)", text)
+        said = re.search(r"The slider covers (\S+) to (\S+)\.(?= |$)", text)
         said = said or re.search(r"(?:From|Above) (\S+) (?:to|below) (\S+)\.(?= |$)", text)
         assert said, text
         near = pytest.approx((low, high), abs=(high - low) / 300)

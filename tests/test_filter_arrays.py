@@ -402,7 +402,7 @@ def test_a_dataset_of_another_array(half):
     assert sample["cfa"] == "RRGG/RRGG/GGBB/GGBB"
     assert (sample["place"] % 4 == 0).all()
     assert sample["raw"].shape == (32, 32) == sample["variance"].shape
-    with pytest.raises(RequestError, match="raw='packed': its planes are of a Bayer pattern"):
+    with pytest.raises(RequestError, match="raw='packed': planes need a Bayer pattern"):
         Dataset(half, patch=32, raw="packed", **options)
 
 

@@ -2,6 +2,7 @@
 
 import inspect
 import re
+from doctest import SKIP, DocTestParser
 
 import numpy as np
 import pytest
@@ -11,13 +12,15 @@ from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import ROOT, STILL_LIFE, run_python
 
 
-def test_every_exported_name_is_there_and_documented():
+def test_every_exported_name_is_there_and_has_an_example():
     page = (ROOT / "docs" / "api.md").read_text()
     for name in clpipe.__all__:
         exported = getattr(clpipe, name)
         assert name in dir(clpipe)
         if name != "__version__":
-            assert exported.__doc__
+            examples = DocTestParser().get_examples(exported.__doc__)
+            assert examples, name
+            assert not any(SKIP in example.options for example in examples), name
             assert f"::: clpipe.{name}\n" in page
     with pytest.raises(AttributeError, match="no attribute 'Pipelin'"):
         _ = clpipe.Pipelin
@@ -58,6 +61,16 @@ def test_importing_it_imports_nothing_heavy():
     heavy = ("numpy", "pydantic", "pyopencl", "OpenImageIO", "click")
     code = f"import clpipe, sys; print([name for name in {heavy} if name in sys.modules])"
     assert run_python("-c", code).stdout == "[]\n"
+
+
+def test_a_camera_is_called_and_a_wrong_request_is_a_value_error():
+    camera = clpipe.Pipeline(iso=3200, device="numpy")
+    render = np.full((24, 32, 3), 0.2, np.float32)
+    shots = [camera(render, "a").image, camera.process(render, "a").image, camera(render).image]
+    np.testing.assert_array_equal(shots[0], shots[1])
+    assert (shots[0] != shots[2]).any()
+    with pytest.raises(ValueError, match="unknown key 'noize'"):
+        clpipe.Pipeline(noize=1)
 
 
 def test_reprs_are_short():

@@ -95,8 +95,8 @@ def test_an_iso_is_drawn_for_each_raw():
         (np.zeros((3, 4, 4), np.float32), r"shape \(3, 4, 4\); expected a mosaic"),
         (np.zeros((0, 4), np.float32), r"shape \(0, 4\)"),
         (np.zeros(4, np.float32), r"shape \(4,\)"),
-        (np.zeros((4, 4), np.uint16), "found uint16; .* raws in DN less the black level"),
-        ([[0.5, 0.5]], "raw is a list, but an array is expected. Pass numpy.asarray"),
+        (np.zeros((4, 4), np.uint16), "found uint16; .* Subtract the black level from DN"),
+        ([[0.5, 0.5]], "mosaic is a list, but an array is expected. Pass numpy.asarray"),
         (np.full((4, 4), np.nan), "NaN"),
     ],
 )
@@ -109,7 +109,7 @@ def test_values_that_are_not_allowed(raw):
     with pytest.raises(api.RequestError, match="found key 3; expected a text"):
         noise()(raw, key=3)
     with pytest.raises(
-        api.RequestError, match="found until, but it runs from crosstalk to normalize"
+        api.RequestError, match="found until, but it always runs from crosstalk to normalize"
     ):
         noise(until="quantize")
     with pytest.raises(api.RequestError, match="most similar: sony-a7r2"):

@@ -205,7 +205,7 @@ def test_a_dng_of_two_readouts_that_fit(clpipe, part):
 @pytest.mark.slow
 def test_a_sample_of_more_than_16_bits(part):
     given = {"raw": "mosaic", "sensor_noise": {"method": "dual_gain"}, "device": "numpy"}
-    with pytest.raises(RequestError, match="raw in DN goes to 262143, which uint16 does not hold"):
+    with pytest.raises(RequestError, match="raw has values to 262143 DN, more than uint16 holds"):
         Dataset(part, **given)
     sample = Dataset(part, dtype="float32", **given)[0]
     assert sample["raw"].dtype == np.float32

@@ -105,15 +105,15 @@ def out(made, tmp_path):
 
 def test_figures_pictures_and_failures(out):
     page = report(out)
-    assert "pictures 3" in page.said and "failed 1" in page.said
+    assert "Images 3" in page.said and "Failed 1" in page.said
     assert "cut.exr" in page.said
     entries = page.data["sheet-data"]
     assert [entry["name"] for entry in entries] == [SHOWN, "a", "b"]
     assert all(entry["image"].startswith("data:image/webp;base64,") for entry in entries)
     assert {entry["iso"] for entry in entries} == {1600}
     large = page.data["look-data"]
-    assert [view["label"] for view in large[0]["views"]] == ["picture", "truth", "after normalize"]
-    assert [view["label"] for view in large[2]["views"]] == ["picture", "truth"]
+    assert [view["label"] for view in large[0]["views"]] == ["image", "truth", "after normalize"]
+    assert [view["label"] for view in large[2]["views"]] == ["image", "truth"]
     assert re.search(r"exposure\.ev ?: -?[\d.]+, -?[\d.]+, -?[\d.]+", page.said)
     assert "sensor_noise skewed_gaussian" in page.said
     assert "finished" in page.said
@@ -146,26 +146,26 @@ def test_names_with_characters_that_cannot_be_printed(out):
 
 def test_the_law_is_held_against_raws(out):
     page = report(out)
-    assert "Raws against the law that was asked" in page.said
-    assert "leaves the law" not in page.said
+    assert "Raw noise compared with the noise model" in page.said
+    assert "deviates from the model" not in page.said
     pair = (out / "a.normalize.exr", "--truth", out / "a.truth_mosaic.exr")
     report_of_it = json.loads(clpipe("measure", *pair, "--json"))
     fit = report_of_it["channels"]["mosaic"]["law"]
     assert f"{fit['a']:.4g} ± {fit['a_error']:.1g}" in page.said
     assert f"{fit['b']:.4g} ± {fit['b_error']:.1g}" in page.said
-    (name,) = re.findall(r"Against (.*?)\.truth\.jpg, in flat places", page.said)
+    (name,) = re.findall(r"against (.*?)\.truth\.jpg in flat areas", page.said)
     name = name.replace(SHOWN, HOSTILE)
     pair = (out / f"{name}.jpg", "--truth", out / f"{name}.truth.jpg")
     channels = json.loads(clpipe("measure", *pair, "--json"))["channels"]
     assert f"R {channels['R']['sigma'] * 255:.2f}, G" in page.said
-    assert f"leaves {channels['Y']['energy_left_2x2']:.2f} of luma" in page.said
+    assert f"leaves {channels['Y']['energy_left_2x2']:.2f} of the luma" in page.said
     sidecar = out / "a.json"
     record = json.loads(sidecar.read_text())
     asked = record["noise"]["signal"]["a"]
     text = sidecar.read_text().replace(f'"a": {asked}, "b"', f'"a": {asked * 1.5}, "b"')
     reseal(sidecar, json.loads(text))
     page = report(out)
-    assert page.said.count("leaves the law") == 1
+    assert page.said.count("deviates from the model") == 1
     assert page.data["look-data"][0]["name"] == "a"  # it is shown first
 
 
@@ -176,7 +176,7 @@ def test_files_that_are_gone_or_changed_are_named(out):
     (out / "b.jpg").write_bytes(changed)
     (out / "b.normalize.exr").write_bytes(b"short")
     page = report(out)
-    assert "a.jpg: is gone" in page.said
+    assert "a.jpg: is missing" in page.said
     assert "b.jpg: was changed since; its SHA-256" in page.said
     assert "b.normalize.exr: has 5 bytes, not the " in page.said
     by_name = {entry["name"]: entry for entry in page.data["sheet-data"]}
@@ -191,7 +191,7 @@ def test_half_a_run_and_a_log_that_is_cut_off(out):
     (out / "b.json").write_text((out / "b.json").read_text()[:200])
     (out / "notes.json").write_text('{"mine": 1}')
     page = report(out)
-    assert "cut off, or still going" in page.said
+    assert "killed, or still running" in page.said
     assert "b.json: was changed since clpipe wrote it" in page.said and "notes" not in page.said
     assert [entry["name"] for entry in page.data["sheet-data"]] == [SHOWN, "a"]
 
@@ -221,14 +221,14 @@ def test_without_truths_a_picture_is_beside_another_of_its_image_or_sequence(ren
     run = ("run", renders / "a.exr", *NUMPY)
     clpipe(*run, "-o", tmp_path / "isos", "--iso", "100,1600")
     views = views_of(report(tmp_path / "isos"))
-    assert views["iso100/a"] == ["picture", "iso1600/a (sony-a7r2, ISO 1600)"]
+    assert views["iso100/a"] == ["image", "iso1600/a (sony-a7r2, ISO 1600)"]
     clpipe(*run, "-o", tmp_path / "bracket", "--bracket=-1,1", "--iso", 800)
     views = views_of(report(tmp_path / "bracket"))
-    assert views["a.ev+1"] == ["picture", "a.ev-1 (sony-a7r2, ISO 800)"]
+    assert views["a.ev+1"] == ["image", "a.ev-1 (sony-a7r2, ISO 800)"]
     clpipe(*run, "-o", tmp_path / "one", "--iso", 800)
     page = report(tmp_path / "one")
-    assert views_of(page) == {"a": ["picture"]}
-    assert "a run with --truth clean has the picture without noise" in page.said
+    assert views_of(page) == {"a": ["image"]}
+    assert "To get the image without noise, run with --truth clean" in page.said
     for i in range(3):
         picture = np.asarray(np.random.default_rng(i).random((64, 96, 3)), np.float32)
         write(tmp_path / f"view{i}.exr", picture, ("R", "G", "B"), {})
@@ -246,7 +246,7 @@ def test_what_was_drawn_is_drawn_and_what_follows_is_folded(renders, tmp_path):
     clpipe("run", renders, "-o", out, "-c", config, "--seed", 4, *NUMPY, status=1)
     page = report(out)
     assert 'aria-label="Histogram of ISO"' in page.text
-    asked, _, follows = page.said.partition("What follows from these")
+    asked, _, follows = page.said.partition("Derived values")
     assert re.search(r"ISO ?: \d+, \d+, \d+", asked)
     assert "noise a" in follows and "noise a" not in asked
     assert all(isinstance(entry["iso"], int) for entry in page.data["sheet-data"])
@@ -255,7 +255,7 @@ def test_what_was_drawn_is_drawn_and_what_follows_is_folded(renders, tmp_path):
 def test_a_report_that_takes_long_says_where_it_is(out, monkeypatch):
     monkeypatch.setattr("clpipe.commands.progress.EVERY", 0)
     said = clpipe("report", out)
-    for text in ("sidecars", "noise of raws", "small picture 2 of 3", "large picture 1 of 3"):
+    for text in ("sidecars", "noise of raw mosaics", "thumbnail 2 of 3", "comparison 1 of 3"):
         assert f"{text}\n" in said
 
 
@@ -273,7 +273,7 @@ def test_tars_and_series_are_read(renders, tmp_path):
     assert [entry["name"] for entry in page.data["sheet-data"]] == ["a", "b"]
     assert all(entry["image"] for entry in page.data["sheet-data"])
     views = [view["label"] for view in page.data["look-data"][0]["views"]]
-    assert views == ["picture", "truth_clean"]
+    assert views == ["image", "truth_clean"]
     tar = out / "t" / "000000.tar"
     tar.write_bytes(tar.read_bytes()[:3000])
     assert "000000.tar: cannot be read to its end" in report(out / "t").said
@@ -326,7 +326,7 @@ def test_two_runs_are_compared(out, renders, tmp_path):
     assert "denoise.luma_strength 0.5 2" in page.said
     large = {each["name"]: each for each in page.data["look-data"]}
     labels = [view["label"] for view in large["a"]["views"]]
-    assert labels[:2] == ["out picture", "other picture"]
+    assert labels[:2] == ["out image", "other image"]
     names = [entry["name"] for entry in page.data["sheet-data"]]
     assert "out: a" in names and "other: a" in names and "other: b" not in names
 
@@ -335,14 +335,14 @@ def test_many_pictures_are_sampled_within_the_budget(out, monkeypatch):
     monkeypatch.setattr("clpipe.reports.page.BUDGET", 3_000)
     page = report(out)
     assert len(page.data["sheet-data"]) < 3
-    assert re.search(r"\d of 3 pictures: unusual ones", page.said)
+    assert re.search(r"\d of 3 images are shown: unusual ones", page.said)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["nowhere"], "nowhere: there is no such file or folder"),
-        (["."], "has no picture of clpipe's with its sidecar"),
+        (["."], "has no picture of clpipe with its sidecar"),
         ([".", "-o", "x.pdf"], "-o: found x.pdf; expected a name that ends in .html"),
         ([".", ".", "."], "found 3 folders; one is reported on, or two are compared"),
     ],
@@ -372,7 +372,7 @@ def test_the_pace_of_a_run():
     (late,) = sessions([start, images[0], images[39], {"event": "end", "seconds": 40.0}])
     assert len(late.pace()) == 1
     (cut,) = sessions([start, *images])
-    assert cut.seconds == 39 and cut.state.startswith("cut off")
+    assert cut.seconds == 39 and cut.state.startswith("killed")
 
 
 def test_in_a_browser(browser_page, out):
@@ -419,7 +419,7 @@ def test_each_exposure_of_a_bracket_is_a_picture_of_its_own(renders, tmp_path):
     run = read_run(tmp_path / "out")
     assert [made.name for made in run.pictures] == ["a.ev+1.frame0", "a.ev-1.frame0"]
     shown = large([run], [""], run.pictures[1], Budget(1 << 24), [])
-    assert [view["label"] for view in shown.views] == ["picture", "truth", "truth_clean"]
+    assert [view["label"] for view in shown.views] == ["image", "truth", "truth_clean"]
 
 
 def test_a_run_is_read_from_its_sidecars(out):

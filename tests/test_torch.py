@@ -147,7 +147,7 @@ def test_what_is_wrong_is_said():
         add(torch.zeros(3, 8, 8))
     with pytest.raises(api.ImageError, match="float64"):
         add(torch.zeros(1, 8, 8, dtype=torch.float64))
-    with pytest.raises(api.RequestError, match="2, one for each raw"):
+    with pytest.raises(api.RequestError, match="2, one for each mosaic"):
         add(torch.zeros(2, 1, 8, 8), ["a"])
     with pytest.raises(api.RequestError, match="sony-a7r9"):
         RawNoise("sony-a7r9", 3200)

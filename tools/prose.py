@@ -21,7 +21,12 @@ from tools import ROOT
 CHECKED = (
     "tools/prose.py",
     "clpipe/batch",
+    "clpipe/dataset",
+    "clpipe/explorer",
+    "clpipe/pipeline.py",
+    "clpipe/reports",
     "clpipe/stage/signal.py",
+    "clpipe/torch/raw_noise.py",
     "docs/batches.md",
     "docs/blender.md",
     "docs/blur.md",

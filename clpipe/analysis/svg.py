@@ -122,7 +122,7 @@ def shares_svg(
         axes.stackplot(x, *shares.values(), labels=list(shares), colors=used, alpha=0.8)
         axes.set(ylim=(0, 1), xlabel=label)
         axes.yaxis.set_major_formatter("{x:.0%}")
-        axes.set_ylabel("share of the time")
+        axes.set_ylabel("share of time")
         axes.legend(loc="center left", bbox_to_anchor=(1, 0.5))
         return _text(figure, title)
 
@@ -201,8 +201,8 @@ def law_svg(report: NoiseReport, a: float, b: float, title: str) -> str:
                 one.curve.mean, variance, "o", markersize=4, color=INK[one.name], label=one.name
             )
         ends = np.array([0, max(one.curve.mean.max() for one in sites)])
-        axes.plot(ends, a * ends + b, color=PAGE, linewidth=1.2, label="asked")
-        axes.set(ylim=(0, None), xlabel="intensity (signal)", ylabel="variance")
+        axes.plot(ends, a * ends + b, color=PAGE, linewidth=1.2, label="model")
+        axes.set(ylim=(0, None), xlabel="intensity (signal)", ylabel="variance (signal²)")
         axes.ticklabel_format(axis="y", scilimits=(0, 0))
         axes.legend()
         return _text(figure, title)

@@ -1,4 +1,4 @@
-"""The errors that a user sees, by their cause. Each class carries the program's exit status."""
+"""Errors for users, by cause. Each class has the exit status of the program."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +10,15 @@ LONGEST = 4000  # characters of a message; what it repeats of a file can have an
 
 
 class ClpipeError(Exception):
-    """Base of all errors that are reported as one clear message, without a traceback."""
+    """Base of all errors that clpipe reports as a message without a traceback.
+
+    >>> import clpipe
+    >>> try:
+    ...     clpipe.Pipeline(denoise={"luma_strength": -1})
+    ... except clpipe.ClpipeError as error:
+    ...     print(error)
+    denoise.luma_strength: found -1: should be greater than or equal to 0
+    """
 
     exit_status = 2
 
@@ -20,8 +28,16 @@ class ClpipeError(Exception):
         return text if len(text) <= LONGEST else f"{text[:half]} ... {text[-half:]}"
 
 
-class RequestError(ClpipeError):
-    """The request was wrong: an unknown name, a bad value, a chain that does not fit."""
+class RequestError(ClpipeError, ValueError):
+    """The request is wrong: an unknown name, a bad value, or a chain that does not fit.
+
+    >>> import clpipe
+    >>> try:
+    ...     clpipe.load_camera("sony-a7r9")
+    ... except ValueError as error:
+    ...     print(type(error).__name__)
+    RequestError
+    """
 
     exit_status = 2
 
@@ -49,11 +65,20 @@ class KeyedError(RequestError):
 
 
 class ImageError(ClpipeError):
-    """One image cannot be read, processed or written; the run continues with the others.
+    """One image cannot be read, processed or written. A run continues with the others.
+
+    >>> import numpy as np
+    >>> import clpipe
+    >>> try:
+    ...     clpipe.Pipeline(device="numpy").process(np.zeros((4, 6, 2), np.float32), "a")
+    ... except clpipe.ImageError as error:
+    ...     print(str(error).partition(". ")[0])
+    a: the image has shape (4, 6, 2), but (height, width, 3) is expected
 
     Args:
-        message: what is wrong.
-        way: a sentence with options that help, which some commands lack; not in the text.
+        message: the problem.
+        way: a sentence about options that help. It is not part of the text, because some commands
+            lack these options.
     """
 
     exit_status = 1
@@ -87,7 +112,15 @@ class DeviceFailedError(ImageError):
 
 
 class DeviceError(ClpipeError):
-    """There is no usable device, or the requested one cannot be used."""
+    """There is no usable device, or the requested device cannot be used.
+
+    >>> import clpipe
+    >>> try:
+    ...     clpipe.Pipeline(device="no such device")
+    ... except clpipe.DeviceError as error:
+    ...     print(type(error).__name__)
+    DeviceError
+    """
 
     exit_status = 3
 

@@ -79,12 +79,20 @@ def run(
     Where several values are allowed, one will do. ``camera`` and ``iso`` may also be draws, such as
     ``{"log_uniform": [100, 6400]}``. ``patch`` may also be ``Patches(128, per_image=4)``.
 
+    >>> import tempfile
+    >>> import OpenImageIO as oiio
     >>> import clpipe
-    >>> made = clpipe.run("renders/", "out", iso=1600, truth="clean")  # doctest: +SKIP
-    >>> for outcome in made:  # doctest: +SKIP
-    ...     print(outcome.job.path, outcome.status, outcome.outputs)
-    >>> made.summary.counts  # doctest: +SKIP
-    {'done': 24, 'skipped': 0, 'left out': 0, 'failed': 0}
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> render = oiio.ImageBufAlgo.fill((0.2, 0.3, 0.4), oiio.ROI(0, 32, 0, 24, 0, 1, 0, 3))
+    >>> _ = render.write(f"{folder.name}/a.exr")
+    >>> out = f"{folder.name}/out"
+    >>> made = clpipe.run(f"{folder.name}/a.exr", out, iso=1600, truth="clean", device="numpy")
+    >>> for outcome in made:
+    ...     print(outcome.job.path.name, outcome.status, outcome.outputs)
+    a.exr done ('a.jpg', 'a.json', 'a.truth_clean.jpg', 'a.truth_clean.json')
+    >>> made.summary.counts
+    {'done': 1, 'skipped': 0, 'left out': 0, 'failed': 0}
+    >>> folder.cleanup()
 
     Args:
         inputs: files, directories, globs, URLs and manifests (.csv, .jsonl).

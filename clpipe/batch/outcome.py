@@ -29,7 +29,13 @@ class Span:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of one job.
+    """The outcome of one job of a run, see :func:`clpipe.run`.
+
+    >>> from pathlib import Path
+    >>> from clpipe.inputs.find import Job
+    >>> outcome = Outcome(Job(Path("renders/a.exr"), "a.exr"), "done", outputs=("a.jpg", "a.json"))
+    >>> outcome.job.key, outcome.status, outcome.outputs
+    ('a.exr', 'done', ('a.jpg', 'a.json'))
 
     Args:
         job: the job.

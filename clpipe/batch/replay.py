@@ -117,7 +117,7 @@ def replay_of(
         files = {str(name): str(digest) for name, digest in values["request"]["files"].items()}
         of = inputs_in(values, replay.job.paths)
         files |= {str(path): str(was["sha256"]) for path, was in of}
-    except (KeyError, TypeError, ValueError, AttributeError, RequestError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise RequestError(f"{path}: it is damaged: {error}") from None
     code = {name: files.pop(name) for name in list(files) if Path(name).suffix in CODE}
     _check_files(path, files)
@@ -126,7 +126,7 @@ def replay_of(
     replay = replace(replay, request=request)
     try:
         request.settings()
-    except (TypeError, ValueError, AttributeError, RequestError) as error:
+    except (TypeError, ValueError, AttributeError) as error:
         raise RequestError(f"{path}: it is damaged: {error}") from None
     return replay
 

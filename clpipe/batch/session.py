@@ -94,6 +94,21 @@ class Images:
 class Run:
     """A run. Iterate over it to make the images, and to get the outcome of each as it finishes.
 
+    :func:`clpipe.run` returns one.
+
+    >>> import tempfile
+    >>> import OpenImageIO as oiio
+    >>> import clpipe
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> render = oiio.ImageBufAlgo.fill((0.2, 0.3, 0.4), oiio.ROI(0, 32, 0, 24, 0, 1, 0, 3))
+    >>> _ = render.write(f"{folder.name}/a.exr")
+    >>> run = clpipe.run(f"{folder.name}/a.exr", f"{folder.name}/out", device="numpy")
+    >>> len(run.jobs)
+    1
+    >>> [outcome.status for outcome in run]
+    ['done']
+    >>> folder.cleanup()
+
     The constructor checks everything that can be checked early. Nothing is written before you
     iterate, which you can do once.
 

@@ -68,6 +68,10 @@ class NoiseModel:
     the black level in DN. The part of b that arises after the gain is ``after``. The analogue gain
     relative to the camera's lowest is ``theta``. Neither follows from a and b. The defaults put all
     of b before the gain and set theta to 1.
+
+    >>> noise = NoiseModel(a=0.002, b=3.6e-05, signal_range=1000)  # Var[y] = a*y + b
+    >>> noise.emva()
+    Emva(system_gain=2.0, read_noise=3.0, adc_noise=0.0)
     """
 
     a: float

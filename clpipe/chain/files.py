@@ -87,17 +87,18 @@ def load_config(name: str) -> Config:
     try:
         text = read_text(path)
         values = parse_toml(text)
-        stage_files = [path.parent / file for file in names_in(values, CODE, "files")]
-        for file in stage_files:
-            load_stage_file(file)
-        values.pop(CODE, None)
-        settings = settings_from(values, path.parent)
     except OSError as error:
         raise RequestError(f"{path}: cannot read this configuration: {error.strerror}") from None
     except UnicodeDecodeError:
         raise RequestError(f"{path}: not a text file, so not a TOML configuration") from None
     except ValueError as error:
         raise RequestError(f"{path}: not valid TOML: {error}") from None
+    try:
+        stage_files = [path.parent / file for file in names_in(values, CODE, "files")]
+        for file in stage_files:
+            load_stage_file(file)
+        values.pop(CODE, None)
+        settings = settings_from(values, path.parent)
     except KeyedError as error:
         line = line_of(text, error.key)
         place = f"{path}, line {line}" if line else str(path)

@@ -1,6 +1,7 @@
-"""Training data: samples and patches of renders, developed when needed; noise for clean raws.
+"""Training data: samples and patches of renders, and noise for clean mosaics.
 
-Nothing is written. It imports ``pipeline`` and below, but not ``batch`` and ``analysis``.
+Samples are developed on demand, and no results are written. This package may import ``pipeline``
+and lower packages, but not ``batch`` or ``analysis``.
 """
 
 from clpipe.dataset.dataset import Dataset

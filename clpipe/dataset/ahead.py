@@ -1,4 +1,4 @@
-"""Decodes and develops samples together, and before they are asked for."""
+"""Prefetching: decodes and develops several samples before they are requested."""
 
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -17,9 +17,9 @@ from clpipe.inputs.loader import LoadedImage
 Read = Future[tuple[LoadedImage, Sample]]
 Begun = tuple[SampleBatch, Callable[[], list[Sample]]]
 
-PATCHES = 16  # with draws of their own that are begun together
-# Samples are developed together until either limit is reached. In a shuffled dataset every render
-# is another one. More pixels would only wait in memory.
+PATCHES = 16  # patches with their own draws in one batch
+# Samples are developed together until either limit is reached. In a shuffled dataset, every sample
+# may have its own render. More pixels would only wait in memory.
 MOST_BYTES = 2**27  # of renders
 MOST_PIXELS = 2**21  # of samples
 
@@ -28,7 +28,7 @@ class Size:
     """The size of the images that are developed together.
 
     Args:
-        side: the sides of patches in px; None is whole pictures.
+        side: the side of patches in px. None is whole pictures.
     """
 
     def __init__(self, side: int | None) -> None:
@@ -54,7 +54,7 @@ def begun_ahead(
     """Decode images in threads and begin to develop them, a few ahead.
 
     Args:
-        loader: what decodes and develops.
+        loader: decodes and develops.
         batches: the batches.
         threads: how many images are decoded at once.
         together: how many batches are begun together.

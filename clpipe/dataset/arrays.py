@@ -1,4 +1,4 @@
-"""How the arrays of a sample look: their type, their order, and the planes of a raw. Pure."""
+"""The format of the arrays of a sample: type, order of axes, and packing of raws. Pure."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -12,16 +12,16 @@ from clpipe.reference.cfa import sites
 from clpipe.stage import Kind
 
 DTYPES = ("float16", "float32", "uint16")
-HIGHEST = 65535  # of uint16
+HIGHEST = 65535  # the maximum of uint16
 
 RawForm = Literal["packed", "mosaic"]
 
 
 def dtype_named(dtype: Any) -> str | None:
-    """The name of a type of :data:`DTYPES`, from all that NumPy takes for one; None stays None.
+    """Return the name of a type of :data:`DTYPES`. None stays None.
 
     Raises:
-        RequestError: it is another one, or none.
+        RequestError: it is another type, or not a type.
     """
     if dtype is None:
         return None
@@ -35,7 +35,7 @@ def dtype_named(dtype: Any) -> str | None:
 
 
 def packed(mosaic: Array, pattern: str) -> Array:
-    """A mosaic of even height and width as planes: (4, height / 2, width / 2) in R, Gr, Gb, B.
+    """Pack a mosaic of even size into planes R, Gr, Gb, B: (4, height / 2, width / 2).
 
     Gr is green in the rows of red.
 
@@ -46,7 +46,7 @@ def packed(mosaic: Array, pattern: str) -> Array:
 
 
 def unpacked(planes: Array, pattern: str) -> Array:
-    """The mosaic of planes, as :func:`packed` makes them.
+    """Return the mosaic of planes from :func:`packed`.
 
     >>> unpacked(np.array([2, 1, 4, 3]).reshape(4, 1, 1), "GRBG").tolist()
     [[1, 2], [3, 4]]
@@ -60,13 +60,13 @@ def unpacked(planes: Array, pattern: str) -> Array:
 
 @dataclass(frozen=True)
 class ArrayFormat:
-    """How the arrays of a sample look.
+    """The format of the arrays of a sample.
 
     Args:
-        dtype: of pictures and raws, one of :data:`DTYPES`; None is uint8 for display values,
+        dtype: the type of images and raws, one of :data:`DTYPES`. None is uint8 for display values,
             uint16 for raws, and float32 for the rest.
-        channels_first: whether pictures are (channel, height, width).
-        raw: how raws look; None is that there are none.
+        channels_first: whether images are (channel, height, width).
+        raw: the layout of raws. None means no raws.
     """
 
     dtype: str | None = None
@@ -75,56 +75,56 @@ class ArrayFormat:
 
     @property
     def is_in_dn(self) -> bool:
-        """Whether raws are in DN, not in signal."""
+        """Whether raws are in DN, not scaled to signal."""
         return self.dtype in (None, "uint16")
 
     def check(self, kind: Kind) -> None:
-        """See that the last image of a chain can be of the type.
+        """Check that the type can hold the last image of a chain.
 
         Raises:
             RequestError: it cannot.
         """
         if self.dtype == "uint16" and kind not in (Kind.DISPLAY, Kind.RAW):
             raise RequestError(
-                f"dtype uint16: the chain ends in {kind.label}, which has values below 0 and "
-                "above 1; it holds display values (65535 is white) and DN. Use float16 or float32"
+                "dtype uint16: it holds display values (65535 is white) and DN, but the chain ends "
+                f"in {kind.label}, with values below 0 and above 1. Use float16 or float32"
             )
         if self.dtype == "float16" and kind is Kind.RAW:
             raise RequestError(
-                "dtype float16: the chain ends in DN, which it does not hold exactly; use uint16 "
-                "or float32, or end the chain with normalize"
+                "dtype float16: it cannot hold DN exactly, in which the chain ends. Use uint16 or "
+                "float32, or end the chain with normalize"
             )
 
     def check_size(self, width: int, height: int) -> None:
-        """See that the raw of a whole picture can be packed, if it is.
+        """Check that the raw of a whole picture can be packed, if requested.
 
         Raises:
             ImageError: it cannot.
         """
         if self.raw == "packed" and (width % 2 or height % 2):
             raise ImageError(
-                f"its picture has {width}x{height} pixels, an odd width or height, and a packed "
-                "raw has planes of half the size; cut patches, or say raw='mosaic'"
+                f"its picture has {width}x{height} pixels, but a packed raw needs even width and "
+                "height. Use patches, or raw='mosaic'"
             )
 
     def picture(self, image: Array, kind: Kind) -> Array:
-        """The last image of a chain, (height, width[, channel]), as a sample has it."""
+        """Convert the last image of a chain, (height, width[, channel]), for a sample."""
         if self.dtype == "uint16" and kind is Kind.DISPLAY:
             image = image * np.float32(HIGHEST)
         return self.ordered(self._typed(image, self.dtype))
 
     def mosaic(self, mosaic: Array, pattern: str) -> Array:
-        """A raw, (height, width) in DN or in signal, as a sample has it."""
+        """Convert a raw, (height, width) in DN or in signal, for a sample."""
         mosaic = self._typed(mosaic, self.dtype or "uint16")
         return packed(mosaic, pattern) if self.raw == "packed" else mosaic
 
     def variance(self, variance: Array, pattern: str) -> Array:
-        """A variance of each pixel, (height, width), as a sample has it: float32."""
+        """Convert a variance of each pixel, (height, width), for a sample: float32."""
         variance = packed(variance, pattern) if self.raw == "packed" else variance
         return np.require(variance, requirements=("C", "W"))
 
     def ordered(self, image: Array) -> Array:
-        """An image, (height, width[, channel]), in the order of its channels; C-contiguous."""
+        """Return an image, (height, width[, channel]), in the order of axes; C-contiguous."""
         first = self.channels_first and image.ndim == 3
         return np.ascontiguousarray(image.transpose(2, 0, 1) if first else image)
 

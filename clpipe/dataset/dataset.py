@@ -1,4 +1,4 @@
-"""Training data straight from renders: each sample is developed when it is needed."""
+"""Training data from renders. Each sample is developed when it is needed."""
 
 import copy
 import hashlib
@@ -30,86 +30,95 @@ if TYPE_CHECKING:
 
 
 class Dataset(ReadOnly):
-    """Renders as a camera sees them, sample by sample, with new noise in each epoch.
+    """Samples of renders as a camera records them, with new noise in each epoch.
 
-    Iterate over it, or index it: ``torch.utils.data.DataLoader`` takes it as it is. A sample is a
-    dict of
+    Iterate over the dataset, index it, or pass it to ``torch.utils.data.DataLoader``.
 
-    - "image": (height, width, 3) uint8 where the chain ends in display values, else float32,
-    - "truth", with ``truth``: the same without noise; images of ``keep`` by the names of their
-      steps, and "truth.NAME" for each of them without noise; float32,
-    - "raw", with ``raw``, and "truth.raw": the mosaic, uint16 in DN; or in signal, see ``dtype``,
-    - "variance", with ``variance``: that of the noise in each pixel of the mosaic, in signal
-      squared, float32, in the form of the raw,
-    - "carried.NAME" for each layer of ``carry``, (height, width, channel) as the picture is, and
-      "carried.valid", (height, width): 1 where the render has something, else 0,
-    - "key": the name of the render, its path below the folder that was given; "epoch", "seed",
-    - "camera", "iso", and "a" and "b": the sensor noise that was added, Var[y] = a*y + b in signal
-      units (1 is the white level), zeros where none was,
-    - where the chain makes a raw: "cfa", such as "RGGB"; "black_level" and "white_level" in DN;
-      "gains", the white balance of red, green and blue; "xyz_to_camera", 3x3, from CIE XYZ (D65) to
-      the raw's colours, as a DNG's ColorMatrix,
-    - of a patch, "place": its first column and row in the picture, and "turn": how it was turned
-      then, one of EXIF's orientations (1 is not at all).
+    >>> import tempfile
+    >>> import OpenImageIO as oiio
+    >>> import clpipe
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> render = oiio.ImageBufAlgo.fill((0.2, 0.3, 0.4), oiio.ROI(0, 64, 0, 48, 0, 1, 0, 3))
+    >>> _ = render.write(f"{folder.name}/a.exr")
+    >>> samples = clpipe.Dataset(folder.name, iso=3200, patch=16, device="numpy", cache=0)
+    >>> len(samples), samples[0]["image"].shape, samples[0]["truth"].shape
+    (16, (16, 16, 3), (16, 16, 3))
+    >>> folder.cleanup()
 
-    All arrays are C-contiguous and writable, in the sensor's orientation. The noise of an image in
-    epoch E is that of frame E of ``clpipe run --frames``. So a sample depends on its render, the
-    settings and the epoch alone, and not on order, sharding, workers or restarts. Draws are made
-    again in each epoch; kept images keep theirs.
+    A sample is a dict:
 
-    With ``patch``, samples are square parts of pictures, and only they are developed, each from as
-    much of the render as it needs: a patch has the bits that the whole picture has there. It begins
-    where its mosaic, turned, has the camera's CFA pattern. Places and turns are drawn for each key,
-    epoch and seed. Turned by 90 degrees, what a sensor does to its rows is done to columns. What a
-    chain estimates from the whole picture (``gray_world``, ``auto`` exposure) it still does, once
-    for the patches of an image that are asked for together.
+    - "image": (height, width, 3) uint8 if the chain ends in display values, else float32.
+    - "truth", with ``truth``: the image without noise. With ``keep``, images of steps by their
+      names, and "truth.NAME" for the same without noise, float32.
+    - "raw", with ``raw``, and "truth.raw": the mosaic, uint16 in DN. A float ``dtype`` scales it.
+    - "variance", with ``variance``: the variance of the noise in each pixel of the mosaic, in
+      squared signal, float32, in the layout of the raw.
+    - "carried.NAME" for each layer of ``carry``, (height, width, channel), warped like the image.
+      "carried.valid", (height, width), is 1 where the render has content, else 0.
+    - "key": the path of the render relative to the input directory. "epoch", "seed".
+    - "camera", "iso". "a" and "b" state the sensor noise, Var[y] = a*y + b in signal units (1 is
+      the white level). They are 0 without noise.
+    - With a raw in the chain, "cfa", such as "RGGB", and "black_level" and "white_level" in DN.
+      "gains" is the white balance of red, green and blue. "xyz_to_camera", 3x3, maps CIE XYZ (D65)
+      to the colours of the raw, like ColorMatrix of a DNG.
+    - With ``patch``, "place": its first column and row in the picture, and "turn": its EXIF
+      orientation after augmentation (1 is unchanged).
 
-    The device is opened by the process that first makes a sample. OpenCL does not survive a fork:
+    All arrays are C-contiguous and writable, in the orientation of the sensor. The noise in epoch E
+    is the noise of frame E of ``clpipe run --frames``. A sample depends only on its render, the
+    settings and the epoch, not on order, sharding, workers or restarts. Each epoch draws new
+    values, except for kept images.
+
+    With ``patch``, samples are square parts of pictures. Only these parts are developed, and their
+    values are those of the whole picture. The mosaic of a patch starts with the CFA pattern of the
+    camera. Places and augmentation are drawn by key, epoch and seed. A rotation by 90 degrees turns
+    row noise into column noise. Estimates from the whole picture (``gray_world``, ``auto``
+    exposure) are made once for all patches of an image that are requested together.
+
+    The process that develops the first sample opens the device. OpenCL does not survive a fork, so
     workers of a process that has used it must be spawned (``multiprocessing_context="spawn"``).
 
     Args:
-        inputs: files, folders, globs and manifests, as ``clpipe run`` takes them.
-        config: as for :class:`~clpipe.Pipeline`; None is the settings that a kept image carries,
+        inputs: files, directories, globs and manifests, as for :func:`clpipe.run`.
+        config: as for :class:`~clpipe.Pipeline`. None is the settings that a kept image carries,
             else the default.
         device: as for :class:`~clpipe.Pipeline`.
-        keep: steps whose image a sample has, too, or "all".
-        start_at: the first step to run; inputs are then images that were kept before it.
+        keep: steps whose images are added to samples, or "all".
+        start_at: the first step to run. Inputs are then images that were kept before it.
         until: the last step to run.
-        truth: whether a sample has its image without noise, too. "clean" is the picture to train
-            on; "development", or True, is denoised as strongly as the noisy one is. None is "clean"
-            with ``patch``, where the chain adds noise, else False.
-        carry: layers that go along with the picture, such as "Depth" or "nn:normal", as ``--carry``
-            of ``clpipe run``.
-        layer: the layer of an EXR that is the picture; None chooses.
-        transfer: the transfer curve of renders in whole numbers: "srgb" or "linear".
-        exclude: patterns of files that are not taken from folders and globs, such as depth.
-        patch: the sides of patches, in px, or :class:`~clpipe.Patches`; None is whole pictures.
-        raw: whether a sample has its raw, too: "mosaic" is (height, width), "packed" is its planes,
-            (4, height/2, width/2) in R, Gr, Gb, B, whatever the pattern.
-        variance: whether a sample has the variance of its noise, in the form of ``raw``, else as a
-            mosaic.
-        dtype: of pictures and raws. None is as above. "float16" and "float32": display values from
-            0 to 1, not rounded to eight bits, and raws in signal, 0 at black and 1 at white.
-            "uint16": display values from 0 to 65535, and raws in DN.
+        truth: adds the image without noise. "clean" is the training target. "development", or
+            True, is denoised as strongly as the noisy image. None is "clean" for patches of a chain
+            with noise, else False.
+        carry: layers to warp with the image, such as "Depth" or "nn:normal", like ``--carry`` of
+            ``clpipe run``.
+        layer: the layer of an EXR that is the picture. None selects it automatically.
+        transfer: the transfer curve of renders with integer samples: "srgb" or "linear".
+        exclude: patterns of files to skip in directories and globs, such as depth.
+        patch: the side of patches in px, or :class:`~clpipe.Patches`. None is whole pictures.
+        raw: adds the raw. "mosaic" is (height, width). "packed" is four planes, (4, height/2,
+            width/2), in the order R, Gr, Gb, B for every pattern.
+        variance: adds the variance of the noise, in the layout of ``raw``, else as a mosaic.
+        dtype: the type of images and raws. None is as above. "float16" and "float32" contain
+            display values from 0 to 1 without rounding, and raws scaled to 0 at black and 1 at
+            white. "uint16" contains display values from 0 to 65535, and raws in DN.
         channels_first: whether arrays of three dimensions are (channel, height, width).
-        draws: whether an "image" has one draw of each value and epoch, or each "patch" its own; the
-            picture that its bits are those of is then developed with that. None is "patch", but
-            for a grid.
-        on_error: what becomes of an image that cannot be read or developed: "raise" its error, or
-            "skip" it with a warning. Asked for by their numbers, its samples are then those of the
-            next image. Headers are read at once; files without one are refused, or left out.
-        cache: bytes of decoded renders that are kept for further patches and epochs, also as a
-            text, such as "4G". Workers share them: they are files among the system's temporary
-            ones (``TMPDIR``), mapped into memory. 0 keeps none.
+        draws: "image" draws values once per image and epoch, and "patch" once per patch. None is
+            "patch", except for a grid.
+        on_error: "raise" the error of an image that cannot be read or developed, or "skip" the
+            image with a warning. An index of a skipped image returns a sample of the next one.
+            Headers are read at once. Files without a valid header are rejected, or skipped.
+        cache: the bytes of decoded renders to keep for further patches and epochs, also as text,
+            such as "4G". Workers share them as memory-mapped files in the temporary directory
+            (``TMPDIR``). 0 keeps none.
         epoch: the number of the first epoch.
-        epochs: how many epochs there are; None is no end.
-        threads: how many images are decoded at once; None is one for each processor.
-        **settings: what a configuration file may hold, over ``config``.
+        epochs: the number of epochs. None is endless.
+        threads: the number of images to decode in parallel. None is one per processor.
+        **settings: any value of a configuration file, which overrides ``config``.
 
     Raises:
-        RequestError: a name or value that is not allowed, a missing input, a folder without images,
-            two images of one name, a truth of a chain without noise, a raw or a variance that it
-            has not, a type that does not hold its values.
+        RequestError: a name or value is not allowed, an input is missing, a directory has no
+            images, or two images have the same name. It is also raised if the chain has no noise,
+            raw or variance that is requested, or if a type cannot hold the values.
     """
 
     @typed
@@ -182,10 +191,10 @@ class Dataset(ReadOnly):
         return f"Dataset({len(self._jobs)} images, {epochs}, {self._label})"
 
     def set_epoch(self, epoch: int) -> None:
-        """Begin with this epoch, from the next sample on; use it to resume a training run.
+        """Continue with the start of an epoch. Use it to resume a training run.
 
         Raises:
-            RequestError: it is negative.
+            RequestError: the epoch is negative.
         """
         if epoch < 0:
             raise RequestError(f"found epoch {epoch}; expected 0 or more")
@@ -193,30 +202,28 @@ class Dataset(ReadOnly):
         self._first = self._next = 0
 
     def state_dict(self) -> dict[str, Any]:
-        """Where iteration is: what :meth:`load_state_dict` takes, as plain values."""
+        """Return the position of the iteration as plain values for :meth:`load_state_dict`."""
         return {"epoch": self._epoch, "sample": self._next, "images": self._digest()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Have the next iteration go on behind the last sample of the one that a state is of.
+        """Start the next iteration after the last sample of a saved state.
 
         Raises:
-            RequestError: the state is of other images or other patches.
+            RequestError: the state belongs to other images or patches.
         """
         if state.get("images") != self._digest():
             raise RequestError(
-                "the state is of a dataset of other images, or of other patches of them; make the "
-                "dataset as it was when the state was taken"
+                "the state belongs to a dataset with other images or patches. Create the dataset "
+                "with the same inputs and patches as when the state was saved"
             )
         self.set_epoch(state["epoch"])
         self._first = self._next = state["sample"]
 
     def shard(self, index: int, of: int) -> Self:
-        """A part for one of several workers: every ``of``-th image, from the ``index``-th on.
-
-        Indices count from 0.
+        """Return the part of one of several workers: every ``of``-th image from ``index`` on.
 
         Raises:
-            RequestError: there is no such part.
+            RequestError: ``index`` is not from 0 to ``of`` - 1.
         """
         if not 0 <= index < of:
             raise RequestError(f"found shard {index} of {of}; expected 0 to {of - 1}")
@@ -226,36 +233,37 @@ class Dataset(ReadOnly):
         return part
 
     def __len__(self) -> int:
-        """How many samples there are, over all epochs.
+        """Return the number of samples in all epochs.
 
         Raises:
-            TypeError: epochs are endless.
-            ImageError: the size of an image is needed for a grid, and cannot be read.
+            TypeError: the number of epochs is endless.
+            ImageError: the size of an image, which a grid needs, cannot be read.
         """
         if self._epochs is None:
-            raise TypeError("a dataset of endless epochs has no length; set epochs=N")
+            raise TypeError("a dataset with endless epochs has no length. Set epochs=N")
         return self._numbering().of_epoch * self._epochs
 
     def __getitem__(self, index: int) -> Sample:
-        """A sample; those of an image follow each other, and those of the second epoch the first's.
+        """Return a sample. Samples are ordered by epoch, then by image.
 
         Raises:
-            IndexError: there is none of that number.
-            ImageError: its image cannot be read or processed.
+            IndexError: the index is out of range.
+            ImageError: the image cannot be read or processed.
             DeviceError: there is no usable device.
         """
         return self.__getitems__([index])[0]
 
     def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
-        """Samples by their numbers, those of one image, and small ones of any, developed together.
+        """Return the samples of a batch, as PyTorch's ``DataLoader`` requests them.
 
-        PyTorch's ``DataLoader`` asks so for the samples of a batch. Errors as :meth:`__getitem__`.
+        Samples of one image, and small samples of several images, are developed together. Raises
+        the errors of :meth:`__getitem__`.
         """
         places = [self._place(index) for index in indices]
         groups: dict[tuple[int, ...], list[int]] = {}
         together = self._patches and not self._draws_by_patch
         for i, place in enumerate(places):
-            # A whole picture is all that an image has; asked for twice, it is made twice.
+            # Whole pictures are not grouped: a repeated index is developed again.
             groups.setdefault(place[:2] if together else (i,), []).append(i)
         samples: list[Sample] = [{}] * len(places)
         asked = [(*places[own[0]][:2], [places[i][2] for i in own]) for own in groups.values()]
@@ -267,9 +275,10 @@ class Dataset(ReadOnly):
     def _made_together(
         self, asked: Sequence[tuple[int, int, Sequence[int]]]
     ) -> Iterator[list[Sample]]:
-        """Samples of several images, each by epoch, image and the numbers of its samples.
+        """Yield the samples of several images, each given by epoch, image and sample numbers.
 
-        What fails together is made alone, which says why. Errors as :meth:`_made`.
+        If images fail together, each is developed alone to find the error. Raises the errors of
+        :meth:`_made`.
         """
         side = self._patches.size if self._patches else None
         pending: list[tuple[int, int, Sequence[int]]] = []
@@ -295,10 +304,10 @@ class Dataset(ReadOnly):
             pending, read, size, are_enough = [], [], Size(side), False
 
     def _made(self, epoch: int, image: int, numbers: Sequence[int]) -> list[Sample]:
-        """Samples of an image; of the next one that has any, where it is to be skipped.
+        """Return samples of an image. If it fails and may be skipped, use the next valid image.
 
         Raises:
-            ImageError: it cannot be read or processed, or no image can.
+            ImageError: the image, or every image, cannot be read or processed.
         """
         for following in range(len(self._jobs)):
             batch = self._batch(epoch, (image + following) % len(self._jobs), numbers)
@@ -311,12 +320,12 @@ class Dataset(ReadOnly):
         raise ImageError("no image of the dataset can be read and developed")
 
     def _batch(self, epoch: int, image: int, numbers: Sequence[int]) -> SampleBatch:
-        """Samples of an image, in an epoch counted from the first one."""
+        """Return samples of an image, in an epoch counted from the first one."""
         drawn = numbers[0] if self._draws_by_patch else None
         return SampleBatch(self._jobs[image], self._epoch + epoch, numbers, drawn)
 
     def __iter__(self) -> Iterator[Sample]:
-        """Every sample in order; images are decoded and developed ahead, a few at a time.
+        """Yield every sample in order. A few images are decoded and developed ahead.
 
         Raises:
             ImageError: an image cannot be read or processed.
@@ -340,20 +349,20 @@ class Dataset(ReadOnly):
                     yield sample
 
     def _numbering(self) -> Numbering:
-        """How samples are numbered.
+        """Return the numbering of samples.
 
         Raises:
-            ImageError: the size of an image is needed, and cannot be read.
+            ImageError: the size of an image, which a grid needs, cannot be read.
         """
         if self._numbered is None:
             self._numbered = Numbering([self._loader.count(job, self._epoch) for job in self._jobs])
         return self._numbered
 
     def _place(self, index: int) -> tuple[int, int, int]:
-        """Epoch, image, and number within the image of a sample.
+        """Return epoch, image, and number within the image of a sample.
 
         Raises:
-            IndexError: there is none of that number.
+            IndexError: the index is out of range.
         """
         number = index + len(self) if index < 0 else index
         if number < 0 or not self._jobs or (self._epochs is not None and number >= len(self)):
@@ -361,7 +370,7 @@ class Dataset(ReadOnly):
         return self._numbering().place(number)
 
     def _batches(self, first: int) -> Iterator[SampleBatch]:
-        """What is to be developed, image by image, from a sample on."""
+        """Yield what to develop, image by image, from a sample on."""
         if self._jobs:
             for epoch, image, numbers in self._numbering().groups(first):
                 if epoch == self._epochs:
@@ -370,6 +379,6 @@ class Dataset(ReadOnly):
                 yield from (self._batch(epoch, image, part) for part in parts)
 
     def _digest(self) -> str:
-        """What tells the images and patches of one dataset from those of another."""
+        """Return a digest of the images and patches of this dataset."""
         named = [self._patches, *(job.key for job in self._jobs)]
         return hashlib.sha256(repr(named).encode()).hexdigest()

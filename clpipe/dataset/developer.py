@@ -1,4 +1,4 @@
-"""Samples, developed on a device: pictures with their truth, raws, and the variance of noise."""
+"""Development of samples on a device: images with truth, raws, and the variance of noise."""
 
 import os
 import threading
@@ -29,13 +29,13 @@ MAX_STRUCTURES = 256
 
 @dataclass(frozen=True)
 class SampleSpec:
-    """What a sample has.
+    """The contents of a sample.
 
     Args:
-        arrays: how they look.
-        keep: steps whose image it has.
-        truth: which picture without noise it has, as :func:`picture_without_noise` takes it.
-        variance: whether it has the variance of the noise in its mosaic.
+        arrays: the format of arrays.
+        keep: steps whose images are added.
+        truth: the image without noise to add, as for :func:`picture_without_noise`.
+        variance: whether to add the variance of the noise in the mosaic.
     """
 
     arrays: ArrayFormat
@@ -44,24 +44,24 @@ class SampleSpec:
     variance: bool
 
     def check(self, chain: Chain, patches: Patches | None) -> None:
-        """See that a chain makes it, of patches where there are any.
+        """Check that a chain can make the samples, or patches.
 
         Raises:
-            RequestError: it does not.
+            RequestError: it cannot.
         """
         if patches and self.arrays.raw == "packed" and patches.size % 2:
             raise RequestError(
-                f"found patch {patches.size}; a packed raw has planes of half the size, so give an "
-                "even one"
+                f"found patch {patches.size}, but a packed raw has planes of half the size. Use an "
+                "even size"
             )
         if self.arrays.raw == "packed" and not chain.filters.bayer:
             raise RequestError(
-                f"raw='packed': its planes are of a Bayer pattern, but the mosaic is "
-                f"{chain.filters.name}; say raw='mosaic'"
+                f"raw='packed': planes need a Bayer pattern, but the mosaic is "
+                f"{chain.filters.name}. Use raw='mosaic'"
             )
         self.arrays.check(chain.result)
         if self.truth:
-            picture_without_noise(self.truth, chain)  # refuses a chain that adds no noise
+            picture_without_noise(self.truth, chain)  # rejects a chain without noise
         if self.arrays.raw:
             raw_step(chain, self.arrays)
         if self.variance:
@@ -69,36 +69,36 @@ class SampleSpec:
 
 
 def raw_step(chain: Chain, arrays: ArrayFormat) -> str:
-    """The step whose image is the raw: the last one in DN, or the noisy mosaic in signal.
+    """Return the step of the raw: the last one in DN, or the noisy mosaic in signal.
 
     Raises:
-        RequestError: there is none.
+        RequestError: there is no such step.
     """
     if not arrays.is_in_dn:
         return noisy_mosaic(chain).steps[-1].name
     maker, after = chain.maker_of_raw, chain.context_of_raw
     if maker is None:
         raise RequestError(
-            f"the chain {chain.label} makes no raw in DN, which quantize does; put that stage in, "
-            "or say dtype='float32' for a raw in signal"
+            f"the chain {chain.label} makes no raw in DN. Add the stage quantize, or use "
+            "dtype='float32' for a raw scaled to signal"
         )
     if not after.knots and (after.white_level or 0) > HIGHEST:
         raise RequestError(
-            f"the raw in DN goes to {after.white_level:.0f}, which uint16 does not hold; say "
-            f"dtype='float32' for a raw in signal, or {maker}.method=pwl"
+            f"the raw has values to {after.white_level:.0f} DN, more than uint16 holds. Use "
+            f"dtype='float32' for a raw scaled to signal, or {maker}.method=pwl"
         )
     return maker
 
 
 @dataclass(frozen=True)
 class Order:
-    """An image of which samples are made.
+    """An image to develop for samples.
 
     Args:
-        chain: how it is developed.
+        chain: the chain.
         source: the image.
-        noise_key: what its noise is made of.
-        patches: the parts of the picture that are samples; () is one sample, all of it.
+        noise_key: the key of its noise.
+        patches: the patches that are samples. () is one sample of the whole picture.
     """
 
     chain: Chain
@@ -108,33 +108,33 @@ class Order:
 
     @property
     def options(self) -> RunOptions:
-        """How it is run."""
+        """The options of the run."""
         boxes = [patch.box for patch in self.patches]
         return RunOptions(unchanged=True, boxes=boxes, later=self.source.later)
 
 
 class Developer:
-    """Develops images on a device, in the order in which they are begun.
+    """Develops images on a device, in the order of :meth:`begin`.
 
     Args:
-        device: where; None is NumPy.
-        spec: what of each.
+        device: the device. None is NumPy.
+        spec: the contents of samples.
     """
 
     def __init__(self, device: Device | None, spec: SampleSpec) -> None:
         self.process = os.getpid()
         self._device = device
         self._spec = spec
-        self._lock = threading.Lock()  # guards the runners, and lets one thread use the device
+        self._lock = threading.Lock()  # guards the runners and the device
         self._raws: BoundedCache[dict[str, str]] = BoundedCache(MAX_STRUCTURES)
         self._latest: dict[str, Runner] = {}
 
     def begin(self, orders: Sequence[Order]) -> list[Callable[[], list[Sample]]]:
-        """Begin with the arrays and facts of samples of images, small ones together.
+        """Begin to develop samples of images. Small ones are developed together.
 
         Returns:
-            What waits for those of each image and gives them, called in order; it raises the same
-            errors.
+            For each image, a callable that waits for its samples. Call them in order. They raise
+            the same errors.
 
         Raises:
             ImageError, RequestError, MemoryError: an image cannot be developed.
@@ -156,7 +156,7 @@ class Developer:
         ]
 
     def _runs(self, chain: Chain, raws: Mapping[str, str]) -> dict[str, Runner]:
-        """What makes "image", "truth", and the "signal" that a variance is computed from."""
+        """Return the runners of "image", "truth", and "signal", from which the variance follows."""
         spec = self._spec
         encode = chain.result is Kind.DISPLAY and spec.arrays.dtype is None
         chains = {"image": chain}
@@ -172,7 +172,7 @@ class Developer:
         return runs
 
     def _raws_of(self, chain: Chain) -> dict[str, str]:
-        """The steps whose images are the raws of "image" and "truth"."""
+        """Return the steps of the raws of "image" and "truth"."""
         spec = self._spec
         if not spec.arrays.raw:
             return {}
@@ -201,7 +201,7 @@ class Developer:
     def _finish(
         self, order: Order, raws: Mapping[str, str], begun: Mapping[str, Callable[[], Result]]
     ) -> list[Sample]:
-        """The samples of what was begun."""
+        """Return the samples of an order that was begun."""
         results = {}
         for name, wait in begun.items():
             with self._lock:
@@ -220,7 +220,7 @@ class Developer:
         return samples
 
     def drain(self) -> None:
-        """Wait for what was begun."""
+        """Wait for all orders that were begun."""
         with self._lock:
             if self._device:
                 self._device.drain()
@@ -234,15 +234,15 @@ class Developer:
         noise: tuple[Step, ...],
         part: Callable[[Array], Array],
     ) -> Sample:
-        """The arrays of the sample of an image, or of a patch.
+        """Return the arrays of the sample of an image or patch.
 
         Args:
-            chain: of the image.
-            raws: the steps whose images are raws, by the names of results.
-            results: what came out.
-            patch: the patch; None is the image.
-            noise: the steps that the variance follows from.
-            part: returns the sample's part of an image of a result.
+            chain: the chain of the image.
+            raws: the steps of the raws, by the names of results.
+            results: the results.
+            patch: the patch. None is the whole picture.
+            noise: the steps from which the variance follows.
+            part: returns the part of an image that belongs to the sample.
         """
         arrays = self._spec.arrays
         pattern = chain.filters.pattern
@@ -269,7 +269,7 @@ class Developer:
 
 
 def last_until(truth: Chain, chain: Chain, name: str) -> str:
-    """The last step of a truth up to a step of its chain, which the truth may do without."""
+    """Return the last step of a truth up to a step of its chain, which the truth may lack."""
     names = chain.step_names
     until = names[: names.index(name) + 1]
     return [step for step in truth.step_names if step in until][-1]

@@ -1,4 +1,4 @@
-"""What a dataset is made of, as its arguments name it: images, texts, bytes."""
+"""The inputs of a dataset: its images and the size of its cache."""
 
 import logging
 import os
@@ -20,10 +20,10 @@ NOWHERE = Path(os.devnull)  # nothing is written
 
 
 def cache_size(cache: int | str) -> int:
-    """The bytes of a number, or of a text with a unit.
+    """Return the bytes of a number, or of a text with a unit.
 
     Raises:
-        RequestError: it is neither.
+        RequestError: the value is neither.
     """
     try:
         size = parse_size(cache) if isinstance(cache, str) else cache
@@ -37,16 +37,16 @@ def cache_size(cache: int | str) -> int:
 def jobs_of(
     loader: ImageLoader, inputs: Sequence[str], exclude: Sequence[str], skips: bool
 ) -> list[Job]:
-    """The images of a dataset.
+    """Return the images of a dataset.
 
     Args:
-        loader: how they enter.
+        loader: reads the images.
         inputs, exclude: as for :func:`clpipe.inputs.find.find_jobs`.
-        skips: leave files out, with a warning, whose headers cannot be read.
+        skips: whether to skip files with unreadable headers, with a warning.
 
     Raises:
-        RequestError: none is found, one that is named does not exist, one has a header that cannot
-            be read, or two have the same name, and so the same draws.
+        RequestError: there is no image, an input does not exist, a header cannot be read, or two
+            images have the same name, and therefore the same draws.
     """
     jobs = loader.exposures(find_jobs(inputs, NOWHERE, loader.endings(), exclude))
     loader.check(jobs)
@@ -56,13 +56,13 @@ def jobs_of(
         log.warning("%s", note)
     owners: dict[str, Job] = {}
     for job in jobs:
-        if job.listed and not job.path.exists():  # those of a folder were found there
+        if job.listed and not job.path.exists():  # files of directories exist
             raise RequestError(f"{job.label}: there is no such file or folder")
         other = owners.setdefault(job.key, job)
         if other is not job:
             raise RequestError(
-                f"{other.label} and {job.label} are both called {job.key}, and what is drawn for "
-                "them would be the same; give the folder that both are in"
+                f"{other.label} and {job.label} have the same name {job.key}, and would get the "
+                "same draws. Name the directory that contains both"
             )
     with ThreadPoolExecutor() as threads:
         opens = list(threads.map(loader.opens, jobs))
@@ -78,7 +78,7 @@ def jobs_of(
 
 
 def _reason(loader: ImageLoader, job: Job) -> str:
-    """Why the header of a job's file cannot be read."""
+    """Return why the header of a file cannot be read."""
     try:
         loader.for_job(job).read(job)
     except ImageError as error:

@@ -1,17 +1,17 @@
-"""How samples are numbered: image after image, epoch after epoch. Pure."""
+"""The numbering of samples: image after image, epoch after epoch. Pure."""
 
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from itertools import accumulate
 
-TOGETHER = 64  # patches of an image that are developed at a time
+TOGETHER = 64  # patches of an image in one batch
 
 
 class Numbering:
     """The numbers of samples: image after image, epoch after epoch.
 
     Args:
-        counts: how many samples there are of each image.
+        counts: the number of samples of each image.
 
     >>> numbering = Numbering([2, 3])
     >>> numbering.place(4), numbering.place(5), next(numbering.groups(1))
@@ -23,19 +23,19 @@ class Numbering:
 
     @property
     def of_epoch(self) -> int:
-        """How many samples an epoch has."""
+        """The number of samples in an epoch."""
         return self._ends[-1]
 
     def place(self, number: int) -> tuple[int, int, int]:
-        """Epoch, image, and number within the image of a sample; each counts from 0."""
+        """Return epoch, image, and number within the image of a sample, from 0."""
         epoch, rest = divmod(number, self.of_epoch)
         image = bisect_right(self._ends, rest) - 1
         return epoch, image, rest - self._ends[image]
 
     def groups(self, first: int) -> Iterator[tuple[int, int, range]]:
-        """All samples from a number on, those of an image at most :data:`TOGETHER` at a time.
+        """Yield all samples from a number on, at most :data:`TOGETHER` of an image at a time.
 
-        It does not end.
+        The iterator is endless.
         """
         epoch, image, begin = self.place(first)
         while True:

@@ -1,4 +1,4 @@
-"""A camera's noise alone, put into clean raws that come from elsewhere."""
+"""The noise of a camera for clean mosaics from other sources."""
 
 import os
 from collections.abc import Mapping
@@ -16,34 +16,38 @@ from clpipe.images.arrays import as_array
 from clpipe.pipeline import Pipeline
 from clpipe.reference.cfa import PATTERNS
 
-FIRST, LAST = (
-    "crosstalk",
-    "normalize",
-)  # what a chain does between the clean mosaic and the noisy one
+FIRST, LAST = "crosstalk", "normalize"  # from the clean mosaic to the noisy one
 MOSAIC, PACKED = 1, 4  # channels
 
 
 class RawNoise(ReadOnly):
-    """Puts a camera's noise into clean raws: a transform, to be called with each.
+    """A transform that adds the raw noise of a camera to clean mosaics in signal units.
 
-    It runs the default chain from ``crosstalk`` to ``normalize``: sensor noise, what a sensor does
-    to rows, columns and single pixels, clipping and rounding to DN. Noise depends on the raw, the
-    ISO, the seed and the key; with one ``noise_key``, the bits are those that the raw gets in the
-    chain.
+    >>> import numpy as np
+    >>> import clpipe
+    >>> add_noise = clpipe.RawNoise("sony-a7r2", iso=3200, device="numpy")
+    >>> planes = np.full((4, 16, 16), 0.25, np.float32)  # R, Gr, Gb, B
+    >>> noisy = add_noise(planes, "frame_0001")
+    >>> noisy.shape, bool(noisy.std() > 0)
+    ((4, 16, 16), True)
 
-    The process that first calls it opens the device. OpenCL does not survive a fork: workers of a
-    process that has used it must be spawned.
+    It runs the default chain from ``crosstalk`` to ``normalize``: sensor noise, row, column and
+    pixel defects, clipping and rounding to DN. Noise depends on the mosaic, the ISO, the seed and
+    the key. With a ``noise_key``, the result is that of the whole chain with this key.
+
+    The process that first calls it opens the device. OpenCL does not survive a fork, so workers of
+    a process that has used it must be spawned.
 
     Args:
-        camera: a name that ``clpipe cameras`` lists, or the TOML file of a profile.
-        iso: its ISO; ``{"log_uniform": [800, 12800]}`` or another draw is made for each raw.
-        seed: None is other noise in each process and at each call without a key; with a number,
-            calls without a key give the same noise in the same order, in each process.
+        camera: a name from ``clpipe cameras``, or the TOML file of a profile.
+        iso: the ISO. ``{"log_uniform": [800, 12800]}`` or another draw is made for each mosaic.
+        seed: None gives other noise in each process and at each call without a key. With a number,
+            calls without a key give the same sequence of noise in each process.
         device: as for :class:`~clpipe.Pipeline`.
         **settings: as for :class:`~clpipe.Pipeline`, such as ``sensor_noise={"a": 1e-3}``.
 
     Raises:
-        RequestError: a name or value that is not allowed.
+        RequestError: a name or value is not allowed.
     """
 
     @typed
@@ -58,7 +62,9 @@ class RawNoise(ReadOnly):
     ) -> None:
         for name in ("start_at", "until"):
             if name in settings:
-                raise RequestError(f"RawNoise: found {name}, but it runs from {FIRST} to {LAST}")
+                raise RequestError(
+                    f"RawNoise: found {name}, but it always runs from {FIRST} to {LAST}"
+                )
         self._settings = {**settings, "camera": str(camera), "iso": iso, "seed": seed or 0}
         self._seed = seed
         self._device = device
@@ -71,67 +77,67 @@ class RawNoise(ReadOnly):
     def __repr__(self) -> str:
         return f"RawNoise({self._settings['camera']!r}, {self._settings['iso']!r})"
 
-    def __call__(self, raw: Array, key: str | np.random.Generator | None = None) -> Array:
-        """A raw with noise.
+    def __call__(self, mosaic: Array, key: str | np.random.Generator | None = None) -> Array:
+        """Return a mosaic with noise.
 
         Args:
-            raw: linear signal, 0 is black and 1 is white, in float16, float32 or float64: a mosaic,
-                (height, width) or (1, height, width), with the camera's CFA pattern; or its planes
-                R, Gr, Gb, B, (4, height / 2, width / 2), where Gr is green in the rows of red; or a
-                batch of these, (raw, channel, height, width).
-            key: its name, for noise that can be had again; give it another one in each epoch. Raws
-                of a batch are told apart by their numbers in it. None, or a generator, is a new
-                name, drawn.
+            mosaic: linear signal, where 0 is black and 1 is white, in float16, float32 or float64.
+                It is (height, width) or (1, height, width) with the camera's CFA pattern. Or it is
+                packed as planes R, Gr, Gb, B, (4, height / 2, width / 2). Gr is green in the rows
+                of red. A batch has another axis in front.
+            key: a name for repeatable noise. Pass another one in each epoch. Mosaics of a batch
+                differ by their index. None, or a generator, draws a new name.
 
         Returns:
-            The noisy raw, in the shape and type of the clean one. Values below 0 stay as they are,
-            down to 0 DN; above 1 there are none.
+            The noisy mosaic, in the shape and type of the clean one. Negative values remain, down
+            to 0 DN. Values are clipped at 1.
 
         Raises:
-            ImageError: an array of another shape or type, or one that is not finite.
-            RequestError: a key of another type.
+            ImageError: the array has a wrong shape or type, or is not finite.
+            RequestError: the key has a wrong type.
             DeviceError: there is no usable device.
         """
         pipeline, random = self._open()
-        raw = as_array(raw, "raw")
-        shape = raw.shape
+        mosaic = as_array(mosaic, "mosaic")
+        shape = mosaic.shape
         channels = MOSAIC if len(shape) == 2 else shape[-3] if len(shape) in (3, 4) else 0
         if channels not in (MOSAIC, PACKED) or 0 in shape:
             raise ImageError(
                 f"found an array of shape {shape}; expected a mosaic, (height, width), its planes, "
-                "(4, height / 2, width / 2), or a batch, (raw, 1 or 4, height, width)"
+                "(4, height / 2, width / 2), or a batch, (mosaic, 1 or 4, height, width)"
             )
-        if raw.dtype.kind != "f":
+        if mosaic.dtype.kind != "f":
             raise ImageError(
-                f"found {raw.dtype}; expected floats in signal: raws in DN less the black level, "
-                "over white less black"
+                f"found {mosaic.dtype}; expected floats in signal units. Subtract the black level "
+                "from DN, and divide by the white level minus the black level"
             )
         if key is None or isinstance(key, np.random.Generator):
             key = f"{(key or random).integers(2**63):016x}"
         if not isinstance(key, str):
             raise RequestError(f"found key {key!r}; expected a text, a generator or None")
-        if raw.ndim == 4:
-            noisy = [self._noisy(pipeline, each, f"{key}/{i}") for i, each in enumerate(raw)]
+        if mosaic.ndim == 4:
+            noisy = [self._noisy(pipeline, each, f"{key}/{i}") for i, each in enumerate(mosaic)]
             return np.stack(noisy)
-        return self._noisy(pipeline, raw, key)
+        return self._noisy(pipeline, mosaic, key)
 
-    def _noisy(self, pipeline: Pipeline, raw: Array, key: str) -> Array:
-        """One raw with noise, of two or three dimensions."""
-        is_packed = raw.ndim == 3 and len(raw) == PACKED
+    def _noisy(self, pipeline: Pipeline, clean: Array, key: str) -> Array:
+        """Return one mosaic with noise, of two or three dimensions."""
+        is_packed = clean.ndim == 3 and len(clean) == PACKED
         if is_packed and self._pattern not in PATTERNS:
             raise RequestError(
-                f"found planes, but the mosaic is {self._pattern}, no Bayer pattern; give mosaics"
+                f"found planes, but the camera's pattern {self._pattern} is not a Bayer pattern. "
+                "Pass a mosaic, (height, width)"
             )
-        mosaic = unpacked(raw, self._pattern) if is_packed else raw.reshape(raw.shape[-2:])
+        mosaic = unpacked(clean, self._pattern) if is_packed else clean.reshape(clean.shape[-2:])
         noisy = pipeline.process(mosaic, key).image
-        noisy = packed(noisy, self._pattern) if is_packed else noisy.reshape(raw.shape)
-        return noisy.astype(raw.dtype, copy=False)
+        noisy = packed(noisy, self._pattern) if is_packed else noisy.reshape(clean.shape)
+        return noisy.astype(clean.dtype, copy=False)
 
     def _open(self) -> tuple[Pipeline, np.random.Generator]:
-        """The pipeline of this process, and what it draws names from.
+        """Return the pipeline of this process, and its generator of names.
 
         Raises:
-            DeviceError: there is no usable device, or another process had opened it.
+            DeviceError: there is no usable device, or a parent process has opened it.
         """
         if self._opened is None or self._opened[0] != os.getpid():
             pipeline = self._pipeline(self._device)

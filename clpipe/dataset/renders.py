@@ -1,4 +1,4 @@
-"""Decoded renders, kept for further patches and epochs, which all workers of a dataset share."""
+"""A cache of decoded renders that all workers of a dataset share."""
 
 import os
 import pickle
@@ -17,23 +17,22 @@ from clpipe.base.files import passing_files, whole_file
 from clpipe.engine.runner import is_planar
 from clpipe.images.read import SourceImage
 
-OPEN = 4096  # files that a process has mapped at a time
+OPEN = 4096  # files that a process maps at most
 
 
 class SharedRenders:
-    """Renders as they were decoded, in files that every process maps into its memory.
+    """Decoded renders in files that every process maps into its memory.
 
-    Workers of a ``DataLoader`` each get a copy of the dataset, and with it the folder's name. A
-    render that one of them has decoded, the others read; its pages are in memory once. Files are
-    kept until they take ``size`` bytes together; further renders are decoded each time. The folder
-    is among the system's temporary files. It belongs to the process that made it, and is removed
-    with the dataset there.
+    Each worker of a ``DataLoader`` gets a copy of the dataset with the path of the cache. Workers
+    share decoded renders, whose pages are in memory once. When the files take ``size`` bytes,
+    further renders are decoded each time. The cache is a temporary directory. It belongs to the
+    process that created it, and is removed with the dataset there.
 
     Args:
-        size: bytes that all of them may take; 0 keeps none.
+        size: the bytes of all files. 0 keeps none.
 
     Raises:
-        RequestError: no temporary folder can be made.
+        RequestError: the temporary directory cannot be created.
 
     >>> image = SourceImage(np.ones((2, 3, 3), np.float16), "", "", (), {})
     >>> renders = SharedRenders(100)
@@ -50,8 +49,8 @@ class SharedRenders:
                 self._folder = Path(tempfile.mkdtemp(prefix="clpipe-renders-"))
             except OSError as error:
                 raise RequestError(
-                    f"cache: decoded renders are kept in a temporary folder, but none can be made "
-                    f"({error.strerror}); set TMPDIR to a folder that can be written, or cache=0"
+                    f"cache: the temporary directory for decoded renders cannot be created "
+                    f"({error.strerror}). Set TMPDIR to a writable directory, or cache=0"
                 ) from None
             weakref.finalize(self, _remove, self._folder, os.getpid())
 
@@ -60,8 +59,8 @@ class SharedRenders:
 
     @property
     def taken(self) -> int:
-        """The bytes of all samples that are kept."""
-        # Those without a dot, which are whole.
+        """The bytes of all pixels in the cache."""
+        # Names with a leading dot are unfinished files.
         files = list(self._folder.glob("[!.]*.npy")) if self._folder else []
         return sum(file.stat().st_size - HEADER for file in files)
 
@@ -69,8 +68,8 @@ class SharedRenders:
         """Return a render.
 
         Args:
-            key: what the render follows from, with its file's size and time of change.
-            decode: decodes it, where nobody has yet.
+            key: identifies the render, with the size and modification time of its file.
+            decode: decodes a render that is not in the cache.
         """
         if not self._folder:
             return decode()
@@ -89,14 +88,14 @@ class SharedRenders:
         return mapped
 
 
-HEADER = 128  # bytes, of NumPy's files
+HEADER = 128  # bytes of the header of .npy files
 
 
 def _mapped(place: Path) -> SourceImage | None:
-    """The render that is kept in a place, if one is."""
+    """Return the render in a place of the cache, or None."""
     try:
         with place.with_suffix(".pickle").open("rb") as file:
-            source, planar = pickle.load(file)  # noqa: S301  # that a process of this user made
+            source, planar = pickle.load(file)  # noqa: S301  # written by this user
         pixels = np.asarray(np.load(place.with_suffix(".npy"), mmap_mode="r"))
     except OSError:
         return None
@@ -104,14 +103,16 @@ def _mapped(place: Path) -> SourceImage | None:
 
 
 def _keep(place: Path, source: SourceImage) -> bool:
-    """Keep a render in a place; whether that worked."""
+    """Write a render to a place of the cache. Return whether that worked."""
     planar, pixels = is_planar(source.pixels), source.pixels
     rest = replace(source, pixels=np.broadcast_to(pixels[:1, :1], (1, 1, *pixels.shape[2:])))
     try:
         with passing_files():
             with whole_file(place.with_suffix(".npy")) as file:
                 np.save(file, pixels.transpose(2, 0, 1) if planar else pixels)
-            with whole_file(place.with_suffix(".pickle")) as file:  # last: the other one is whole
+            with whole_file(
+                place.with_suffix(".pickle")
+            ) as file:  # last, so the other file is complete
                 pickle.dump((rest, planar), file)
     except (ImageError, OSError):
         return False
@@ -119,7 +120,7 @@ def _keep(place: Path, source: SourceImage) -> bool:
 
 
 def _shared(size: int, folder: Path | None) -> SharedRenders:
-    """The renders of another process; its own where the folder is not on this machine."""
+    """Return the cache of another process, or a new one if it is on another machine."""
     renders = SharedRenders(0 if folder and folder.is_dir() else size)
     if folder and not renders._folder:
         renders._size, renders._folder = size, folder

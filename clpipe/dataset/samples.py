@@ -1,4 +1,4 @@
-"""Samples of an image: it is read, or is in memory still, and is developed."""
+"""Samples of images: decoding, or the cache, and development."""
 
 import os
 import threading
@@ -31,9 +31,9 @@ class SampleBatch:
 
     Args:
         job: the image.
-        epoch: of the samples.
-        numbers: theirs among those of the image.
-        drawn: the number of the patch that draws are made for; None is all of the image.
+        epoch: the epoch.
+        numbers: the numbers of the samples within the image.
+        drawn: the number of the patch whose draws are used. None is the draws of the image.
     """
 
     job: Job
@@ -43,20 +43,20 @@ class SampleBatch:
 
     @property
     def draw_key(self) -> str:
-        """What draws belong to."""
+        """The key of draws."""
         key = of_frame(self.job.key, self.epoch or None)
         return key if self.drawn is None else f"{key}, patch {self.drawn}"
 
 
 class SampleLoader:
-    """Makes the samples of images, in the order in which they are begun.
+    """Makes the samples of images, in the order of :meth:`begin`.
 
     Args:
-        loader: how images enter.
-        spec: what samples have.
-        patches: which patches they are; None is whole pictures.
-        cache: bytes that decoded images may take.
-        device: as for :func:`open_device`. The process that first makes a sample opens it.
+        loader: reads the images.
+        spec: the contents of samples.
+        patches: the patches. None is whole pictures.
+        cache: the bytes of decoded images to keep.
+        device: as for :func:`open_device`. The process that makes the first sample opens it.
     """
 
     def __init__(
@@ -79,15 +79,15 @@ class SampleLoader:
         return {**self.__dict__, "_opened": None}  # a device stays with its process
 
     def drain(self) -> None:
-        """Wait for what was begun."""
+        """Wait for all samples that were begun."""
         if self._opened:
             self._opened.drain()
 
     def count(self, job: Job, epoch: int) -> int:
-        """How many samples there are of an image; for a grid, the image is read.
+        """Return the number of samples of an image. A grid needs to read the image.
 
         Raises:
-            ImageError: it cannot be read, or is smaller than a patch.
+            ImageError: the image cannot be read, or is smaller than a patch.
         """
         if self.patches is None:
             return 1
@@ -98,7 +98,7 @@ class SampleLoader:
             return self.patches.cutting(loaded.chain, *loaded.source.pixels.shape[1::-1]).count
 
     def read(self, batch: SampleBatch) -> tuple[LoadedImage, Sample]:
-        """An image, and the layers that go along with its picture."""
+        """Read an image and its layers, which are warped like its picture."""
         job = batch.job
         loader = self._loader
         carried: Sample = {}
@@ -115,8 +115,8 @@ class SampleLoader:
             raise ImageError(loader.error_text(job, error)) from None
         if loaded is None:
             raise ImageError(
-                f"{job.path}: was kept after another step than the one before "
-                f"{loader.request.start_at}; name the images to go on from by a glob"
+                f"{job.path}: this image was not kept directly before "
+                f"{loader.request.start_at}. Select such images with a glob"
             )
         for warning in set(loaded.source.warnings) - self._warned:  # once, not for each image
             self._warned.add(warning)
@@ -124,7 +124,7 @@ class SampleLoader:
         return loaded, carried
 
     def _source(self, job: Job, loader: ImageLoader) -> SourceImage:
-        """The image of a job, as it is held where its pixels are those of its files."""
+        """Return the image of a job, from the cache unless sub-frames are combined."""
         if loader.shutter(job):  # which may be drawn
             return loader.read(job)
         overscan = not loader.raw.takes(job.path) and loader.reads_overscan
@@ -134,16 +134,16 @@ class SampleLoader:
     def begin(
         self, read: Sequence[tuple[SampleBatch, LoadedImage, Sample]]
     ) -> list[Callable[[], list[Sample]]]:
-        """Begin to develop samples of images, small ones together.
+        """Begin to develop samples of images. Small ones are developed together.
 
         Args:
-            read: batches, each with what :meth:`read` gave of it.
+            read: batches, each with the result of :meth:`read`.
 
         Returns:
-            What waits for those of each batch and gives them, called in order.
+            For each batch, a callable that waits for its samples. Call them in order.
 
         Raises:
-            ImageError: an image cannot be developed; of several it is not said which.
+            ImageError: an image cannot be developed. The error of several images names none.
         """
         orders = [self._order(batch, loaded) for batch, loaded, _ in read]
         with self._errors_of(*(batch.job for batch, *_ in read)):
@@ -154,7 +154,7 @@ class SampleLoader:
         ]
 
     def _order(self, batch: SampleBatch, loaded: LoadedImage) -> Order:
-        """What is to be developed for a batch."""
+        """Return the order of a batch."""
         job, chain, pixels = batch.job, loaded.chain, loaded.source.pixels
         patches: list[Patch] = []
         with self._errors_of(job):
@@ -174,7 +174,7 @@ class SampleLoader:
         patches: Sequence[Patch],
         begun: Callable[[], list[Sample]],
     ) -> list[Sample]:
-        """The samples of a batch that was begun."""
+        """Return the samples of a batch that was begun."""
         with self._errors_of(batch.job):
             samples = begun()
         arrays, facts = self._spec.arrays, self._facts(batch, loaded)
@@ -186,7 +186,7 @@ class SampleLoader:
 
     @contextmanager
     def _errors_of(self, *jobs: Job) -> Iterator[None]:
-        """Errors within say which image they are of, where there is one."""
+        """Add the name of the image to errors of the body, if there is one image."""
         try:
             yield
         except (ImageError, RequestError, MemoryError) as error:
@@ -196,7 +196,7 @@ class SampleLoader:
 
     @staticmethod
     def _facts(batch: SampleBatch, loaded: LoadedImage) -> Sample:
-        """What a sample has beside its arrays, of its image."""
+        """Return the facts of an image for its samples."""
         chain = loaded.chain
         adds_noise = chain.is_noisy or not isinstance(loaded.source, RawImage)
         noise = chain.noise if adds_noise else None
@@ -204,10 +204,10 @@ class SampleLoader:
         return {"key": batch.job.key, "epoch": batch.epoch, "iso": chain.iso, "a": a, "b": b}
 
     def _developer(self) -> Developer:
-        """The developer of this process.
+        """Return the developer of this process.
 
         Raises:
-            DeviceError: there is no usable device, or another process had opened it.
+            DeviceError: there is no usable device, or a parent process has opened it.
         """
         with _opening:
             if self._opened is None or self._opened.process != os.getpid():

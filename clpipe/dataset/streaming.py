@@ -1,4 +1,4 @@
-"""Samples of renders that lie in tars, which are unpacked one after the other."""
+"""Samples of renders in tars, which are unpacked one after the other."""
 
 import glob
 import shutil
@@ -19,31 +19,43 @@ from clpipe.torch.iterable import IterableDataset, worker
 
 
 class StreamingDataset(ReadOnly, IterableDataset):
-    """Samples of renders in tars, tar by tar: an iterable, for more renders than a disk holds.
+    """Samples of renders in tars: an iterable for data sets that are larger than the disk.
 
-    It is a :class:`~clpipe.Dataset` of each tar in turn, and yields the same samples: "key" is the
-    tar's name without ``.tar``, a slash, and the name in the tar. While one tar is developed, the
-    next is fetched and unpacked into a temporary folder (``TMPDIR``), which is removed then. Pass
-    it to ``torch.utils.data.DataLoader``: each worker takes a part of the tars. Each pass over it
-    is an epoch, with noise and draws of its own.
+    >>> import tarfile
+    >>> import tempfile
+    >>> import OpenImageIO as oiio
+    >>> import clpipe
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> render = oiio.ImageBufAlgo.fill((0.2, 0.3, 0.4), oiio.ROI(0, 64, 0, 48, 0, 1, 0, 3))
+    >>> _ = render.write(f"{folder.name}/a.exr")
+    >>> with tarfile.open(f"{folder.name}/renders-0.tar", "w") as tar:
+    ...     tar.add(f"{folder.name}/a.exr", "a.exr")
+    >>> tars = f"{folder.name}/renders-*.tar"
+    >>> samples = clpipe.StreamingDataset(tars, iso=3200, device="numpy", cache=0)
+    >>> [(sample["key"], sample["image"].shape) for sample in samples]
+    [('renders-0/a.exr', (48, 64, 3))]
+    >>> folder.cleanup()
+
+    It yields the samples of a :class:`~clpipe.Dataset` of each tar in turn. "key" is the name of
+    the tar without ``.tar``, a slash, and the name in the tar. While one tar is developed, the next
+    is fetched and unpacked into a temporary directory (``TMPDIR``), which is removed afterwards.
+    Pass the data set to ``torch.utils.data.DataLoader``: each worker takes a part of the tars. Each
+    pass is an epoch with new noise and draws.
 
     Args:
         tars: paths, globs or URLs of tars.
-        **options: as for :class:`~clpipe.Dataset`, but for ``epochs``; ``epoch`` is the first one.
+        **options: as for :class:`~clpipe.Dataset`, except ``epochs``. ``epoch`` is the first one.
 
     Raises:
-        RequestError: there is no such tar, or ``epochs`` is set; options are checked with the first
+        RequestError: a tar does not exist, or ``epochs`` is set. Options are checked with the first
             tar.
-
-    Example::
-
-        samples = clpipe.StreamingDataset("renders-*.tar", iso=3200, patch=128)
-        loader = DataLoader(samples, batch_size=32, num_workers=2)
     """
 
     def __init__(self, tars: str | Path | Sequence[str | Path], **options: Any) -> None:
         if "epochs" in options:
-            raise RequestError("found epochs; each pass over a StreamingDataset is an epoch")
+            raise RequestError(
+                "found epochs, but each pass over a StreamingDataset is an epoch. Remove it"
+            )
         self._epoch: int = options.pop("epoch", 0)
         self._options = options
         self._tars = [found for name in several(tars) for found in _found(name)]
@@ -52,11 +64,11 @@ class StreamingDataset(ReadOnly, IterableDataset):
         return f"StreamingDataset({len(self._tars)} tars)"
 
     def set_epoch(self, epoch: int) -> None:
-        """Begin the next pass with this epoch."""
+        """Set the epoch of the next pass."""
         self._epoch = epoch
 
     def __iter__(self) -> Iterator[Sample]:
-        """Every sample of this process's tars, in order.
+        """Yield every sample of the tars of this worker, in order.
 
         Raises:
             ImageError: a tar or an image cannot be read, or an image cannot be developed.
@@ -83,25 +95,25 @@ class StreamingDataset(ReadOnly, IterableDataset):
 
 
 def _found(name: str) -> list[str]:
-    """The tars of a path, a glob or a URL.
+    """Return the tars of a path, a glob or a URL.
 
     Raises:
-        RequestError: there is none.
+        RequestError: there is no such tar.
     """
     if is_url(name):
         tars = listed(name) if is_glob(name) else [name]
     else:
         tars = sorted(glob.glob(name)) if glob.has_magic(name) else [name] * Path(name).is_file()
     if not tars:
-        raise RequestError(f"{name}: there is no such tar")
+        raise RequestError(f"{name}: no such tar exists")
     return tars
 
 
 def _unpack(tar: str, folder: Path) -> None:
-    """Unpack a tar into a folder of its name in a folder.
+    """Unpack a tar into a new directory with the tar's name inside a folder.
 
     Raises:
-        ImageError: it cannot be read.
+        ImageError: the tar cannot be read.
     """
     folder.mkdir()
     into = folder / PurePosixPath(tar).name.removesuffix(".tar")

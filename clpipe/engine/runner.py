@@ -27,7 +27,16 @@ from clpipe.stage import Method, NoiseScope, ReferenceContext, Resample
 
 @dataclass(frozen=True)
 class Result:
-    """The images that one image became in a chain.
+    """The result of a chain for one image.
+
+    >>> import numpy as np
+    >>> import clpipe
+    >>> camera = clpipe.Pipeline(device="numpy", keep="normalize")
+    >>> result = camera(np.full((24, 32, 3), 0.2, np.float32))
+    >>> result
+    Result(encoded: (24, 32, 3) uint8, normalize: (24, 32) float32)
+    >>> result.image is result.encoded
+    True
 
     ``final`` is the last image in float32, ``encoded`` the same in eight bits; both are (height,
     width[, channel]), and None where not requested. ``kept`` has the images of the steps to keep,

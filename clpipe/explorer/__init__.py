@@ -1,5 +1,5 @@
-"""A camera to try: one render developed on the device as its settings change, in a web page.
+"""The explorer: a web page that develops a render while its settings change.
 
-It is above everything that develops and measures, and below the commands. Starlette and uvicorn are
-imported here alone.
+It may import every package that develops and measures. Only the commands import it. Only this
+package imports Starlette and uvicorn.
 """

@@ -1,6 +1,6 @@
-"""What a page can set: the stages of a chain with their methods and parameters, as declared."""
+"""The controls of the page: stages, methods and parameters, from their declarations."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +13,16 @@ from clpipe.chain.keys import KEYS, LENS
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
+from clpipe.stage import Kind, Stage
 
-HIDDEN = {"title", "description"}  # of a parameter's schema; the description is sent as "text"
+HIDDEN = {"title", "description"}  # keys of a schema; the description is sent as "text"
 
 
 def stage_controls() -> dict[str, Any]:
-    """Every stage by its name: what it does, and its methods with their parameters.
+    """Return every stage by its name, with its summary, methods and parameters.
 
-    A parameter is its JSON schema, which has its type, limits, unit and default; "text" says what
-    it is, "auto" where its value comes from when it is not set.
+    A parameter is a JSON schema with type, limits, unit and default. Its "text" describes it, and
+    its "auto" states the source of a value that is not set.
     """
     return {
         name: {
@@ -41,7 +42,7 @@ def stage_controls() -> dict[str, Any]:
 
 
 def parameters_of(model: type[BaseModel]) -> dict[str, Any]:
-    """The parameters that a class declares, each as its JSON schema with a text.
+    """Return the parameters that a class declares, each as a JSON schema with a text.
 
     >>> from clpipe.stages.gamma import STAGE
     >>> list(parameters_of(STAGE.methods[0]))
@@ -56,9 +57,9 @@ def parameters_of(model: type[BaseModel]) -> dict[str, Any]:
 
 
 def key_controls() -> dict[str, Any]:
-    """The values that stand in no table, each as a JSON schema with a text.
+    """Return the settings outside tables, each as a JSON schema with a text.
 
-    That of "lens" has all names as "suggested", or says what to install for them.
+    The schema of "lens" lists all names as "suggested", or states what to install for them.
     """
     names = {int: "integer", str: "string", float: "number"}
     controls: dict[str, dict[str, Any]] = {}
@@ -74,10 +75,10 @@ def key_controls() -> dict[str, Any]:
 
 
 def camera_controls(others: Sequence[str]) -> list[dict[str, Any]]:
-    """The cameras that can be chosen, with their ISOs: the built-in ones, and files that are named.
+    """Return the built-in cameras and those of given files, with their ISO ranges.
 
     Raises:
-        RequestError: a file is no camera profile.
+        RequestError: a file is not a camera profile.
     """
     cameras = [(name, load_camera(name)) for name in (*sorted(built_in_cameras()), *others)]
     return [
@@ -91,7 +92,30 @@ def camera_controls(others: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def steps_of(settings: Settings) -> list[dict[str, Any]]:
-    """All steps of settings in their order, those that are skipped as well, with their stages."""
+    """Return all steps of settings in order, including skipped ones, with stage and group."""
     on = set(settings.step_names)
     every = Settings(stages=settings.stages).step_names
-    return [{"name": name, "stage": base_name(name), "on": name in on} for name in every]
+    stages = [base_name(name) for name in every]
+    groups = groups_of([all_stages()[stage] for stage in stages])
+    return [
+        {"name": name, "stage": stage, "group": group, "on": name in on}
+        for name, stage, group in zip(every, stages, groups, strict=True)
+    ]
+
+
+def groups_of(stages: Sequence[Stage]) -> Iterator[str]:
+    """Yield the group of each stage of a chain: Optics, Sensor or Development.
+
+    Without a mosaic there is no sensor, and all stages are Development.
+
+    >>> list(groups_of([all_stages()[n] for n in ("vignetting", "mosaic", "quantize", "demosaic")]))
+    ['Optics', 'Sensor', 'Sensor', 'Development']
+    """
+    ends = [(stage.reads, stage.writes) for stage in stages]
+    group = "Optics" if (Kind.RGB, Kind.MOSAIC) in ends else "Development"
+    for reads, writes in ends:
+        if (reads, writes) == (Kind.RGB, Kind.MOSAIC):
+            group = "Sensor"
+        elif reads is Kind.RAW or (reads, writes) == (Kind.MOSAIC, Kind.RGB):
+            group = "Development"
+        yield group

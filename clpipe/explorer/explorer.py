@@ -1,4 +1,4 @@
-"""Images developed again and again with other settings, as ``clpipe run`` would develop them."""
+"""Repeated development of images with changing settings, with the results of ``clpipe run``."""
 
 import threading
 import time
@@ -36,42 +36,36 @@ from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
-SOURCES = 2  # images that stay decoded
-SAMPLES = 3  # of what was made, that can always still be asked for
-KEPT = 1 << 28  # bytes, up to which more are
-AT_START = (
-    "camera",
-    "iso",
-    "seed",
-    "stages",
-    "skip",
-)  # of Settings.record(), which always has them
+SOURCES = 2  # decoded images in memory
+SAMPLES = 3  # results that are always kept
+KEPT = 1 << 28  # bytes; more results are kept up to this size
+AT_START = ("camera", "iso", "seed", "stages", "skip")  # always in Settings.record()
 
 
 class Explorer:
     """Develops the images of a request with any settings, on one device.
 
-    It may be used by several threads; they take turns at the device.
+    Several threads may use it. One at a time uses the device.
 
     Args:
         jobs: the images.
-        request: what was asked for at the start.
-        device: where to run; None is NumPy.
+        request: the request of the command line.
+        device: the device. None is NumPy.
 
     Raises:
-        RequestError: an image has settings of its own, from a manifest.
+        RequestError: an image has its own settings, from a manifest.
     """
 
     def __init__(self, jobs: Sequence[Job], request: Request, device: Device | None) -> None:
         if listed := next((job for job in jobs if job.place), None):
             raise RequestError(
-                f"{listed.place}: its rows may have settings of their own; give the images "
-                "themselves, or folders"
+                f"{listed.place}: rows of a manifest may have their own settings. Name the "
+                "images or their directories instead"
             )
         self.jobs = tuple(jobs)
         self.device = device
         self._request = request
-        self._lock = threading.Lock()  # guards the samples, and lets one thread use the device
+        self._lock = threading.Lock()  # guards the samples and the device
         self._sources: BoundedCache[SourceImage] = BoundedCache(SOURCES)
         self._runners: dict[bool, Runner] = {}
         self._samples: OrderedDict[int, Sample] = OrderedDict()
@@ -79,16 +73,13 @@ class Explorer:
 
     @property
     def label(self) -> str:
-        """How many images, and where they are developed, for people."""
+        """The number of images, and the device that develops them."""
         count = "1 image" if len(self.jobs) == 1 else f"{len(self.jobs)} images"
         return f"{count}, on {self.device.info.label if self.device else 'NumPy'}"
 
     @cached_property
     def initial(self) -> dict[str, Any]:
-        """The values that are set at the start, nested as in a configuration.
-
-        Whoever changes them has a configuration: what is left out is automatic.
-        """
+        """The initial values, nested like a configuration. Absent values are automatic."""
         settings = replace(self._request, image={}, image_name="").settings()
         asked = {**(self._request.config or {}), **self._request.options}
         record = settings.record()
@@ -96,7 +87,7 @@ class Explorer:
 
     @cached_property
     def named(self) -> tuple[str, ...]:
-        """The files that the settings name at the start."""
+        """The files in the initial settings."""
         return tuple(dict.fromkeys(name for _, name in files_in(self.initial)))
 
     @property
@@ -105,7 +96,7 @@ class Explorer:
         return tuple(dict.fromkeys(name for key, name in files_in(self.initial) if key == "camera"))
 
     def job(self, image: int) -> Job:
-        """An image by its number.
+        """Return an image by its number.
 
         Raises:
             RequestError: there is no such image.
@@ -115,10 +106,10 @@ class Explorer:
         return self.jobs[image]
 
     def check(self) -> None:
-        """See that the first image can be read.
+        """Check that the first image can be read.
 
         Raises:
-            ImageError: it cannot.
+            ImageError: it cannot be read.
         """
         job, loader = self.jobs[0], ImageLoader(self.request(self.initial))
         try:
@@ -127,10 +118,10 @@ class Explorer:
             raise ImageError(loader.error_text(job, error)) from None
 
     def request(self, values: Mapping[str, Any]) -> Request:
-        """The request of values, which hold in place of those at the start.
+        """Return the request with values instead of the initial ones.
 
         Raises:
-            KeyedError: they name a file that was not named at the start.
+            KeyedError: a value names a file that the initial settings do not name.
         """
         check_named(values, self.named)
         none = replace(self._request, config=None, options={}, image={}, image_name="")
@@ -140,27 +131,27 @@ class Explorer:
 
     @property
     def goes_on_from_embedded(self) -> bool:
-        """Whether values lie over those that a kept image carries, as none were configured."""
+        """Whether values override those that a kept image carries, because none were configured."""
         return self._request.start_at is not None and self._request.config is None
 
     def settings(self, image: int, values: Mapping[str, Any]) -> Settings:
-        """All settings of an image, with those that it carries and those that are drawn.
+        """Return all settings of an image, including carried and drawn ones.
 
         Raises:
-            ClpipeError: as of a run.
+            ClpipeError: the errors of a run.
         """
         return self._loaded(image, values)[1]
 
     def develop(self, image: int, values: Mapping[str, Any], view: View) -> Sample:
-        """An image, developed as ``clpipe run`` does with a configuration of these values.
+        """Develop an image like ``clpipe run`` with a configuration of these values.
 
         Args:
-            image: which of the jobs.
+            image: the number of the image.
             values: nested, as in a configuration file.
-            view: what of it.
+            view: the step and truth to show.
 
         Raises:
-            ClpipeError: as of a run.
+            ClpipeError: the errors of a run.
         """
         start = time.perf_counter()
         loaded, settings = self._loaded(image, values)
@@ -198,28 +189,28 @@ class Explorer:
         return sum(each.image.nbytes + each.shown.nbytes for each in self._samples.values())
 
     def sample(self, number: int) -> Sample:
-        """What :meth:`develop` gave a short while ago.
+        """Return a recent result of :meth:`develop`.
 
         Args:
-            number: of it, among its facts.
+            number: "number" among its facts.
 
         Raises:
-            RequestError: it is not kept any more.
+            RequestError: the result is no longer kept.
         """
         with self._lock:
             if number not in self._samples:
-                raise RequestError(f"image {number} is not kept any more; ask for it again")
+                raise RequestError(f"image {number} is no longer kept. Develop it again")
             return self._samples[number]
 
     def values_at(self, number: int, x: int, y: int) -> dict[str, Any]:
-        """The values of a pixel of what :meth:`develop` gave a short while ago.
+        """Return the values of a pixel of a recent result of :meth:`develop`.
 
         Args:
-            number: of it, among its facts.
-            x, y: the place, in px.
+            number: "number" among its facts.
+            x, y: column and row, in px.
 
         Raises:
-            RequestError: it is not kept any more, or has no such pixel.
+            RequestError: the result is no longer kept, or has no such pixel.
         """
         sample = self.sample(number)
         height, width = sample.image.shape[:2]
@@ -231,16 +222,14 @@ class Explorer:
     def noise(
         self, image: int, values: Mapping[str, Any], view: View, box: tuple[int, int, int, int]
     ) -> NoiseReport:
-        """The noise in a part of an image, against the truth of its development.
-
-        It is that of ``clpipe measure`` of these parts.
+        """Measure the noise in a part of an image against its truth, like ``clpipe measure``.
 
         Args:
             image, values, view: as for :meth:`develop`.
-            box: left, top, width and height in px; of a mosaic they are made even.
+            box: left, top, width and height in px. For mosaics they are rounded down to even.
 
         Raises:
-            ClpipeError: as of a run; or there is no noise, or the part is none of the image.
+            ClpipeError: the errors of a run, there is no noise, or the part is outside the image.
         """
         loaded, _ = self._loaded(image, values)
         pair = []
@@ -251,10 +240,10 @@ class Explorer:
         return measure(pair[:1], pair[1])
 
     def _loaded(self, image: int, values: Mapping[str, Any]) -> tuple[LoadedImage, Settings]:
-        """An image with its chain, and the settings that are asked for it.
+        """Return an image with its chain, and its settings.
 
         Raises:
-            ClpipeError: it cannot be read, or has no chain with these values.
+            ClpipeError: the image cannot be read, or the values give no valid chain.
         """
         job, request = self.job(image), self.request(values)
         loader = ImageLoader(request).for_job(job)
@@ -263,11 +252,13 @@ class Explorer:
         except (ImageError, MemoryError) as error:
             raise ImageError(loader.error_text(job, error)) from None
         if loaded is None:
-            raise ImageError(f"{job.path}: is not the image that this chain goes on from")
+            raise ImageError(
+                f"{job.path}: this image was not kept before the first step of the chain"
+            )
         return loaded, loaded.chain.settings
 
     def _source(self, image: int, loader: ImageLoader) -> SourceImage:
-        """An image's pixels, decoded once for all settings that read its file in the same way."""
+        """Return the decoded pixels of an image. Settings with the same decoding share them."""
         stamp = stamp_of(self.jobs[image].path)
         key = image, stamp, loader.reads, loader.reads_overscan, loader.settings.dump_format
         return self._sources.get(key, lambda: loader.read(self.jobs[image]))
@@ -275,7 +266,7 @@ class Explorer:
     def _run(
         self, loaded: LoadedImage, view: View, timings: list[Timing] | None
     ) -> tuple[Chain, Result, Sequence[AnyLaunch]]:
-        """The chain of a view, what it makes of an image, and all launches of its plan.
+        """Return the chain of a view, its result, and all launches of its plan.
 
         Raises:
             ClpipeError: the chain has no such step or truth, or the device fails.
@@ -295,7 +286,7 @@ class Explorer:
         return chain, result, runner.plan_for(pixels).launches
 
     def _runner(self, chain: Chain) -> Runner:
-        """A runner of a chain, which shares plans with those before it."""
+        """Return a runner of a chain. It shares plans with earlier runners."""
         encode = chain.result is Kind.DISPLAY
         if encode not in self._runners:
             self._runners[encode] = Runner(
@@ -305,7 +296,7 @@ class Explorer:
 
 
 def _steps(settings: Settings, chain: Chain) -> list[dict[str, Any]]:
-    """All steps, each with its method and the values that its parameters have."""
+    """Return all steps, each with its method and parameter values."""
     resolved = {step.name: step.method for step in chain.steps}
     steps = steps_of(settings)
     for step in steps:
@@ -319,7 +310,7 @@ def _steps(settings: Settings, chain: Chain) -> list[dict[str, Any]]:
 
 
 def _finite(estimates: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
-    """Estimates that JSON can hold."""
+    """Return the finite estimates, which JSON can represent."""
     return {
         step: {name: value for name, value in found.items() if np.isfinite(value)}
         for step, found in estimates.items()
@@ -327,7 +318,7 @@ def _finite(estimates: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str,
 
 
 def _times(launches: Sequence[AnyLaunch], timings: Sequence[Timing]) -> list[dict[str, Any]]:
-    """The launches of a plan, each with its time in ms; None where it was not run again."""
+    """Return the launches of a plan with their times in ms. None marks reused results."""
     seconds: dict[str, list[float]] = {}
     for timing in timings:
         if not timing.transfer:

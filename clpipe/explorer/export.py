@@ -1,4 +1,4 @@
-"""What a page's settings are elsewhere: a configuration, and the commands that use it."""
+"""Export of the settings of a page: a configuration, and commands that use it."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -13,15 +13,15 @@ from clpipe.explorer.explorer import Explorer
 from clpipe.images.pixels import USUAL_MAX_PIXELS
 from clpipe.inputs.find import Job
 
-OUT = "out"  # the output folder of the commands
-SAVED = "camera.toml"  # the name that a configuration is saved under
+OUT = "out"  # the output directory in the commands
+SAVED = "camera.toml"  # the file name of a saved configuration
 
 
 def exported(explorer: Explorer, image: int, values: Mapping[str, Any]) -> dict[str, str]:
-    """Values as texts: "config", "command" for the image alone and "folder" for all beside it.
+    """Return values as texts: "config", "command" for the image, and "folder" for its directory.
 
     Raises:
-        ClpipeError: the values are not allowed.
+        ClpipeError: a value is not allowed.
     """
     request = explorer.request(values)
     steps = request.settings().step_names
@@ -32,7 +32,7 @@ def exported(explorer: Explorer, image: int, values: Mapping[str, Any]) -> dict[
     options, saved = options_of(used), ["-c", SAVED]
     own = saved if options is None else [*loading, *options]
     carries = explorer.goes_on_from_embedded
-    # A configuration stands in place of what a kept image carries, so it must have that, too.
+    # A configuration replaces the settings that a kept image carries, so it must contain them.
     config = explorer.settings(image, values).record() if carries else values
     return {
         "config": config_text(config, files),
@@ -42,25 +42,25 @@ def exported(explorer: Explorer, image: int, values: Mapping[str, Any]) -> dict[
 
 
 def run_command(sources: Sequence[Path], options: list[str]) -> str:
-    """A command of a shell that develops files and folders."""
+    """Return the shell command that develops files and directories."""
     named = [f"./{source}" if str(source).startswith("-") else str(source) for source in sources]
     return shlex.join(["clpipe", "run", *named, "-o", OUT, *options])
 
 
 def inputs_of(jobs: Sequence[Job]) -> list[Path]:
-    """The files and folders that images came from; of a single file, the folder that it is in."""
+    """Return the inputs of images. For a single file, this is its directory."""
     if len(jobs) == 1:
         return [root_of(jobs[0])]
     return list(dict.fromkeys(job.path if job.listed else root_of(job) for job in jobs))
 
 
 def root_of(job: Job) -> Path:
-    """The folder below which an image has its key."""
+    """Return the directory to which the key of an image is relative."""
     return job.path.parents[len(Path(job.key).parts) - 1]
 
 
 def input_of(job: Job) -> Path:
-    """What is given to ``clpipe run`` so that an image has the same key, and so the same noise.
+    """Return the input for ``clpipe run`` with which an image has the same key and noise.
 
     >>> input_of(Job(Path("a/b.exr"), "b.exr")), input_of(Job(Path("a/left/b.exr"), "left/b.exr"))
     (PosixPath('a/b.exr'), PosixPath('a'))
@@ -69,7 +69,7 @@ def input_of(job: Job) -> Path:
 
 
 def options_of(values: Mapping[str, Any]) -> list[str] | None:
-    """Nested values as options of ``clpipe run``; None where these cannot say them.
+    """Return nested values as options of ``clpipe run``. None if options cannot express them.
 
     >>> options_of({"iso": 800.0, "skip": ["gamma"], "denoise": {"method": "mean", "radius": 2}})
     ['--iso', '800', '--skip', 'gamma', '--set', 'denoise.method=mean', '--set', 'denoise.radius=2']
@@ -93,7 +93,7 @@ def options_of(values: Mapping[str, Any]) -> list[str] | None:
 
 
 def _reading(request: Request) -> list[str]:
-    """The options of a request that say how images are read, and where they enter."""
+    """Return the options of a request for reading images and for the ends of the chain."""
     own = {
         "--start-at": request.start_at,
         "--until": request.until,

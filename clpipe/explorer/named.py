@@ -1,4 +1,4 @@
-"""Names of files in settings: a page may use those that the command line named, and no others."""
+"""File names in settings. A page may only use those that the command line named."""
 
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
@@ -11,7 +11,7 @@ from clpipe.chain.registry import all_stages
 
 
 def files_in(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """The names of files in nested values, each after its dotted key; those of draws, too.
+    """Yield the file names in nested values, each with its dotted key. Includes those of draws.
 
     >>> list(files_in({"camera": "a.toml", "iso": 100, "tone_curve": {"path": "b.cube"}}))
     [('camera', 'a.toml'), ('tone_curve.path', 'b.cube')]
@@ -28,7 +28,7 @@ def files_in(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def texts_in(value: Any) -> Iterator[str]:
-    """The texts in a value, however deep."""
+    """Yield the texts in a nested value."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, Mapping):
@@ -39,16 +39,16 @@ def texts_in(value: Any) -> Iterator[str]:
 
 
 def check_named(values: Mapping[str, Any], named: Collection[str]) -> None:
-    """See that values name no files but those in ``named``.
+    """Check that values name only files in ``named``.
 
     Raises:
-        KeyedError: they do.
+        KeyedError: a value names another file.
     """
     for key, name in files_in(values):
         if name not in named:
             what = "a built-in camera or a file" if key == "camera" else "a file"
             raise KeyedError(
                 key,
-                f"{key}: found {name!r}; a page may name {what} that clpipe explore was started "
-                "with, and no other",
+                f"{key}: found {name!r}, but a page may only name {what} from the command line of "
+                "clpipe explore",
             )

@@ -1,4 +1,4 @@
-"""Connections that are not held for ever: who asks nothing whole in time is hung up on."""
+"""HTTP connections with a time limit for each request."""
 
 import asyncio
 from typing import Any
@@ -6,11 +6,11 @@ from typing import Any
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-PATIENCE = 30.0  # s, from the first byte of a question, or from the connection, to its last byte
+PATIENCE = 30.0  # s, from the connection or the first byte of a request to its last byte
 
 
 class ImpatientProtocol(H11Protocol):
-    """HTTP, with a limit of time for each question; uvicorn has none."""
+    """HTTP with a time limit for each request, which uvicorn does not have."""
 
     _limit: asyncio.TimerHandle | None = None
 

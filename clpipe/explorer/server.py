@@ -1,4 +1,4 @@
-"""The page and what it asks for, on this machine alone and below an address that nobody guesses."""
+"""The server of the page. It listens on this machine only, at an address with a random token."""
 
 import json
 import secrets
@@ -38,13 +38,13 @@ from clpipe.explorer.view import View
 from clpipe.images.preview import reduced
 
 HOST = "127.0.0.1"
-LONGEST = 1 << 20  # bytes of a question
-MOST = 1 << 20  # px a side, more than a picture has
+LONGEST = 1 << 20  # bytes of a request
+MOST = 1 << 20  # px, more than the side of an image
 PAGE = "explore.html"
 TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; connect-src 'self'; "
-    "style-src 'self' 'unsafe-inline'; "  # Matplotlib's drawings have styles
+    "style-src 'self' 'unsafe-inline'; "  # Matplotlib's SVGs have styles
     "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
@@ -58,11 +58,11 @@ class Server:
     """Serves an explorer to browsers on this machine.
 
     Args:
-        explorer: what develops.
-        port: 0 takes a free one.
+        explorer: the explorer.
+        port: the port. 0 selects a free one.
 
     Raises:
-        RequestError: the port is in use, or may not be used.
+        RequestError: the port is in use or not permitted.
     """
 
     def __init__(self, explorer: Explorer, port: int = 0) -> None:
@@ -76,7 +76,7 @@ class Server:
         except OSError as error:
             self._socket.close()
             raise RequestError(
-                f"--port {port}: cannot be used: {error.strerror}; choose another, or leave it out"
+                f"--port {port}: cannot be used: {error.strerror}. Choose another, or omit --port"
             ) from None
         self.address = f"http://{HOST}:{self._socket.getsockname()[1]}/{token}/"
         config = uvicorn.Config(
@@ -91,12 +91,12 @@ class Server:
         self._server = uvicorn.Server(config)
 
     def run(self) -> None:
-        """Answer until :meth:`stop`, or Ctrl-C."""
+        """Serve until :meth:`stop` or Ctrl-C."""
         with suppress(KeyboardInterrupt):
             self._server.run(sockets=[self._socket])
 
     def stop(self) -> None:
-        """Have :meth:`run` return."""
+        """Make :meth:`run` return."""
         self._server.should_exit = True
 
     def _app(self, token: str) -> Starlette:
@@ -119,7 +119,7 @@ class Server:
         return Starlette(routes=[Mount(f"/{token}", routes=routes)], middleware=[hosts])
 
     def _start(self, question: Mapping[str, Any]) -> Response:
-        """What does not change: the images, the controls, and the values to begin with."""
+        """Return the constants of a page: images, controls, and initial values."""
         explorer = self._explorer
         device = explorer.device
         return in_json(
@@ -136,9 +136,9 @@ class Server:
         )
 
     def _develop(self, question: Mapping[str, Any]) -> Response:
-        """What is made of an image: facts, and the part of it that is on the screen, made smaller.
+        """Develop an image. Return facts, and the visible part of the image, reduced.
 
-        A browser takes longer to receive a whole picture than clpipe to develop it.
+        Sending the whole image to a browser takes longer than its development.
         """
         sample = self._explorer.develop(*subject(question))
         left, top, width, height, by = whole_numbers(
@@ -151,7 +151,7 @@ class Server:
         return with_pixels(sample.facts, small, place)
 
     def _pixels(self, question: Mapping[str, Any]) -> Response:
-        """Pixels of all that was made."""
+        """Return all pixels of a recent result."""
         (number,) = whole_numbers(question, "number")
         return with_pixels({}, self._explorer.sample(number).shown, {})
 
@@ -170,7 +170,7 @@ class Server:
 
 
 def page_files() -> dict[str, Callable[[Request], Response]]:
-    """What answers with each file of the page, by its path."""
+    """Return the routes of the files of the page, by path."""
     folder = resources.files("clpipe.explorer") / "page"
     return {
         "/" if file.name == PAGE else f"/{file.name}": file_answer(
@@ -181,12 +181,12 @@ def page_files() -> dict[str, Callable[[Request], Response]]:
 
 
 def file_answer(content: bytes, media_type: str) -> Callable[[Request], Response]:
-    """What answers with a file."""
+    """Return a route that serves a file."""
     return lambda _: Response(content, media_type=media_type, headers=HEADERS)
 
 
 def asked(answer: Answer) -> Callable[[Request], Any]:
-    """What answers a question in JSON; errors are JSON, too, with the key that they are about."""
+    """Return a route for requests in JSON. Errors are JSON with the key that they concern."""
 
     async def respond(request: Request) -> Response:
         body = b""
@@ -194,14 +194,14 @@ def asked(answer: Answer) -> Callable[[Request], Any]:
             async for part in request.stream():
                 body += part
                 if len(body) > LONGEST:
-                    return problem(f"the question is longer than {LONGEST} bytes", status=413)
+                    return problem(f"the request is longer than {LONGEST} bytes", status=413)
             question = parse_json(body or b"{}")
             if not isinstance(question, dict):
                 raise ValueError("expected an object")
         except ValueError as error:
-            return problem(f"the question is no JSON: {error}")
+            return problem(f"the request is not valid JSON: {error}")
         except ClientDisconnect:
-            return Response()  # which nobody reads
+            return Response()  # the client has gone
         try:
             return await run_in_threadpool(answer, question)
         except ClpipeError as error:
@@ -211,9 +211,9 @@ def asked(answer: Answer) -> Callable[[Request], Any]:
 
 
 def with_pixels(facts: Mapping[str, Any], pixels: Array, place: Mapping[str, int]) -> Response:
-    """The length of the JSON in four bytes, JSON, and RGB, a byte a channel.
+    """Return the length of the JSON in four bytes, the JSON, and RGB with a byte per channel.
 
-    The JSON has the facts, and as "part" the place of the pixels in the picture and their number.
+    The JSON contains the facts. Its "part" states the position and size of the pixels in the image.
     """
     height, width = pixels.shape[:2]
     part = {**place, "columns": width, "rows": height}
@@ -223,21 +223,21 @@ def with_pixels(facts: Mapping[str, Any], pixels: Array, place: Mapping[str, int
 
 
 def in_json(value: Any, status: int = 200) -> Response:
-    """A value as JSON, in ASCII, since names of files need not be UTF-8."""
+    """Return a value as ASCII JSON, because file names may not be UTF-8."""
     text = json.dumps(value, allow_nan=False)
     return Response(text, status, HEADERS, "application/json")
 
 
 def problem(text: str, key: str = "", status: int = 400) -> Response:
-    """An error as the page shows it."""
+    """Return an error for the page."""
     return in_json({"error": text, "key": key}, status)
 
 
 def subject(question: Mapping[str, Any]) -> tuple[int, Mapping[str, Any], View]:
-    """What a question is about: the image, the values, the view.
+    """Return the image, the values and the view of a request.
 
     Raises:
-        RequestError: it does not say them.
+        RequestError: one is missing or has a wrong type.
     """
     (image,) = whole_numbers(question, "image")
     values, step, truth = (
@@ -246,17 +246,17 @@ def subject(question: Mapping[str, Any]) -> tuple[int, Mapping[str, Any], View]:
         question.get("truth", ""),
     )
     if not isinstance(values, dict) or not isinstance(step, str) or not isinstance(truth, str):
-        raise RequestError("the question says no values, or no view")
+        raise RequestError("the request has no values or no view")
     return image, values, View(step, truth)
 
 
 def whole_numbers(question: Mapping[str, Any], *names: str) -> tuple[int, ...]:
-    """Whole numbers of a question, by their names.
+    """Return integers of a request by their names.
 
     Raises:
-        RequestError: one is missing, or is of another type.
+        RequestError: one is missing or has another type.
     """
     found = tuple(question.get(name) for name in names)
     if not all(type(value) is int for value in found):
-        raise RequestError(f"the question says no whole numbers {', '.join(names)}")
+        raise RequestError(f"the request needs the whole numbers {', '.join(names)}")
     return tuple(value for value in found if isinstance(value, int))

@@ -1,4 +1,4 @@
-"""What is looked at: a result as it is shown, its values, and a part of it as it is measured."""
+"""Views of a result: displayed pixels, values, and parts to measure."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ from clpipe.stage import Kind
 
 @dataclass(frozen=True)
 class View:
-    """What is looked at: the image after a step ("" is the last), or the truth of it.
+    """The image after a step ("" is the last one), or its truth.
 
-    ``truth`` is one of :data:`~clpipe.chain.rendition.PICTURES`, or "" for the noisy picture.
+    ``truth`` is one of :data:`~clpipe.chain.rendition.PICTURES`, or "" for the noisy image.
     """
 
     step: str = ""
@@ -29,10 +29,10 @@ class View:
 
 @dataclass(frozen=True)
 class Sample:
-    """What was made of an image, turned as ``clpipe run`` turns it.
+    """A developed image, oriented like the pictures of ``clpipe run``.
 
-    ``image`` has its values, of which ``unit`` is the unit; ``shown`` is (height, width, 3) uint8,
-    as it is looked at. ``facts`` are what is said of it, as JSON values.
+    ``image`` has the values, in ``unit``. ``shown`` is (height, width, 3) uint8, for display.
+    ``facts`` are JSON values about the image.
     """
 
     image: Array
@@ -50,7 +50,7 @@ UNITS = {
 
 
 def shown_of(chain: Chain, result: Result) -> Array:
-    """A result as eight bits, (height, width, 3)."""
+    """Return a result for display, (height, width, 3) uint8."""
     image = result.image
     if result.encoded is None:
         image = encoded_light(signal_of(image, chain))
@@ -58,7 +58,7 @@ def shown_of(chain: Chain, result: Result) -> Array:
 
 
 def signal_of(image: Floats, chain: Chain) -> Floats:
-    """A result in which 0 is black and 1 is white: a raw in signal, others as they are."""
+    """Return a result scaled to 0 at black and 1 at white. Only raws need scaling."""
     context = chain.context_after
     black, white = context.black_level, context.white_level
     if chain.result is not Kind.RAW or black is None or white is None:
@@ -67,13 +67,13 @@ def signal_of(image: Floats, chain: Chain) -> Floats:
 
 
 def cut(image: Array, box: tuple[int, int, int, int]) -> Array:
-    """A part of an image, from left, top, width and height; of a mosaic, whole 2x2 cells.
+    """Return a part of an image by left, top, width and height. Mosaics keep whole 2x2 cells.
 
     >>> cut(np.arange(12).reshape(3, 4), (1, 0, 3, 3)).tolist()
     [[0, 1], [4, 5]]
 
     Raises:
-        RequestError: it is empty, or not all in the image.
+        RequestError: the part is empty, or not inside the image.
     """
     left, top, width, height = box
     if image.ndim == 2:
@@ -90,7 +90,7 @@ def cut(image: Array, box: tuple[int, int, int, int]) -> Array:
 
 
 def part_as_read(name: str, part: Array, chain: Chain) -> Picture:
-    """A part of a result as it is measured, as if it had been read from a file."""
+    """Return a part of a result to measure, as if read from a file."""
     path, kind, context = Path(name), chain.result, chain.context_after
     if kind is Kind.DISPLAY:
         step = 1 / 255

@@ -52,8 +52,9 @@ def parsed(path: Path) -> Any:
     Raises:
         RequestError: it cannot be read, or is no JSON.
     """
+    text = read_named("--annotations", path, LARGEST)
     try:
-        return parse_json(read_named("--annotations", path, LARGEST))
+        return parse_json(text)
     except ValueError as error:
         raise RequestError(f"--annotations {path}: no valid JSON ({error})") from None
 

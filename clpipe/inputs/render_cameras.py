@@ -58,8 +58,9 @@ def read_views(path: Path) -> list[View]:
         if not views:
             raise RequestError(f"--poses {path}: its images.txt has no image")
         return views
+    text = read_named("--poses", path, MANIFEST_BYTES)
     try:
-        values = parse_json(read_named("--poses", path, MANIFEST_BYTES))
+        values = parse_json(text)
     except ValueError as error:
         raise RequestError(
             f"--poses {path}: no valid JSON ({error}); it is a cameras.json, a transforms.json, or "

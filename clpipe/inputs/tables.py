@@ -117,6 +117,8 @@ def _from_json(line: str, check_column: Callable[[str], None]) -> dict[str, Any]
     except json.JSONDecodeError as error:
         message = f"not valid JSON: {error.msg} at character {error.colno}"
         raise RequestError(message) from None
+    except RequestError:
+        raise
     except (ValueError, RecursionError) as error:
         raise RequestError(f"not valid JSON: {error}") from None
     if not isinstance(row, dict):

@@ -81,16 +81,20 @@ def first_place(pattern: str, orientation: int, size: int) -> tuple[int, int] | 
 
 @dataclass(frozen=True)
 class Patches:
-    """Which patches are cut of each picture.
+    """The patches to cut from each picture.
+
+    >>> from clpipe import Patches
+    >>> Patches(128, per_image=4, augment=True)
+    Patches(size=128, per_image=4, augment=True)
 
     Args:
-        size: of their sides, in px.
-        per_image: how many, at random places; "grid" is all side by side that cover the picture
-            (but for a last odd column or row), the last ones overlapping.
-        augment: whether they are flipped and turned by 90 degrees, at random.
+        size: the side of a patch, in px.
+        per_image: the number of patches, at random places. "grid" is the smallest grid that covers
+            the picture, except an odd last column or row. Its last patches overlap.
+        augment: whether patches are flipped and rotated by 90 degrees at random.
 
     Raises:
-        RequestError: there would be none.
+        RequestError: a number is below 1.
     """
 
     size: int

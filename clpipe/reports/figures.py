@@ -1,4 +1,4 @@
-"""The figures of a run: what became of its images, how long it took, and what was drawn."""
+"""Figures of a run: outcomes of images, times, and drawn values."""
 
 import math
 from collections import Counter
@@ -14,43 +14,43 @@ from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS
 from clpipe.engine.clipping import MUCH
 from clpipe.reports.run import Made, Run
 
-TIMES = 60  # pieces of a run's time, at most
+TIMES = 60  # intervals of a run, at most
 DISTINCT = 12  # values of a parameter that are listed
 
 
 @dataclass(frozen=True)
 class Session:
-    """One start of the program, by its log: the lines of its images and its end."""
+    """One start of the program, from its log: the lines of images and of the end."""
 
     start: Mapping[str, Any]
     images: Sequence[Mapping[str, Any]]
-    end: Mapping[str, Any]  # empty where it was cut off
+    end: Mapping[str, Any]  # empty if the log has no end
 
     @property
     def command(self) -> Sequence[str]:
-        """The words of the command."""
+        """The arguments of the command."""
         words = self.start.get("arguments")
         return [str(word) for word in words] if isinstance(words, list) else []
 
     @property
     def state(self) -> str:
-        """How it ended, in a word."""
+        """How the session ended."""
         if not self.end:
-            return "cut off, or still going"
+            return "killed, or still running"
         return "interrupted" if self.end.get("interrupted") else "finished"
 
     def count(self, status: str) -> int:
-        """How many images have a status."""
+        """Return the number of images with a status."""
         return sum(line.get("status") == status for line in self.images)
 
     @cached_property
     def megapixels(self) -> float:
-        """Of what was done."""
+        """The megapixels of finished images."""
         return sum(number(line.get("megapixels")) for line in self.images)
 
     @cached_property
     def seconds(self) -> float:
-        """From the start to the end, or to the last image that was begun."""
+        """The time from the start to the end, or to the start of the last image."""
         if self.end:
             return number(self.end.get("seconds"))
         moments = [moment(line) for line in self.images]
@@ -58,14 +58,14 @@ class Session:
 
     @property
     def speed(self) -> float:
-        """In MP/s; 0 where nothing was done."""
+        """The speed in MP/s. 0 without finished images."""
         return self.megapixels / self.seconds if self.seconds > 0 else 0.0
 
     def pace(self) -> list[dict[str, float]]:
-        """How fast it was over its time: seconds since the start, MP/s, and shares of the steps.
+        """Return the progress: seconds since the start, MP/s, and time shares of the steps.
 
-        An image counts where the last of its steps ends, as near as the log tells: when it was
-        begun, and the time of its steps. Where none ends, there are no shares.
+        An image counts in the interval in which its last step ends. This is its start plus the time
+        of its steps. Intervals in which no image ends have no shares.
         """
         done = [line for line in self.images if line.get("status") == DONE]
         begun, length = moment(self.start), self.seconds
@@ -89,7 +89,7 @@ class Session:
 
 
 def sessions(logs: Iterable[Mapping[str, Any]]) -> list[Session]:
-    """The starts of the program that logs tell of, in the order of the lines."""
+    """Return the sessions in logs, in the order of the lines."""
     found: list[Session] = []
     images: list[Mapping[str, Any]] = []
     for line in logs:
@@ -105,7 +105,7 @@ def sessions(logs: Iterable[Mapping[str, Any]]) -> list[Session]:
 
 
 def number(value: Any) -> float:
-    """A value as a number; what is none, or not finite, counts as 0."""
+    """Return a value as a float. It is 0 for other types and values that are not finite."""
     try:
         found = float(value) if isinstance(value, int | float) else 0.0
     except OverflowError:
@@ -114,7 +114,7 @@ def number(value: Any) -> float:
 
 
 def moment(line: Mapping[str, Any]) -> float:
-    """When a line of a log was, in seconds since 1970; 0 where it does not say."""
+    """Return the time of a log line in seconds since 1970. It is 0 if absent."""
     try:
         return datetime.fromisoformat(str(line.get("at"))).timestamp()
     except ValueError:
@@ -122,9 +122,9 @@ def moment(line: Mapping[str, Any]) -> float:
 
 
 def last_failures(found: Sequence[Session]) -> list[str]:
-    """The errors of images that failed and were not done since.
+    """Return the errors of images that failed and were not finished later.
 
-    An image is told by where its pictures are: a series makes several of one input.
+    Images are identified by their output path, because a series makes several of one input.
     """
     errors: dict[str, str] = {}
     for session in found:
@@ -138,26 +138,26 @@ def last_failures(found: Sequence[Session]) -> list[str]:
 
 
 def totals(run: Run, found: Sequence[Session]) -> list[tuple[str, str]]:
-    """The figures that stand on top, by their names; the last run is one that made pictures."""
+    """Return the figures of the summary by name. The last run is the last that made images."""
     pictures = run.pictures
     others = len(run.made) - len(pictures)
     megapixels = sum(number(p.value("width")) * number(p.value("height")) for p in pictures) / 1e6
     last = next((session for session in reversed(found) if session.count(DONE)), None)
     rows = [
-        ("pictures", f"{len(pictures):,}"),
-        ("truths, frames, baselines", f"{others:,}"),
-        ("megapixels", f"{megapixels:,.1f}"),
-        ("failed", f"{len(last_failures(found)):,}"),
+        ("Images", f"{len(pictures):,}"),
+        ("Truths, frames, baselines", f"{others:,}"),
+        ("Megapixels", f"{megapixels:,.1f}"),
+        ("Failed", f"{len(last_failures(found)):,}"),
     ]
     if last:
         left_out = last.count(LEFT_OUT)
-        rows += [("left out", f"{left_out:,}")] if left_out else []
+        rows += [("Left out", f"{left_out:,}")] if left_out else []
         if last.seconds > 0:
-            rows.append(("time of the last run", duration(last.seconds)))
+            rows.append(("Time of the last run", duration(last.seconds)))
         if last.speed:
-            rows.append(("speed of the last run", f"{last.speed:.3g} MP/s"))
+            rows.append(("Speed of the last run", f"{last.speed:.3g} MP/s"))
         if peak := number(last.end.get("peak_memory")):
-            rows.append(("most memory", in_words(peak)))
+            rows.append(("Peak memory", in_words(peak)))
     return rows
 
 
@@ -167,16 +167,16 @@ class Parameter:
 
     name: str
     values: Counter[Any]  # JSON values, lists as their text
-    is_asked: bool = True  # whether it was drawn, or set for images alone; else it follows
+    is_asked: bool = True  # drawn, or set for single images; else derived
 
     @property
     def varies(self) -> bool:
-        """Whether pictures differ in it."""
+        """Whether the value differs between pictures."""
         return len(self.values) > 1
 
     @property
     def numbers(self) -> list[float]:
-        """All values that are numbers, each as often as it occurs."""
+        """All numeric values, each as often as it occurs."""
         return [
             float(value)
             for value, count in self.values.items()
@@ -186,7 +186,7 @@ class Parameter:
 
     @property
     def text(self) -> str:
-        """The value, or what values there are."""
+        """The value, or the list or range of values."""
         numbers = self.numbers
         if len(self.values) > DISTINCT and len(numbers) == self.values.total():
             return f"{min(numbers):.6g} to {max(numbers):.6g}"
@@ -198,13 +198,13 @@ class Parameter:
 
 
 def plain(value: Any) -> int | float | str | None:
-    """A value of a sidecar that can be counted and ordered; what is none is its text."""
+    """Return a value of a sidecar that can be counted and sorted. Other types become text."""
     is_plain = isinstance(value, str | None) or value == number(value)
     return value if is_plain else str(value)
 
 
 def text_of(value: Any) -> str:
-    """A value of a sidecar for people."""
+    """Return a value of a sidecar as readable text."""
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: "-"}[value]
     return f"{value:.6g}" if isinstance(value, float) else one_line(str(value))
@@ -212,23 +212,23 @@ def text_of(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Step:
-    """A step of the chains of a run: its methods, and the values of their parameters."""
+    """A step of the chains of a run, with its methods and parameter values."""
 
     name: str
     methods: Counter[str]
     parameters: Sequence[Parameter]
-    pictures: int  # that have it
+    pictures: int  # with this step
 
     @property
     def is_idle(self) -> bool:
-        """Whether it does nothing to any picture."""
+        """Whether the step changes no picture."""
         return set(self.methods) == {"none"}
 
 
 def steps_of(pictures: Sequence[Made]) -> list[Step]:
-    """The steps of the chains of pictures, in the order of the longest chain."""
+    """Return the steps of the chains of pictures, in the order of the longest chain."""
     order: list[str] = []
-    records: dict[int, Mapping[str, Any]] = {}  # steps that are alike are the same object
+    records: dict[int, Mapping[str, Any]] = {}  # equal steps are the same object
     counts: Counter[int] = Counter()
     for made in pictures:
         ids = [id(step) for step in made.steps]
@@ -244,7 +244,7 @@ def steps_of(pictures: Sequence[Made]) -> list[Step]:
 
 
 def _step(name: str, counted: Sequence[tuple[Mapping[str, Any], int]]) -> Step:
-    """A step, from how often each record of it occurs."""
+    """Return a step, from its records and their counts."""
     methods: Counter[str] = Counter()
     values: dict[str, Counter[Any]] = {}
     for record, count in counted:
@@ -257,7 +257,7 @@ def _step(name: str, counted: Sequence[tuple[Mapping[str, Any], int]]) -> Step:
 
 
 def drawn(pictures: Sequence[Made], steps: Sequence[Step]) -> list[Parameter]:
-    """What differs from picture to picture: camera, ISO, noise and parameters."""
+    """Return what varies between pictures: camera, ISO, noise and parameters."""
     asked: set[str] = set().union(*(made.value("asked") or () for made in pictures))
     cameras = Counter(text_of(made.value("camera")) for made in pictures)
     isos = Counter(round(number(made.value("iso"))) for made in pictures)
@@ -282,13 +282,13 @@ def drawn(pictures: Sequence[Made], steps: Sequence[Step]) -> list[Parameter]:
 
 
 def warnings_of(made: Made) -> list[str]:
-    """The warnings of a picture."""
+    """Return the warnings of a picture."""
     found = made.value("warnings")
     return [str(each) for each in found] if isinstance(found, list) else []
 
 
 def oddities(made: Made) -> list[str]:
-    """What is unusual with a picture: files that are gone or changed, clipping, warnings."""
+    """Return what is unusual in a picture: missing or changed files, clipping, warnings."""
     found = [blob.problem for blob in made.files.values() if blob.problem]
     clipped = number(made.value("clipped"))
     if clipped >= MUCH:

@@ -1,4 +1,4 @@
-"""The noise of pictures against their truth, and against the law that was asked."""
+"""The noise of images, measured against their truth and compared with the noise model."""
 
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -19,14 +19,14 @@ from clpipe.reports.figures import number
 from clpipe.reports.run import Blob, Made, Run
 from clpipe.reports.shown import checked, picture_file
 
-JUDGED = 12  # images whose raw is held against the law
+JUDGED = 12  # raws that are compared with the noise model
 LIMIT = 5.0  # standard errors
-NORMALIZED = "normalize.exr"  # the mosaic in signal, as the law is
+NORMALIZED = "normalize.exr"  # the mosaic in signal units
 
 
 @dataclass(frozen=True)
 class Law:
-    """The variance of one raw, as measured and as asked: a y + b."""
+    """The variance a y + b of one raw, as measured and from the noise model."""
 
     name: str
     measured: VarianceLaw
@@ -36,7 +36,7 @@ class Law:
 
     @property
     def errors(self) -> float:
-        """By how many standard errors the further of the two is away."""
+        """The larger deviation of a and b, in standard errors."""
         return max(
             abs(self.measured.a - self.asked_a) / max(self.measured.a_error, 1e-30),
             abs(self.measured.b - self.asked_b) / max(self.measured.b_error, 1e-30),
@@ -44,19 +44,19 @@ class Law:
 
     @property
     def svg(self) -> str:
-        """The raw, drawn."""
-        title = f"Variance by intensity of {self.name}, and the law that was asked"
+        """A plot of the variance of the raw."""
+        title = f"Variance by intensity of {self.name}, and the noise model"
         return law_svg(self.report, self.asked_a, self.asked_b, title)
 
     @property
     def leaves(self) -> bool:
-        """Whether the raw leaves the law."""
+        """Whether the raw deviates from the model."""
         return self.errors > LIMIT
 
 
 @dataclass(frozen=True)
 class Noise:
-    """The noise of one picture, measured and drawn."""
+    """The measured noise of one picture, with a plot."""
 
     name: str
     against: str
@@ -66,15 +66,15 @@ class Noise:
 
     @property
     def channels(self) -> Mapping[str, Channel]:
-        """The noise of each channel, by its name."""
+        """The noise of each channel by name."""
         return {one.name: one for one in self.report.channels}
 
 
 def measured(files: Sequence[Blob]) -> NoiseReport:
-    """The noise of the first file against the second.
+    """Measure the noise of the first file against the second.
 
     Raises:
-        ClpipeError: they cannot be read or compared.
+        ClpipeError: the files cannot be read or compared.
     """
     with ExitStack() as stack:
         paths = []
@@ -90,13 +90,13 @@ def measured(files: Sequence[Blob]) -> NoiseReport:
 
 
 def noises(run: Run, pictures: Sequence[Made], problems: list[str], most: int) -> list[Noise]:
-    """The noise of some pictures against the truth of their development, where there is one.
+    """Measure the noise of pictures against their development truth.
 
     Args:
-        run: that they are of.
-        pictures: the first of them with a truth are measured.
-        problems: gets what cannot be measured, and why.
-        most: how many are.
+        run: the run of the pictures.
+        pictures: the first ones with a truth are measured.
+        problems: gets the errors of measurements.
+        most: the number of pictures to measure.
     """
     found: list[Noise] = []
     for made in pictures:
@@ -115,9 +115,9 @@ def noises(run: Run, pictures: Sequence[Made], problems: list[str], most: int) -
 
 
 def laws(run: Run, problems: list[str]) -> list[Law]:
-    """Raws against the law that was asked, where the mosaic after normalize and its truth are kept.
+    """Compare raws with the noise model. Needs kept mosaics after normalize, and their truth.
 
-    The law is that of all four sites together, as ``clpipe measure`` fits it.
+    The fit is over all four CFA sites together, like in ``clpipe measure``.
     """
     found = []
     pictures = [made for made in run.pictures if NORMALIZED in made.files]
@@ -127,7 +127,7 @@ def laws(run: Run, problems: list[str]) -> list[Law]:
         asked = made.value("noise", "signal")
         is_known = truth and "exr" in truth.files and isinstance(asked, dict)
         if not truth or not is_known or parameters_of(made, "prnu").get("sigma"):
-            continue  # PRNU is no line over intensity
+            continue  # with PRNU the variance is not linear in the intensity
         try:
             report = measured([made.files[NORMALIZED], truth.files["exr"]])
         except ClpipeError as error:
@@ -142,7 +142,7 @@ def laws(run: Run, problems: list[str]) -> list[Law]:
 
 
 def parameters_of(made: Made, step: str) -> Mapping[str, Any]:
-    """The parameters of a step of a picture's chain; none where it has no such step."""
+    """Return the parameters of a step of a picture's chain. Empty without the step."""
     for each in made.steps:
         if each.get("name") == step:
             parameters = each.get("parameters")
@@ -151,10 +151,10 @@ def parameters_of(made: Made, step: str) -> Mapping[str, Any]:
 
 
 def other_noise(made: Made) -> float:
-    """The variance that a mosaic has besides that of shot and read noise, in signal squared.
+    """Return the variance of a mosaic besides shot and read noise, in squared signal.
 
-    It is that of rows, columns and dark signals, and of rounding to whole DN: 1/12 of their square,
-    twice, since the truth is rounded as well.
+    It contains row noise, column noise, DSNU and rounding to DN. Rounding adds 1/12 DN² twice,
+    because the truth is rounded as well.
     """
     lines = ("row_noise", "column_noise", "dsnu")
     variance = sum(number(parameters_of(made, step).get("sigma")) ** 2 for step in lines)

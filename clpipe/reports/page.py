@@ -1,4 +1,4 @@
-"""One HTML file of one or two runs: everything is in it, so that it opens without a network."""
+"""The HTML file of one or two runs. It is self-contained and needs no network."""
 
 import json
 import shlex
@@ -23,42 +23,42 @@ from clpipe.reports.shown import BUDGET, Budget, Large, add_stages, chosen, cont
 TEMPLATES = Path(__file__).parent / "page"
 LISTED = 40  # failures, warnings, problems
 HISTOGRAMS = 12
-BARS = 8  # values that are drawn as bars
+BARS = 8  # distinct values of a bar chart
 SHEET_SHARE = 0.45  # of the budget, for contact sheets
-STAGED = 2  # images whose kept stages are shown large
-DRAWN = 3  # pictures whose noise is drawn
-SESSIONS = 12  # starts of the program, the latest
+STAGED = 2  # images whose kept stages can be compared
+DRAWN = 3  # pictures whose noise is plotted
+SESSIONS = 12  # the latest starts of the program
 
-# Of real cameras' own pictures at native size, a 5D Mark III's and a D800's at ISO 1600 and 3200
-# (Nam et al., CVPR 2016), measured by clpipe.analysis.signature; see docs/validation.md: the share
-# of luma's variance that averaging 2x2 leaves, and luma's correlation one pixel to the right.
+# The share of luma variance that 2x2 averaging leaves, and the luma correlation of horizontal
+# neighbours. The source is JPEGs of a 5D Mark III and a D800 at native size, ISO 1600 and 3200 (Nam
+# et al., CVPR 2016), measured by clpipe.analysis.signature. See docs/validation.md.
 REAL_LEFT = (0.57, 0.63)
 REAL_RIGHT = (0.51, 0.59)
-REAL_EDGES = (1.1, 2.4)  # luma noise where they are steepest over where they are flattest
+REAL_EDGES = (1.1, 2.4)  # luma noise of the steepest areas over that of the flattest
 
 
 @dataclass(frozen=True)
 class Listed:
-    """Texts, of which only the first are shown."""
+    """A list of texts. Only the first ones are shown."""
 
     shown: Sequence[str]
-    more: int  # different ones
+    more: int  # distinct texts that are not shown
     total: int
 
 
 def listed(texts: Sequence[str]) -> Listed:
-    """Texts, at most so many as are read; those that are equal are one."""
+    """Return texts for display. Equal texts are merged, and the list is limited."""
     counted = Counter(texts)
     lines = [text + (f" ({n:,} times)" if n > 1 else "") for text, n in counted.items()]
     return Listed(lines[:LISTED], max(len(lines) - LISTED, 0), len(texts))
 
 
 def html(runs: Sequence[Run], tell: Callable[[str], None] = lambda _: None) -> str:
-    """The report of a run, or of two runs beside each other.
+    """Return the report of a run, or a comparison of two runs.
 
     Args:
-        runs: one or two.
-        tell: is called with what is done next, in words.
+        runs: one or two runs.
+        tell: called with a description of the next step.
     """
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
@@ -74,12 +74,12 @@ def html(runs: Sequence[Run], tell: Callable[[str], None] = lambda _: None) -> s
     steps = [figures.steps_of(run.pictures) for run in runs]
     drawn = figures.drawn(first.pictures, steps[0]) if not others else []
     problems = [text for run in runs for text in run.problems]
-    tell("noise of raws")
+    tell("noise of raw mosaics")
     judged = [law for run in runs for law in laws(run, problems)]
     picked = chosen(first, {law.name for law in judged if law.leaves})
     typical = sorted(picked, key=lambda made: bool(figures.oddities(made)))
     budget = Budget(BUDGET)
-    tell("noise of pictures")
+    tell("noise of images")
     noise = [
         (label, each)
         for label, run in zip(labels, runs, strict=True)
@@ -97,7 +97,7 @@ def html(runs: Sequence[Run], tell: Callable[[str], None] = lambda _: None) -> s
     entries = [entry for sheet in sheets for entry in sheet.entries]
     found_large = []
     for i, made in enumerate(picked, 1):
-        tell(f"large picture {i} of {len(picked)}")
+        tell(f"comparison {i} of {len(picked)}")
         found_large.append((made, large(runs, labels, made, budget, problems)))
     tell("figures")
     shown = [each for _, each in found_large if each]
@@ -160,7 +160,7 @@ def visible(value: Any) -> Any:
 
 
 def labels_of(runs: Sequence[Run]) -> list[str]:
-    """What tells the runs apart: the names of their folders, or their paths; "" of a single one."""
+    """Return unique labels of runs: directory names or paths. The label of a single run is ""."""
     if len(runs) == 1:
         return [""]
     names = [run.folder.resolve().name for run in runs]
@@ -168,17 +168,17 @@ def labels_of(runs: Sequence[Run]) -> list[str]:
 
 
 def same(run: Run, pictures: Sequence[Made]) -> list[Made]:
-    """The pictures of a run with the names of those of another."""
+    """Return the pictures of a run that have the names of given pictures."""
     return [own for made in pictures if (own := run.picture_beside(made))]
 
 
 def warnings(run: Run) -> list[str]:
-    """The warnings of all pictures, with their names."""
+    """Return the warnings of all pictures, with their names."""
     return [f"{made.name}: {text}" for made in run.pictures for text in figures.warnings_of(made)]
 
 
 def differences(first: Sequence[Step], second: Sequence[Step]) -> list[tuple[str, str, str]]:
-    """What the chains of two runs differ in: methods and values, by their names."""
+    """Return the differences between the chains of two runs: methods and values by name."""
     tables = []
     for steps in (first, second):
         rows = {f"{step.name}.method": ", ".join(step.methods) for step in steps}
@@ -193,7 +193,7 @@ def differences(first: Sequence[Step], second: Sequence[Step]) -> list[tuple[str
 
 
 def script_json(value: Any) -> str:
-    """JSON that can stand in a ``<script>``, whatever its texts hold."""
+    """Return JSON that is safe inside a ``<script>`` element."""
     text = json.dumps(visible(value), separators=(",", ":"))
     for character in "<>&\u2028\u2029":
         text = text.replace(character, f"\\u{ord(character):04x}")
@@ -201,7 +201,7 @@ def script_json(value: Any) -> str:
 
 
 def view_record(each: Large) -> Mapping[str, Any]:
-    """What the script needs of a large picture."""
+    """Return the data of an image for the comparison script."""
     return {
         "name": each.name,
         "width": each.width,
@@ -213,7 +213,7 @@ def view_record(each: Large) -> Mapping[str, Any]:
 
 
 def session_row(session: Session) -> Mapping[str, str]:
-    """A start of the program, as a row of a table."""
+    """Return a session as a row of the table."""
     return {
         "command": shlex.join(["clpipe", *session.command]),
         "at": str(session.start.get("at", ""))[:19].replace("T", " "),
@@ -227,7 +227,7 @@ def session_row(session: Session) -> Mapping[str, str]:
 
 
 def pace_drawings(found: Sequence[Session]) -> list[str]:
-    """How fast the last run with pictures was, and its steps' shares, over its time."""
+    """Return plots of the speed and the time shares of the last run with images."""
     for session in reversed(found):
         rows = session.pace()
         if len(rows) < 3:
@@ -237,22 +237,22 @@ def pace_drawings(found: Sequence[Session]) -> list[str]:
         told = [row for row in rows if STEPS[0] in row]
         told_x = [row["seconds"] for row in told]
         shares = {step: [row[step] for row in told] for step in STEPS}
-        label = "seconds since the start"
+        label = "time since the start, s"
         return [
-            lines_svg(x, speed, (label, "MP/s"), "Speed over the time of the run"),
-            shares_svg(told_x, shares, label, "Shares of the steps over the time of the run"),
+            lines_svg(x, speed, (label, "MP/s"), "Speed during the run"),
+            shares_svg(told_x, shares, label, "Time shares of the steps during the run"),
         ]
     return []
 
 
 def machine_facts(pictures: Sequence[Made]) -> list[tuple[str, str]]:
-    """On what pictures were made, and with which versions."""
+    """Return the devices and versions that made the pictures."""
     rows: dict[str, dict[str, None]] = {}
     for made in pictures:
         device = made.value("device")
         if isinstance(device, Mapping):
             text = f"{device.get('name')}, {device.get('version')}"
-            rows.setdefault("device", {})[text] = None
+            rows.setdefault("Device", {})[text] = None
         versions = made.value("versions")
         said = versions if isinstance(versions, Mapping) else {}
         for name, version in {"clpipe": made.value("clpipe"), **said}.items():
@@ -261,7 +261,10 @@ def machine_facts(pictures: Sequence[Made]) -> list[tuple[str, str]]:
 
 
 def drawings_of(drawn: Sequence[Parameter]) -> list[tuple[Parameter, str]]:
-    """What differs; what was asked has a histogram, or bars where there are few values."""
+    """Return varying parameters with plots: a histogram, or bars for few distinct values.
+
+    Derived parameters have no plot.
+    """
     found: list[tuple[Parameter, str]] = []
     for fact in drawn:
         numbers = fact.numbers

@@ -1,5 +1,4 @@
-"""What an output folder has: its pictures by their sidecars, in the folder and in its tars, and its
-logs."""
+"""The contents of an output directory: pictures from sidecars in it and in its tars, and logs."""
 
 import os
 import tarfile
@@ -18,30 +17,30 @@ from clpipe.chain.rendition import Rendition
 from clpipe.outputs.sidecar import SIDECAR, SidecarError, outputs_in, values_in
 
 TAR = ".tar"
-# What is kept of sidecars, of which there may be hundreds of thousands.
+# The values of sidecars to keep. There may be hundreds of thousands of sidecars.
 KEYS = (
     *("clpipe", "sha256", "iso", "camera", "lens", "width", "height", "noise", "clipped"),
     "warnings",
 )
-ALIKE = ("device", "versions")  # which most of them share
+ALIKE = ("device", "versions")  # equal in most sidecars
 LOGS = "run*.jsonl"
 
 
 @dataclass(frozen=True, slots=True)
 class Blob:
-    """A file, or a member of a tar, and what its sidecar says of it."""
+    """A file or a member of a tar, and its record in the sidecar."""
 
     path: str
-    name: str  # below the output folder; of a member, behind the tar's
+    name: str  # relative to the output directory; for members, after the name of the tar
     said: Mapping[str, Any]  # its size and SHA-256
-    offset: int | None = None  # of a tar's member
-    size: int = -1  # that it has; -1: there is none
+    offset: int | None = None  # of a member in its tar
+    size: int = -1  # the actual size; -1 is a missing file
 
     def read(self) -> bytes:
-        """The bytes.
+        """Return the bytes.
 
         Raises:
-            OSError: they cannot be read.
+            OSError: the file cannot be read.
         """
         with open(self.path, "rb") as file:
             file.seek(self.offset or 0)
@@ -49,9 +48,9 @@ class Blob:
 
     @property
     def problem(self) -> str:
-        """What is wrong with it, as far as its size tells; "" is nothing."""
+        """The problem of the file according to its size, or ""."""
         if self.size < 0:
-            return f"{self.name}: is gone"
+            return f"{self.name}: is missing"
         if self.size != self.said["size"]:
             return f"{self.name}: has {self.size} bytes, not the {self.said['size']} of its sidecar"
         return ""
@@ -59,16 +58,16 @@ class Blob:
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """One picture of a run, by its sidecar: of an image, a frame, a truth, a baseline."""
+    """One picture of a run, from its sidecar: an image, a frame, a truth or a baseline."""
 
-    image: str  # the name of what it was made of, without ending; with folders of a series
+    image: str  # the name of its input without extension, with directories of a series
     rendition: Rendition
-    record: dict[str, Any]  # what is needed of the sidecar, in which what is alike is one
-    files: Mapping[str, Blob]  # by what is behind the picture's name: "jpg", "demosaic.exr"
+    record: dict[str, Any]  # the needed part of the sidecar; equal parts are shared
+    files: Mapping[str, Blob]  # by suffix: "jpg", "demosaic.exr"
 
     @property
     def name(self) -> str:
-        """The name of the picture, without ending."""
+        """The name of the picture without extension."""
         return self.image + self.rendition.suffix
 
     @property
@@ -78,7 +77,7 @@ class Made:
         return found
 
     def value(self, *keys: str) -> Any:
-        """A value of the sidecar, by the keys on the way to it; None where it is not there."""
+        """Return a value of the sidecar by nested keys. None if absent."""
         found: Any = self.record
         for key in keys:
             found = found.get(key) if isinstance(found, dict) else None
@@ -87,7 +86,7 @@ class Made:
 
 @dataclass
 class Run:
-    """An output folder."""
+    """The contents of an output directory."""
 
     folder: Path
     made: list[Made] = field(default_factory=list)
@@ -96,15 +95,15 @@ class Run:
 
     @property
     def pictures(self) -> Sequence[Made]:
-        """The pictures themselves, in the order of their names; first frames of bursts."""
+        """The noisy pictures in the order of their names. Bursts count with the first frame."""
         return [each for each in self.made if each.rendition.is_first]
 
     def of_image(self, image: str) -> Mapping[Rendition, Made]:
-        """All pictures of an image, by their rendition."""
+        """Return all pictures of an image by rendition."""
         return self._by_image.get(image, {})
 
     def picture_beside(self, other: Made) -> Made | None:
-        """The picture of another one's image at its exposure, or its first frame."""
+        """Return the picture, or first frame, with the image and exposure of another one."""
         return next(
             (
                 made
@@ -119,7 +118,7 @@ class Run:
         self._alike: dict[str, Any] = {}
 
     def slim(self, record: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what is kept of a sidecar. Machines and steps that are alike become one object."""
+        """Return the values of a sidecar to keep. Equal devices and steps become one object."""
         steps = record.get("stages")
         steps = steps if isinstance(steps, list) else []
         asked, one = asked_in(record.get("request")), self._alike.setdefault
@@ -136,7 +135,7 @@ class Run:
 
 
 def asked_in(request: Any) -> frozenset[str]:
-    """The values that a sidecar's request draws, or has for its image alone; others follow.
+    """Return the names of values that a request draws, or sets for its image only.
 
     >>> config = {"iso": {"choice": [100, 200]}, "denoise": {"luma_strength": 1}}
     >>> sorted(asked_in({"config": config, "image": {"x": {"y": 2}}}))
@@ -157,13 +156,13 @@ def asked_in(request: Any) -> frozenset[str]:
 
 
 def read_run(folder: Path) -> Run:
-    """What an output folder has, finished or not.
+    """Read an output directory of a finished or unfinished run.
 
     Raises:
-        RequestError: it is no folder, or has no sidecar of clpipe's.
+        RequestError: it is not a directory, or has no sidecars or logs of clpipe.
     """
     if not folder.is_dir():
-        raise RequestError(f"{folder}: it is no folder; name the output folder of a run")
+        raise RequestError(f"{folder}: it is not a directory. Name the output directory of a run")
     run = Run(folder)
     found = sorted(_in_folder(run), key=lambda made: (made.image, made.rendition.suffix))
     for made in found:
@@ -175,14 +174,14 @@ def read_run(folder: Path) -> Run:
             run.problems.append(f"{path.name}: cannot be read: {error}")
     if not run.made and not run.logs:
         raise RequestError(
-            f"{folder}: has no picture of clpipe's with its sidecar (NAME.json), and no log "
-            "(run.jsonl); name the output folder of clpipe run"
+            f"{folder}: has no picture of clpipe with its sidecar (NAME.json), and no log "
+            "(run.jsonl). Name the output directory of clpipe run"
         )
     return run
 
 
 def _in_folder(run: Run) -> Iterator[Made]:
-    """The pictures of a folder, and of the tars in it."""
+    """Yield the pictures of the output directory and of its tars."""
     for place, folders, names in os.walk(run.folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         below = Path(place).relative_to(run.folder).as_posix()
@@ -203,7 +202,7 @@ def _in_folder(run: Run) -> Iterator[Made]:
 
 
 def _files(folder: str, below: str) -> dict[str, Blob]:
-    """A folder's files by their names."""
+    """Return the files of a directory by name."""
     with os.scandir(folder) as entries:
         return {
             entry.name: Blob(entry.path, _joined(below, entry.name), {}, None, entry.stat().st_size)
@@ -213,7 +212,7 @@ def _files(folder: str, below: str) -> dict[str, Blob]:
 
 
 def _in_tar(run: Run, path: Path) -> Iterator[Made]:
-    """The pictures of a tar."""
+    """Yield the pictures of a tar."""
     label = path.relative_to(run.folder).as_posix()
     beside: dict[str, dict[str, Blob]] = defaultdict(dict)  # by folder and name
     sidecars: list[tuple[str, str, bytes]] = []
@@ -240,14 +239,14 @@ def _in_tar(run: Run, path: Path) -> Iterator[Made]:
 def _made(
     run: Run, below: str, name: str, data: bytes, beside: Mapping[str, Blob]
 ) -> Iterator[Made]:
-    """The picture of a sidecar; nothing of what is none of clpipe's or is damaged.
+    """Yield the picture of a sidecar, unless the sidecar is damaged or not from clpipe.
 
     Args:
         run: gets the problem.
-        below: the sidecar's folder, below the output folder or in the tar.
-        name: of its file.
+        below: the directory of the sidecar, relative to the output directory or the tar.
+        name: the file name of the sidecar.
         data: its bytes.
-        beside: the files of its folder by their names.
+        beside: the files of the directory by name.
     """
     try:
         record = values_in(data, _joined(below, name))

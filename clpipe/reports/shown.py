@@ -1,4 +1,4 @@
-"""The pictures that a report holds, within a budget: small ones of many, large ones of a few."""
+"""The images in a report, within a size budget: many thumbnails, and a few for comparison."""
 
 import base64
 import hashlib
@@ -23,25 +23,25 @@ from clpipe.reports.figures import number, oddities
 from clpipe.reports.run import Blob, Made, Run
 
 BUDGET = 14 << 20  # bytes of the whole page
-SMALL = 160  # px, the longer side of a picture on the contact sheet
-SMALL_PIXELS = 4e9  # of the pictures that the contact sheet reads: a minute of one processor
-TOGETHER = 64  # small pictures that are made at a time
-CHOSEN = 8  # images that are shown large
-LARGE = 1_200_000  # px, of a picture that is shown large; one that has more is reduced
-CROP = 320, 240  # px, width and height of what is kept as it is of a picture that is reduced
-TRUE_QUALITY, REDUCED_QUALITY = 93, 85  # of JPEGs of pixels as they are, and reduced
-PICTURE = "picture"  # its label, beside truths and baselines
+SMALL = 160  # px, the longer side of a thumbnail
+SMALL_PIXELS = 4e9  # to read for the contact sheet: about a minute of one processor
+TOGETHER = 64  # thumbnails in one batch
+CHOSEN = 8  # images to compare
+LARGE = 1_200_000  # px; larger images are reduced for the comparison
+CROP = 320, 240  # px, width and height of full-resolution regions of reduced images
+TRUE_QUALITY, REDUCED_QUALITY = 93, 85  # of JPEGs at full and at reduced resolution
+PICTURE = "image"  # its label in the comparison
 SHOWN = ("jpg", "png", "tif", "tif16", "exr", "npy")
 
 
 @dataclass
 class Budget:
-    """How many bytes of a page may still be taken."""
+    """The remaining bytes of a page."""
 
     left: int
 
     def take(self, text: str) -> bool:
-        """Take the bytes of a text; False where there are not enough."""
+        """Take the bytes of a text. Return False if they exceed the budget."""
         if len(text) > self.left:
             return False
         self.left -= len(text)
@@ -49,15 +49,15 @@ class Budget:
 
 
 def picture_file(made: Made) -> Blob | None:
-    """The file of a picture that can be shown: the first in a format for display."""
+    """Return the file of a picture to display: the first one in a supported format."""
     return next((made.files[kind] for kind in SHOWN if kind in made.files), None)
 
 
 def checked(blob: Blob) -> bytes:
-    """The bytes of a file, as its sidecar says them.
+    """Return the bytes of a file after a check against its sidecar.
 
     Raises:
-        ImageError: it is gone, or is another than its sidecar says, by its SHA-256.
+        ImageError: the file is missing, or its SHA-256 differs from the sidecar.
     """
     if blob.problem:
         raise ImageError(blob.problem)
@@ -71,18 +71,18 @@ def checked(blob: Blob) -> bytes:
 
 
 def jpeg_uri(pixels: Array, quality: int = TRUE_QUALITY) -> str:
-    """(height, width, 3) uint8 as a JPEG in an address."""
+    """Return (height, width, 3) uint8 as a JPEG in a data URI."""
     return data_uri("jpeg", jpeg_bytes(np.ascontiguousarray(pixels), quality))
 
 
 def data_uri(kind: str, data: bytes) -> str:
-    """A picture as an address that holds it."""
+    """Return an image file as a data URI."""
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
 
 @dataclass
 class Sheet:
-    """The contact sheet: entries of pictures, for the page's script."""
+    """The contact sheet: entries of images for the script of the page."""
 
     entries: list[dict[str, Any]] = field(default_factory=list)
     pictures: int = 0  # of the run
@@ -92,13 +92,13 @@ class Sheet:
 def contact_sheet(
     run: Run, budget: Budget, label: str, tell: Callable[[str], None] = lambda _: None
 ) -> Sheet:
-    """Small pictures of a run, in its order: as many as there is room and time for.
+    """Return thumbnails of a run in its order, limited by the budget and by time.
 
     Args:
         run: the run.
-        budget: that they take from.
-        label: stands before the names of its pictures; "" does not.
-        tell: is called with how far it is, in words.
+        budget: the budget that thumbnails use.
+        label: a prefix of the image names, or "".
+        tell: called with the progress.
     """
     pictures = run.pictures
     sheet = Sheet(pictures=len(pictures))
@@ -109,7 +109,7 @@ def contact_sheet(
         if not budget.take(json.dumps(entry)):
             break
         entries[i] = entry
-        tell(f"small picture {len(entries)} of {len(order)}")
+        tell(f"thumbnail {len(entries)} of {len(order)}")
         sheet.problems += [problem] if problem else []
     sheet.entries = [entries[i] for i in sorted(entries)]
     return sheet
@@ -118,7 +118,7 @@ def contact_sheet(
 def _small_pictures(
     pictures: Sequence[Made], order: Sequence[int]
 ) -> Iterator[tuple[int, str, str]]:
-    """Numbers of pictures, with the small picture of each or why there is none."""
+    """Yield the numbers of pictures, each with its thumbnail or the reason for its absence."""
 
     def small(i: int) -> tuple[str, str]:
         if not (file := picture_file(pictures[i])):
@@ -140,7 +140,7 @@ def _small_pictures(
 
 
 def _entry(made: Made, image: str, label: str) -> dict[str, Any]:
-    """What the page's script needs of a small picture."""
+    """Return the data of a thumbnail for the script of the page."""
     return {
         "name": f"{label}: {made.name}" if label else made.name,
         "image": image,
@@ -152,13 +152,13 @@ def _entry(made: Made, image: str, label: str) -> dict[str, Any]:
 
 
 def telling_order(odd: Sequence[bool]) -> list[int]:
-    """The numbers of pictures in an order whose every beginning is a fair sample of them.
+    """Return the numbers of pictures in an order of which every prefix is a fair sample.
 
-    Unusual ones alternate with others as long as there are both; each are spread evenly, in the
-    order of van der Corput (1935).
+    Unusual and other pictures alternate while both remain. Both are spread evenly, in the order of
+    van der Corput (1935).
 
     Args:
-        odd: of each picture, whether it is unusual.
+        odd: whether each picture is unusual.
 
     >>> telling_order([False, False, True, False, False])
     [2, 0, 3, 1, 4]
@@ -177,23 +177,21 @@ def _spread(values: Sequence[int]) -> list[int]:
 
 @dataclass
 class Large:
-    """An image that is shown large: the picture and what there is beside it."""
+    """An image to compare, with its views."""
 
     name: str
     facts: str
     odd: Sequence[str]
     width: int  # px, of the picture
     height: int
-    by: int  # this many pixels, squared, are one of the page's; 1 is the picture as it is
-    places: Sequence[
-        Place
-    ]  # to look at; of a picture that is reduced, the page has these as they are
+    by: int  # the reduction factor; 1 is full resolution
+    places: Sequence[Place]  # regions of interest; reduced images have these at full resolution
     views: list[dict[str, Any]] = field(default_factory=list)  # label, image, crops
-    strip: list[dict[str, str]] = field(default_factory=list)  # kept stages, from the mosaic on
+    strip: list[dict[str, str]] = field(default_factory=list)  # thumbnails of kept stages
 
     @classmethod
     def of(cls, made: Made, pixels: Array) -> "Large":
-        """An image, without views yet.
+        """Return an image without views.
 
         Args:
             made: the picture.
@@ -205,12 +203,12 @@ class Large:
         return cls(made.name, _facts(made), oddities(made), width, height, by, places)
 
     def add(self, label: str, pixels: Array, budget: Budget) -> bool:
-        """Add a view; False where the budget does not have it.
+        """Add a view. Return False if it exceeds the budget.
 
         Args:
-            label: of the view.
+            label: the label of the view.
             pixels: (height, width, 3) uint8, as large as the picture.
-            budget: that it takes from.
+            budget: the budget that the view uses.
         """
         if self.by > 1:
             image = jpeg_uri(reduced(pixels, self.by), REDUCED_QUALITY)
@@ -224,12 +222,12 @@ class Large:
 
 
 def places_of(pixels: Array, by: int) -> list[Place]:
-    """The places of a picture that are worth a closer look.
+    """Return regions of interest of a picture.
 
     Args:
         pixels: (height, width, 3) uint8.
-        by: as of :class:`Large`. Places are looked for in the reduced picture; those of one that is
-            reduced are CROP px large, around what was found.
+        by: the reduction factor, as in :class:`Large`. The search uses the reduced picture. Regions
+            of reduced pictures are enlarged to CROP px.
     """
     height, width = pixels.shape[:2]
     small = reduced(pixels, by)
@@ -253,7 +251,7 @@ def places_of(pixels: Array, by: int) -> list[Place]:
 
 
 def chosen(run: Run, names: Collection[str]) -> list[Made]:
-    """The images that are shown large: those of these names and unusual ones, then some evenly."""
+    """Return the images to compare: given and unusual ones first, then an even sample."""
     pictures = [made for made in run.pictures if picture_file(made)]
     odd = [made for made in pictures if made.name in names or oddities(made)][: CHOSEN // 2]
     others = [made for made in pictures if made not in odd]
@@ -264,14 +262,14 @@ def chosen(run: Run, names: Collection[str]) -> list[Made]:
 def large(
     runs: Sequence[Run], labels: Sequence[str], made: Made, budget: Budget, problems: list[str]
 ) -> Large | None:
-    """One image, as it is shown large; None where nothing of it can be shown.
+    """Return one image to compare. None if no view of it can be shown.
 
     Args:
-        runs: the run that it is of, and another that may have the same picture.
-        labels: of the runs.
-        made: its picture.
-        budget: that it takes from.
-        problems: gets what cannot be shown, and why.
+        runs: the run of the image, and a second run that may have the same picture.
+        labels: the labels of the runs.
+        made: the picture.
+        budget: the budget that views use.
+        problems: gets the errors of views.
     """
     shown: Large | None = None
     comparison = [(label, file) for label, file in _beside(runs[0], made) if len(runs) == 1]
@@ -290,7 +288,7 @@ def large(
             continue
         shown = shown or Large.of(made, pixels)
         if pixels.shape[:2] != (shown.height, shown.width):
-            problems.append(f"{file.name}: is of another size than {made.name}")
+            problems.append(f"{file.name}: its size differs from {made.name}")
         elif not shown.add(label, pixels, budget):
             return None
     if shown:
@@ -299,7 +297,7 @@ def large(
 
 
 def _views(run: Run, made: Made) -> Iterator[tuple[str, Blob]]:
-    """The picture, its truths and its baselines, with their labels."""
+    """Yield the picture, its truths and its baselines, with their labels."""
     if file := picture_file(made):
         yield PICTURE, file
     for rendition, other in run.of_image(made.image).items():
@@ -309,10 +307,10 @@ def _views(run: Run, made: Made) -> Iterator[tuple[str, Blob]]:
 
 
 def _beside(run: Run, made: Made) -> Iterator[tuple[str, Blob]]:
-    """What a picture without truths can be compared with, with a label.
+    """Yield a picture to compare with one without truths, and its label.
 
-    It is a picture of the same file, such as another ISO, exposure or frame; else its neighbour in
-    a sequence, whose name has other digits.
+    It is a picture of the same file with another ISO, exposure or frame. Otherwise it is the
+    neighbour in a sequence, whose name differs only in digits.
     """
     alike = [
         other
@@ -337,17 +335,17 @@ def _without_digits(name: str) -> str:
 
 
 def _kept(made: Made) -> Iterator[tuple[str, Blob]]:
-    """The kept stages of a picture, in the order of its chain."""
+    """Yield the kept stages of a picture in the order of its chain."""
     for name in (str(step.get("name")) for step in made.steps):
         if file := made.files.get(f"{name}.exr") or made.files.get(f"{name}.npy"):
             yield name, file
 
 
 def add_stages(shown: Large, made: Made, budget: Budget) -> None:
-    """Show the kept stages of a picture large, too, as far as the budget goes.
+    """Add the kept stages of a picture as views, within the budget.
 
-    Those of another size, before a picture is made smaller, are left out. What cannot be read is
-    known from the small ones.
+    Stages of another size, before the picture is resized, are skipped. Unreadable files are
+    reported with the thumbnails.
     """
     for name, file in _kept(made):
         try:
@@ -360,7 +358,7 @@ def add_stages(shown: Large, made: Made, budget: Budget) -> None:
 
 
 def _strip(made: Made, budget: Budget, problems: list[str]) -> list[dict[str, str]]:
-    """The kept stages of a picture, small, in the order of its chain."""
+    """Return thumbnails of the kept stages of a picture in the order of its chain."""
     strip = []
     for name, file in _kept(made):
         try:
@@ -374,9 +372,9 @@ def _strip(made: Made, budget: Budget, problems: list[str]) -> list[dict[str, st
 
 
 def _facts(made: Made) -> str:
-    """A line about a picture."""
+    """Return a line of facts about a picture."""
     a, b = (number(made.value("noise", "signal", key)) for key in "ab")
-    law = f"; variance {a:.3g} y + {b:.3g}"
+    law = f", noise variance {a:.3g} y + {b:.3g} (in squared signal, y from 0 to 1)"
     size = f"{number(made.value('width')):.0f} x {number(made.value('height')):.0f} px"
     iso, clipped = number(made.value("iso")), number(made.value("clipped"))
     lens = f" with {made.value('lens')}" if made.value("lens") else ""

@@ -1,6 +1,6 @@
-"""A camera's raw noise on PyTorch's tensors, inside a training loop, on a CPU or a GPU.
+"""The raw noise of a camera for PyTorch tensors in a training loop, on CPUs and GPUs.
 
-It is PyTorch alone: no OpenCL, no files, no processes of its own. It needs the package ``torch``.
+It uses only PyTorch: no OpenCL, files or processes. It needs the package ``torch``.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ __all__ = ["RawNoise"]
 
 
 def __getattr__(name: str) -> Any:
-    """What is exported, imported on first use.
+    """Import an exported name on first use.
 
     Raises:
         ImportError: PyTorch is not installed.

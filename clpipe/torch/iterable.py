@@ -1,4 +1,4 @@
-"""What PyTorch's ``DataLoader`` takes as an iterable, where PyTorch is there."""
+"""PyTorch's ``IterableDataset``, or a substitute if PyTorch is not installed."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""A camera's noise in clean raws, as a transform of tensors."""
+"""The raw noise of a camera as a transform of tensors."""
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -23,33 +23,36 @@ from clpipe.stage import NoiseScope
 from clpipe.torch.table import Drawn, Table
 
 FIRST, LAST = "crosstalk", "normalize"
-DRAWN = 1024  # chains, where something is drawn
-ROOM = 512  # px, over the height and width of a sample: of a sensor's part that has places
+DRAWN = 1024  # chains, if values are drawn
+ROOM = 512  # px; positions on the sensor are drawn from the size of a sample plus this
 
 
 class RawNoise(ReadOnly):
-    """Puts a camera's noise into clean raws that are tensors, where these are: CPU or GPU.
+    """A transform that adds the raw noise of a camera to clean mosaics, on their device.
 
-    It is what :class:`clpipe.RawNoise` does, from ``crosstalk`` to ``normalize``: sensor noise,
-    what a sensor does to rows, columns and single pixels, clipping and rounding to DN. Every sample
-    has noise of its own, with a camera, an ISO and other values of its own where these are drawn.
-    On a CPU a sample that has a key has the bits that the chain gives it for that ``noise_key``.
+    Like :class:`clpipe.RawNoise`, it runs from ``crosstalk`` to ``normalize``: sensor noise, row,
+    column and pixel defects, clipping and rounding to DN. Each sample gets its own noise, and its
+    own camera, ISO and other values if these are drawn. On a CPU, a sample with a key gets the same
+    bits as from the chain with this ``noise_key``.
 
-    It is differentiable in the clean raw: noise grows with the signal, clipping stops a gradient,
-    and rounding lets it through; so does Poisson noise, whose own derivative is taken as 0.
+    The transform is differentiable in the clean mosaic. Noise grows with the signal, clipping stops
+    the gradient, and rounding passes it. Poisson noise passes it, and its own derivative is 0.
 
     Args:
-        camera: a name that ``clpipe cameras`` lists, or the TOML file of a profile;
+        camera: a name from ``clpipe cameras``, or the TOML file of a profile.
             ``{"choice": [...]}`` is drawn.
-        iso: its ISO; ``{"log_uniform": [800, 12800]}`` or another law is drawn for each sample.
-        seed: None is other noise in each object; with a number, an object's calls give the same
-            noise in the same order.
+        iso: the ISO. ``{"log_uniform": [800, 12800]}`` or another draw is made for each sample.
+        seed: None gives other noise in each object. With a number, the calls of an object give the
+            same sequence of noise.
         config: a built-in configuration or a TOML file, or several.
         **settings: as for :class:`clpipe.Pipeline`, such as ``sensor_noise={"method": "poisson"}``.
 
     Raises:
-        RequestError: a name or value that is not allowed, or a stage of one's own between the two.
+        RequestError: a name or value is not allowed, or a user's stage is in this part of the
+            chain.
 
+    >>> import torch
+    >>> from clpipe.torch import RawNoise
     >>> add_noise = RawNoise("sony-a7r2", {"log_uniform": [800, 12800]}, seed=1)
     >>> noisy = add_noise(torch.full((8, 4, 32, 32), 0.2))
     >>> noisy.shape, bool(noisy.std() > 0)
@@ -76,58 +79,58 @@ class RawNoise(ReadOnly):
             self._random.manual_seed(seed)
         self._table: Table | None = None
         self._one = lru_cache(maxsize=DRAWN)(self._chain)
-        Table([self._chain("")])  # refuses what has no twin
+        Table([self._chain("")])  # rejects stages without a PyTorch version
 
     def __repr__(self) -> str:
         return f"RawNoise({self._settings.label})"
 
-    def __call__(self, raw: Tensor, keys: Sequence[str] | str | None = None) -> Tensor:
-        """Raws with noise.
+    def __call__(self, mosaic: Tensor, key: Sequence[str] | str | None = None) -> Tensor:
+        """Return mosaics with noise.
 
         Args:
-            raw: linear signal, 0 is black and 1 is white, float32: a batch of mosaics, (raw, 1,
-                height, width), with the camera's CFA pattern, or of their planes R, Gr, Gb, B,
-                (raw, 4, height / 2, width / 2), where Gr is green in the rows of red; or one of
-                them, without the first axis.
-            keys: names of the raws, for noise that can be had again; give them others in each
-                epoch. What is fixed to a sensor is then that of its upper left corner. None is new
-                noise, and a place on the sensor, for each.
+            mosaic: linear signal, where 0 is black and 1 is white, float32. It is (batch, 1,
+                height, width) with the camera's CFA pattern. Or it is packed as planes R, Gr, Gb,
+                B, (batch, 4, height / 2, width / 2). Gr is green in the rows of red. The batch axis
+                may be absent.
+            key: a name for each mosaic of the batch, for repeatable noise. Pass others in each
+                epoch. Fixed patterns are then those of the upper left corner of the sensor. None
+                draws new noise and a position on the sensor for each mosaic.
 
         Returns:
-            The noisy raws, of the same shape, on the same device.
+            The noisy mosaics, of the same shape, on the same device.
 
         Raises:
-            ImageError: a tensor of another shape or type.
-            RequestError: as many keys as there are raws are needed.
+            ImageError: the tensor has a wrong shape or type.
+            RequestError: the number of keys is not the number of mosaics.
         """
-        if raw.dim() not in (3, 4) or raw.shape[-3] not in (1, 4) or 0 in raw.shape:
+        shape = tuple(mosaic.shape)
+        if len(shape) not in (3, 4) or shape[-3] not in (1, 4) or 0 in shape:
             raise ImageError(
-                f"found a tensor of shape {tuple(raw.shape)}; expected mosaics, (raw, 1, height, "
-                "width), or their planes, (raw, 4, height / 2, width / 2), or one of these"
+                f"found a tensor of shape {shape}; expected mosaics, (batch, 1, height, width), "
+                "or their planes, (batch, 4, height / 2, width / 2), or one of these"
             )
-        if raw.dtype != torch.float32:
-            raise ImageError(f"found {raw.dtype}; expected torch.float32, in signal")
-        if raw.dim() == 3:
-            own = None if keys is None else [keys] if isinstance(keys, str) else keys
-            one: Tensor = self(raw[None], own)[0]
+        if mosaic.dtype != torch.float32:
+            raise ImageError(f"found {mosaic.dtype}; expected torch.float32 in signal units")
+        if len(shape) == 3:
+            one: Tensor = self(mosaic[None], [key] if isinstance(key, str) else key)[0]
             return one
-        if keys is not None and (isinstance(keys, str) or len(keys) != len(raw)):
-            raise RequestError(f"keys: found {keys!r}; expected {len(raw)}, one for each raw")
-        drawn = self._drawn(raw, keys)
+        if key is not None and (isinstance(key, str) or len(key) != len(mosaic)):
+            raise RequestError(f"key: found {key!r}; expected {len(mosaic)}, one for each mosaic")
+        drawn = self._drawn(mosaic, key)
         table = drawn.table
-        order = table.planes[torch.from_numpy(drawn.chains)].to(raw.device)
-        mosaics = raw[:, 0] if raw.shape[1] == 1 else _unpacked(raw, order)
-        if raw.shape[1] == 1 and bool((table.planes != table.planes[0]).any()):
+        order = table.planes[torch.from_numpy(drawn.chains)].to(mosaic.device)
+        mosaics = mosaic[:, 0] if shape[1] == 1 else _unpacked(mosaic, order)
+        if shape[1] == 1 and bool((table.planes != table.planes[0]).any()):
             raise RequestError(
-                f"{self!r}: the cameras have several CFA patterns; give planes, (raw, 4, ...)"
+                f"{self!r}: the cameras have several CFA patterns. Pass planes, (batch, 4, ...)"
             )
         noisy = table.noisy(mosaics, drawn)
-        return noisy[:, None] if raw.shape[1] == 1 else _packed(noisy, order)
+        return noisy[:, None] if shape[1] == 1 else _packed(noisy, order)
 
-    def _drawn(self, raw: Tensor, keys: Sequence[str] | None) -> "Drawn":
-        """What is drawn for raws."""
-        count, cell = len(raw), 2 if raw.shape[1] == 4 else 1
-        size = cell * raw.shape[2], cell * raw.shape[3]
+    def _drawn(self, mosaic: Tensor, keys: Sequence[str] | None) -> "Drawn":
+        """Return what is drawn for mosaics."""
+        count, cell = len(mosaic), 2 if mosaic.shape[1] == 4 else 1
+        size = cell * mosaic.shape[2], cell * mosaic.shape[3]
         if keys is None:
             self._table = self._table or self._of_all()
             table = self._table
@@ -154,26 +157,29 @@ class RawNoise(ReadOnly):
         return Drawn(table, chains, words, [(0, 0)] * count, size)
 
     def _of_all(self) -> "Table":
-        """The chains that are drawn from: one where nothing is drawn."""
+        """Return the chains to draw from. It is a single one if no value is drawn."""
         count = DRAWN if self._settings.draws else 1
         return Table([self._chain(str(number)) for number in range(count)])
 
     def _chain(self, name: str) -> Chain:
-        """The chain of a sample's name, on which draws depend; one where there are none."""
+        """Return the chain of a sample's name, on which draws depend."""
         if not self._settings.draws:
             name = ""
         return make_chain(self._settings.drawn(name), start_at=FIRST, until=LAST)
 
 
 def _unpacked(planes: Tensor, order: Tensor) -> Tensor:
-    """Mosaics of planes, (sample, 4, height, width); ``order`` has each place's plane."""
+    """Return the mosaics of planes, (sample, 4, height, width).
+
+    ``order`` has the plane of each pixel of a cell.
+    """
     each = torch.arange(len(planes), device=planes.device)[:, None]
     mosaics: Tensor = functional.pixel_shuffle(planes[each, order], 2)[:, 0]
     return mosaics
 
 
 def _packed(mosaics: Tensor, order: Tensor) -> Tensor:
-    """The planes of mosaics, as :func:`_unpacked` takes them."""
+    """Return the planes of mosaics, in the form that :func:`_unpacked` takes."""
     each = torch.arange(len(mosaics), device=mosaics.device)[:, None]
     places: Tensor = functional.pixel_unshuffle(mosaics[:, None], 2)
     return places[each, order.argsort(1)]

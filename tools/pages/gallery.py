@@ -2,10 +2,11 @@
 
     tools/run pages gallery
 
-They go to docs/gallery_cameras.webp and docs/gallery_truths.webp; each cell is what the command
-above it in docs/index.md makes.
+It writes docs/gallery_cameras.webp and docs/gallery_truths.webp. Their cells are results of the
+commands above them in docs/index.md. The scene's render gets a layer of object numbers first.
 """
 
+import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -21,14 +22,23 @@ from tools import RENDER, ROOT
 CAMERAS = ("sony-a7s2", "canon-6d", "nikon-d800", "oppo-reno-10x")
 ISOS = (100, 1600, 6400)
 CROP = (560, 292, 120, 96)  # x, y, width, height, with smooth places, edges and a dark corner
-SCENE = ROOT / "tools" / "reconstruction" / "data" / "view0.exr"
+SCENES = ROOT / "tools" / "reconstruction" / "data"
+# x, y and radius of the objects that tools/reconstruction/scene.py adds before the wall, in m.
+OBJECTS = (
+    (-1.1, 0.1, 0.55),
+    (-0.45, 0.55, 0.32),
+    (0.1, -0.1, 0.42),
+    (0.45, 0.6, 0.29),
+    (1.2, 0.25, 0.43),
+)
+WALL, FLOOR = len(OBJECTS), len(OBJECTS) + 1  # their numbers
 SCALE = 2
 GAP, HEAD = 6, 26
 LENS = {"method": "brown_conrady", "fx": 900, "k1": 0.12}
 
 
 def grid(rows: list[list[Image.Image]], columns: list[str], names: list[str]) -> Image.Image:
-    """Pictures of one size in rows, with captions above the columns and beside the rows."""
+    """Return pictures of one size in rows, with captions of columns and rows."""
     font = ImageFont.load_default(15)
     width, height = rows[0][0].size
     left = max(font.getlength(name) for name in names) + 10 * any(names)
@@ -46,7 +56,7 @@ def grid(rows: list[list[Image.Image]], columns: list[str], names: list[str]) ->
 
 
 def cameras(folder: Path) -> Image.Image:
-    """One place of a render, as cameras see it at some ISOs."""
+    """Return a crop of a render for several cameras and ISOs."""
     made = clpipe.run(RENDER, folder, camera=CAMERAS, iso=ISOS, format="png")
     list(made)
     left, top, width, height = CROP
@@ -62,10 +72,11 @@ def cameras(folder: Path) -> Image.Image:
 
 
 def truths(folder: Path) -> Image.Image:
-    """A view of a scene, and what else comes out beside it."""
-    options = {"truth": ["clean", "variance"], "carry": ["Z:depth", "texture:label"]}
-    list(clpipe.run(SCENE, folder, format="png", iso=3200, distortion=LENS, **options))
-    name = SCENE.stem
+    """Return a view of a scene with its ground truth."""
+    options = {"truth": ["clean", "variance"], "carry": ["Z:depth", "object:label"]}
+    scene = with_objects(folder)
+    list(clpipe.run(scene, folder, format="png", iso=3200, distortion=LENS, **options))
+    name = scene.stem
     pictures = {
         f"{name}.png": Image.open(folder / f"{name}.png"),
         "truth_clean.png": Image.open(folder / f"{name}.truth_clean.png"),
@@ -73,22 +84,45 @@ def truths(folder: Path) -> Image.Image:
     }
     along = folder / f"{name}.carried.exr"
     names = oiio.ImageBuf(str(along)).spec().channelnames
-    depth, label = (next(i for i, n in enumerate(names) if key in n) for key in ("Z", "texture"))
+    depth, label = (next(i for i, n in enumerate(names) if key in n) for key in ("Z", "object"))
     pictures["carried.exr: depth"] = coloured(-layer(along, depth))
-    pictures["carried.exr: labels"] = coloured(layer(along, label), "tab20")
+    pictures["carried.exr: objects"] = coloured(layer(along, label), "tab20")
     size = (240, 160)
     small = [i.convert("RGB").resize(size, Image.Resampling.BOX) for i in pictures.values()]
     return grid([small], list(pictures), [""])
 
 
+def with_objects(folder: Path) -> Path:
+    """Write a view with a layer "object", the object number of each pixel, from its depth."""
+    view = json.loads((SCENES / "cameras.json").read_text("utf-8"))["views"][0]
+    render = oiio.ImageBuf(str(SCENES / view["file"]))
+    depth = layer(SCENES / view["file"], render.spec().channelnames.index("Z"))
+    (height, width), k = depth.shape, np.array(view["K"])
+    v, u = np.mgrid[:height, :width] + 0.5
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(k).T
+    points = (rays * depth[..., None] - view["t"]) @ np.array(view["R"])  # in the world
+    centres, radii = np.array(OBJECTS)[:, :2], np.array(OBJECTS)[:, 2]
+    away = np.linalg.norm(points[..., None, :2] - centres, axis=-1) / radii
+    numbers = np.where(points[..., 2] < 0.01, FLOOR, away.argmin(-1))
+    numbers = np.where(points[..., 1] > 1.19, WALL, numbers)
+    samples = np.dstack([*(layer(SCENES / view["file"], i) for i in range(4)), numbers])
+    spec = oiio.ImageSpec(width, height, 5, oiio.FLOAT)
+    spec.channelnames = ("R", "G", "B", "Z", "object")
+    written = oiio.ImageBuf(spec)
+    written.set_pixels(oiio.ROI(), np.ascontiguousarray(samples, np.float32))
+    path = folder.with_name(view["file"])
+    written.write(str(path))
+    return path
+
+
 def layer(path: Path, channel: int) -> Array:
-    """A channel of a file, (height, width)."""
+    """Return a channel of a file, (height, width)."""
     pixels = oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT)
     return np.asarray(pixels).reshape(*pixels.shape[:2], -1)[..., channel]
 
 
 def coloured(values: Array, colours: str = "viridis") -> Image.Image:
-    """Values as colours, from the lowest to the highest that is finite but for a hundredth."""
+    """Return values as colours. The scale leaves out the lowest and the highest 1 %."""
     low, high = np.percentile(values[np.isfinite(values)], (1, 99))
     scaled = np.clip((values - low) / max(high - low, 1e-9), 0, 1)
     pixels = matplotlib.colormaps[colours](np.nan_to_num(scaled))[..., :3]

@@ -54,7 +54,7 @@ def report(page: Any, folder: Path) -> None:
     path.write_text(html([read_run(out)]), "utf-8")
     page.goto(f"file://{path}")
     page.locator("#look-image").select_option(index=1)
-    page.get_by_role("heading", name="Look closer").evaluate("e => e.scrollIntoView()")
+    page.get_by_role("heading", name="Compare").evaluate("e => e.scrollIntoView()")
     page.wait_for_timeout(500)
     taken(page, "report")
 

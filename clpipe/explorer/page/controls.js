@@ -1,6 +1,6 @@
 "use strict";
 
-// Controls. Each is made once from what the server declares; then only its value changes.
+// Controls. Each is built once from the server's declarations. Later only its value changes.
 
 const typeOf = (schema) => (schema.anyOf || [schema]).find((each) => each.type !== "null") || schema;
 
@@ -10,10 +10,10 @@ const limitsOf = (schema, value) => {
   const high = type.maximum ?? type.exclusiveMaximum;
   const size = Math.abs(Number(value)) || 0;
   const top = high === undefined || (size > 0 && high > 40 * size) ? (size ? 4 * size : 1) : high;
-  // A slider over all that is allowed would be too coarse.
+  // A slider over the whole allowed range would be too coarse.
   const to = size || low === undefined || low >= 0 ? top : Math.min(top, 5);
   const from = Math.max(low ?? -to, size || low >= 0 ? -Infinity : -to);
-  const within = (to - from) / 400; // of a limit that is not allowed itself
+  const within = (to - from) / 400; // distance to an exclusive limit
   return {
     low,
     high,
@@ -22,7 +22,7 @@ const limitsOf = (schema, value) => {
   };
 };
 
-// The limits of a number in words, and those of its slider where they are others.
+// The allowed range of a number in words, and the slider's range if it differs.
 const between = (type) => {
   const { minimum, exclusiveMinimum, maximum, exclusiveMaximum } = type;
   const low = minimum !== undefined ? `from ${minimum}` : exclusiveMinimum !== undefined ? `above ${exclusiveMinimum}` : "";
@@ -36,17 +36,17 @@ const figures = (value) => Number(Number(value).toPrecision(6));
 const sliderText = (type, { from, to }) => {
   const [low, high] = [type.minimum ?? type.exclusiveMinimum, type.maximum ?? type.exclusiveMaximum];
   const near = (limit, end) => limit !== undefined && Math.abs(limit - end) <= (to - from) / 400;
-  return near(low, from) && near(high, to) ? "" : `The slider: ${figures(from)} to ${figures(to)}.`;
+  return near(low, from) && near(high, to) ? "" : `The slider covers ${figures(from)} to ${figures(to)}.`;
 };
 
 let count = 0;
 
-// A row: the name, what sets it, and a button that leaves it to the camera again.
+// A row: the name, the inputs, and a button that resets the value to automatic.
 const row = (key, name, schema, resolved) => {
   const type = typeOf(schema);
   const id = `set-${count += 1}`;
   const inputs = made("span", { className: "inputs" });
-  const auto = made("button", { className: "auto", type: "button", textContent: "auto", title: "Leave it out, as it was not set" });
+  const auto = made("button", { className: "auto", type: "button", textContent: "auto", title: "Reset to the automatic value" });
   auto.setAttribute("aria-label", `auto: ${name}`);
   const element = made("div", { className: "row" },
     made("div", { className: "line" }, made("label", { htmlFor: id, textContent: name + (schema.unit ? ` (${schema.unit})` : "") }), inputs, auto));
@@ -73,7 +73,7 @@ const row = (key, name, schema, resolved) => {
     if (limits.low !== undefined) field.min = limits.low;
     if (limits.high !== undefined) field.max = limits.high;
     field.addEventListener("change", () => set(key, field.value === "" ? null : Number(field.value)));
-    // Of whole numbers without both limits not every one may be allowed, such as even ones.
+    // Integers without both limits may have other constraints, for example odd numbers only.
     const slides = !schema.plain && limits.to > limits.from && !(whole && (limits.low === undefined || limits.high === undefined));
     if (slides) {
       const log = schema.log;
@@ -132,14 +132,14 @@ const parsed = (text, type) => {
   try {
     return JSON.parse(text);
   } catch {
-    return text; // the server says what is wrong with it
+    return text; // the server reports what is wrong with it
   }
 };
 
 let isoRow = null;
 let isoCamera = "";
 let structure = "";
-const rows = []; // a key may have several
+const rows = []; // several rows may share a key
 
 const keyRow = (key, name, schema, value) => {
   const element = row(key, name, schema, value);
@@ -148,7 +148,7 @@ const keyRow = (key, name, schema, value) => {
 };
 
 const makeKeys = (facts) => {
-  const camera = keyRow("camera", "camera", { options: known.cameras });
+  const camera = keyRow("camera", "Camera", { options: known.cameras });
   isoRow = made("div");
   const switchRow = made("div", { className: "row" });
   const noise = made("input", { type: "checkbox", id: "noise-on" });
@@ -156,24 +156,24 @@ const makeKeys = (facts) => {
     const skip = (state.values.skip || []).filter((name) => name !== "noise");
     set("skip", noise.checked ? (skip.length ? skip : null) : [...skip, "noise"]);
   });
-  switchRow.append(made("div", { className: "line" }, made("label", { htmlFor: "noise-on", textContent: "noise" }), noise));
+  switchRow.append(made("div", { className: "line" }, made("label", { htmlFor: "noise-on", textContent: "Noise" }), noise));
   const exposing = facts.steps.find((each) => known.stages[each.stage].role === "EXPOSURE" && "ev" in each.values);
   const methods = exposing ? known.stages[exposing.stage].methods : [];
   const ev = methods.filter((method) => method.name === exposing.method).map((method) => method.parameters.ev);
   byId("keys").replaceChildren(camera, isoRow, switchRow,
-    ...ev.map((schema) => keyRow(`${exposing.name}.ev`, exposing.name, schema, 0)));
+    ...ev.map((schema) => keyRow(`${exposing.name}.ev`, "Exposure", schema, 0)));
   byId("more-keys").replaceChildren(...Object.entries(known.keys).map(([key, schema]) => keyRow(key, key.replaceAll("_", " "), schema, 0)));
   isoCamera = "";
 };
 
 const makeStages = (facts) => {
   const opened = new Set([...document.querySelectorAll("#stages details[open]")].map((each) => each.dataset.step));
-  // A raw enters behind the first ones; and without noise there are no stages of noise.
-  byId("stages").replaceChildren(...facts.steps.filter((each) => each.here || !each.on).map((each) => {
+  // Raws skip the first stages, and chains without noise have no noise stages.
+  const items = facts.steps.filter((each) => each.here || !each.on).map((each) => {
     const declared = known.stages[each.stage];
     const chosen = declared.methods.find((method) => method.name === each.method) || declared.methods[0];
     const toggle = made("input", { type: "checkbox", checked: each.on });
-    // What an image carries cannot be taken back by values over it.
+    // Settings that the image file carries cannot be reverted here.
     toggle.disabled = !each.on && !(state.values.skip || []).includes(each.name);
     toggle.addEventListener("change", () => {
       const skip = (state.values.skip || []).filter((name) => name !== each.name);
@@ -190,24 +190,56 @@ const makeStages = (facts) => {
       const key = `${each.name}.${name}`;
       details.append(keyRow(key, name, schema, each.values[name]));
     }
-    const item = made("div", { className: `step${each.on ? "" : " off"}` }, toggle, details);
+    const item = made("div", { className: `step${each.on ? "" : " off"}${each.idle ? " idle" : ""}` }, toggle, details);
     item.dataset.step = each.name;
-    return item;
-  }));
-  byId("step").replaceChildren(new Option("the picture", ""), ...facts.steps.filter((each) => each.here).map((each) => new Option(`after ${each.name}`, each.name)));
+    details.addEventListener("toggle", () => placeStep(item));
+    return [each.group, item];
+  });
+  const names = [...new Set(items.map(([group]) => group))];
+  byId("stages").replaceChildren(...names.map((name) => stageGroup(name, items.filter(([group]) => group === name).map(([, item]) => item))));
+  byId("step").replaceChildren(new Option("final image", ""), ...facts.steps.filter((each) => each.here).map((each) => new Option(`after ${each.name}`, each.name)));
 };
 
-// What becomes of a stage: a switch of one that is on and does nothing is neither on nor off.
+// A group of stages: a heading, the active stages, and "inactive", which is collapsed.
+const stageGroup = (name, items) => {
+  const inactive = made("details", { className: "inactive" }, made("summary"), made("div"));
+  inactive.open = Boolean(document.querySelector(`[data-group="${name}"] .inactive[open]`));
+  const group = made("section", {}, made("h2", { textContent: name }), made("div", { className: "active" }), inactive);
+  group.dataset.group = name;
+  group.setAttribute("aria-label", name);
+  for (const item of items) item.group = { inactive, items, active: group.children[1] };
+  items.forEach(placeStep);
+  return group;
+};
+
+// Move a stage to the active or the inactive ones, unless it is open. Stages that the user skips
+// count as active, so that they stay in view.
+const placeStep = (item) => {
+  const { inactive, items, active } = item.group;
+  if (item.parentElement && item.querySelector("details").open) return;
+  const isSkipped = (state.values.skip || []).includes(item.dataset.step);
+  const list = item.matches(".idle") && !isSkipped ? inactive.lastChild : active;
+  if (item.parentElement !== list) {
+    const later = items.slice(items.indexOf(item) + 1);
+    list.insertBefore(item, later.find((each) => each.parentElement === list) || null);
+  }
+  const count = inactive.lastChild.childElementCount;
+  inactive.hidden = !count;
+  inactive.firstChild.textContent = `inactive (${count})`;
+};
+
+// Show the state of a stage. The checkbox of an inactive stage is indeterminate.
 const showStep = (item, { name, on, idle, method }) => {
   const toggle = item.querySelector("input");
   const nothing = on && idle;
   item.classList.toggle("idle", idle);
   toggle.indeterminate = nothing;
-  toggle.setAttribute("aria-label", `${name}: on${nothing ? ", but does nothing" : ""}`);
-  item.querySelector("summary span").textContent = !on ? "off" : !nothing ? method : method === "none" ? "does nothing" : `does nothing (${method})`;
+  toggle.setAttribute("aria-label", `${name}: on${nothing ? ", inactive" : ""}`);
+  item.querySelector("summary span").textContent = !on ? "off" : !nothing ? method : method === "none" ? "inactive" : `inactive (${method})`;
+  placeStep(item);
 };
 
-// Facts with the methods and switches that were asked, so that what is refused can be set right.
+// The facts with the requested methods and switches, so that rejected settings can be corrected.
 const asAsked = (facts) => {
   const { values } = state;
   const steps = facts.steps.map((each) => {

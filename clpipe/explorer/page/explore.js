@@ -1,6 +1,6 @@
 "use strict";
 
-// Developing: one question at a time, and then the latest settings.
+// Development: one request at a time, then the latest settings.
 
 let running = false;
 let again = false;
@@ -77,10 +77,10 @@ const changed = () => {
   refresh();
 };
 
-let developedOf = null; // the last values that could be developed
+let developedOf = null; // the last valid values
 
 const complain = (error) => {
-  if (error && picture && picture.image !== state.image) { // which would be taken for this image
+  if (error && picture && picture.image !== state.image) { // it shows another image
     picture = null;
     byId("status").textContent = "";
     draw();
@@ -97,23 +97,23 @@ const tell = (facts, shown) => {
   const ran = facts.launches.filter((launch) => launch.ms !== null);
   const device = ran.reduce((sum, launch) => sum + launch.ms, 0);
   byId("status").textContent =
-    `${facts.width} x ${facts.height} px; on the screen after ${shown.toFixed(0)} ms, ` +
-    `of which developed in ${(facts.seconds * 1e3).toFixed(0)} ms, ${device.toFixed(1)} ms on the device` +
+    `${facts.width} x ${facts.height} px; ${shown.toFixed(0)} ms in total, ` +
+    `development ${(facts.seconds * 1e3).toFixed(0)} ms, device ${device.toFixed(1)} ms` +
     (facts.clipped ? `; ${(facts.clipped * 100).toFixed(2)} % clipped` : "") +
     Object.entries(facts.estimates).map(([step, found]) =>
       `; ${step}: ${Object.entries(found).map(([name, value]) => `${name} ${value.toPrecision(4)}`).join(", ")}`).join("") +
     facts.warnings.map((warning) => `; warning: ${warning}`).join("");
   byId("launches").replaceChildren(...facts.launches.map((launch) => {
-    const time = launch.ms === null ? "not run again" : launch.ms.toFixed(2);
+    const time = launch.ms === null ? "reused" : launch.ms.toFixed(2);
     return made("tr", {}, made("td", { textContent: launch.name }), made("td", { textContent: time }));
   }));
 };
 
-// Settings, their past and their future.
+// Settings with undo and redo.
 
 let lastKey = "";
 
-// What undoing brings back: the values and, where they changed places with it, setting B.
+// Undo restores the values and, after a swap, also settings B.
 const setValues = (values, key = "", swapped = null) => {
   if (same(values, state.values)) return;
   if ((values.skip || []).includes(state.step)) state.step = "";
@@ -153,12 +153,12 @@ const step = (from, to) => {
 
 byId("back").addEventListener("click", () => setValues(developedOf));
 
-// The keys [ and ] go through the stages.
+// The keys [ and ] select the previous and the next stage.
 document.addEventListener("keydown", (event) => {
   const way = { "[": -1, "]": 1 }[event.key];
   if (!way || event.target.matches('input[type="text"], input[type="number"]')) return;
   const { options } = byId("step");
-  const order = [...[...options].slice(1), options[0]]; // the picture is the last
+  const order = [...[...options].slice(1), options[0]]; // the final image is last
   const next = order[order.findIndex((each) => each.selected) + way];
   if (!next) return;
   state.step = next.value;
@@ -175,8 +175,8 @@ document.addEventListener("keydown", (event) => {
   else step(past, future);
 });
 
-// The fragment of the address has all that makes a view: what was developed last, and how it is
-// looked at.
+// The fragment of the address stores the view: the settings developed last, zoom, comparison and
+// rectangle.
 
 let remembered = "";
 let remembering = 0;
@@ -197,7 +197,7 @@ const viewed = () => ({
 
 const areNumbers = (values, length) => Array.isArray(values) && values.length === length && values.every(Number.isFinite);
 
-// Look as a fragment says; of what is damaged, not.
+// Restore a view from a fragment. Damaged values are ignored.
 const lookAs = ({ compare, split, b, box: rectangle, at }) => {
   if (b && typeof b === "object") keepB(b);
   if ([...byId("compare").options].some(({ value }) => value === compare && (value !== "B" || settingB))) compareWith(compare);
@@ -213,7 +213,7 @@ const lookAs = ({ compare, split, b, box: rectangle, at }) => {
   }
 };
 
-// What a page's settings are elsewhere.
+// Export of the settings.
 
 const exported = async () => (await ask("export", { image: state.image, values: state.values })).json();
 
@@ -235,7 +235,7 @@ const toClipboard = async (text) => {
     await navigator.clipboard.writeText(text);
     return true;
   } catch {
-    return false; // the text is there to be copied by hand
+    return false; // the dialog shows the text to copy by hand
   }
 };
 
@@ -245,18 +245,18 @@ byId("save").addEventListener("click", tried(async () => save((await exported())
 byId("copy").addEventListener("click", tried(async () => {
   const { command } = await exported();
   const done = await toClipboard(command);
-  say("Command line", done ? "It is copied, and makes this picture." : "It makes this picture.", command);
+  say("Command line", `${done ? "Copied. " : ""}This command produces this image.`, command);
 }));
 byId("apply").addEventListener("click", tried(async () => {
   const { config, folder } = await exported();
   await save(config);
-  say("Apply to a folder", `The settings are saved as ${known.saved}; beside it, this develops the folder:`, folder);
+  say("Apply to a folder", `The settings are saved as ${known.saved}. Run this command next to that file to develop the folder:`, folder);
 }));
 byId("link").addEventListener("click", tried(async () => {
   if (!remembered) return;
   const address = location.href.split("#")[0] + fragment();
   const done = await toClipboard(address);
-  say("Link", `${done ? "It is copied, and" : "It"} shows this view as long as this program runs; behind “#” it has the settings.`, address);
+  say("Link", `${done ? "Copied. " : ""}The link works while this program runs. The part after “#” contains the settings.`, address);
 }));
 byId("say-copy").addEventListener("click", () => toClipboard(byId("say-command").textContent));
 
@@ -336,7 +336,7 @@ const begin = async () => {
       view = held;
     }
   } catch {
-    // no settings in the address, so those of the start
+    // the address has no settings: keep the initial ones
   }
   byId("image").value = state.image;
   sizeCanvas();
@@ -346,7 +346,7 @@ const begin = async () => {
     lookAs(view);
     await refresh();
   }
-  if (!developedOf && location.hash) { // what was kept there does not fit these images
+  if (!developedOf && location.hash) { // the stored settings do not fit these images
     Object.assign(state, { image: 0, values: known.values, step: "" });
     byId("image").value = 0;
     changed();

@@ -1,6 +1,6 @@
 "use strict";
 
-// The noise of a rectangle.
+// Noise measured in a rectangle.
 
 const setBox = ([x0, y0], [x1, y1]) => {
   const limit = (value, most) => Math.min(Math.max(value, 0), most);
@@ -19,7 +19,7 @@ const measure = async () => {
   if (measuring) measureAgain = true;
   if (measuring || !picture) return;
   measuring = true;
-  byId("measured").textContent = "measuring …";
+  byId("measured").textContent = "Measuring …";
   const question = JSON.stringify([state, box]);
   try {
     const [left, top, width, height] = box;
@@ -38,7 +38,7 @@ const measure = async () => {
     drawn.setAttribute("xmlns", "http://www.w3.org/2000/svg");
     byId("noise-plot").replaceChildren(document.importNode(drawn, true));
     measuredOf = question;
-    byId("measured").textContent = `${(answer.report.share_used * 100).toFixed(0)} % of it counts; sigma ${scale === 255 ? "of 255" : answer.report.unit}`;
+    byId("measured").textContent = `${(answer.report.share_used * 100).toFixed(0)} % of the pixels are used. Unit of sigma: ${scale === 255 ? "levels of 255" : answer.report.unit}.`;
   } catch (error) {
     byId("measured").textContent = error.message;
     measuredOf = "";
@@ -55,7 +55,7 @@ let remeasure = 0;
 const noiseIsOld = () => {
   clearTimeout(remeasure);
   if (measuredOf && measuredOf !== JSON.stringify([state, box])) {
-    byId("measured").textContent = "of the settings before";
+    byId("measured").textContent = "Measured with earlier settings.";
     remeasure = setTimeout(measure, 700);
   }
 };

@@ -1,6 +1,6 @@
 "use strict";
 
-// The picture on the screen. Scale is device pixels for each of the picture's.
+// The image on the screen. The scale is device pixels per image pixel.
 
 const canvas = byId("picture");
 const ZOOMS = [0.0625, 0.125, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4, 6, 8];
@@ -69,7 +69,7 @@ const draw = () => {
     context.fillStyle = "#fff";
     context.fillRect(split - 1, 0, 2, canvas.height);
     label(context, byId("compare").selectedOptions[0].textContent, split + 8, "left");
-    label(context, "this", split - 8, "right");
+    label(context, "current", split - 8, "right");
   }
   if (box) {
     context.strokeStyle = "#fff";
@@ -103,7 +103,7 @@ const onCanvas = (event) => {
 const inPicture = ([x, y]) => [Math.floor((x - seen.x) / seen.scale), Math.floor((y - seen.y) / seen.scale)];
 
 let drag = null;
-const POINTERS = new Map(); // of two fingers
+const POINTERS = new Map(); // two of them pinch
 
 canvas.addEventListener("pointerdown", (event) => {
   if (!picture) return;
@@ -161,7 +161,7 @@ canvas.addEventListener("wheel", (event) => {
   zoomBy(-event.deltaY, ...onCanvas(event));
 }, { passive: false });
 
-// Keys of the whole page; fields, lists, sliders, tabs and dialogs have their own.
+// Shortcuts of the whole page. Fields, lists, sliders, tabs and dialogs handle their own keys.
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey || !picture) return;
   if (event.target.closest('input:not([type="checkbox"]), select, [role="tab"], dialog')) return;
@@ -190,7 +190,7 @@ new ResizeObserver(() => {
   }
 }).observe(canvas);
 
-// Values under the pointer: of eight bits those on the screen, of floats as they are computed.
+// Values under the pointer: 8-bit values as displayed, floats as computed.
 
 let asked = null;
 
@@ -202,10 +202,10 @@ const readPixel = async ([x, y]) => {
   }
   const place = `x ${x}, y ${y}: `;
   const eight = (shown) => [0, 1, 2].map((c) => shown[3 * (y * facts.width + x) + c]).join(", ");
-  const beside = other && byId("compare").value && other.facts.width === facts.width && other.facts.height === facts.height
-    ? ` (beside: ${eight(other.pixels)})` : "";
+  const compared = other && byId("compare").value && other.facts.width === facts.width && other.facts.height === facts.height
+    ? ` (other: ${eight(other.pixels)})` : "";
   if (facts.kind === "display") {
-    byId("pixel").textContent = `${place}R, G, B ${eight(pixels)}${beside}`;
+    byId("pixel").textContent = `${place}R, G, B ${eight(pixels)}${compared}`;
     return;
   }
   const waits = Boolean(asked);
@@ -234,7 +234,7 @@ const drawHistogram = () => {
   const area = byId("histogram");
   const context = area.getContext("2d");
   context.clearRect(0, 0, area.width, area.height);
-  // The ends are left out of the scale: what is clipped would hide the rest.
+  // The first and last bins do not scale the plot, because clipped pixels would dominate it.
   const top = Math.max(...counts.map((each) => each.slice(1, 255).reduce((a, b) => Math.max(a, b), 1)));
   context.globalCompositeOperation = "source-over";
   ["#d13b3b", "#2e9e4f", "#3b6fd1"].forEach((colour, channel) => {
@@ -246,10 +246,10 @@ const drawHistogram = () => {
     });
   });
   const share = (value) => counts.map((each) => `${(300 * each[value] / pixels.length).toFixed(2)} %`).join(", ");
-  byId("histogram-text").textContent = `At 0: ${share(0)}; at 255: ${share(255)} (R, G, B). Heights are square roots of counts.`;
+  byId("histogram-text").textContent = `Share at 0: ${share(0)}; at 255: ${share(255)} (R, G, B). Bar heights are square roots of counts.`;
 };
 
-// The part of the picture that is on the screen, and by how much it is smaller there.
+// The visible part of the image, and the factor by which it is reduced.
 const window_ = () => {
   if (!picture) return { left: 0, top: 0, width: 1 << 20, height: 1 << 20, by: 4 };
   const { scale, x, y } = seen;

@@ -1,20 +1,20 @@
 "use strict";
 
-// The page holds one thing: a configuration, as nested values. The server develops whatever is
-// asked of it and remembers no settings, so that pages do not disturb each other.
+// The page's state is a configuration, as nested values. The server is stateless: it develops each
+// request, so several pages do not affect each other.
 
 const copy = (value) => JSON.parse(JSON.stringify(value));
 const same = (one, two) => JSON.stringify(one) === JSON.stringify(two);
 
 const state = { image: 0, values: {}, step: "" };
-let known; // what the server says at the start
+let known; // the server's declarations
 let past = [];
 let future = [];
 let settingB = null;
-let picture = null; // facts, pixels, canvas; and the part that came first, until they are there
-let other = null; // what is beside it, and the question that gave it
+let picture = null; // facts, pixels, canvas; and the visible part, until they are loaded
+let other = null; // the image to compare with, and its request
 
-// Questions.
+// Requests.
 
 const ask = async (name, question) => {
   const body = JSON.stringify(question);
@@ -22,7 +22,7 @@ const ask = async (name, question) => {
   try {
     response = await fetch(name, { method: "POST", body });
   } catch {
-    throw Object.assign(new Error("clpipe explore has ended; start it again"), { key: "" });
+    throw Object.assign(new Error("clpipe explore has ended. Start it again."), { key: "" });
   }
   if (response.ok) return response;
   const said = await response.json().catch(() => ({ error: `status ${response.status}` }));

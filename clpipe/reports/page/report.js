@@ -1,6 +1,6 @@
 const held = (id) => (byId(id) ? JSON.parse(byId(id).textContent) : []);
 
-// The contact sheet: filters, and pages of what they leave.
+// The contact sheet: filters, and pages of the images that pass them.
 
 const PAGE = 42;
 const FILTERS = ["filter-iso", "filter-camera", "filter-clipped", "filter-odd", "filter-name"];
@@ -25,7 +25,7 @@ const filtered = () => {
 const listItem = (entry) => {
   const picture = entry.image
     ? made("img", { src: entry.image, alt: entry.name })
-    : made("span", { className: "none", textContent: "no picture" });
+    : made("span", { className: "none", textContent: "no image" });
   const about = [`ISO ${entry.iso}, ${(entry.clipped * 100).toFixed(1)} % clipped`, ...entry.odd];
   return made("li", { className: entry.odd.length ? "odd" : "" }, picture,
     made("span", { className: "name", textContent: entry.name }),
@@ -37,8 +37,8 @@ const drawSheet = () => {
   const pages = Math.max(Math.ceil(left.length / PAGE), 1);
   page = Math.min(page, pages - 1);
   byId("sheet-list").replaceChildren(...left.slice(page * PAGE, (page + 1) * PAGE).map(listItem));
-  byId("sheet-count").textContent = `${left.length} of ${entries.length} pictures`;
-  byId("page-number").textContent = `page ${page + 1} of ${pages}`;
+  byId("sheet-count").textContent = `${left.length} of ${entries.length} images`;
+  byId("page-number").textContent = `Page ${page + 1} of ${pages}`;
   byId("page-back").disabled = page === 0;
   byId("page-next").disabled = page === pages - 1;
 };
@@ -49,9 +49,9 @@ byId("page-back").addEventListener("click", turn(-1));
 byId("page-next").addEventListener("click", turn(1));
 drawSheet();
 
-// Two pictures of an image: a slider over both, and crops of one place of both.
+// The comparison: a split over two images, and crops of one region of both.
 
-const SMALLEST = 640; // px on the screen; smaller pictures are enlarged by a whole number
+const SMALLEST = 640; // px on the screen; smaller images are enlarged by an integer factor
 const large = held("look-data");
 if (large.length) {
   const [slider, split, marks, under, over, loupes, image, left, right, place] = [
@@ -62,7 +62,7 @@ if (large.length) {
   const here = made("span", { className: "here" });
   const sides = { left: { select: left, picture: over }, right: { select: right, picture: under } };
   const shown = () => large[image.value];
-  let at = [0, 0]; // the middle of the crops, px of the picture
+  let at = [0, 0]; // centre of the crops, in image px
 
   const within = (value, least, most) => Math.max(least, Math.min(value, most));
   const middle = ({ left, top, width, height }) => [left + width / 2, top + height / 2];
@@ -74,7 +74,7 @@ if (large.length) {
     return mark;
   };
 
-  // Where there are pixels as the picture has them: all of it, or its crops.
+  // The regions stored at full resolution: the whole image, or its crops.
   const parts = () => {
     const { by, width, height, places } = shown();
     return by > 1 ? places : [{ left: 0, top: 0, width, height }];
@@ -95,7 +95,7 @@ if (large.length) {
     return { number, part, point: inside(part, [x, y]) };
   };
 
-  // The corner of what a canvas shows of a part, px of the part.
+  // The top left corner of the area that a canvas shows, in px of its region.
   const corner = (canvas, part, point) => [
     [point[0] - part.left, canvas.width, part.width], [point[1] - part.top, canvas.height, part.height],
   ].map(([value, size, most]) => {
