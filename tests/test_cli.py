@@ -230,7 +230,7 @@ def test_inputs_that_cannot_be(clpipe, small, tmp_path):
     result = clpipe("run", small, other / "small.exr", "-o", "out", status=2)
     assert "would both write out/small.json" in result.stderr
     result = clpipe("run", small, "-o", small.parent, "--format", "exr", status=2)
-    assert "is an input and would be overwritten" in result.stderr
+    assert "this input would be overwritten" in result.stderr
 
 
 def test_a_kept_stage_never_overwrites_an_input_or_another_result(clpipe, write_exr, tmp_path):

@@ -52,10 +52,10 @@ def test_a_dump_by_configuration_and_what_it_does_not_say(tmp_path):
     command = ("run", tmp_path / "a.raw", "-o", tmp_path / "out", "-c", tmp_path / "c.toml")
     output = clpipe(*command)
     for message in (
-        "does not say its pattern; RGGB is taken",
-        "does not say its levels; black 512 and white 16383 are taken",
-        "does not say its ISO; 100 is taken",
-        "does not say its white balance; gray_world estimates it",
+        "does not state its CFA pattern; clpipe assumes RGGB",
+        "does not state its levels; clpipe assumes black 512 and white 16383",
+        "does not state its ISO; clpipe assumes 100",
+        "does not state its white balance; gray_world estimates it",
         "its colour matrix is unknown",
     ):
         assert output.count(message) == 1
