@@ -239,7 +239,7 @@ def test_a_kept_stage_never_overwrites_an_input_or_another_result(clpipe, write_
     before = two.read_bytes()
     keep = ("--keep", "demosaic")
     result = clpipe("run", one, two, "-o", "in", *keep, status=2)
-    assert "a.demosaic.exr is an input and would be overwritten" in result.stderr
+    assert "a.demosaic.exr: this input would be overwritten" in result.stderr
     assert two.read_bytes() == before
     result = clpipe("run", one, two, "-o", "out", *keep, "--format", "exr", status=2)
     assert "would both write out/a.demosaic.exr" in result.stderr
