@@ -249,7 +249,7 @@ def test_kittis_boxes_go_through_a_lens_and_into_patches(clpipe, kitti):
     assert len(boxes) > 4
     assert all((box >= 0).all() and (box <= 48).all() for box in boxes)
     said = clpipe("run", "in/a.exr", "-o", "q", *AS_KITTI, *PLAIN, *patches, "--augment").stderr
-    assert "flipped and turned patches have no poses" in said
+    assert "flipped and rotated patches have no poses" in said
 
 
 AS_BOP = ("--device", "numpy", "--skip", "noise", "--format", "png")
@@ -317,7 +317,7 @@ def test_bops_masks_are_of_all_or_of_none(clpipe, coco, bop):
     with_mask = json.loads(Path("o/scene_gt_info.json").read_text())["3"][1]
     Path("bop/mask/000003_000001.png").unlink()
     said = clpipe("run", "in/000003.exr", "-o", "p", *AS_BOP, status=2).stderr
-    assert "3[1]: found no bop/mask/000003_000001.png; expected masks of all or of none" in said
+    assert "3[1]: found no bop/mask/000003_000001.png; expected masks for all objects" in said
     for kind in bop[1]:
         shutil.rmtree(Path("bop", kind))
     clpipe("run", "in/000003.exr", "-o", "p", *AS_BOP)
@@ -331,11 +331,11 @@ def test_annotations_of_another_size_are_told(clpipe, coco):
     del coco["annotations"][3]  # a mask, which is refused
     Path("coco.json").write_text(json.dumps(coco))
     said = clpipe("run", "in", "-o", "o", *RUN).stderr
-    assert "the annotations are of 100x120 pixels" in said
+    assert "the annotations are for a render of 100x120 pixels" in said
     coco["images"][0]["file_name"] = "b.jpg"
     Path("coco.json").write_text(json.dumps(coco))
     said = clpipe("run", "in", "-o", "o", *RUN).stderr
-    assert "1 pictures are of renders that coco.json does not name" in said
+    assert "1 picture is not annotated, because coco.json does not list" in said
 
 
 def first(coco, **values):
@@ -349,7 +349,7 @@ def mask_with(counts, size=(HEIGHT, WIDTH)):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda coco: coco.pop("images"), "has no list 'images'"),
+        (lambda coco: coco.pop("images"), "the list 'images' is missing"),
         (lambda coco: first(coco, image_id=9), "annotations[0]: found image_id 9"),
         (lambda coco: first(coco, bbox=[1, 2]), "annotations[0].bbox: found [1, 2]"),
         (lambda coco: first(coco, segmentation=[[1, 2]]), "found [[1, 2]]"),
@@ -357,13 +357,13 @@ def mask_with(counts, size=(HEIGHT, WIDTH)):
         (mask_with([-5, HEIGHT * WIDTH + 5]), "annotations[0].segmentation.counts"),
         (mask_with([5, 5]), "found runs of 10 pixels; expected 19200 in all"),
         (mask_with("zzzz"), "found zzzz; expected run lengths"),
-        (mask_with("08Q"), "it is cut off"),
+        (mask_with("08Q"), "they are incomplete"),
         (mask_with([HEIGHT * WIDTH], (HEIGHT, 7)), "found [120, 7]; expected [120, 160]"),
-        (lambda coco: first(coco, segmentation=[[0, 0, 1e12, 0, 9, 9]]), "outlines of three"),
+        (lambda coco: first(coco, segmentation=[[0, 0, 1e12, 0, 9, 9]]), "polygons of three"),
         (lambda coco: first(coco, bbox=[0, 0, float("1e300"), 1]), "x, y, width and height"),
         (
             lambda coco: coco["images"].append({**coco["images"][0], "id": 8}),
-            "found images/a.jpg a second time",
+            "found the file_name images/a.jpg of an earlier image",
         ),
         (lambda coco: coco["images"][0].update(id=[7]), "images[0].id: found [7]; expected the id"),
         (lambda coco: coco["images"][0].pop("id"), "images[0].id: found None; expected the id"),
@@ -375,7 +375,7 @@ def mask_with(counts, size=(HEIGHT, WIDTH)):
             lambda coco: coco["images"][0].update(width=10**4000, height=10**4000),
             "expected whole px from 1 to 100000",
         ),
-        (mask_with([10**4299] * 20), "expected run lengths (whole numbers from 0 to 10000000000)"),
+        (mask_with([10**4299] * 20), "expected run lengths (each must be a whole number from 0"),
     ],
 )
 def test_coco_files_that_are_none(clpipe, coco, damage, message):
@@ -392,14 +392,14 @@ def test_coco_files_that_are_none(clpipe, coco, damage, message):
         ("label_2/a.txt", "Car 0 0", "line 1"),
         ("label_2/a.txt", "Car 0 0 0 9 9 1 1 1 1 1 1 1 1 1", "a box with left <= right"),
         ("label_2/readme.md", "", "has no labels"),
-        ("coco.json", "no json", "no valid JSON"),
+        ("coco.json", "no json", "this is not valid JSON"),
         ("label_2/a.txt", "Car 0 0 0 a b c d 1 1 1 1 1 1 1", "a type and 14 numbers"),
         ("label_2/a.txt", "Car 0 0 0 1e9 1e9 2e9 2e9 1 1 1 1 1 1 1", "a box with left <= right"),
         ("label_2/a.txt", "Car 0 0 0 1 1 nan 3 1 1 1 1 1 1 1", "a type and 14 numbers"),
         ("scene_gt.json", '{"3": 5}', "found 5; expected a list of objects"),
         ("scene_gt.json", '{"3": []}', "3.cam_K: found [1, 2]; expected nine numbers"),
-        ("scene_gt.json", f'{{"{"9" * 4400}": []}}', "999; expected its number, from 0 to 99999"),
-        ("scene_gt.json", f'{{"{"9" * 300}": [{{}}]}}', "999; expected its number, from 0 to 9999"),
+        ("scene_gt.json", f'{{"{"9" * 4400}": []}}', "999; expected a number from 0 to 999999"),
+        ("scene_gt.json", f'{{"{"9" * 300}": [{{}}]}}', "999; expected a number from 0 to 999999"),
         ("scene_gt.json", '{"4": [{}]}', "4[0].px_count_all: found 1000000000000000000000000000"),
     ],
 )

@@ -365,7 +365,10 @@ def test_a_disk_without_room_is_no_problem_where_all_is_done(clpipe, renders, mo
     monkeypatch.setattr(os, "posix_fallocate", full)
     assert "2 of them were there already" in clpipe("run", "in", *RUN, *options).stderr
     told = clpipe("run", "in", *RUN, *options, "--seed", 7, status=1).stderr
-    assert "out: cannot write there: No space left on device (8.0 MiB are needed); " in told
+    assert (
+        "out: cannot write to this directory: No space left on device (8.0 MiB are needed); "
+        in told
+    )
     assert {name: data for name, data in contents("out").items() if name in before} == before
 
 
@@ -386,7 +389,7 @@ def test_two_runs_in_one_folder(tmp_path):
         process.stdout.readline()
         for shard in (Shard(), Shard(1, 2), Shard(1, 3)):
             with (
-                pytest.raises(RequestError, match="another run is writing there"),
+                pytest.raises(RequestError, match="another run is writing to this directory"),
                 output_folder(tmp_path / "out", shard),
             ):
                 pass
@@ -456,8 +459,8 @@ def test_the_disk_is_full(clpipe, renders, monkeypatch):
 
     monkeypatch.setattr(write, "_write", fail_to_write)
     result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)
-    assert "clpipe: out: cannot write there: " in result.stderr
-    assert "the same command goes on" in result.stderr
+    assert "clpipe: out: cannot write to this directory: " in result.stderr
+    assert "the same command resumes" in result.stderr
     assert len(written(Path("out"))) == 4
     monkeypatch.undo()
 
@@ -475,7 +478,7 @@ def test_the_folder_has_gone(clpipe, renders, monkeypatch):
 
     monkeypatch.setattr(write, "_write", fail_to_write)
     result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)
-    assert "out: " in result.stderr and "the same command goes on" in result.stderr
+    assert "out: " in result.stderr and "the same command resumes" in result.stderr
     assert not Path("out").exists()
     assert {"r000.jpg", "r000.json"} <= set(written(Path("elsewhere")))
 
@@ -532,7 +535,7 @@ def test_what_is_drawn_for_an_image_is_drawn_again_where_it_re_enters(clpipe, re
         ("path,iso\nr000.exr,fast\n", "row 2: iso: found 'fast'"),
         ("path,denoise.a\nr000.exr,1\n", "unknown parameter of denoise 'a'"),
         ("path,name\nr000.exr,../up\n", "row 2: name: found '../up'"),
-        ("path\nr000.exr\nr000.exr\n", "row 3: it would make the same outputs as row 2"),
+        ("path\nr000.exr\nr000.exr\n", "row 3: this row would write the same outputs as row 2"),
     ],
 )
 def test_a_wrong_manifest_writes_nothing(clpipe, renders, text, message):
@@ -627,7 +630,7 @@ def test_a_sidecar_whose_picture_cannot_be_the_same(clpipe, renders, monkeypatch
     assert "it is of clpipe 0" in refused("moved.exr")
     assert "clpipe did not write" in clpipe("replay", "mine.toml", "-o", "b", status=2).stderr
     Path("half.json").write_text('{"clpipe": "9.9.9", "request": {}}')
-    assert "was changed since" in clpipe("replay", "half.json", "-o", "b", status=2).stderr
+    assert "was changed after" in clpipe("replay", "half.json", "-o", "b", status=2).stderr
     reseal(Path("half.json"), {"clpipe": "9.9.9", "request": {}})
     assert "it is damaged" in clpipe("replay", "half.json", "-o", "b", status=2).stderr
     assert "no such file" in clpipe("replay", "no.json", "-o", "b", status=2).stderr

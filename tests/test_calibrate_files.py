@@ -139,7 +139,7 @@ def test_mosaics_from_elsewhere(tmp_path, ending):
         )
     given = (tmp_path, "-o", tmp_path / "p.toml")
     message = call("calibrate", *given, status=2).stderr
-    assert "give --black-level, --white-level, --pattern, --iso" in message
+    assert "add --black-level, --white-level, --pattern, --iso" in message
     call("calibrate", *given, *LEVELS)
     camera = load_camera(str(tmp_path / "p.toml"))
     assert camera.gain_stages[0].system_gain[0] == pytest.approx(2, rel=0.03)
@@ -154,7 +154,7 @@ def test_headerless_dumps(tmp_path):
     given = (tmp_path, "-o", tmp_path / "p.toml")
     assert "--dump" in call("calibrate", *given, *LEVELS, status=1).stderr
     message = call("calibrate", *given, "--dump", "128x96:uint16le", status=2).stderr
-    assert "give --black-level, --white-level, --pattern, --iso" in message
+    assert "add --black-level, --white-level, --pattern, --iso" in message
     message = call("calibrate", *given, *LEVELS, "--dump", "128x48:uint16le", status=1).stderr
     assert "it would fit 128x96 uint16le" in message
     call("calibrate", *given, *LEVELS, "--dump", "128x96:uint16le")
@@ -177,7 +177,7 @@ def test_frames_that_do_not_belong_together(shots, tmp_path):
     out = ("-o", tmp_path / "p.toml")
     dark = ("--dark", f"{shots}/dark/640*")
     message = call("calibrate", f"{shots}/scene/500*", *dark, *out, status=2).stderr
-    assert "ISO 640 has dark frames only" in message
+    assert "ISO 640 has only dark frames" in message
     options = ("--until", "quantize", "--device", "numpy", "--iso", 500)
     for name, more, expected in (
         ("camera", ("--camera", "sony-a7s2"), "has the camera Sony ILCE-7SM2"),
@@ -198,7 +198,7 @@ def test_frames_that_do_not_belong_together(shots, tmp_path):
 
 def test_what_is_no_frame(shots, tmp_path):
     out = ("-o", tmp_path / "p.toml")
-    assert "give --black-level" in call("calibrate", shots / "scene.exr", *out, status=2).stderr
+    assert "add --black-level" in call("calibrate", shots / "scene.exr", *out, status=2).stderr
     assert "no such file" in call("calibrate", tmp_path / "x.nef", *out, status=2).stderr
     assert "no mosaic or raw" in call("calibrate", "nothing*.dng", *out, status=2).stderr
     assert "must end in .toml" in call("calibrate", shots, "-o", "p.png", status=2).stderr
@@ -206,7 +206,7 @@ def test_what_is_no_frame(shots, tmp_path):
     assert "not a raw that LibRaw" in call("calibrate", tmp_path / "bad.cr2", *out, status=1).stderr
     call("run", shots / "scene.exr", "-o", tmp_path, "--until", "demosaic", "--device", "numpy")
     message = call("calibrate", tmp_path / "scene.exr", *out, status=1).stderr
-    assert "holds rgb, kept after demosaic" in message
+    assert "contains rgb, kept after demosaic" in message
     same = shots / "scene" / "500_0.exr"
     shutil.copy(same, tmp_path / "copy.exr")
     message = call("calibrate", same, tmp_path / "copy.exr", *out, status=1).stderr
@@ -238,7 +238,7 @@ def test_a_real_raw(tmp_path):
         assert np.array_equal(mosaic, raw.raw_image_visible)  # without the masked pixels
     assert mosaic.shape == (190, 288) and mosaic.min() == 2004  # below the black level
     assert (
-        "does not say its ISO; give --iso"
+        "this file does not state its ISO; add --iso"
         in call("calibrate", path, "-o", tmp_path / "p.toml", status=2).stderr
     )
     call("calibrate", path, "-o", tmp_path / "p.toml", "--iso", 400)

@@ -318,18 +318,21 @@ def test_a_pipeline_moves_arrays():
     ("options", "message"),
     [
         (("--carry", "Dpeth"), "no layer 'Dpeth' (did you mean 'Depth'?); the file and a_"),
-        (("--carry", "Depth:flow"), "its layer Depth has 1 channel, but flow has 2 or more"),
+        (
+            ("--carry", "Depth:flow"),
+            "its layer Depth has 1 channel, but a layer of flow needs 2 or more",
+        ),
         (
             ("--carry", "odd"),
-            "the name of its layer odd does not tell what it holds. Add its kind: --carry",
+            "the kind of its layer odd is not known from the name. Add it: --carry odd:KIND",
         ),
         (
             ("--carry", "small:depth"),
             "its layer small has 3x2 pixels, but the picture in/a.exr has 14x9",
         ),
         (("--carry", "two"), "has no layer called two, but several others (b, c). Name one of"),
-        (("--carry", "Depth", "--carry", "View.Depth"), "both name the channel View.Depth.Z"),
-        (("--carry", "seg={name}_no.exr"), "it has no companion in/a_no.exr"),
+        (("--carry", "Depth", "--carry", "View.Depth"), "both contain the channel View.Depth.Z"),
+        (("--carry", "seg={name}_no.exr"), "its companion in/a_no.exr does not exist"),
         (("--carry", "broken"), "a_broken.exr: cannot be read as an image"),
     ],
 )
@@ -402,4 +405,4 @@ def test_patches_have_their_layers(clpipe, render, turned):
 def test_patches_that_are_turned_have_no_vectors(clpipe, render):
     render(height=40, width=56)
     given = (*RUN, "in", *carrying("Normal"), "--patch", 12, "--format", "png")
-    assert "augment flips and turns patches" in clpipe(*given, "--augment", status=1).stderr
+    assert "augment flips and rotates patches" in clpipe(*given, "--augment", status=1).stderr

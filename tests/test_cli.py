@@ -153,7 +153,7 @@ def test_inputs_that_cannot_be(clpipe, small, tmp_path):
     assert "this folder has no images" in clpipe("run", "empty", "-o", "out", status=2).stderr
     assert "no file matches" in clpipe("run", "*.nothing", "-o", "out", status=2).stderr
     result = clpipe("run", small, "-o", small.parent, "--format", "exr", status=2)
-    assert "is an input and would be overwritten" in result.stderr
+    assert "this input would be overwritten" in result.stderr
 
 
 def test_a_kept_stage_never_overwrites_an_input_or_another_result(clpipe, write_exr, tmp_path):
@@ -162,7 +162,7 @@ def test_a_kept_stage_never_overwrites_an_input_or_another_result(clpipe, write_
     before = two.read_bytes()
     keep = ("--keep", "demosaic")
     result = clpipe("run", one, two, "-o", "in", *keep, status=2)
-    assert "a.demosaic.exr is an input and would be overwritten" in result.stderr
+    assert "a.demosaic.exr: this input would be overwritten" in result.stderr
     assert two.read_bytes() == before
     result = clpipe("run", one, two, "-o", "out", *keep, "--format", "exr", status=2)
     assert "would both write out/a.demosaic.exr" in result.stderr

@@ -188,14 +188,14 @@ def test_mosaics_are_grey(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("a.png", "-o", "f.png"), "a.png: one picture has nothing to be compared with"),
+        (("a.png", "-o", "f.png"), "a.png: there is nothing to compare this picture with"),
         (("a.png", "no.png", "-o", "f.png"), "no.png: there is no such file"),
-        (("a.png", "small.png", "-o", "f.png"), "small.png is 50x40, but a.png is 120x80"),
+        (("a.png", "small.png", "-o", "f.png"), "small.png has 50x40, but a.png has 120x80"),
         (("a.png", "b.png", "-o", "f.gif"), "-o: found f.gif; expected a name that ends in .png,"),
         (("a.png", "b.png", "-o", "./b.png"), "b.png is one of the pictures"),
         (("a.png", "b.png", "--truth", "a.png", "-o", "a.png"), "a.png is one of the pictures"),
-        (("a.png", "b.png", "--crop", "60,0,96x64", "-o", "f.png"), "which are 120x80"),
-        (("a.png", "b.png", "--crop", "0,0,0x4", "-o", "f.png"), "it is empty or reaches beyond"),
+        (("a.png", "b.png", "--crop", "60,0,96x64", "-o", "f.png"), "whose size is 120x80"),
+        (("a.png", "b.png", "--crop", "0,0,0x4", "-o", "f.png"), "this crop is empty or exceeds"),
         (("a.png", "b.png", "--crop", "sky", "-o", "f.png"), "found 'sky'; expected X,Y,WxH"),
         (("small.png", "small.png", "-o", "f.png"), "--crop flat: the pictures are 50x40, smaller"),
         (("a.png", "b.png", "--label", "x", "-o", "f.png"), "found 1 for 2 pictures"),
@@ -205,7 +205,10 @@ def test_mosaics_are_grey(tmp_path):
             "more than 67,108,864; give smaller crops",
         ),
         (("a.png", "mosaic.exr", "-o", "f.png"), "mosaic that does not say its levels"),
-        (("a.png", "shot.DNG", "-o", "f.png"), "shot.DNG: a camera raw, which is not read here"),
+        (
+            ("a.png", "shot.DNG", "-o", "f.png"),
+            "shot.DNG: this is a camera raw, which this command does not read",
+        ),
         (("a.png", "loop.png", "-o", "f.png"), "loop.png: cannot be read: Too many levels of"),
     ],
 )

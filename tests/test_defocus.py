@@ -187,7 +187,7 @@ def test_depth_of_the_file_or_a_companion(render, clpipe):
 @pytest.mark.parametrize(
     ("depth", "options", "message"),
     [
-        (None, (), "defocus needs depth: no layer 'Depth'"),
+        (None, (), "defocus needs depth: there is no layer 'Depth'"),
         (np.full((9, 14), 2), ("--set", 'defocus.layer="Far"'), "no layer 'Far'"),
         (np.full((9, 13), 2), (), "has 13x9 pixels, but the picture a.exr has 14x9"),
         ([[2, 2, -1, np.nan] + [2] * 10] * 9, (), "in 18 pixels, first -1 at column 2, row 0"),

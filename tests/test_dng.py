@@ -330,9 +330,9 @@ def test_a_mosaic_from_elsewhere_as_a_dng(write_exr, tmp_path):
     ("options", "message"),
     [
         (("--stages", "exposure,gamma"), "starts on rgb and has no quantize"),
-        (("--until", "sensor_noise"), "the raw in DN that quantize makes"),
+        (("--until", "sensor_noise"), "the raw in DN that quantize produces"),
         (("--until", "quantize", "--format", "jpg"), "ends in DN, which jpg cannot hold"),
-        (("--set", "quantize.white_level=1000.5"), r"white level of 1000\.5, but DNG wants whole"),
+        (("--set", "quantize.white_level=1000.5"), r"white level of 1000\.5, but DNG needs whole"),
     ],
 )
 def test_a_chain_without_a_raw_is_refused(scene, tmp_path, options, message):
@@ -354,7 +354,7 @@ def test_samples_that_are_no_dn_are_refused(tmp_path, value):
     chain = make_chain(settings_from({}))
     mosaic = np.full((4, 4), 600, np.float32)
     mosaic[2, 1] = value
-    with pytest.raises(ImageError, match=r"a\.dng: holds samples that are not whole DN"):
+    with pytest.raises(ImageError, match=r"a\.dng: this raw has samples that are not whole DN"):
         write_dng(tmp_path / "a.dng", mosaic, negative_of(chain), Tags("a", "b", 100))
     assert not list(tmp_path.iterdir())
 

@@ -52,10 +52,10 @@ def test_a_dump_by_configuration_and_what_it_does_not_say(tmp_path):
     command = ("run", tmp_path / "a.raw", "-o", tmp_path / "out", "-c", tmp_path / "c.toml")
     output = clpipe(*command)
     for message in (
-        "does not say its pattern; RGGB is taken",
-        "does not say its levels; black 512 and white 16383 are taken",
-        "does not say its ISO; 100 is taken",
-        "does not say its white balance; gray_world estimates it",
+        "does not state its CFA pattern; clpipe assumes RGGB",
+        "does not state its levels; clpipe assumes black 512 and white 16383",
+        "does not state its ISO; clpipe assumes 100",
+        "does not state its white balance; gray_world estimates it",
         "its colour matrix is unknown",
     ):
         assert output.count(message) == 1
@@ -68,7 +68,10 @@ def test_a_dump_of_another_size_is_told_what_would_fit(tmp_path):
     (tmp_path / "a.raw").write_bytes(bytes(64 * 48 * 2))
     options = ("--dump", "64x40:uint16le")
     output = clpipe("run", tmp_path / "a.raw", "-o", tmp_path, *options, status=1)
-    assert "a.raw: 6144 bytes, but 64x40 uint16le has 5120; it would fit 64x48 uint16le" in output
+    assert (
+        "a.raw: this file has 6144 bytes, but 64x40 uint16le has 5120; it would fit 64x48 uint16le"
+        in output
+    )
     output = clpipe("run", tmp_path / "a.raw", "-o", tmp_path, status=1)
     assert "not a raw that LibRaw knows" in output or "--dump" in output
 

@@ -140,12 +140,16 @@ LINES = {
     "bits": ("n 10", "n 17", "line 4: bits: found '17'; allowed: 1 to 16"),
     "size": ("n 10 160", "n 10 wide", "line 4: side: found 'wide'; allowed: 16 to 16384"),
     "twice": ("v 3.1", "n 8 20 20", "line 4: a second line n"),
-    "no size": ("n 10 160 128", "v 3.1", "found no line n BITS WIDTH HEIGHT"),
+    "no size": ("n 10 160 128", "v 3.1", "the line n BITS WIDTH HEIGHT is missing"),
     "time": ("d 5000000", "d -1", "time: found '-1'; allowed: 0 to 1e+15"),
     "no light": (" 3100", " 0", "photons: found 0; frames without light are a line d"),
     "one frame": ("i images/b3_1.png\n", "", "found 1 frames of this exposure; at least 2"),
     "frame of none": ("v 3.1", "i a.png", "line 3: a frame of no exposure"),
-    "other times": ("d 10000000", "d 1", "no two frames without light were exposed for 1e+07 ns"),
+    "other times": (
+        "d 10000000",
+        "d 1",
+        "two frames without light are missing that were exposed for 1e+07 ns",
+    ),
     "stacks": ("b 5000000 3100", "b 1 3100", "the stacks were exposed for 1 and 5e+06 ns"),
 }
 
@@ -176,7 +180,7 @@ def test_missing_exposures_are_named(series, clpipe):
     at = text.index("b 5000000 3100\ni images/bs")
     for changed, message in (
         (only(text, "b"), "found 0 exposures of two frames with light; at least 9 are needed"),
-        (only(text, "d"), "found no exposure of two frames without light"),
+        (only(text, "d"), "an exposure of two frames without light (d) is missing"),
         (text[:at], "found 0 stacks of more than two frames with light (b); expected one"),
     ):
         Path("a.txt").write_text(changed)
@@ -201,9 +205,9 @@ def test_frames_that_do_not_fit_are_named(series, clpipe):
         frame.write_bytes(b"text")
         assert str(frame) in error()
         write_grey_png(frame, np.zeros((HEIGHT, 20), np.uint16))
-        assert f"{frame}: found 20x128 pixels; {series.path} says 160x128" in error()
+        assert f"{frame}: found 20x128 pixels, but {series.path} states 160x128" in error()
         write_grey_png(frame, np.full((HEIGHT, WIDTH), 1024, np.uint16))
-        assert f"found 1024 DN; {series.path} says 10 bits, which end at 1023" in error()
+        assert f"found 1024 DN, but {series.path} states 10 bits, so at most 1023" in error()
     finally:
         frame.write_bytes(whole)
 
@@ -213,7 +217,7 @@ def test_a_series_without_saturation_or_noise_in_the_dark_is_refused(series, clp
     at = text.index("\n", text.index("b20_1")) + 1
     Path("a.txt").write_text(text[:at] + text[text.index("d ", at) :])
     error = clpipe("calibrate", "--emva", "a.txt", "-o", "c.toml", status=2).stderr
-    assert "the series ends before the saturation" in error
+    assert "the series ends before saturation" in error
     dark = series.dark_stack.frames[0]
     frame = f"i {dark}"
     black = tmp_path / "black.png"
@@ -336,7 +340,7 @@ def test_a_series_is_the_same_again_and_replaces_none(clpipe):
     frames = read_series(Path("one/EMVA1288_Data.txt")).bright[0].frames
     assert frames[0].read_bytes() != frames[1].read_bytes()
     again = clpipe("emva", "--camera", "mine.toml", "-o", "one", *small, status=2)
-    assert "there is a series already" in again.stderr
+    assert "this folder already contains a series" in again.stderr
     for wrong, message in (
         (("--size", "8x900"), "--size: found '8x900'; expected WIDTHxHEIGHT"),
         (("--iso", "200"), "iso: found 200, but camera mine goes from 100 to 100"),

@@ -82,8 +82,11 @@ def test_what_is_whole_and_was_changed_is_somebodys(again, clpipe, name, how):
     ):
         said = clpipe("run", "in", *RUN, *option, status=1).stderr
         sidecar = "a.truth_mosaic.json" if "truth" in name else "a.json"
-        assert f"{path}: was changed since clpipe wrote it (its SHA-256 is not that in " in said
-        assert f"{sidecar})" in said and "move it, " in said and "say --redo all" in said
+        assert (
+            f"{path}: this file was changed after clpipe wrote it (its SHA-256 differs from "
+            in said
+        )
+        assert f"{sidecar})" in said and "move it, " in said and "use --redo all" in said
         assert path.read_bytes() == changed
     assert name in again("--redo", "all")
     assert path.read_bytes() == before
@@ -105,7 +108,7 @@ def test_a_picture_that_somebody_edited_is_kept(clpipe, write_exr, format_):
     changed = path.read_bytes()
     assert is_marked(path)
     said = clpipe(*run, status=1).stderr
-    assert f"{path}: was changed since clpipe wrote it" in said
+    assert f"{path}: this file was changed after clpipe wrote it" in said
     assert path.read_bytes() == changed
     clpipe(*run, "--redo", "all")
 

@@ -197,7 +197,10 @@ def test_an_exposure_of_a_bracket_is_replayed(clpipe, write_exr, tmp_path, scene
         (["--bracket", "nan"], "expected EVs"),
         (["--bracket", "1e-9,0"], "expected EVs"),
         (["--bracket", "1,1.0"], "found '1,1.0', with +1 EV twice; give it once"),
-        (["--bracket", "0,30"], "+30 EV on exposure.ev=0 is too far; exposure.ev: found 30"),
+        (
+            ["--bracket", "0,30"],
+            "+30 EV added to exposure.ev=0 is not allowed; exposure.ev: found 30",
+        ),
         (["--bracket", "1", "--skip", "exposure"], "this chain has no stage exposure: "),
     ],
 )
@@ -274,8 +277,8 @@ def test_meter_takes_sub_frames_as_one_exposure(clpipe, sequence, tmp_path):
         (["frames", "-o", "a.txt"], "found a.txt; expected a name that ends in .csv"),
         (["frames/day/0.exr", "no.exr", "-o", "a.csv"], "no.exr: there is no such file"),
         (["a.csv", "-o", "./a.csv"], "a.csv is an input; choose another name"),
-        (["frames", "-o", "a.csv", "--set", "exposure.method=gain"], "metering is what auto does"),
-        (["a.dng", "-o", "a.csv"], "a.dng: it is a raw, which is exposed already"),
+        (["frames", "-o", "a.csv", "--set", "exposure.method=gain"], "but only auto meters"),
+        (["a.dng", "-o", "a.csv"], "a.dng: this is a raw, whose exposure is fixed"),
         (["frames", "-o", "a.csv", "--set", "exposure.key=1"], "unknown parameter of exposure"),
     ],
 )

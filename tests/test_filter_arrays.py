@@ -371,9 +371,9 @@ def test_a_dng_of_another_array(clpipe, half, array):
 
 
 NO_DNG = {
-    "RGGB-IR": "RGGB-IR has the channel I, which DNG does not know",
-    "RCCC": "RCCC has the channels R and W only, and LibRaw opens no DNG of two channels",
-    "RG": "RG has the channels R and G only",
+    "RGGB-IR": "RGGB-IR has the channel I, but DNG only allows R, G, B, C",
+    "RCCC": "RCCC has only the channels R and W, but LibRaw opens no DNG of two channels",
+    "RG": "RG has only the channels R and G",
 }
 
 

@@ -73,13 +73,13 @@ def test_what_was_ignored_is_counted(folder, caplog):
     os.mkfifo("in/b.exr")
     assert keys("in") == ["a.exr"]
     assert caplog.messages == [
-        "in: 5 files are no image and were ignored: 2 .txt, 1 .json, 1 pipe or device, "
+        "in: 5 files are not images and were skipped: 2 .txt, 1 .json, 1 pipe or device, "
         "1 without suffix"
     ]
     caplog.clear()
     folder("one/a.exr", "one/a\n.b\tc")
     keys("one")
-    assert caplog.messages == ["one: 1 file is no image and was ignored: 1 .b c"]
+    assert caplog.messages == ["one: 1 file is not an image and was skipped: 1 .b c"]
 
 
 def test_exclude(folder, caplog):
@@ -88,7 +88,7 @@ def test_exclude(folder, caplog):
     assert keys("in", exclude=["old/*.exr"]) == ["a.exr", "tmp/b.exr"]
     assert keys("in/*.exr", exclude=["*_depth*"]) == ["a.exr"]
     assert keys("in/a_depth.exr", exclude=["*_depth*"]) == ["a_depth.exr"]  # it was named
-    assert "--exclude *_depth*: matches nothing" in caplog.messages
+    assert "--exclude *_depth* matches no file" in caplog.messages
     for inputs in ("in", "in/*.exr"):
         with pytest.raises(RequestError, match="excluded"):
             find_jobs([inputs], NOWHERE, exclude=["*"])
@@ -120,8 +120,13 @@ def test_files_of_one_name_need_another(folder, clpipe, write_exr):
     run = ("run", "-o", "out", "--device", "numpy")
     for inputs in (["in"], ["in/a.exr", "in/a.hdr"]):
         refused = clpipe(*run, *inputs, status=2)
-        assert "run them into different folders, or name them in a manifest" in refused.output
-    assert "tell them apart in a column called name" in clpipe(*run, "list.csv", status=2).output
+        assert (
+            "use different output directories, or give them names in a manifest" in refused.output
+        )
+    assert (
+        "give them different names in a column called name"
+        in clpipe(*run, "list.csv", status=2).output
+    )
     refused = clpipe(*run, "in", "--webdataset", 2, status=2)
     assert "give one of them another name" in refused.output
     clpipe(*run, "in", "--exclude", "*.hdr")
@@ -136,9 +141,9 @@ def test_a_depth_file_in_a_folder_is_left_out(clpipe, write_exr):
         write_exr(f"in/{name}.exr", np.ones((4, 6, 1)), "Z")
     run = ("run", "-o", "out", "--device", "numpy")
     done = clpipe(*run, "in")
-    assert "1 file goes with an image beside, such as in/a_depth.exr; see --carry" in done.output
+    assert "1 file is a companion of another image, such as in/a_depth.exr" in done.output
     assert "left out: 1 image in a folder holds no picture, such as in/b_depth.exr" in done.output
-    assert "_depth.exr: no R, G and B channels; found Z" in done.output
+    assert "_depth.exr: there are no R, G and B channels; found Z" in done.output
     assert "1 of 2 images done, 0 failed, 1 left out" in done.output
     assert written(Path("out")) == ["a.jpg", "a.json"]
     lines = map(json.loads, Path("out/run.jsonl").read_text("utf-8").splitlines())
@@ -173,7 +178,7 @@ def test_names_that_are_too_long_fail_alone(clpipe, write_exr):
     for name in ("a" * 251, "b" * 240, "short"):
         write_exr(f"in/{name}.exr", np.full((4, 6, 3), 0.25))
     done = clpipe("run", "in", "-o", "out", "--device", "numpy", status=1)
-    assert "a.json: cannot be read: File name too long" in done.output
+    assert "a.json: this file cannot be read: File name too long" in done.output
     assert "in/short.exr -> out/short.jpg" in done.output
 
 

@@ -62,7 +62,7 @@ def folder(write_exr):
         ((*RUN, "--skip", "gamma", "noise"), "several values, use --skip gamma --skip noise"),
         ((*RUN, "--lens", "Canon", "50mm"), "For a value with spaces, use --lens 'Canon 50mm'"),
         (("explore", "render.exr", "--iso", "100", "200"), "200: {}. --iso takes one value"),
-        (("run", "a.json", "-o", "out"), "to make the picture of a sidecar again, use 'clpipe rep"),
+        (("run", "a.json", "-o", "out"), "to recompute a sidecar's picture, use 'clpipe rep"),
         (
             (*RUN, "--camera", "pngs/a.png"),
             "to make one from a DNG or a noise model, use 'clpipe ca",
@@ -177,7 +177,7 @@ def test_one_image_is_counted_as_one(clpipe, folder):
 def test_a_layer_that_is_not_there(clpipe, folder):
     said = clpipe(*RUN, "--device", "numpy", "--carry", "Depth", status=1).stderr
     expected = "the file has no layers besides the picture, and there is no render_Depth.exr next"
-    assert f"--carry: no layer 'Depth'; {expected}" in said
+    assert f"--carry: there is no layer 'Depth'; {expected}" in said
 
 
 def test_every_command_has_a_form_for_programs():

@@ -149,4 +149,4 @@ def test_what_is_refused(lit):
     wide = ("--set", "projection.method=kannala_brandt", "--set", "shutter.flicker_layer=Lamp")
     wide += ("--set", "shutter.flicker_duty=0.2", "--set", "projection.fx=10")
     told = lit("run", "in", "-o", "x", *wide, status=2).stderr
-    assert "what is seen through a wide lens has no layers of light" in told
+    assert "panoramas have no light layers" in told

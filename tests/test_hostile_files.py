@@ -156,7 +156,7 @@ def test_images_that_claim_too_much_are_refused_in_little_memory(tmp_path):
     told = ("rgb.png", "rgb.tif", "mosaic.tif", "rgb.pfm", "window.exr", "sensor.dng")
     for name in (*told, "display.exr", "chroma.exr", "chroma_display.exr"):
         assert (
-            f"{name}: 60000x60000 pixels; at most 200000000 are read. To read more," in done.stdout
+            f"{name}: this file has 60000x60000 pixels; at most 200000000 are read." in done.stdout
         )
     assert "dump" not in done.stdout
 
@@ -202,7 +202,7 @@ def test_a_dump_of_another_size_is_not_read(tmp_path, clpipe):
     os.truncate(os.open(tmp_path / "a.raw", os.O_CREAT | os.O_WRONLY), 1 << 40)  # takes no place
     dump = ["--dump", "96x80:uint8", "--device", "numpy"]
     done = clpipe("run", "a.raw", "-o", "out", *dump, status=1)
-    assert "a.raw: 1099511627776 bytes, but 96x80 uint8 has 7680" in done.output
+    assert "a.raw: this file has 1099511627776 bytes, but 96x80 uint8 has 7680" in done.output
 
 
 @pytest.mark.slow
@@ -344,7 +344,8 @@ def test_a_pipe_in_the_output_folder_does_not_make_a_run_wait(clpipe, write_exr)
         os.mkfifo(name)
     run = ("run", path, "--device", "numpy")
     assert (
-        "a.json: cannot be read: it is a named pipe" in clpipe(*run, "-o", "out", status=1).output
+        "a.json: this file cannot be read: it is a named pipe"
+        in clpipe(*run, "-o", "out", status=1).output
     )
     os.remove("out/a.json")
     os.mkfifo("out/a.jpg")
@@ -374,7 +375,7 @@ def test_an_image_of_very_many_parts_is_refused(tmp_path, monkeypatch):
         return seek(file, part, *level)
 
     monkeypatch.setattr(oiio.ImageInput, "seek_subimage", noted)
-    with pytest.raises(ImageError, match=r"a\.tif: has more than 1000 parts"):
+    with pytest.raises(ImageError, match=r"a\.tif: this file has more than 1000 parts"):
         read_source(path, Kind.RGB, ReadOptions())
     assert holds_mosaic(path)
     # At most a few passes over the parts that are allowed, never one over all 20,000.

@@ -46,7 +46,7 @@ def test_half_a_character_in_a_sidecar(clpipe, write_exr):
         assert key in whole
         reseal(sidecar, json.loads(whole.replace(key, key + r"\ud800")))
         again = clpipe("replay", sidecar, "-o", "again", "--device", "numpy", status=2)
-        assert f"{sidecar}: was changed since clpipe wrote it" in again.stderr
+        assert f"{sidecar}: this sidecar was changed after clpipe wrote it" in again.stderr
         clpipe(*run)
         assert r"\ud800" not in sidecar.read_text()
 
@@ -181,11 +181,11 @@ def test_json_that_is_nested_too_deeply_is_refused(tmp_path):
     with pytest.raises(RequestError, match="nested too deeply"):
         embedded_settings({"settings": deep})
     (tmp_path / "a.jsonl").write_text(deep)
-    with pytest.raises(RequestError, match="row 1: not valid JSON"):
+    with pytest.raises(RequestError, match="row 1: this is not valid JSON"):
         read_manifest(tmp_path / "a.jsonl")
 
 
 def test_a_giant_field_is_refused(tmp_path):
     (tmp_path / "a.csv").write_text("path\n" + "x" * 1_000_000)
-    with pytest.raises(RequestError, match="row 2: not valid CSV: field larger than"):
+    with pytest.raises(RequestError, match="row 2: this is not valid CSV: field larger than"):
         read_manifest(tmp_path / "a.csv")

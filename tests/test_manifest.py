@@ -155,9 +155,9 @@ def test_rows_lie_over_settings(manifest):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "frames.csv: it is empty; its first row names columns, such as path"),
-        ("\n\n", "frames.csv: it is empty"),
-        ("path,iso\n", "frames.csv: it has no rows"),
+        ("", "frames.csv: this manifest is empty; its first row must name columns, such as path"),
+        ("\n\n", "frames.csv: this manifest is empty"),
+        ("path,iso\n", "frames.csv: this manifest has no rows"),
         (
             "paht,iso\na.exr,1",
             r"row 1: there is no column 'path' .did you mean 'paht'..; found: pa",
@@ -167,7 +167,7 @@ def test_rows_lie_over_settings(manifest):
         ("path,,iso\n", "row 1: column 2 has no name"),
         ("path,isoo\n", "row 1: unknown column 'isoo' .*mean 'iso'.*, or stage.parameter"),
         ("path,skips\n", "row 1: unknown column 'skips'"),
-        ("path,mosaic\n", "row 1: mosaic: its parameters have columns of their own: mosaic.NAME"),
+        ("path,mosaic\n", "row 1: mosaic is not a column, .*; use mosaic.PARAMETER"),
         (
             "path,sensr_noise.a\n",
             "row 1: sensr_noise.a: unknown stage 'sensr_noise' .*sensor_noise",
@@ -176,30 +176,36 @@ def test_rows_lie_over_settings(manifest):
         ("path,output.quality\n", "row 1: unknown key of output 'quality' .*jpeg_quality"),
         ("path,iso\n\na.exr\n", r"row 3: found 1 cells, but there are 2 columns .path, iso."),
         ("path,iso\na.exr,1,2\n", "row 2: found 3 cells, but there are 2 columns"),
-        ('path,iso\n"a\nb.exr",1\n"c.exr,2', "row 4: not valid CSV: unexpected end of data"),
+        (
+            'path,iso\n"a\nb.exr",1\n"c.exr,2',
+            "row 4: this is not valid CSV: unexpected end of data",
+        ),
         ('path,iso\n"a\nb.exr",1\nc.exr', "row 4: found 1 cells"),
-        ('path\n"a"b\n', "row 2: not valid CSV"),
-        ("path,iso\n,100\n", "row 2: path: found '', which names no image"),
-        ("path\na/\n", "row 2: path: found 'a/', which names no image"),
-        ("path\n..\n", "row 2: path: found '..', which names no image"),
-        ("path\na\0b\n", "row 2: path: found .*no NUL"),
-        (b"path\na.exr\n\xff.exr\n", "frames.csv, line 3: not a text in UTF-8"),
+        ('path\n"a"b\n', "row 2: this is not valid CSV"),
+        ("path,iso\n,100\n", "row 2: path: found '', but expected the path of an image"),
+        ("path\na/\n", "row 2: path: found 'a/', but expected the path of an image"),
+        ("path\n..\n", "row 2: path: found '..', but expected the path of an image"),
+        ("path\na\0b\n", "row 2: path: found .*not contain NUL"),
+        (b"path\na.exr\n\xff.exr\n", "frames.csv, line 3: this is not UTF-8"),
         ("path,frames\na.exr,0\n", "row 2: frames: found 0, but it is a whole number from 1 to 1"),
         ("path,frames\na.exr,2.5\n", "row 2: frames: found 2.5"),
         ("path,frames\na.exr,true\n", "row 2: frames: found True"),
         ("path\nx/a.exr\nb.exr\nx/a.exr\n", "row 4: .*same outputs as row 2, x/a; .*called name"),
-        ("path\na.exr\na.hdr\n", "row 3: it would make the same outputs as row 2, a"),
+        ("path\na.exr\na.hdr\n", "row 3: this row would write the same outputs as row 2, a"),
         (
             "path,frames\na,0\nb,1\nc,x\nd,-1\n",
-            "row 2: frames: found 0.*; and 2 more rows are wrong",
+            "row 2: frames: found 0.*; 2 more rows are also wrong",
         ),
-        ("path,frames\na,0\nb,0\n", "row 2: frames: found 0.*; and 1 more row is wrong"),
+        ("path,frames\na,0\nb,0\n", "row 2: frames: found 0.*; 1 more row is also wrong"),
         *(
-            (f"path,name\na.exr,{name}\n", "row 2: name: found .*a path in the output folder")
+            (f"path,name\na.exr,{name}\n", "row 2: name: found .*a path in the output directory")
             for name in ("/x", "../x", "a/../../x", "a/..", "..", ".", "a//b", "x/", "./x", "a/./b")
         ),
         *(
-            (f"path,name\na.exr,{name}\n", "row 2: name: found .* no backslash, .* choose another")
+            (
+                f"path,name\na.exr,{name}\n",
+                "row 2: name: found .* not contain a backslash, .* choose another",
+            )
             for name in (".hidden", ".clpipe.lock", "a/.b", "a\\..\\evil", "~/evil", "a/~b/c")
         ),
     ],
@@ -213,7 +219,7 @@ def test_a_csv_that_is_wrong(manifest, text, message):
 def test_a_name_stays_in_the_output_folder_on_windows(monkeypatch, name):
     windows = SimpleNamespace(sep="\\", path=ntpath)
     monkeypatch.setattr("clpipe.inputs.manifest.os", windows)
-    with pytest.raises(RequestError, match="a path in the output folder"):
+    with pytest.raises(RequestError, match="a path in the output directory"):
         check_output_name(name)
     check_output_name("a/b.c")
 
@@ -221,27 +227,27 @@ def test_a_name_stays_in_the_output_folder_on_windows(monkeypatch, name):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("{", "row 2: not valid JSON: .* at character 2"),
-        ("[1]", r"row 2: found \[1\], but a row is an object"),
-        ('{"path": "b.exr", "iso": NaN}', "row 2: not valid JSON: found NaN"),
-        ('{"path": "b.exr", "iso": -Infinity}', "row 2: not valid JSON: found -Infinity"),
-        ('{"path": "b.exr", "iso": 1, "iso": 2}', "row 2: 'iso' is there twice"),
+        ("{", "row 2: this is not valid JSON: .* at character 2"),
+        ("[1]", r"row 2: found \[1\], but expected an object"),
+        ('{"path": "b.exr", "iso": NaN}', "row 2: this is not valid JSON: NaN is not"),
+        ('{"path": "b.exr", "iso": -Infinity}', "row 2: this is not valid JSON: -Infinity is not"),
+        ('{"path": "b.exr", "iso": 1, "iso": 2}', "row 2: 'iso' occurs twice"),
         (
             '{"path": "b.exr", "exposure": {"ev": 1}, "exposure.ev": 2}',
-            "row 2: 'exposure.ev' is there twice",
+            "row 2: 'exposure.ev' occurs twice",
         ),
-        ('{"iso": 100}', "row 2: path: found '', which names no image"),
-        ('{"path": 3}', "row 2: path: found 3, but it is text"),
-        ('{"path": "b.exr", "name": 3}', "row 2: name: found 3, but it is text"),
-        ('{"path": "b.exr", "name": "\\ud800"}', "row 2: name: .*no text in UTF-8"),
-        ('{"path": "b.exr", "name": "a\\u0000"}', "row 2: name: .*no NUL"),
+        ('{"iso": 100}', "row 2: path: found '', but expected the path of an image"),
+        ('{"path": 3}', "row 2: path: found 3, but expected text"),
+        ('{"path": "b.exr", "name": 3}', "row 2: name: found 3, but expected text"),
+        ('{"path": "b.exr", "name": "\\ud800"}', "row 2: name: .*that UTF-8 can encode"),
+        ('{"path": "b.exr", "name": "a\\u0000"}', "row 2: name: .*not contain NUL"),
         ('{"path": "b.exr", "frames": "3"}', "row 2: frames: found '3'"),
         ('{"path": "b.exr", "isoo": 3}', "row 2: unknown column 'isoo'"),
-        ('{"path": "b.exr", "exposure": 3}', "row 2: exposure: its parameters have columns"),
+        ('{"path": "b.exr", "exposure": 3}', "row 2: exposure is not a column"),
         ('{"path": "b.exr", "exposure": {"e": 3}}', "row 2: unknown parameter of exposure 'e'"),
         ('{"path": "b.exr", "skips": ["denoise"]}', "row 2: unknown column 'skips'"),
-        ('{"path": "b.exr", "iso": ' + "[" * 100_000, "row 2: not valid JSON"),
-        ('{"path": "b.exr", "iso": ' + "1" * 5000 + "}", "row 2: not valid JSON"),
+        ('{"path": "b.exr", "iso": ' + "[" * 100_000, "row 2: this is not valid JSON"),
+        ('{"path": "b.exr", "iso": ' + "1" * 5000 + "}", "row 2: this is not valid JSON"),
     ],
 )
 def test_a_jsonl_that_is_wrong(manifest, line, message):
@@ -252,7 +258,9 @@ def test_a_jsonl_that_is_wrong(manifest, line, message):
 def test_a_manifest_that_is_not_there(tmp_path):
     with pytest.raises(RequestError, match=r"no.csv: there is no such file"):
         read_manifest(tmp_path / "no.csv")
-    with pytest.raises(RequestError, match="cannot read this manifest: it is a folder, not a file"):
+    with pytest.raises(
+        RequestError, match="this manifest cannot be read: it is a folder, not a file"
+    ):
         read_manifest(tmp_path)
 
 
@@ -293,7 +301,7 @@ def test_a_row_whose_values_are_wrong(manifest, cells, message):
 
 def test_what_is_wrong_in_several_rows(manifest):
     rows = manifest("path,iso\na,100\nb,50\nc,x\nd,800\n")
-    with pytest.raises(RequestError, match=r"row 3: iso: found 50.*; and 1 more row is wrong$"):
+    with pytest.raises(RequestError, match=r"row 3: iso: found 50.*; 1 more row is also wrong$"):
         check_rows(rows, DEFAULT)
 
 

@@ -300,8 +300,8 @@ def test_folders_of_photographs_are_a_burst_each_and_what_is_refused(tmp_path, m
     burst(photos / "b", "x.frame{}.jpg", 4, 5)
     (tmp_path / "empty").mkdir()
     for arguments, message in (
-        ([photos / "b"], "it holds frames that end in .jpg and in .png; name those of one ending"),
-        ([tmp_path / "empty"], "empty: it holds no pictures (.jpg, "),
+        ([photos / "b"], "this folder has frames with the extensions .jpg and .png; choose one"),
+        ([tmp_path / "empty"], "empty: this folder has no pictures (.jpg, "),
         (
             [photos / "a", files[3], files[4], "--truth", files[0]],
             "one scene has it, but there are 2",
@@ -359,12 +359,16 @@ def test_refusals(clpipe, tmp_path, write_exr):
     broken = tmp_path / "broken.jpg"
     broken.write_bytes(b"\xff\xd8\xff\xe0" + b"no" * 99)
     for arguments, status, message in (
-        ((one,), 2, "one image, and nothing to measure it against"),
+        ((one,), 2, "there is nothing to measure this image against"),
         ((one, small), 2, "small.png is display, 30x10, but .*one.png is display, 30x20"),
         ((one, "--truth", small), 2, "small.png is display, 30x10"),
         ((one, linear), 2, "linear.exr is rgb, 30x20"),
         ((one, "--truth", mosaic), 2, "mosaic that does not say its levels RGGB"),
-        ((white, white), 1, "white.png: nothing to measure: every sample is clipped"),
+        (
+            (white, white),
+            1,
+            "white.png: there is nothing to measure: all samples, or their noise, are clipped",
+        ),
         ((one, tmp_path / "missing.png"), 2, "missing.png: there is no such file"),
         ((broken, broken), 1, "broken.jpg: "),
         ((one, one, "--pattern", "XYZ"), 2, "RGGB"),
@@ -424,7 +428,7 @@ def test_wrong_partners_are_refused(developed, clpipe):
     other = developed("--until", "quantize", "--seed", "1", "--iso", "1600")
     before = developed("--until", "mosaic")
     found = clpipe("measure", f"{noisy}.exr", f"{other}.exr", status=2)
-    assert "repeats must have one ISO" in found.stderr
+    assert "give repeats of one ISO" in found.stderr
     found = clpipe("measure", f"{noisy}.exr", "--truth", f"{before}.exr", status=2)
     assert "keep both after the same stage" in found.stderr
 
@@ -434,7 +438,7 @@ def test_a_truth_among_the_repeats_is_refused(clpipe, tmp_path):
     images = sorted((tmp_path / "burst").glob("*.exr"))
     assert len(images) == 4
     found = clpipe("measure", *images, status=2)
-    assert "truth.exr has 0." in found.stderr and "give it as --truth" in found.stderr
+    assert "truth.exr has 0." in found.stderr and "pass it with --truth" in found.stderr
 
 
 def test_another_scene_among_the_repeats_is_refused():

@@ -350,14 +350,16 @@ def test_layers_go_along(write_exr, tmp_path):
         assert s["carried.valid"].shape == (16, 16)
     given["carry"] = "Z:normal"
     write_exr("a.exr", rng.random((40, 48, 6)), "R,G,B,Z.X,Z.Y,Z.Z", half=False)
-    with pytest.raises(ImageError, match=r"a\.exr: .*Z: augment flips and turns patches, but not"):
+    with pytest.raises(
+        ImageError, match=r"a\.exr: .*Z: augment flips and rotates patches, but cannot rotate"
+    ):
         api.Dataset(tmp_path / "a.exr", patch=api.Patches(16, augment=True), **given)[0]
 
 
 def test_what_is_refused(renders):
     mosaic = {"until": "normalize"}
     for wrong, message in (
-        ({"patch": 0}, "found patch 0; expected 1 or more"),
+        ({"patch": 0}, "patch: found 0; expected a whole number of 1 or more"),
         (
             {"patch": 9, "raw": "packed"},
             "found patch 9, but a packed raw has planes of half the size",
@@ -376,9 +378,9 @@ def test_what_is_refused(renders):
         with pytest.raises(RequestError, match=message):
             api.Dataset(renders, device="numpy", **wrong)
     for per_image in (0, "all"):
-        with pytest.raises(RequestError, match=f"found per_image {per_image!r}; exp.* or 'grid'"):
+        with pytest.raises(RequestError, match=f"per_image: found {per_image!r}; exp.* or 'grid'"):
             api.Patches(8, per_image)
-    with pytest.raises(ImageError, match=r"in/r1\.exr: .*57x41 pixels, .* 48x48; make them smal"):
+    with pytest.raises(ImageError, match=r"in/r1\.exr: .*57x41 pixels, .* 48x48; choose smal"):
         list(api.Dataset(renders, device="numpy", patch=48, until="mosaic"))
     with pytest.raises(ImageError, match=r"in/r1\.exr: .*57x41 .*even width and height"):
         list(api.Dataset(renders, device="numpy", raw="packed", until="quantize"))

@@ -250,7 +250,7 @@ def test_frames_and_exposures_are_in_it(clpipe, write_exr):
     clpipe(*run, *pose, "--format", "dng", "--format", "png")
     told = clpipe("poses", "o").stdout
     assert (
-        "a blank in the name, which images.txt cannot hold: 6 pictures" in told
+        "6 pictures with a space in the name, which images.txt cannot hold" in told
         and "x/a b.ev+0.frame0" in told
     )
     views = json.loads(Path("o/cameras.json").read_text())["views"]
@@ -293,15 +293,18 @@ def test_a_lens_that_is_fitted_for_nerfstudio(clpipe, renders):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"file": "ab.exr"}, "has no view a; the nearest are ab, b"),
+        ({"file": "ab.exr"}, "this file has no view a; the most similar names are ab, b"),
         ({"R": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}, "its rows have the lengths 2, 2, 2"),
         ({"R": [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]}, "its determinant is -1"),
-        ({"t": [1, 2]}, "t: found [1, 2], but it is 3 numbers"),
-        ({"t": [1, 2, float("nan")]}, "but it is 3 numbers"),
+        ({"t": [1, 2]}, "t: found [1, 2], but expected 3 numbers"),
+        ({"t": [1, 2, float("nan")]}, "but expected 3 numbers"),
         ({"K": [[9, 1, 3], [0, 9, 3], [0, 0, 1]]}, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"),
         ({"K": [[-9, 0, 3], [0, 9, 3], [0, 0, 1]]}, "render.fx: found -9.0"),
-        ({"distortion": {"k1": 0.1}}, "has distortion (k1 0.1), but a render is straight"),
-        ({"model": "OPENCV_FISHEYE"}, "is of the model OPENCV_FISHEYE"),
+        (
+            {"distortion": {"k1": 0.1}},
+            "has distortion (k1 0.1), but renders have no lens distortion",
+        ),
+        ({"model": "OPENCV_FISHEYE"}, "has the model OPENCV_FISHEYE"),
         ({"width": WIDTH / 2, "height": HEIGHT / 2}, "its camera in --poses has 120x80"),
     ],
 )
@@ -336,9 +339,9 @@ def test_what_is_wrong_with_all_is_refused(clpipe, renders):
     told = refused("cameras.json", *sets("render", focal_length=50, sensor_width=36), status=1)
     assert "render.fx makes the focal length of this render of 240x160 pixels 230 px" in told
     assert "no such file" in refused("missing.json").lower()
-    assert "has no images.txt" in refused("renders")
+    assert "there is no images.txt" in refused("renders")
     Path("other.json").write_text('{"frames": 3}')
-    assert "has neither a list 'views'" in refused("other.json")
+    assert "has neither the list 'views'" in refused("other.json")
     Path("model/sparse/0/images.txt").write_text("1 0 0 0 0 0 0 0 7 a.exr\n\n1 2 3\n")
     assert "found the line '1 2 3'" in refused("model")
     Path("o").mkdir(exist_ok=True)
@@ -382,7 +385,7 @@ def test_views_are_found_by_paths_and_by_names_that_are_unique(clpipe, write_exr
         "b/2.exr": 3
     }
     _, told = found("1.png", "b/2.exr", status=1)
-    assert "in/a/1.exr: --poses v.json: has no view a/1, and 2 images are called 1" in told
+    assert "in/a/1.exr: --poses v.json: this file has no view a/1, and its view 1 may" in told
     _, told = found("b/1", "a/1", "c/2", "d/2", status=1)
     assert "b/2 may be any of the views c/2, d/2" in told
 

@@ -90,7 +90,7 @@ def test_without_a_matrix_the_profile_has_one_or_colours_stay(tmp_path):
     write_dng(tmp_path / "c.dng", mosaic(), matrix=None, model=b"Nonesuch")
     output = clpipe("run", tmp_path / "c.dng", "-o", tmp_path)
     assert "its colour matrix is unknown" in output
-    assert "there is no profile of Canon Nonesuch; denoising takes the noise of sony-a7r2" in output
+    assert "there is no profile of Canon Nonesuch; denoising uses the noise of sony-a7r2" in output
     output = clpipe("run", tmp_path / "c.dng", "-o", tmp_path, "--camera", "canon-5d2")
     assert "profile" not in output
 
@@ -239,7 +239,7 @@ def test_noise_can_be_added_to_a_raw_where_that_is_asked_for(tmp_path):
 def test_gains_that_cannot_be(tmp_path, neutral, has_matrix, multipliers):
     kind = {} if has_matrix else {"matrix": None, "model": b"Nonesuch"}
     write_dng(tmp_path / "a.dng", mosaic(), neutral=neutral, **kind)
-    message = f"cannot be right, with multipliers {multipliers}; gray_world estimates it"
+    message = f"is impossible, with multipliers {multipliers}; gray_world estimates it"
     assert message in clpipe("run", tmp_path / "a.dng", "-o", tmp_path)
     record = sidecar(tmp_path / "a.json")
     step = next(s for s in record["stages"] if s["name"] == "white_balance")
@@ -252,12 +252,12 @@ def test_gains_that_cannot_be(tmp_path, neutral, has_matrix, multipliers):
 def test_levels_that_cannot_be(tmp_path):
     write_dng(tmp_path / "a.dng", mosaic(), white=300)
     output = clpipe("run", tmp_path / "a.dng", "-o", tmp_path, status=1)
-    assert "its levels cannot be right: black 512, white 300" in output
+    assert "its levels are impossible: black 512, white 300" in output
     levels = ("--set", "normalize.black_level=512", "--set", "normalize.white_level=16383")
     clpipe("run", tmp_path / "a.dng", "-o", tmp_path, *levels)
     write_dng(tmp_path / "b.dng", mosaic(), white=1000)
     output = clpipe("run", tmp_path / "b.dng", "-o", tmp_path)
-    assert "most of its samples are not below the white level of 1000 DN" in output
+    assert "most samples are at or above the white level of 1000 DN" in output
     write_dng(tmp_path / "c.dng", mosaic(), black=(12000,) * 4)
     output = clpipe("run", tmp_path / "c.dng", "-o", tmp_path)
     assert "not above the black level of 12000 DN" in output
@@ -265,11 +265,16 @@ def test_levels_that_cannot_be(tmp_path):
 
 def test_an_iso_that_is_not_said_or_is_beyond_the_camera(tmp_path):
     write_dng(tmp_path / "a.dng", mosaic(), iso=0)
-    assert "does not say its ISO; 100 is taken" in clpipe("run", tmp_path / "a.dng", "-o", tmp_path)
+    assert "does not state its ISO; denoising uses 100" in clpipe(
+        "run", tmp_path / "a.dng", "-o", tmp_path
+    )
     assert "ISO" not in clpipe("run", tmp_path / "a.dng", "-o", tmp_path, "--iso", 200)
     write_dng(tmp_path / "b.dng", mosaic(), iso=50)
     output = clpipe("run", tmp_path / "b.dng", "-o", tmp_path)
-    assert "its ISO of 50 is beyond camera canon-5d2, 100 to 6400; 100 is taken" in output
+    assert (
+        "its ISO of 50 is outside the range of camera canon-5d2, 100 to 6400; denoising uses 100"
+        in output
+    )
     assert exif(tmp_path / "b.jpg")[1][0x8827] == 50
 
 
@@ -279,12 +284,12 @@ XTRANS = "GGRGGBGGBGGRBRGRBGGGBGGRGGRGGBRBGBRG"
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("linear", "has every colour at every pixel"),
-        ("half", "damaged, or not a raw that LibRaw knows"),
-        ("no pixels", "holds no pixels"),
+        ("linear", "this file has all colours at each pixel"),
+        ("half", "it is damaged, or not a raw that LibRaw knows"),
+        ("no pixels", "this raw has only metadata and no pixels"),
         ("empty", "the file is empty"),
-        ("jpeg", "it is a JPEG, not a camera raw"),
-        ("text", "damaged, or not a raw that LibRaw knows"),
+        ("jpeg", "this is a JPEG, not a camera raw"),
+        ("text", "it is damaged, or not a raw that LibRaw knows"),
     ],
 )
 def test_what_only_looks_like_a_raw(tmp_path, change, message):
@@ -347,7 +352,7 @@ def test_a_chain_without_mosaic_cannot_know_the_pattern(tmp_path):
     write_dng(tmp_path / "a.dng", mosaic("GRBG"), "GRBG")
     options = ("--stages", "normalize,white_balance,demosaic,gamma")
     output = clpipe("run", tmp_path / "a.dng", "-o", tmp_path, *options, status=1)
-    assert "its pattern is GRBG, which the mosaic stage says, but the chain has none" in output
+    assert "its CFA pattern is GRBG, but the chain has no mosaic stage" in output
 
 
 def test_exif_is_found_in_files_that_are_no_tiff(tmp_path):

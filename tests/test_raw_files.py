@@ -19,9 +19,9 @@ DUMP += ("--set", "normalize.white_level=16383")
 # Files of ../shared/data/raw, and the size of the picture or the message.
 ADDITIONAL = {
     "bep_truncated.cr2": "damaged, or not a raw that LibRaw knows",
-    "exiftool_DNG.dng": "holds no pixels",
+    "exiftool_DNG.dng": "only metadata and no pixels",
     "exiftool_Nikon.nef": "damaged, or not a raw that LibRaw knows",
-    "magicknet_DSC8695.dng": "has every colour at every pixel",
+    "magicknet_DSC8695.dng": "has all colours at each pixel",
     "magicknet_RAW_KODAK_DC50.KDC": (512, 768, 3),
     "mei_issue247-1.nef": "it is a JPEG, not a camera raw",
 }
@@ -82,10 +82,10 @@ def test_colours_are_those_that_libraw_makes(tmp_path):
 
 
 def test_a_dump_does_not_describe_itself(tmp_path):
-    assert "a dump of samples" in clpipe("run", ROSE, "-o", tmp_path, status=1)
+    assert "a headerless dump of samples" in clpipe("run", ROSE, "-o", tmp_path, status=1)
     path = tmp_path / "a.raw"
     path.write_bytes(bytes(2 * 1920 * 1080))  # LibRaw takes files of this size for raws
-    with pytest.raises(ImageError, match="names no camera, ISO or exposure"):
+    with pytest.raises(ImageError, match="states no camera, ISO or exposure"):
         read_facts(path)
 
 

@@ -152,7 +152,7 @@ def test_a_companded_raw(clpipe, part):
     assert np.array_equal(*(np.asarray(Image.open(path)) for path in pictures))
     kept = "kept/part.quantize.exr"
     result = clpipe("measure", kept, "--truth", kept, status=1)
-    assert "has fewer DN by a curve" in result.stderr
+    assert "a curve compresses the DN of this raw" in result.stderr
 
 
 KNOTS = "[[0,0],[4096,1024],[16383,4095]]"
@@ -182,8 +182,11 @@ KNOTS = "[[0,0],[4096,1024],[16383,4095]]"
             ("quantize.method=pwl", "normalize.method=pwl", f"normalize.knots={KNOTS}"),
             "differ from those of quantize, .*remove normalize.knots",
         ),
-        (("sensor_noise.method=dual_gain",), "found a white level of 262143, but it holds DN of"),
-        (("quantize.method=pwl",), "by a curve"),
+        (
+            ("sensor_noise.method=dual_gain",),
+            "found a white level of 262143, but a DNG holds at most",
+        ),
+        (("quantize.method=pwl",), "a curve compresses"),
     ],
 )
 def test_what_is_refused(clpipe, options, message):

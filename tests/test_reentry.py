@@ -170,7 +170,7 @@ def test_a_folder_gives_what_was_kept_right_before(kept, tmp_path):
 def test_entering_elsewhere_than_right_after_is_told(kept, tmp_path):
     enter = ("--start-at", "denoise", *NUMPY)
     output = clpipe("run", kept / "crop.denoise.exr", "-o", tmp_path, *enter)
-    assert "was kept after denoise; entering at denoise repeats stages or leaves" in output
+    assert "was kept after denoise; entering at denoise repeats or skips stages" in output
 
 
 def test_a_kept_mosaic_is_no_render(kept, tmp_path):
@@ -182,9 +182,19 @@ def test_a_kept_mosaic_is_no_render(kept, tmp_path):
     ("level", "start_at", "options", "messages"),
     [
         (0.4, "normalize", (), ("not above the black level of 512", "RGGB", "levels", "ISO")),
-        (900, "white_balance", (), ("level here", "its pattern", "its ISO", "are clipped")),
+        (
+            900,
+            "white_balance",
+            (),
+            ("white level is 1 here", "its CFA pattern", "its ISO", "are clipped"),
+        ),
         (0.2, "white_balance", ("--set", "mosaic.pattern=RGGB", "--iso", 800), ()),
-        (0.2, "white_balance", ("--set", "mosaic.pattern=RGGB"), ("say its ISO; 100 is taken",)),
+        (
+            0.2,
+            "white_balance",
+            ("--set", "mosaic.pattern=RGGB"),
+            ("state its ISO; clpipe assumes 100",),
+        ),
     ],
 )
 def test_what_looks_wrong_with_a_mosaic_is_told(tmp_path, level, start_at, options, messages):
@@ -203,7 +213,7 @@ def test_an_image_of_two_channels_is_no_mosaic(tmp_path):
     output = clpipe(
         "run", tmp_path / "m.exr", "-o", tmp_path / "o", "--start-at", "normalize", status=1
     )
-    assert "no single channel with a mosaic; found X, Y" in output
+    assert "several channels, but a mosaic has one; found X, Y" in output
 
 
 def test_settings_that_an_image_carries_may_be_of_no_use(kept, tmp_path):
@@ -217,7 +227,7 @@ def test_settings_that_an_image_carries_may_be_of_no_use(kept, tmp_path):
         write_exr(path, image.pixels, ("R", "G", "B"), attributes)
         enter = ("--start-at", "tone_curve", *NUMPY)
         output = clpipe("run", path, "-o", tmp_path / "out", *enter, status=1)
-        assert f"{number}.exr: what it was made with cannot be used" in output
+        assert f"{number}.exr: the settings in its attributes cannot be used" in output
 
 
 @pytest.mark.parametrize(
@@ -247,7 +257,7 @@ def test_until_gives_a_float_image_unless_it_is_the_end(tmp_path):
 
 def test_a_kept_image_that_is_taken_for_a_render_is_told(kept, tmp_path):
     output = clpipe("run", kept / "crop.demosaic.exr", "-o", tmp_path, *NUMPY)
-    assert "was kept after demosaic; is it a render? See --start-at" in output
+    assert "was kept after demosaic, but is processed as a render" in output
 
 
 @pytest.mark.slow

@@ -107,7 +107,7 @@ def test_max_pixels_on_the_command_line(tmp_path, write_exr):
     path = write_exr("a.exr", np.zeros((6, 9, 3)))
     command = ("run", path, "-o", tmp_path / "out", "--max-pixels")
     said = run_cli(*command, 53, status=1).output
-    assert "a.exr: 9x6 pixels; at most 53 are read" in said
+    assert "a.exr: this file has 9x6 pixels; at most 53 are read" in said
     run_cli(*command, 54)
 
 
@@ -170,7 +170,7 @@ def test_other_primaries_become_those_of_srgb(tmp_path):
         (1, -3e38, *SRGB[2:]),
     ):
         with pytest.raises(
-            ImageError, match=r"a\.exr: its chromaticities, .*, are not those of a red"
+            ImageError, match=r"a\.exr: its chromaticities, .*, do not describe a red"
         ):
             with_chromaticities(grey, path, *wrong)
 
@@ -197,7 +197,7 @@ def test_luminance_alone_is_grey(write_exr):
     pixels = np.arange(24, dtype=np.float32).reshape(4, 6, 1)
     source = read_image(write_exr("y.exr", pixels, "Y"))
     assert np.array_equal(source.pixels, np.repeat(pixels, 3, axis=-1))
-    assert source.warnings == ("it holds luminance alone; the picture is grey",)
+    assert source.warnings == ("the file has only luminance, so the picture is grey",)
     with pytest.raises(ImageError, match="no R, G and B channels; found Y, Cb, Cr"):
         read_image(write_exr("ycc.exr", np.repeat(pixels, 3, axis=-1), "Y,Cb,Cr"))
 

@@ -192,7 +192,8 @@ def test_half_a_run_and_a_log_that_is_cut_off(out):
     (out / "notes.json").write_text('{"mine": 1}')
     page = report(out)
     assert "killed, or still running" in page.said
-    assert "b.json: was changed since clpipe wrote it" in page.said and "notes" not in page.said
+    assert "b.json: this sidecar was changed after clpipe wrote it" in page.said
+    assert "notes" not in page.said
     assert [entry["name"] for entry in page.data["sheet-data"]] == [SHOWN, "a"]
 
 

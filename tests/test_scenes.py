@@ -221,7 +221,7 @@ def test_renders_that_exist_become_a_dataset(clpipe, write_exr, tmp_path):
     assert (depth == 2500).all()
     readme = (tmp_path / "set/README.md").read_text()
     assert str(tmp_path) not in readme + (tmp_path / "set/manifest.csv").read_text()
-    assert "`Depth` (depth): along the axis of view" in readme
+    assert "`Depth` (depth): along the viewing axis" in readme
     transforms = json.loads((tmp_path / "set/iso100/transforms.json").read_text())
     frame = transforms["frames"][1]
     assert (tmp_path / "set/iso100" / frame["depth_file_path"]).exists()
@@ -229,20 +229,20 @@ def test_renders_that_exist_become_a_dataset(clpipe, write_exr, tmp_path):
     assert (tmp_path / "set/train.txt").read_text() == "a\nsub/b\n"
     write_exr("others/a.exr", np.zeros((12, 16, 3), np.float32))
     said = clpipe("dataset", "others", "-o", "set", *NUMPY, status=2).stderr
-    assert 'holds a dataset with renders "renders", and "others" is asked for' in said
+    assert 'has a dataset with renders "renders", but the request has "others"' in said
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--views", 3, "--frames", "1-3"], "each says which views there are: use one"),
-        (["--frames", "3-1"], "which is no frame"),
+        (["--views", 3, "--frames", "1-3"], "each of them sets the views, so use only one"),
+        (["--frames", "3-1"], "which contains no frame"),
         (["--frames", "a"], "--frames: found 'a'; expected frames, such as 1-24"),
         (["--resolution", "96"], "--resolution: found '96'; expected WIDTHxHEIGHT"),
         (["--box", "1,2,3"], "--box: found '1,2,3'; expected two corners"),
-        (["--box", "0,0,0,1,1,1"], "--box: it is for --path random"),
+        (["--box", "0,0,0,1,1,1"], "--box: this option needs --path random"),
         (["--iso", "1"], "camera sony-a7r2 goes from 100 to 25600"),
-        (["--poses", "cameras.json"], "must have width, height, focal length and pose"),
+        (["--poses", "cameras.json"], "width, height, focal length or pose is missing"),
     ],
 )
 def test_what_is_refused(clpipe, scene, blender, tmp_path, options, message):
@@ -258,10 +258,10 @@ def test_scenes_that_cannot_be_rendered(clpipe, scene, blender, tmp_path, monkey
     assert said == f"clpipe: {scene}: it has no camera; add one\n"
     assert "no such file" in clpipe("dataset", "no.blend", "-o", "set", *blender, status=2).stderr
     Path("no").touch()
-    assert "expected a .blend, or a folder" in clpipe("dataset", "no", "-o", "s", status=2).stderr
+    assert "neither a .blend nor a folder" in clpipe("dataset", "no", "-o", "s", status=2).stderr
     monkeypatch.setitem(sys.modules, "bpy", None)
     said = clpipe("dataset", scene, "-o", "set", status=2).stderr
-    assert "name an installed one with --blender PATH, or a Python that has the package bpy" in said
+    assert "pass an installed Blender, or a Python that has bpy, with --blender PATH" in said
     none = ("--blender", tmp_path / "none")
     assert "No such file" in clpipe("dataset", scene, "-o", "set", *none, status=2).stderr
     (tmp_path / "renders").mkdir()

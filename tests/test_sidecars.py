@@ -17,7 +17,7 @@ from clpipe.batch.run_log import read_log
 from clpipe.outputs.sidecar import SEAL, SidecarError, read_sidecar, sealed, values_in
 from tests.conftest import reseal
 
-CHANGED = f"was changed since clpipe wrote it (its {SEAL} does not fit)"
+CHANGED = f"this sidecar was changed after clpipe wrote it (its {SEAL} does not match)"
 CAMERA = ("--set", "render.fx=30", "--set", "render.fy=30")
 
 
@@ -78,13 +78,13 @@ def test_an_edited_sidecar_is_a_missing_one(made, clpipe, edit):
         said = clpipe(command, "out").output
         if command == "report":
             said = Path("out/report.html").read_text()
-        assert "a.json" in said and "was changed since clpipe wrote it" in said
-        assert "the same clpipe run makes it again" in said
+        assert "a.json" in said and "was changed after clpipe wrote it" in said
+        assert "repeat the same clpipe run" in said
     views = json.loads(Path("out/cameras.json").read_text())["views"]
     assert [view["file"] for view in views] == ["b.jpg"]
     said = clpipe("replay", sidecar, "-o", "again", status=2).stderr
     assert said.startswith(f"clpipe: {sidecar}: {CHANGED}")
-    assert "options or in a configuration" in said
+    assert "use options or a configuration" in said
     assert made() == {"a": "done", "b": "skipped"}
     assert sidecar.read_bytes() == whole
     assert made() == {"a": "skipped", "b": "skipped"}
@@ -103,7 +103,7 @@ def test_every_byte_counts():
         ):
             if data == whole:
                 continue
-            with pytest.raises(SidecarError, match=r"a\.json: was changed since"):
+            with pytest.raises(SidecarError, match=r"a\.json: this sidecar was changed after"):
                 values_in(data, "a.json")
 
 
@@ -229,7 +229,7 @@ def test_an_edited_sidecar_in_a_tar(clpipe, write_exr, options, names):
         edited_in_tar(tar, name)
         clpipe("report", "out")
         said = Path("out/report.html").read_text()
-        assert f"{name}: was changed since clpipe wrote it" in said
+        assert f"{name}: this sidecar was changed after clpipe wrote it" in said
         clpipe(*run)
         assert tar.read_bytes() == whole
 

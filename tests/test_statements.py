@@ -123,7 +123,7 @@ def test_a_radiance_header_that_is_wrong(tmp_path, line, message):
 def test_pixels_that_are_not_square_are_named(tmp_path, write_exr):
     source = read(write_hdr(tmp_path / "a.hdr", lines=("PIXASPECT=0.5",)))
     assert source.warnings == (
-        "its pixel aspect ratio of 2 is not applied; its pixels are read as square",
+        "its pixel aspect ratio of 2 is not applied; pixels are read as square",
     )
     planes = {c: np.ones((4, 4), np.float32) for c in "RGB"}
     header = {"pixelAspectRatio": 2.0, "whiteLuminance": 250.0}
@@ -329,12 +329,20 @@ def integers(*values):
     [
         ({"gAMA": integers(1 / 2.2)}, SRGB, ""),
         ({"sRGB": b"\0", "gAMA": integers(0.7)}, SRGB, ""),
-        ({"gAMA": integers(1.0)}, SRGB, "transfer curve linear; read as srgb"),
-        ({"gAMA": integers(1 / 1.8)}, SRGB, "transfer curve gamma 1.8 (gAMA chunk); read as srgb"),
+        ({"gAMA": integers(1.0)}, SRGB, "transfer curve linear is not applied; it is read as srgb"),
+        (
+            {"gAMA": integers(1 / 1.8)},
+            SRGB,
+            "transfer curve gamma 1.8 (gAMA chunk) is not applied; it is read as srgb",
+        ),
         ({"cHRM": integers(*P3[6:], *P3[:6])}, P3, ""),
         ({"cICP": bytes([12, 13, 0, 1])}, P3, ""),
-        ({"cICP": bytes([9, 16, 0, 1]), "gAMA": integers(1)}, REC_2020, "PQ (cICP chunk); read as"),
-        ({"cICP": bytes([99, 13, 0, 1])}, SRGB, "cICP chunk states primaries 99"),
+        (
+            {"cICP": bytes([9, 16, 0, 1]), "gAMA": integers(1)},
+            REC_2020,
+            "PQ (cICP chunk) is not applied; it is read as",
+        ),
+        ({"cICP": bytes([99, 13, 0, 1])}, SRGB, "cICP chunk states unknown primaries 99"),
     ],
 )
 def test_colours_of_png(tmp_path, chunks, primaries, warning):
@@ -354,7 +362,7 @@ def test_an_icc_profile_is_named(tmp_path, ending):
     Image.fromarray(CODES).save(tmp_path / f"wide.{ending}", icc_profile=wide)
     Image.fromarray(CODES).save(tmp_path / f"srgb.{ending}", icc_profile=srgb)
     (warning,) = read(tmp_path / f"wide.{ending}", "srgb").warnings
-    assert warning == "its ICC profile, Wide built-in, is not applied; read as sRGB"
+    assert warning == "its ICC profile, Wide built-in, is not applied; it is read as sRGB"
     assert read_finished(tmp_path / f"wide.{ending}").warnings == (warning,)
     assert read(tmp_path / f"srgb.{ending}", "srgb").warnings == ()
 

@@ -116,8 +116,8 @@ def test_a_dataset_and_a_manifest_group_frames_too(frames, write_exr):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("shutter.subframes=3",), "in: shutter.subframes is 3, but there are 8 images"),
-        (("shutter.subframes={choice=[2, 4]}",), "shutter.subframes: found a draw"),
+        (("shutter.subframes=3",), "in: shutter.subframes is 3, but this folder has 8 images"),
+        (("shutter.subframes={choice=[2, 4]}",), "shutter.subframes: found a random draw"),
         (("shutter.subframes=0",), "shutter.subframes"),
     ],
 )
@@ -137,7 +137,7 @@ def test_a_frame_of_another_size_fails_alone(frames, clpipe, write_exr):
     write_exr("in/f03.exr", np.zeros((24, 39, 3), np.float16))
     options = ("--set", "shutter.subframes=4", "--device", "numpy")
     told = clpipe("run", "in", "-o", "o", *options, status=1).stderr
-    assert "f03.exr: it is 39x24, and in/f00.exr, a part of the same exposure, 40x24" in told
+    assert "this frame is 39x24, but that of in/f00.exr, in the same exposure, is 40x24" in told
     with Image.open("o/f04.jpg") as picture:
         assert picture.size == (40, 24)
 

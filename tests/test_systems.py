@@ -146,7 +146,7 @@ def test_shards_share_a_folder_by_the_locks_of_windows(tmp_path, monkeypatch):
     with output_folder(out, Shard(1, 2)):
         for shard in (Shard(), Shard(1, 2), Shard(1, 3)):
             with (
-                pytest.raises(RequestError, match="another run is writing there"),
+                pytest.raises(RequestError, match="another run is writing to this directory"),
                 output_folder(out, shard),
             ):
                 pass
@@ -179,7 +179,7 @@ def test_a_full_disk_is_noticed_without_posix_fallocate(tmp_path, monkeypatch):
     assert write_problem(tmp_path) == ""
     monkeypatch.delattr(os, "posix_fallocate")
     assert write_problem(tmp_path) == (
-        "cannot write there: No space left on device (8.0 MiB are needed)"
+        "cannot write to this directory: No space left on device (8.0 MiB are needed)"
     )
     assert not list(tmp_path.iterdir())
 

@@ -164,7 +164,7 @@ def test_each_chain_wants_its_own_kind(tmp_path, write_exr):
     render = write_exr("render.exr", smooth() / 255)
     Image.fromarray(smooth()).save(tmp_path / "photo.png")
     for path, more, message in (
-        (render, ["-c", "unprocess"], "holds linear light, but the chain starts on finished"),
+        (render, ["-c", "unprocess"], "contains linear light, but the chain starts on finished"),
         (tmp_path / "photo.png", [], "For a photograph, use -c unprocess"),
     ):
         assert message in run_cli("run", path, "-o", tmp_path / "out", *more, status=1).output

@@ -176,7 +176,9 @@ def test_what_is_wrong_with_a_url_is_said(bucket, clpipe, monkeypatch):
         assert "Traceback" not in text
         return " ".join(text.split())
 
-    assert "flaky://b/none: no image is there" in told("flaky://b/none", "-o", "o", status=2)
+    assert "flaky://b/none: there are no images at this URL" in told(
+        "flaky://b/none", "-o", "o", status=2
+    )
     for url in ("nosuch://b/x", "nosuch://b/x.exr"):
         assert f"clpipe: {url}: Protocol not known" in told(url, "-o", "o", status=2)
     text = told("flaky://b/gone.exr", "in/x0/r0.exr", "-o", "o", status=1)

@@ -288,7 +288,7 @@ def test_the_disk_is_full(clpipe, renders, when):
         else:
             patch.setattr(writer, "write_display", write)
         result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)
-    assert "the same command goes on" in result.stderr
+    assert "the same command resumes" in result.stderr
     clpipe("run", "in", *RUN)
     assert list(statuses("out").values()).count("skipped") >= 4
     assert contents("out") == contents("whole")
@@ -430,7 +430,7 @@ def test_the_variance_of_patches(clpipe, renders):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--patch", 12, "--format", "dng"), "--patch: dng holds whole images"),
+        (("--patch", 12, "--format", "dng"), "--patch: patches cannot be written as dng"),
         (
             ("--patch", 12, "--patches-per-image", "grit"),
             "found 'grit'; expected a whole number from 1 to 9999, or grid",

@@ -434,7 +434,7 @@ def test_a_dataset_of_faces_that_exist(write, clpipe):
     assert {"one.jpg", "two.jpg", "one.Depth.png", "one.truth_clean.jpg"} <= made
     readme = Path("set/README.md").read_text()
     assert "2 in `train.txt`" in readme
-    assert "`Depth` (depth): along the axis of view" in readme
+    assert "`Depth` (depth): along the viewing axis" in readme
     assert "`Depth.Distance` (depth): the distance from the camera" in readme
     other = (*chosen[:-2], "--set", "projection.method=double_sphere")
     assert "use only one of them" in clpipe("dataset", "in", "-o", "n", *other, status=2).output
@@ -463,7 +463,7 @@ def test_only_faces_that_a_lens_sees_are_rendered():
 def test_a_cube_map_that_is_none(write, clpipe):
     write("a.exr", {"envmap": OpenEXR.ENVMAP_CUBE}, **colours(np.zeros((40, 9, 3))))
     told = clpipe("run", "a.exr", "-o", "o", *RUN, *options_of("unified"), status=1).output
-    assert "a cube map of 9x40 pixels; its faces are squares" in " ".join(told.split())
+    assert "this cube map has 9x40 pixels, but its height must be 6 times" in " ".join(told.split())
 
 
 def test_a_map_without_a_border_is_an_image_as_well(device):

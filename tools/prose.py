@@ -90,6 +90,13 @@ CHECKED = (
     "clpipe/torch/numbers.py",
     "clpipe/torch/poisson.py",
     "clpipe/torch/table.py",
+    "clpipe/analysis",
+    "clpipe/batch",
+    "clpipe/images",
+    "clpipe/inputs",
+    "clpipe/outputs",
+    "clpipe/scenes",
+    "clpipe/stage/signal.py",
 )
 
 MOST_WORDS = 30  # in a sentence
@@ -158,7 +165,7 @@ def texts_of(path: Path) -> Iterator[Text]:
         elif isinstance(node, ast.Constant | ast.JoinedStr) and node not in docstrings:
             text = node.value if isinstance(node, ast.Constant) else message_of(node)
             if isinstance(text, str) and len(text.split()) > 3:
-                yield node.lineno, text
+                yield from paragraphs(text, node.lineno)
     comments: list[Text] = []  # lines, of which those on lines of their own belong together
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:

@@ -1,8 +1,9 @@
-"""Measurement of noise: statistics of images; cameras, calibrated or of others' noise models;
-and the development of a camera, matched. And of light: the exposures of a sequence. And pictures
-compared, as figures.
+"""Analysis of images and cameras.
 
-This room works on arrays and on files that ``images`` reads; only ``matching`` develops pictures,
-``metering`` runs a chain as far as its exposure, and ``emva`` one as far as its raw. It imports
-``outputs`` and below, and is the only room that imports SciPy and Matplotlib.
+It measures the noise of images, calibrates cameras, imports noise models of other programs, and
+matches the development of a camera. It also meters sequences, and draws comparisons of pictures.
+
+This package works on arrays, and on files that ``images`` reads. Only ``matching`` develops
+pictures, ``metering`` runs a chain up to its exposure, and ``emva`` runs one up to its raw. The
+package imports ``outputs`` and below. No other package imports SciPy or Matplotlib.
 """

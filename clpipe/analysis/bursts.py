@@ -1,4 +1,4 @@
-"""Bursts: which files show one scene, as frames of it."""
+"""Bursts: groups files that are frames of one scene."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -7,20 +7,20 @@ from pathlib import Path
 from clpipe.base.errors import RequestError
 from clpipe.images.read import PICTURE_SUFFIXES
 
-FRAME = re.compile(r"(.+)\.frame\d+(\..+)")  # the name of a frame, as --frames of clpipe run has it
+FRAME = re.compile(r"(.+)\.frame\d+(\..+)")  # the name of a frame from clpipe run --frames
 
-Key = tuple[Path, str, str]  # folder, name and ending of a burst
+Key = tuple[Path, str, str]  # folder, name and extension of a burst
 
 
 def bursts_in(paths: Sequence[Path]) -> list[list[Path]]:
-    """The bursts among files and folders.
+    """Return the bursts among files and folders.
 
-    A folder holds, itself and in folders below, a burst for each NAME of NAME.frame0.png,
-    NAME.frame1.png and so on; where it has no such files, all of its pictures are one. Files are
-    bursts where each is called so and none is alone; else they are one burst together.
+    NAME.frame0.png, NAME.frame1.png and so on form a burst. In a folder, and in folders below it,
+    there is a burst for each NAME. Without such files, all pictures of a folder form one burst.
+    Files that are given directly form one burst, unless all are frames of bursts of two or more.
 
     Raises:
-        RequestError: a folder holds no pictures, or frames of several formats.
+        RequestError: a folder has no pictures, or frames of several formats.
     """
     bursts: list[list[Path]] = []
     files = [path for path in paths if not path.is_dir()]
@@ -39,7 +39,7 @@ def bursts_in(paths: Sequence[Path]) -> list[list[Path]]:
 
 
 def by_name(files: Sequence[Path]) -> dict[Key, list[Path]]:
-    """Frames by the burst that their names say; other files are left out."""
+    """Return frames by burst, according to their names. Other files are skipped."""
     frames: dict[Key, list[Path]] = {}
     for file in files:
         if match := FRAME.fullmatch(file.name):
@@ -48,23 +48,23 @@ def by_name(files: Sequence[Path]) -> dict[Key, list[Path]]:
 
 
 def bursts_below(folder: Path) -> Iterator[list[Path]]:
-    """The bursts in a folder and below.
+    """Yield the bursts in a folder and below.
 
     Raises:
-        RequestError: as :func:`bursts_in`.
+        RequestError: as for :func:`bursts_in`.
     """
     files = sorted(
         f for f in folder.rglob("*") if f.suffix.lower() in PICTURE_SUFFIXES and f.is_file()
     )
     if not files:
-        raise RequestError(f"{folder}: it holds no pictures ({', '.join(PICTURE_SUFFIXES)})")
+        raise RequestError(f"{folder}: this folder has no pictures ({', '.join(PICTURE_SUFFIXES)})")
     for here in sorted({file.parent for file in files}):
         own = [file for file in files if file.parent == here]
         frames = by_name(own)
         endings = sorted({ending for _, _, ending in frames})
         if len(endings) > 1:
             raise RequestError(
-                f"{here}: it holds frames that end in {' and in '.join(endings)}; "
-                f"name those of one ending: {here}/*{endings[0]}"
+                f"{here}: this folder has frames with the extensions {' and '.join(endings)}; "
+                f"choose one of them: {here}/*{endings[0]}"
             )
         yield from frames.values() if frames else [own]

@@ -1,4 +1,4 @@
-"""Pictures compared: their crops beside each other, their differences, the noise of each."""
+"""Compares pictures of one scene: crops next to each other, differences, and noise."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -18,19 +18,20 @@ from clpipe.base.text import one_line
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.transfer import srgb_curve
 
-LEVELS = 255  # sigmas are in levels of eight bits
-STRONGEST = 64  # times that a difference is shown
+LEVELS = 255  # sigmas are in 8-bit levels
+STRONGEST = 64  # the largest factor by which a difference is amplified
 LEFT = "2x2 leaves: the share of its variance after averaging 2x2 (independent noise: 0.25)"
-SHOWN = 99  # percentile of the differences that the strength leaves unclipped
+SHOWN = 99  # percentile of the differences that are not clipped after amplification
 
 
 @dataclass(frozen=True)
 class Noise:
-    """The noise of a picture, in levels of 255.
+    """The noise of a picture, in levels of 255. NaN is unknown.
 
-    ``rms`` is the difference from the truth over all of the picture, R, G and B. ``sigma`` is that
-    of luma in flat places, and ``left`` the share of its variance that averaging 2x2 pixels leaves.
-    NaN is what is not known.
+    Args:
+        rms: the difference from the ground truth over all pixels of R, G and B.
+        sigma: the standard deviation of luma in flat areas.
+        left: the share of that variance that remains after averaging 2x2 pixels.
     """
 
     rms: float
@@ -40,7 +41,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Row:
-    """A place, or the differences there: its name, and a crop of each picture, 0..1."""
+    """A row of a figure: its name, and a crop (or difference) for each picture, 0..1."""
 
     name: str
     crops: tuple[Floats, ...]  # (height, width, 3)
@@ -48,16 +49,16 @@ class Row:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What a figure shows; ``notes`` say what its numbers are and how pictures are shown."""
+    """The content of a figure; ``notes`` explain its numbers and how pictures are shown."""
 
     labels: tuple[str, ...]
     places: tuple[Place, ...]
     rows: tuple[Row, ...]
-    noise: tuple[Noise, ...]  # of each picture; empty where it is not known
+    noise: tuple[Noise, ...]  # of each picture; empty if not known
     notes: tuple[str, ...]
 
     def record(self) -> dict[str, Any]:
-        """The figure's content but for its pixels, as JSON values; unknown numbers are None."""
+        """Return the figure's content without pixels, as JSON values; unknown numbers are None."""
         noise = [{k: json_number(v) for k, v in asdict(each).items()} for each in self.noise]
         return {
             "labels": list(self.labels),
@@ -76,22 +77,22 @@ def compare(
 ) -> Comparison:
     """Compare pictures of one scene.
 
-    Places are found in the mean of the truths, or else of the pictures, so that neither order nor
-    labels change them. The noise of a picture with a truth is what :func:`measure` finds of it, of
-    what is shown; without one it is what luma has about a plane in the flat place, where one was
-    looked for. The pattern of a mosaic would count as noise there.
+    Automatic crops are chosen in the mean of the ground truths, or of the pictures, so they do not
+    depend on order or labels. With ground truth, noise is that of :func:`measure` in the pictures
+    as shown. Without it, noise is the deviation of luma from a plane in the flat crop, if there is
+    one. Mosaics are not measured, because their pattern would count as noise.
 
     Args:
-        paths: of two pictures or more, of one size: finished ones, kept images, renders.
-        crops: as :func:`clpipe.analysis.crops.choose_places` takes them.
-        labels: of the pictures; none: what tells their paths apart.
-        truths: the same without noise: none, one for all pictures, or one for each.
-        difference: a row of differences below each place: from the truth, or else from the first
+        paths: two or more pictures of one size: finished pictures, kept images or renders.
+        crops: see :func:`clpipe.analysis.crops.choose_places`.
+        labels: labels of the pictures; without any, the parts in which their paths differ.
+        truths: pictures without noise: none, one for all pictures, or one for each.
+        difference: whether to add rows of differences from the ground truth, or from the first
             picture.
 
     Raises:
-        RequestError: there are too few pictures, or as many labels or truths as cannot be, or sizes
-            differ, or a crop cannot be had.
+        RequestError: there are too few pictures, the number of labels or truths is wrong, sizes
+            differ, or a crop is not possible.
         ImageError: a picture cannot be read or shown.
     """
     _check_counts(paths, labels, truths)
@@ -100,8 +101,8 @@ def compare(
     for other in (*loaded[1:], *true):
         if other.pixels.shape[:2] != loaded[0].pixels.shape[:2]:
             raise RequestError(
-                f"{other.path} is {_size(other)}, but {loaded[0].path} is {_size(loaded[0])}; "
-                "compare pictures of one size, which show the same places"
+                f"{other.path} has {_size(other)}, but {loaded[0].path} has {_size(loaded[0])} "
+                "pixels; give pictures of one size, which show the same scene"
             )
     pictures, references = list(map(displayed, loaded)), list(map(displayed, true))
     places = choose_places(crops, np.mean([one.pixels for one in references or pictures], axis=0))
@@ -129,14 +130,14 @@ def compare(
 
 
 def _check_counts(paths: Sequence[Path], labels: Sequence[str], truths: Sequence[Path]) -> None:
-    """See that there are pictures to compare, and as many labels and truths as fit.
+    """Check the numbers of pictures, labels and ground truths.
 
     Raises:
-        RequestError: there are not.
+        RequestError: a number is wrong.
     """
     if len(paths) < 2:
         raise RequestError(
-            f"{paths[0] if paths else 'nothing'}: one picture has nothing to be compared with; "
+            f"{paths[0] if paths else 'nothing'}: there is nothing to compare this picture with; "
             "give two or more"
         )
     if labels and len(labels) != len(paths):
@@ -156,15 +157,15 @@ def _size(picture: Picture) -> str:
 
 
 def displayed(picture: Picture) -> Picture:
-    """A picture as a screen shows it: linear light through sRGB's curve, mosaics in grey.
+    """Return a picture for display: linear light is encoded with sRGB's curve, mosaics are grey.
 
     Raises:
-        RequestError: it is a mosaic whose levels are not known.
+        RequestError: the picture is a mosaic of unknown levels.
     """
     if picture.kind == "values":
         raise RequestError(
-            f"{picture.path}: {picture.what}, so it cannot be shown; develop it first, as "
-            "'clpipe run' does"
+            f"{picture.path}: this is {picture.what}, which cannot be shown; develop it first with "
+            "'clpipe run'"
         )
     pixels = picture.pixels
     if picture.kind != "display":
@@ -174,7 +175,7 @@ def displayed(picture: Picture) -> Picture:
 
 
 def distinct_names(paths: Sequence[Path]) -> list[str]:
-    """What tells paths apart: their file names without ending, else what differs of their folders.
+    """Return names that distinguish paths: file names without extension, or differing folders.
 
     >>> distinct_names([Path("out/a.png"), Path("out/a.iid.png")])
     ['a', 'a.iid']
@@ -197,7 +198,7 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
 def _with_differences(
     rows: Sequence[Row], places: Sequence[Place], against: Sequence[Floats]
 ) -> list[Row]:
-    """Each row, and below it its difference from what each picture is compared with."""
+    """Return the rows, each followed by a row of amplified differences from ``against``."""
     differences = [
         [crop - place.of(other) for crop, other in zip(row.crops, against, strict=True)]
         for row, place in zip(rows, places, strict=True)
@@ -213,7 +214,7 @@ def _with_differences(
 
 
 def _against_truth(picture: Picture, truth: Picture) -> Noise:
-    """The noise of a picture against its truth."""
+    """Return the noise of a picture, measured against its ground truth."""
     if np.array_equal(picture.pixels, truth.pixels):
         return Noise(0.0, 0.0, np.nan)
     (light,) = (one for one in measure([picture], truth).channels if one.name == "Y")
@@ -222,7 +223,7 @@ def _against_truth(picture: Picture, truth: Picture) -> Noise:
 
 
 def _in_flat_place(picture: Picture, place: Place) -> Noise:
-    """The noise of a picture about a plane in a flat place."""
+    """Return the noise of a picture as deviations from a plane in a flat crop."""
     if picture.pixels.ndim == 2:
         return Noise(np.nan, np.nan, np.nan)
     noise = _without_plane(luma(place.of(displayed(picture).pixels)))
@@ -231,7 +232,7 @@ def _in_flat_place(picture: Picture, place: Place) -> Noise:
 
 
 def _without_plane(values: Doubles) -> Doubles:
-    """(height, width) less the plane that fits it best."""
+    """Return (height, width) values minus the plane that fits them best."""
     y, x = np.indices(values.shape)
     terms = np.stack([np.ones(values.size), x.ravel(), y.ravel()], axis=1)
     plane, *_ = np.linalg.lstsq(terms, values.ravel(), rcond=None)

@@ -1,6 +1,6 @@
-"""The figure of a comparison: rows of places, columns of pictures, text around them.
+"""Draws a comparison: rows of crops, columns of pictures, and text.
 
-Everything is placed in whole pixels of 300 dpi, so that each pixel of a crop becomes a square.
+Everything is placed in whole pixels at 300 dpi, so each pixel of a crop becomes a square.
 """
 
 import logging
@@ -27,13 +27,13 @@ log = logging.getLogger(__name__)
 
 DPI = 300
 LARGEST = 1 << 26  # pixels of a figure, 256 MB while it is drawn
-GAP = 12  # px, between crops and around all
+GAP = 12  # px, between crops and as the outer margin
 SIZE, SMALL = 7, 6  # points
-# Of a text in DejaVu Sans of one point, in px: a line's height, and the width of a digit.
+# In px, for text in DejaVu Sans of one point: the height of a line, and the width of a digit.
 LINE, LETTER = (each * DPI / 72 for each in (1.25, 0.64))
 
 SUFFIXES = (".png", ".pdf", ".svg")
-# Text stays text, each crop an image; files are the same whenever they are made.
+# Text stays text, each crop is an image, and files do not depend on the time.
 STYLE = {
     "image.composite_image": False,
     "pdf.fonttype": 42,
@@ -44,10 +44,10 @@ METADATA = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 
 
 def check_name(path: Path, pictures: Sequence[Path]) -> None:
-    """See that a figure can have this name, and is none of the pictures.
+    """Check that a figure can have this name, which is not that of a picture.
 
     Raises:
-        RequestError: it cannot, or is.
+        RequestError: its extension is unknown, or a picture has that name.
     """
     if path.suffix not in SUFFIXES:
         raise RequestError(f"-o: found {path}; expected a name that ends in {', '.join(SUFFIXES)}")
@@ -56,15 +56,15 @@ def check_name(path: Path, pictures: Sequence[Path]) -> None:
 
 
 def draw(comparison: Comparison, path: Path, zoom: int = 4) -> None:
-    """Draw a comparison as PNG, PDF or SVG, by the ending of its name.
+    """Draw a comparison as PNG, PDF or SVG, according to the extension.
 
     Args:
-        comparison: what is shown.
+        comparison: the content.
         path: the file.
-        zoom: squares of ``zoom`` x ``zoom`` pixels of 300 dpi stand for the pixels of a crop.
+        zoom: the side of the square for each pixel of a crop, in pixels at 300 dpi.
 
     Raises:
-        RequestError: it would be too large.
+        RequestError: the figure would be too large.
         ImageError: the file cannot be written.
     """
     words = [len(word) for label in comparison.labels for word in label.split()]
@@ -108,7 +108,7 @@ def draw(comparison: Comparison, path: Path, zoom: int = 4) -> None:
             x = left + column * (columns + GAP)
             place = (x, x + wide, top + tall, top)
             page.imshow(_enlarged(crop, zoom), interpolation="none", aspect="auto", extent=place)
-    page.set(xlim=(0, width), ylim=(height, 0))  # imshow has moved them
+    page.set(xlim=(0, width), ylim=(height, 0))  # imshow changes the limits
     for note in notes:
         write(GAP, below, note, SMALL, va="top")
         below += _height([note], SMALL)
@@ -117,22 +117,22 @@ def draw(comparison: Comparison, path: Path, zoom: int = 4) -> None:
         warnings.simplefilter("always")
         figure.savefig(data, format=path.suffix[1:], metadata=METADATA[path.suffix])
     if missing:
-        log.warning("%s: the font lacks letters of the labels; give others with --label", path)
+        log.warning("%s: the font lacks letters of the labels; choose others with --label", path)
     write_new(path, data.getvalue())
 
 
 def _wrapped(text: str, width: int, size: int) -> str:
-    """A text in lines of a width in pixels."""
+    """Return a text wrapped to a width in pixels."""
     return "\n".join(textwrap.wrap(one_line(text), max(int(width / (LETTER * size)), 1)))
 
 
 def _height(texts: Sequence[str], size: int) -> int:
-    """The height of the text with the most lines, in pixels; 0 of none."""
+    """Return the height in pixels of the text with the most lines; 0 without texts."""
     return round(max((text.count("\n") + 1 for text in texts), default=0) * LINE * size)
 
 
 def _foot(noise: Noise) -> str:
-    """The noise of a picture in two lines."""
+    """Return the noise of a picture in two lines."""
     if np.isnan(noise.sigma):
         return ""
     if not noise.sigma:
@@ -142,5 +142,5 @@ def _foot(noise: Noise) -> str:
 
 
 def _enlarged(crop: Array, zoom: int) -> Array:
-    """A crop of 0..1 with each pixel as a square, eight bits."""
+    """Return an 8-bit crop in which each pixel of 0..1 is a square."""
     return to_8_bit(crop).repeat(zoom, 0).repeat(zoom, 1)

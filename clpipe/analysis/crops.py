@@ -1,4 +1,4 @@
-"""Places of a picture that are worth a closer look: named by hand, or found."""
+"""Chooses crops of a picture: given by the user, or found automatically."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,18 +10,18 @@ from clpipe.analysis.signature import luma
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Array, Doubles, Floats, Mask
 
-WIDTH, HEIGHT = 96, 64  # px, of a place that is found
-SMOOTH = 5  # px, the window over which noise is averaged before places are looked for
-MIDDLE = 0.2, 0.8  # display values between which a flat place is, in the mean
-BLACK = 0.08  # display value of luma; what is darker shows nothing,
-MOST_BLACK = 0.05  # and is at most this share of a dark place
+WIDTH, HEIGHT = 96, 64  # px, of an automatic crop
+SMOOTH = 5  # px: the window over which noise is averaged before the search
+MIDDLE = 0.2, 0.8  # the range of a flat crop's mean display value
+BLACK = 0.08  # display value of luma below which nothing is visible
+MOST_BLACK = 0.05  # the largest share of such pixels in a dark crop
 
 BY_HAND = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<box>\d{1,9},\d{1,9},\d{1,9}x\d{1,9})")
 
 
 @dataclass(frozen=True)
 class Place:
-    """A rectangle of a picture, px, and what it is called."""
+    """A named rectangle of a picture, in px."""
 
     name: str
     left: int
@@ -31,7 +31,7 @@ class Place:
 
     @property
     def box(self) -> str:
-        """Where it is, as it is given by hand.
+        """Its position and size, in the format of --crop.
 
         >>> Place("sky", 10, 20, 96, 64).box
         '10,20,96x64'
@@ -39,26 +39,26 @@ class Place:
         return f"{self.left},{self.top},{self.width}x{self.height}"
 
     def of(self, image: Array) -> Array:
-        """The part of an image that lies there, (height, width[, channel])."""
+        """Return this part of an image, (height, width[, channel])."""
         return image[self.top : self.top + self.height, self.left : self.left + self.width]
 
     def within(self, width: int, height: int) -> bool:
-        """Whether all of it is inside an image of this size, and it is not empty."""
+        """Return whether it is not empty, and inside an image of this size in px."""
         right, bottom = self.left + self.width, self.top + self.height
         return min(self.width, self.height) > 0 and right <= width and bottom <= height
 
 
 def choose_places(texts: Sequence[str], picture: Floats) -> list[Place]:
-    """The places that are asked for, in their order; of none, one of each of :data:`FOUND`.
+    """Return the requested crops in order; without any, one of each kind in :data:`FOUND`.
 
     Args:
-        texts: each ``X,Y,WxH`` (px from the left and the top), with ``NAME=`` before it or not, or
-            a name of :data:`FOUND`.
-        picture: (height, width, 3), display values, in which places are found; the less noise, the
-            better.
+        texts: ``X,Y,WxH`` (px from the left and the top), ``NAME=X,Y,WxH``, or a kind in
+            :data:`FOUND`.
+        picture: display values, (height, width, 3), in which crops are found. Noise disturbs the
+            search.
 
     Raises:
-        RequestError: a text is neither, or its place is not in the picture.
+        RequestError: a text has another form, or its rectangle exceeds the picture.
 
     >>> choose_places(["sky=10,20,30x40", "0,0,2x2"], np.zeros((99, 99, 3), np.float32))[0]
     Place(name='sky', left=10, top=20, width=30, height=40)
@@ -71,7 +71,7 @@ def choose_places(texts: Sequence[str], picture: Floats) -> list[Place]:
             if width < WIDTH or height < HEIGHT:
                 raise RequestError(
                     f"--crop {text}: the pictures are {width}x{height}, smaller than the "
-                    f"{WIDTH}x{HEIGHT} of a place that is found; name places by hand, such as "
+                    f"{WIDTH}x{HEIGHT} of an automatic crop; choose crops yourself, such as "
                     f"--crop 0,0,{width}x{height}"
                 )
             places.append(finder.find(text))
@@ -85,7 +85,7 @@ def choose_places(texts: Sequence[str], picture: Floats) -> list[Place]:
         place = Place(match["name"] or match["box"], *map(int, re.split("[,x]", match["box"])))
         if not place.within(width, height):
             raise RequestError(
-                f"--crop {text}: it is empty or reaches beyond the pictures, which are "
+                f"--crop {text}: this crop is empty or exceeds the pictures, whose size is "
                 f"{width}x{height}"
             )
         places.append(place)
@@ -93,7 +93,7 @@ def choose_places(texts: Sequence[str], picture: Floats) -> list[Place]:
 
 
 def flat(picture: Floats) -> Doubles:
-    """The flattest: the variance of R, G and B is least, at a middle brightness."""
+    """Score flat places: low variance of R, G and B, at a medium brightness."""
     variance = np.asarray(
         sum(window_means(plane**2) - window_means(plane) ** 2 for plane in _planes(picture))
     )
@@ -103,29 +103,29 @@ def flat(picture: Floats) -> Doubles:
 
 
 def textured(picture: Floats) -> Doubles:
-    """The richest in detail: the gradient of luma is largest in the mean."""
+    """Score places with detail: a large mean gradient of luma."""
     return window_means(np.hypot(*np.gradient(luma(picture))))
 
 
 def saturated(picture: Floats) -> Doubles:
-    """The most colourful: the largest of R, G and B is furthest above the smallest."""
+    """Score colourful places: a large range of R, G and B."""
     return window_means(np.ptp(picture, axis=2).astype(np.float64))
 
 
 def dark(picture: Floats) -> Doubles:
-    """The darkest that is hardly anywhere black."""
+    """Score dark places that are hardly anywhere black."""
     light = luma(picture)
     return _only(-window_means(light), window_means(light < BLACK) <= MOST_BLACK)
 
 
-# How good each place is for what is looked for, by the place of its upper left corner.
+# For each kind of crop, a function that scores the crop at each upper left corner.
 FOUND: Mapping[str, Callable[[Floats], Doubles]] = {
     function.__name__: function for function in (flat, textured, saturated, dark)
 }
 
 
 class _Finder:
-    """Finds places in one picture, each beside those before it where there is room."""
+    """Finds crops in one picture that do not overlap earlier ones, if there is space."""
 
     def __init__(self, picture: Floats) -> None:
         self._picture = picture
@@ -148,7 +148,7 @@ class _Finder:
 
 
 def window_means(plane: Doubles | Mask) -> Doubles:
-    """The mean of a plane over each place, by its upper left corner: (height - 63, width - 95).
+    """Return the mean of a plane in the crop at each corner: (height - 63, width - 95).
 
     >>> window_means(np.ones((65, 99))).shape
     (2, 4)
@@ -163,5 +163,5 @@ def _planes(picture: Floats) -> Iterator[Doubles]:
 
 
 def _only(score: Doubles, allowed: Mask) -> Doubles:
-    """The score of what is allowed; of all where nothing is."""
+    """Return the score with places that are not allowed excluded, unless this excludes all."""
     return np.where(allowed, score, -np.inf) if np.isfinite(score[allowed]).any() else score

@@ -1,6 +1,6 @@
-"""What the PNG figures of this room share: their page, their colours, and how axes end.
+"""Shared parts of this package's PNG figures: page, colours, and the finish of axes.
 
-The module imports Matplotlib, so import it and the ``plot`` modules when something is drawn.
+The module imports Matplotlib, so import it and the ``plot`` modules only to draw something.
 """
 
 from io import BytesIO
@@ -43,7 +43,7 @@ def png_of(figure: Figure) -> bytes:
 
 
 def finish(axes: Axes, **texts: Any) -> None:
-    """Set titles, labels and limits of axes, and add a grid and the legend of what has a label."""
+    """Set titles, labels and limits of axes, and add a grid and a legend of labelled artists."""
     axes.set(**texts)
     axes.grid(alpha=0.3, which="both")
     if axes.get_legend_handles_labels()[1]:

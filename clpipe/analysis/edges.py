@@ -1,4 +1,4 @@
-"""Noise at edges: cameras spare edges when they smooth, and sharpen them."""
+"""Noise at edges, which cameras smooth less than other areas, and sharpen."""
 
 import math
 from dataclasses import dataclass
@@ -9,30 +9,30 @@ from numpy.typing import NDArray
 
 from clpipe.base.types import Mask
 
-FLATTEST, STEEPEST = 25, 90  # percentiles of the gradient: up to one, and from the other on
-BINOMIAL = np.array([1, 4, 6, 4, 1]) / 16  # as wide as a Gaussian of 1 px: luma is smoothed
+FLATTEST, STEEPEST = 25, 90  # percentiles of the gradient: flat below the first, steep above
+BINOMIAL = np.array([1, 4, 6, 4, 1]) / 16  # smooths luma like a Gaussian of 1 px
 REACH = len(BINOMIAL) // 2
 FEWEST = 500  # pixels of each
 
 
 @dataclass(frozen=True, eq=False)
 class Slopes:
-    """Where a picture is flattest and where it is steepest, (height, width) each."""
+    """Masks of the flattest and the steepest pixels of a picture, (height, width) each."""
 
     flat: Mask
     steep: Mask
 
     def within(self, mask: Mask) -> "Slopes":
-        """Those of them that are in a mask."""
+        """Return the slopes restricted to a mask."""
         return Slopes(self.flat & mask, self.steep & mask)
 
     def ratio(self, noise: NDArray[np.floating[Any]]) -> float:
-        """The rms of noise where it is steepest over that where it is flattest.
+        """Return the rms of noise in steep pixels over that in flat pixels.
 
-        NaN with fewer than 500 pixels of one of them.
+        It is NaN with fewer than 500 pixels of either.
 
         Args:
-            noise: of luma, (frame, height, width).
+            noise: the noise of luma, (frame, height, width).
         """
         if min(self.flat.sum(), self.steep.sum()) < FEWEST:
             return math.nan
@@ -41,11 +41,11 @@ class Slopes:
 
 
 def slopes_of(luma: NDArray[np.floating[Any]], mask: Mask) -> Slopes:
-    """The flattest quarter and the steepest tenth of the pixels of a mask.
+    """Return the flattest quarter and the steepest tenth of the pixels of a mask.
 
     Args:
-        luma: without noise, (height, width).
-        mask: the pixels that count: neither clipped nor moving.
+        luma: luma without noise, (height, width).
+        mask: the valid pixels, which are neither clipped nor moving, (height, width).
 
     >>> ramp = np.add.outer(np.zeros(100), np.arange(100.0) ** 2)
     >>> slopes = slopes_of(ramp, np.ones((100, 100), bool))

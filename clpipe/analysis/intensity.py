@@ -1,7 +1,7 @@
 """Noise by intensity: its size in intensity bins, and the line variance = a*intensity + b.
 
 Functions take planes: ``intensity`` (height, width) and ``noise`` (frame, height, width) in one
-unit, and ``mask`` (height, width), True where a pixel counts.
+unit, and ``mask`` (height, width), which is True for valid pixels.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from clpipe.base.types import Doubles, Floats, Mask
 
 BINS = 24
-FEWEST = 100  # samples of a bin; the standard error of its sigma is then 7 %
+FEWEST = 100  # samples in a bin, for which the standard error of sigma is 7 %
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class VarianceLaw:
 
 
 def bin_edges(low: float, high: float, linear: bool) -> Doubles:
-    """The edges of :data:`BINS` bins from the lowest intensity to the highest.
+    """Return the edges of :data:`BINS` bins from the lowest intensity to the highest.
 
-    Display values get bins of equal width. For ``linear`` light the edges are the squares of evenly
-    spaced numbers: fine in the shadows, where a sensor's sigma, about the root of the intensity,
-    changes most.
+    Display values get bins of equal width. For ``linear`` light, the edges are squares of evenly
+    spaced numbers. Bins are then fine in the shadows, where a sensor's sigma, which is about the
+    root of the intensity, changes most.
 
     >>> bin_edges(0, 576, linear=True)[:4].tolist()
     [0.0, 1.0, 4.0, 9.0]
@@ -52,7 +52,7 @@ def bin_edges(low: float, high: float, linear: bool) -> Doubles:
 
 
 def bin_of(intensity: Floats, edges: Doubles) -> NDArray[np.int64]:
-    """The number of each intensity's bin; intensities beyond the edges are in the first or last.
+    """Return the number of each intensity's bin. Values outside belong to the first or last bin.
 
     >>> bin_of(np.float32([-1, 0.2, 7]), np.linspace(0, 1, BINS + 1)).tolist()
     [0, 4, 23]
@@ -63,18 +63,18 @@ def bin_of(intensity: Floats, edges: Doubles) -> NDArray[np.int64]:
 def noise_by_intensity(
     intensity: Floats, noise: Floats, mask: Mask, edges: Doubles, spread: float = 0.0
 ) -> tuple[NoiseCurve, Floats, Floats]:
-    """Noise by intensity, and the noise with its dependence on intensity removed.
+    """Return noise by intensity, and the noise with its dependence on intensity removed.
 
-    The mean of the noise at an intensity is a difference of tone between image and truth, not
-    noise; it is subtracted, interpolated linearly between bins. Standardised noise is the rest over
-    its sigma at that intensity, so that dark and bright places have equal weight.
+    The mean of the noise at an intensity is a difference of tone between image and truth, so it is
+    subtracted, with linear interpolation between bins. Standardised noise is the rest divided by
+    its sigma at that intensity, which gives dark and bright places equal weight.
 
     Args:
         intensity: (height, width).
         noise: (frame, height, width).
-        mask: (height, width), the pixels that count; at least one.
-        edges: of the intensity bins.
-        spread: the variance of the intensity's own error relative to that of the noise: 1 / n where
+        mask: the valid pixels, (height, width); at least one.
+        edges: edges of the intensity bins.
+        spread: the variance of the intensity's own error relative to that of the noise: 1 / n if
             the intensity is the mean of n frames.
 
     Returns:
@@ -112,16 +112,16 @@ def noise_by_intensity(
 
 
 def _selection_bias(values: Doubles, edges: Doubles, error: Doubles) -> Doubles:
-    """For each bin, the sum of the true values in it less the sum of the observed ones.
+    """Return, for each bin, the sum of true values minus the sum of observed values.
 
-    Values with an error of sigma s are sorted into bins by what was observed. The true value of an
-    observed one is higher by s^2 p'/p in the mean, with p the density of observed values (Efron,
-    "Tweedie's formula and selection bias", JASA 2011). Summed over a bin this is s^2 p at its upper
-    edge less s^2 p at its lower edge; p is estimated from the values within one s of the edge.
+    Values with an error of sigma s are sorted into bins by their observed value. On average, the
+    true value is higher by s^2 p'/p, where p is the density of observed values (Efron, "Tweedie's
+    formula and selection bias", JASA 2011). The sum over a bin is the difference of s^2 p between
+    its upper and its lower edge. The density is estimated from values within one s of the edge.
 
     Args:
-        values: the observed values that count.
-        edges: of the bins.
+        values: the observed valid values.
+        edges: edges of the bins.
         error: s at each inner edge.
     """
     ordered = np.sort(values)
@@ -132,7 +132,7 @@ def _selection_bias(values: Doubles, edges: Doubles, error: Doubles) -> Doubles:
 
 
 def pool_curves(curves: Sequence[NoiseCurve]) -> NoiseCurve:
-    """The curve of several channels together; all curves have the same edges."""
+    """Return the curve of several channels together; all curves have the same edges."""
     bins, place = np.unique(np.concatenate([c.bins for c in curves]), return_inverse=True)
     count = np.concatenate([c.count for c in curves])
     total = np.bincount(place, count)
@@ -149,17 +149,17 @@ def pool_curves(curves: Sequence[NoiseCurve]) -> NoiseCurve:
 def fit_variance(curve: NoiseCurve, independent: float = 1.0) -> VarianceLaw | None:
     """Fit variance = a*intensity + b to a curve by weighted least squares.
 
-    The variance v of a bin of n independent normal samples has the standard error v*sqrt(2/n). The
-    weights take v from the fitted line, in ten rounds: with the measured v, bins that came out low
-    by chance would get too much weight. Where bins scatter more than that about the line, the
-    standard errors grow in proportion.
+    The variance v of a bin of n independent normal samples has the standard error v*sqrt(2/n). In
+    ten rounds, the weights take v from the fitted line, because measured values that are low by
+    chance would get too much weight. If bins scatter more than expected, the standard errors grow
+    in proportion.
 
     Args:
         curve: noise by intensity.
-        independent: the share of the samples that are independent.
+        independent: the share of independent samples.
 
     Returns:
-        The law; None for fewer than two bins, or without noise.
+        The law; None if there are fewer than two bins, or no noise.
     """
     if len(curve.mean) < 2 or not curve.sigma.any():
         return None

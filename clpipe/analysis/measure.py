@@ -1,4 +1,4 @@
-"""Measuring the noise of images against their clean truth, or against each other."""
+"""Measures the noise of images against their clean ground truth, or against each other."""
 
 import math
 from collections.abc import Sequence
@@ -22,29 +22,29 @@ from clpipe.reference.cfa import sites
 from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.stage import Kind
 
-# The share of pixels that count, the channels, the correlations of pairs of them, covariances.
+# The share of valid pixels, the channels, the correlations of their pairs, and covariances.
 Parts = tuple[float, tuple[Channel, ...], dict[tuple[str, str], float], dict[str, Doubles]]
 
-CORRELATED = 4  # sites of a mosaic, of which each pair is correlated
+CORRELATED = 4  # up to this many sites of a mosaic, all pairs are correlated
 
 
 def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseReport:
-    """Measure the noise of images against one truth, or against their mean.
+    """Measure the noise of images against one ground truth, or against their mean.
 
-    Against the mean of n frames, noise is the difference times sqrt(n / (n - 1)). What all frames
-    share, such as column noise, is then part of the mean and not measured. Clipped intensities are
-    ignored, see :func:`clpipe.analysis.selection.select_unclipped`. In pictures only flat areas
-    count, see :func:`clpipe.outputs.noise_areas.select_flat`. The whole sigma, and the covariances
-    of the whole picture before and after averaging 2x2, are those of every pixel.
+    Against the mean of n frames, noise is the difference times sqrt(n / (n - 1)). Noise that all
+    frames share, such as column noise, is part of the mean and is not measured. Clipped intensities
+    are ignored, see :func:`clpipe.analysis.selection.select_unclipped`. In pictures, only flat
+    areas are measured, see :func:`clpipe.outputs.noise_areas.select_flat`. The whole sigma, and the
+    covariances of the whole picture before and after averaging 2x2, include every pixel.
 
     Args:
-        images: of one kind and size.
-        truth: the same without noise, of that kind and size.
+        images: images of one kind and size.
+        truth: the image without noise, of the same kind and size.
 
     Raises:
-        RequestError: there is a single image without a truth, or the images do not match, or they
-            are no repeats of one scene.
-        ImageError: no pixel counts.
+        RequestError: there is a single image without a truth, the images do not match, or they are
+            not repeats of one scene.
+        ImageError: there are no valid pixels.
     """
     clean, freedom, noise, clipped = against(images, truth)
     first = images[0]
@@ -53,7 +53,7 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
         raise nothing_counts(first)
     span = clean[start]
     low, high = float(span.min()), float(span.max())
-    if high > 0:  # the first bin takes what is below black; else the shadows had few bins
+    if high > 0:  # values below black are in the first bin, so the shadows get enough bins
         low = max(low, 0.0)
     edges = bin_edges(low, high, first.kind != "display")
     parts = mosaic_channels if clean.ndim == 2 else picture_channels
@@ -79,9 +79,9 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
 
 
 def against(images: Sequence[Picture], truth: Picture | None) -> tuple[Floats, float, Floats, Mask]:
-    """The clean image, the share of freedom that it leaves, each image's noise and clipped samples.
+    """Return the clean image, its share of degrees of freedom, the noise, and clipped samples.
 
-    Arguments and errors as for :func:`measure`.
+    The arguments and errors are those of :func:`measure`.
     """
     check_partners(images, truth)
     frames = np.stack([image.pixels for image in images])
@@ -96,13 +96,13 @@ def against(images: Sequence[Picture], truth: Picture | None) -> tuple[Floats, f
 
 
 def at_edges(clean: Floats, noise: Floats, unclipped: Mask) -> float:
-    """The rms of luma's noise where a picture is steepest over that where it is flattest."""
+    """Return the rms of luma's noise in the steepest pixels over that in the flattest."""
     slopes = slopes_of(rgb_to_ycbcr(clean)[..., 0], np.all(unclipped, axis=-1))
     return slopes.ratio(np.stack([rgb_to_ycbcr(frame)[..., 0] for frame in noise]))
 
 
 def check_partners(images: Sequence[Picture], truth: Picture | None) -> None:
-    """See that images and truth can be compared.
+    """Check that images and truth can be compared.
 
     Raises:
         RequestError: there is a single image without a truth, or the images do not match.
@@ -111,12 +111,14 @@ def check_partners(images: Sequence[Picture], truth: Picture | None) -> None:
     first = images[0]
     if truth is None and len(images) == 1:
         raise RequestError(
-            f"{first.path}: one image, and nothing to measure it against; "
-            "give its clean truth (--truth) or more frames of the same scene"
+            f"{first.path}: there is nothing to measure this image against; "
+            "give its clean ground truth (--truth) or more frames of the same scene"
         )
     for other in (*images[1:], *([truth] if truth else [])):
         if other.what != first.what:
-            raise RequestError(f"{other.path} is {other.what}, but {first.path} is {first.what}")
+            raise RequestError(
+                f"{other.path} is {other.what}, but {first.path} is {first.what}; give equal images"
+            )
         if other.balance and first.balance and other.balance != first.balance:
             raise RequestError(
                 f"{other.path} is {other.balance}, but {first.path} is {first.balance}; "
@@ -126,48 +128,53 @@ def check_partners(images: Sequence[Picture], truth: Picture | None) -> None:
         if other is not truth and len(isos) > 1:
             raise RequestError(
                 f"{other.path} was made at ISO {other.iso:g}, {first.path} at {first.iso:g}; "
-                "repeats must have one ISO"
+                "give repeats of one ISO"
             )
     if min(first.pixels.shape[:2]) < 2:
-        raise ImageError(f"{first.path}: {first.what}: too small to measure")
+        raise ImageError(f"{first.path}: this image, {first.what}, is too small to measure")
 
 
 def clipped_samples(images: Sequence[Picture], frames: Floats) -> Mask:
-    """True where a sample is clipped, (frame, height, width[, channel])."""
+    """Return a mask that is True for clipped samples, (frame, height, width[, channel])."""
     if images[0].kind != "values":
         return np.stack([image.clipped() for image in images])
-    # The levels are unknown; samples that clip can only be the smallest and the largest.
+    # The levels are unknown, so only the smallest and the largest samples may be clipped.
     low, high = frames.min(), frames.max()
     return ((frames <= low) | (frames >= high)) & (low < high)
 
 
 def notes_on(images: Sequence[Picture], truth: Picture | None, noise: Floats) -> list[str]:
-    """What a reader of the report must know."""
+    """Return sentences that a reader of the report must know."""
     notes = []
     if not noise.any():
         notes.append("the images are identical: there is no noise")
     if truth is None:
         notes.append(
-            "against the mean of the frames: what they share, such as column noise, is not measured"
+            "measured against the mean of the frames, so noise that they share, such as column "
+            "noise, is excluded"
         )
         if len(images) == 2:
-            notes.append("with two frames, every sample comes with its negative: skewness is 0")
+            notes.append(
+                "with two frames, each sample has a negative counterpart, so skewness is 0"
+            )
     if images[0].kind == "values":
         notes.append(
-            "the levels are unknown: intensity counts from 0, so b also holds -a times black"
+            "the levels are unknown: intensity counts from 0, so b also contains -a times black"
         )
     if images[0].kind == "mosaic":
         notes.append("b includes the variance of row and, against a truth, of column noise")
     if images[0].kind == "display":
-        notes.append("display values: variance is not linear in intensity, so a and b are left out")
+        notes.append(
+            "display values: variance is not linear in intensity, so a and b are not fitted"
+        )
     return notes
 
 
 def nothing_counts(picture: Picture, where: str = "") -> ImageError:
-    """The error that no pixel counts, in the whole picture or at a site."""
+    """Return the error that there are no valid pixels, in the whole picture or at a site."""
     return ImageError(
-        f"{picture.path}: nothing to measure{where}: every sample is clipped, or so bright or dark "
-        "that its noise is"
+        f"{picture.path}: there is nothing to measure{where}: all samples, or their noise, are "
+        "clipped"
     )
 
 
@@ -180,7 +187,7 @@ def picture_channels(
     edges: Doubles,
     freedom: float,
 ) -> Parts:
-    """R, G, B and Y, Cb, Cr of a picture, over the pixels that count in all channels."""
+    """Return R, G, B, Y, Cb and Cr of a picture, over pixels that are valid in all channels."""
     mask: Mask = np.all(start, axis=-1)
     for c in range(3):
         mask = select_unclipped(clean[..., c], clipped[..., c], edges, mask)
@@ -228,7 +235,7 @@ def mosaic_channels(
     edges: Doubles,
     freedom: float,
 ) -> Parts:
-    """The sites of a mosaic, each as one plane, and the whole mosaic as one plane."""
+    """Return the sites of a mosaic, each as one plane, and the whole mosaic as one plane."""
     own = sites(first.pattern)
     steps = next(iter(own.values()))
     height, width = (size // at.step * at.step for size, at in zip(clean.shape, steps, strict=True))

@@ -17,15 +17,15 @@ from clpipe.inputs.manifest import Row, key_of, manifest_text
 from clpipe.stages.exposure.auto import Auto
 
 EXPOSURE = "exposure"
-DIGITS = 4  # of an EV behind the point
+DIGITS = 4  # decimal places of an EV
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """The exposure of a frame, in EV.
+    """The exposure of a frame in EV.
 
-    ``metered`` is what ``exposure.method=auto`` finds for the frame alone, ``ev`` the same smoothed
-    over time, with the compensation that is set. ``headroom`` is that of the frame's chain.
+    ``metered`` is the result of ``exposure.method=auto`` for this frame only. ``ev`` is smoothed
+    over time, and includes the compensation. ``headroom`` is that of the frame's chain.
     """
 
     job: Job
@@ -35,46 +35,45 @@ class Exposure:
 
 
 def to_meter(jobs: Sequence[Job]) -> list[Job]:
-    """Jobs without what the row of a manifest says of their exposure."""
+    """Return jobs without the exposure in their manifest."""
     return [
         replace(job, values={k: v for k, v in job.values.items() if k != EXPOSURE}) for job in jobs
     ]
 
 
 def check_request(loader: ImageLoader, jobs: Sequence[Job]) -> None:
-    """See that frames can be metered.
+    """Check that frames can be metered.
 
     Raises:
-        RequestError: a frame is a camera's raw, a row of a manifest is wrong, or the chain does not
-            expose by ``exposure.method=auto``.
+        RequestError: a frame is a camera raw, a row of a manifest is wrong, or the chain does not
+            use ``exposure.method=auto``.
     """
     for job in jobs:
         if loader.raw.takes(job.path):
-            raise RequestError(f"{job.label}: it is a raw, which is exposed already; name renders")
+            raise RequestError(f"{job.label}: this is a raw, whose exposure is fixed; give renders")
     loader.check(jobs)
     for each in {id(one): one for one in map(loader.for_job, jobs)}.values():
         method = each.chain.step_named(EXPOSURE).method
         if not isinstance(method, Auto):
             raise RequestError(
-                f"exposure.method: found {method.method}, but metering is what auto does; leave "
-                "it out"
+                f"exposure.method: found {method.method}, but only auto meters; remove this setting"
             )
 
 
 def exposures(
     loader: ImageLoader, jobs: Sequence[Job], device: Device | None, frames: float
 ) -> Iterator[Exposure]:
-    """The exposure of each frame, in the order of the jobs; each folder is a sequence of its own.
+    """Yield the exposure of each frame, in the order of the jobs. Each folder is a sequence.
 
-    As a camera's does, it follows the metered one with a delay: after a change of light, all but
-    1/e of it is made up for within ``frames`` frames (exponential smoothing). A sequence begins
-    with what its first frame is metered at.
+    Like in a camera, exposure follows the metered value with a delay (exponential smoothing). It
+    covers all but 1/e of a change of light within ``frames`` frames. A sequence begins with the
+    metered value of its first frame.
 
     Args:
-        loader: of a request that ends with the step ``exposure``, see :func:`check_request`.
-        jobs: the frames, in order of time.
-        device: where to meter; None is NumPy.
-        frames: the time constant; 0 does not smooth.
+        loader: the loader of a request that ends with ``exposure``, see :func:`check_request`.
+        jobs: the frames in temporal order.
+        device: the device for metering; None is NumPy.
+        frames: the time constant in frames; 0 does not smooth.
 
     Raises:
         ImageError: a frame cannot be read or metered.
@@ -87,7 +86,7 @@ def exposures(
             own = loader.for_job(job)
             try:
                 loaded = own.enter(job, own.read(job))
-                assert loaded  # only where a chain starts in its midst it may be None
+                assert loaded  # it may be None only if --start-at is used
                 runner = runner.for_chain(loaded.chain) if runner else Runner(loaded.chain, device)
                 metered = _metered(loaded, runner)
             except (ImageError, RequestError, MemoryError) as error:
@@ -99,26 +98,26 @@ def exposures(
 
 
 def _metered(loaded: LoadedImage, runner: Runner) -> float:
-    """What metering finds for one image, in EV."""
+    """Return the metered EV of one image."""
     chain = loaded.chain
     result = runner.run(loaded.source.pixels, noise_key(chain.settings, loaded.key))
     return result.estimates[EXPOSURE]["metered_ev"]
 
 
 def write_exposures(path: Path, found: Sequence[Exposure]) -> None:
-    """Write exposures as a manifest, with which a run gives each frame its ``exposure.ev``.
+    """Write exposures as a manifest that sets ``exposure.ev`` for each frame of a run.
 
-    A frame that came from a manifest keeps what else its row said.
+    A frame from a manifest keeps the other values of its row.
 
     Raises:
-        ImageError: it cannot be written.
+        ImageError: the manifest cannot be written.
     """
     rows = [row for each in found for row in _rows(path.parent, each)]
     write_new(path, manifest_text(path.parent, rows))
 
 
 def _rows(folder: Path, exposure: Exposure) -> Iterator[Row]:
-    """A row for each file of an exposure, with the same values."""
+    """Yield a row for each file of an exposure, with the same values."""
     job = exposure.job
     name = job.name or (job.stem if key_of(folder, job.path) != job.key else "")
     own = {"method": "gain", "ev": round(exposure.ev, DIGITS) + 0.0}

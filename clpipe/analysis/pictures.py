@@ -1,4 +1,4 @@
-"""The images that are measured: their kind, levels and clipping, from files of any stage."""
+"""Loads images to measure, from files of any stage, with their kind, levels and clipping."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,9 +22,9 @@ WHOLE = "mosaic"  # the channel of all sites together
 class Picture:
     """An image whose noise is measured.
 
-    ``kind`` is display, rgb, mosaic (signal) or values (a mosaic of unknown levels); ``pixels`` is
-    (height, width, 3) or (height, width). Samples at and beyond ``black`` and ``white`` are
-    clipped; None where no such limit is known.
+    ``kind`` is display, rgb, mosaic (signal) or values (a mosaic of unknown levels). ``pixels`` is
+    (height, width, 3) or (height, width). Samples at or beyond ``black`` and ``white`` are clipped;
+    None means that the limit is not known.
     """
 
     path: Path
@@ -33,20 +33,20 @@ class Picture:
     pattern: str = "RGGB"  # Bayer's, or rows of letters
     black: float | None = None
     white: float | None = None
-    balance: str = ""  # of a kept mosaic, in words: the white balance gains taken out and applied
-    iso: float | None = None  # where the file says it
-    step: float = 0.0  # of a finished picture, to which its samples are rounded
+    balance: str = ""  # of a kept mosaic, as text: the white balance gains removed and applied
+    iso: float | None = None  # None if the file does not state it
+    step: float = 0.0  # of a finished picture: the step to which samples are rounded
 
     @property
     def what(self) -> str:
-        """The kind, pattern and size in words."""
+        """The kind, pattern and size as text."""
         height, width = self.pixels.shape[:2]
         name = "mosaic that does not say its levels" if self.kind == "values" else self.kind
         bayer = f" {self.pattern}" if self.pixels.ndim == 2 else ""
         return f"{name}{bayer}, {width}x{height}"
 
     def clipped(self) -> Mask:
-        """True where a sample is clipped, in the shape of the pixels."""
+        """A mask that is True for clipped samples, with the shape of the pixels."""
         clipped = np.zeros(self.pixels.shape, bool)
         if self.kind == "rgb":
             # Linear RGB may be negative; clipping leaves exactly 0.
@@ -61,16 +61,16 @@ class Picture:
 def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
     """Read an image of any stage: a kept EXR, a render, a mosaic or a finished picture.
 
-    A kept raw is converted from DN to signal by its own levels. A mosaic without clpipe's settings
-    stays in the unit of the file and gets ``pattern``.
+    A kept raw is converted from DN to signal with its levels. A mosaic without clpipe's settings
+    stays in the unit of the file, and gets ``pattern``.
 
     Raises:
         ImageError: the file cannot be read, is a camera raw, or its settings cannot be used.
     """
-    if path.suffix.lower() in RAW_SUFFIXES:  # some hold a small picture, too
+    if path.suffix.lower() in RAW_SUFFIXES:  # some also contain a small picture
         raise ImageError(
-            f"{path}: a camera raw, which is not read here; give what 'clpipe run' makes of it: "
-            "'--format png' develops it, '--keep normalize' keeps its mosaic"
+            f"{path}: this is a camera raw, which this command does not read; run 'clpipe run' "
+            "first: '--format png' develops it, '--keep normalize' keeps its mosaic"
         )
     iso, bits = photograph_facts(path)
     finished = read_finished(path, grey=bits == 8)  # grey of more bits may be a mosaic
@@ -89,7 +89,7 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
     iso = context.iso if context else None
     if not mosaic:
         if kind == Kind.DISPLAY.label:
-            shown = np.clip(pixels, 0, 1)  # as in finished pictures
+            shown = np.clip(pixels, 0, 1)  # like finished pictures
             return Picture(path, "display", shown, black=0.0, white=1.0, iso=iso)
         return Picture(path, "rgb", pixels, white=1.0, iso=iso)
     if context is None:
@@ -99,7 +99,7 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
     )
     balance = f"without the gains {removed} and with the gains {applied}"
     black, white = context.black_level, context.white_level
-    if black is None or white is None:  # not digitised, so nothing clips at a lower end
+    if black is None or white is None:  # not digitised, so nothing is clipped at black
         highest = context.full_scale
         clean = Picture(path, "mosaic", pixels, context.filters.pattern, white=highest)
         return replace(clean, balance=balance, iso=iso)
@@ -107,8 +107,8 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
     lowest = float(-black / (white - black) * full)
     if kind == Kind.RAW.label and context.knots:
         raise ImageError(
-            f"{path}: has fewer DN by a curve, which the next stage undoes; give what is kept "
-            "behind that"
+            f"{path}: a curve has compressed its DN, which the next stage undoes; give the image "
+            "that is kept after that stage"
         )
     if kind == Kind.RAW.label:
         pixels = (pixels - np.float32(black)) / np.float32(white - black) * full
@@ -117,7 +117,7 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
 
 
 def context_after(settings: Settings, stage: str | None) -> Context:
-    """The context of an image that the chain of these settings kept after ``stage``.
+    """Return the context of an image that the chain of these settings kept after ``stage``.
 
     Raises:
         RequestError: the chain has no such stage.

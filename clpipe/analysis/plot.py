@@ -1,4 +1,4 @@
-"""The picture of a noise report: noise by intensity, tails, autocorrelation."""
+"""Draws a noise report: noise by intensity, tails, autocorrelation."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from clpipe.analysis.spatial import LAGS
 from clpipe.analysis.statistics import HISTOGRAM, Channel, gaussian_beyond
 from clpipe.base.files import write_new
 
-# The channels whose autocorrelation is drawn: of pictures by their kind, and of mosaics.
+# The channels whose autocorrelation is drawn, for each kind of picture and for mosaics.
 MAPS = {"display": ("Y", "Cb", "Cr"), "rgb": ("Y", "Cb", "Cr")}
 SITE_MAPS = ("mosaic", "R", "G1", "B")
 
@@ -50,13 +50,13 @@ def _figure(report: NoiseReport) -> Figure:
 
 
 def mapped(report: NoiseReport) -> list[Channel]:
-    """The channels whose autocorrelation is drawn."""
+    """Return the channels whose autocorrelation is drawn."""
     by_name = {one.name: one for one in report.channels}
     return [by_name[name] for name in MAPS.get(report.kind, SITE_MAPS)]
 
 
 def short_name(path: str) -> str:
-    """The last folder and the file of a path; the folder tells truth and noisy image apart.
+    """Return the last folder and the file of a path, which distinguish truth and noisy image.
 
     >>> short_name("a/b/c.exr")
     'b/c.exr'
@@ -65,14 +65,14 @@ def short_name(path: str) -> str:
 
 
 def peak(one: Channel) -> float:
-    """The largest absolute autocorrelation of a channel, lag 0 left out; 0.05 at least."""
+    """Return the largest absolute autocorrelation of a channel without lag 0; at least 0.05."""
     table = np.nan_to_num(one.autocorrelation.copy())
     table[LAGS, LAGS] = 0
     return float(np.clip(np.abs(table).max(), 0.05, 1.0))
 
 
 def draw_intensity(axes: Axes, report: NoiseReport) -> None:
-    """Draw sigma over intensity, and the fitted sqrt(a*y + b) where there is one."""
+    """Draw sigma over intensity, and the fitted sqrt(a*y + b) if there is one."""
     for one in report.channels:
         ink, curve = INK[one.name], one.curve
         dashed = one.name in ("Y", "Cb", "Cr")
@@ -100,7 +100,7 @@ def draw_intensity(axes: Axes, report: NoiseReport) -> None:
 
 
 def draw_tails(axes: Axes, report: NoiseReport) -> None:
-    """Draw the share of standardised noise further out than each value, over a Gaussian's share."""
+    """Draw the share of standardised noise beyond each value, and that of a Gaussian."""
     beyond = [gaussian_beyond(abs(z)) / 2 for z in HISTOGRAM]
     axes.fill_between(HISTOGRAM, beyond, 1e-12, color="0.85", label="Gaussian")
     for one in report.channels:

@@ -1,7 +1,7 @@
-"""Pooling: one report of the noise in several bursts, of other scenes or views, at one ISO.
+"""Pooling: one noise report for several bursts of different scenes or views at one ISO.
 
-Variances and correlations are means over all samples. The laws of a raw are means weighted by the
-inverse of their squared errors, since each burst is an estimate of its own.
+Variances and correlations are means over all samples. The laws of raws are means weighted by the
+inverse of their squared errors, because each burst is a separate estimate.
 """
 
 from collections.abc import Sequence
@@ -20,23 +20,23 @@ from clpipe.base.types import Doubles
 
 
 def pool_by_iso(reports: Sequence[NoiseReport]) -> list[NoiseReport]:
-    """One report for each ISO, in ascending order; of images that do not say theirs, one as well.
+    """Return one report for each ISO, in ascending order, and one for images of unknown ISO.
 
     Raises:
-        RequestError: the reports are on images of several kinds.
+        RequestError: the reports have images of several kinds.
     """
     for other in reports:
         if other.kind != reports[0].kind:
             raise RequestError(
                 f"{other.images[0]} is {other.kind}, but {reports[0].images[0]} is "
-                f"{reports[0].kind}; measure them apart"
+                f"{reports[0].kind}; measure them separately"
             )
     isos = sorted({report.iso for report in reports}, key=lambda iso: iso or 0)
     return [pool([report for report in reports if report.iso == iso]) for iso in isos]
 
 
 def pool(reports: Sequence[NoiseReport]) -> NoiseReport:
-    """One report of several, of one kind; the size is that of the first."""
+    """Return one report from several of one kind, with the size of the first."""
     first = reports[0]
     if len(reports) == 1:
         return first
@@ -67,7 +67,7 @@ def pool(reports: Sequence[NoiseReport]) -> NoiseReport:
 
 
 def pool_channel(channels: Sequence[Channel], edges: Doubles) -> Channel:
-    """One channel of several bursts, with intensity bins between these edges."""
+    """Return one channel from several bursts, with intensity bins between these edges."""
     count = np.array([one.count for one in channels], float)
     sizes = np.array([one.size for one in channels], float)
     laws = [one.law for one in channels if one.law]
@@ -90,7 +90,7 @@ def pool_channel(channels: Sequence[Channel], edges: Doubles) -> Channel:
 
 
 def mean(values: Sequence[Any], weights: Doubles) -> NDArray[np.float64]:
-    """The weighted mean of numbers or arrays, those left out that are NaN; NaN where all are."""
+    """Return the weighted mean of numbers or arrays without NaN; NaN if all are NaN."""
     stack = np.array(values, float)
     known = np.isfinite(stack)
     each = weights.reshape(-1, *[1] * (stack.ndim - 1)) * known
@@ -100,17 +100,17 @@ def mean(values: Sequence[Any], weights: Doubles) -> NDArray[np.float64]:
 
 
 def root_mean_square(sigmas: Sequence[float], weights: Doubles) -> float:
-    """The sigma of all samples together."""
+    """Return the sigma of all samples taken together."""
     return float(np.sqrt(mean([sigma**2 for sigma in sigmas], weights)))
 
 
 def rebinned(curve: NoiseCurve, edges: Doubles) -> NoiseCurve:
-    """A curve with the numbers of the bins between other edges that its means are in."""
+    """Return a curve whose bins are numbered by other edges, according to their means."""
     return replace(curve, bins=bin_of(curve.mean.astype(np.float32), edges))
 
 
 def pool_laws(laws: Sequence[VarianceLaw]) -> VarianceLaw:
-    """The law of several, weighted by the inverse of their squared errors."""
+    """Return the mean of several laws, weighted by the inverse of their squared errors."""
     numbers = []
     for name in ("a", "b"):
         values = np.array([getattr(law, name) for law in laws])
@@ -121,7 +121,7 @@ def pool_laws(laws: Sequence[VarianceLaw]) -> VarianceLaw:
 
 
 def pool_lines(lines: Sequence[LineNoise], count: Doubles) -> LineNoise:
-    """The noise that rows share in several bursts; the limits are of independent variances."""
+    """Return the row noise of several bursts; the limits assume independent variances."""
     share = count / count.sum()
     limits = np.array([one.limit for one in lines]) ** 2 * share
     sigma = root_mean_square([one.sigma for one in lines], count)
@@ -129,7 +129,7 @@ def pool_lines(lines: Sequence[LineNoise], count: Doubles) -> LineNoise:
 
 
 def pool_tails(tails: Sequence[Tails], count: Doubles) -> Tails:
-    """The distribution of all samples together."""
+    """Return the distribution of all samples taken together."""
     beyond = mean([one.beyond for one in tails], count)
     return Tails(
         skewness=float(mean([one.skewness for one in tails], count)),

@@ -1,4 +1,4 @@
-"""Repeats: whether frames show one scene, from one place, each with noise of its own."""
+"""Checks that frames are repeats: one scene from one position, with independent noise."""
 
 from collections.abc import Sequence
 
@@ -9,33 +9,33 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.outputs.noise_areas import halved
 
-# A repeat with less than this share of the others' noise energy is taken for a truth among them.
-# Among n frames and against their mean, a truth has (n - 1) / (n^2 - n - 1), at most 0.4.
+# A repeat with less than this share of the others' noise energy counts as a ground truth. Among n
+# frames, measured against their mean, a ground truth has (n - 1) / (n^2 - n - 1), at most 0.4.
 TRUTH_SHARE = 0.6
 
-# A repeat shows another scene, where averaging BLOCK x BLOCK pixels leaves more than this share of
-# the energy of its difference from the mean. Noise leaves 1 / BLOCK^2, and up to 0.02 where
-# processing has smeared it; another view leaves 0.17.
+# A repeat shows another scene if averaging BLOCK x BLOCK pixels leaves more than this share of the
+# energy of its difference from the mean. Noise leaves 1 / BLOCK^2, and up to 0.02 if processing has
+# correlated it. Another view leaves 0.17.
 SCENE_SHARE = 0.08
 BLOCK = 32  # px
 
-# A repeat is shifted, where more than this share of the energy of its difference from the mean
-# follows the mean's gradient. Noise leaves 0.001 at most; a shift by a pixel 0.2 at ISO 12800.
+# A repeat is shifted if more than this share of the energy of its difference from the mean follows
+# the mean's gradient. Noise has at most 0.001, and a shift by a pixel has 0.2 at ISO 12800.
 SHIFTED_SHARE = 0.02
 
-FEWEST = 1000  # samples, below which chance decides
+FEWEST = 1000  # samples that the checks need
 
 
 def check_repeats(images: Sequence[Picture], mean: Floats, noise: Floats) -> None:
-    """See that images are repeats.
+    """Check that images are repeats.
 
     Args:
-        images: what was measured.
-        mean: of them.
-        noise: (frame, height, width[, 3]), their difference from the mean, scaled.
+        images: the images.
+        mean: their mean.
+        noise: their scaled differences from the mean, (frame, height, width[, 3]).
 
     Raises:
-        RequestError: one shows another scene, is shifted, or has much less noise.
+        RequestError: an image shows another scene, is shifted, or has much less noise.
     """
     refuse_other_scenes(images, noise)
     refuse_shifted(images, mean, noise)
@@ -43,20 +43,21 @@ def check_repeats(images: Sequence[Picture], mean: Floats, noise: Floats) -> Non
 
 
 def refuse_shifted(images: Sequence[Picture], mean: Floats, noise: Floats) -> None:
-    """See that no repeat is shifted against the others, by least squares (Lucas and Kanade, IJCAI
-    1981): a small shift changes a picture by its gradient times the shift.
+    """Check that no repeat is shifted against the others, by least squares.
+
+    A small shift changes a picture by its gradient times the shift (Lucas and Kanade, IJCAI 1981).
 
     Raises:
-        RequestError: one is.
+        RequestError: one is shifted.
     """
-    if mean.ndim == 2:  # of a mosaic, whose neighbours have other colours
+    if mean.ndim == 2:  # neighbouring pixels of a mosaic have different colours
         mean, noise = halved(mean[None, ..., None])[0], halved(noise[..., None])
     if min(mean.shape[:2]) < 2 or mean.size < FEWEST:
         return
     gradients = np.gradient(mean, axis=(0, 1))
     table = np.array([[(a * b).sum(dtype=np.float64) for b in gradients] for a in gradients])
     if np.linalg.det(table) <= 0:
-        return  # there is no structure to see a shift by
+        return  # a shift is not visible without structure
     products = np.array([[(frame * g).sum(dtype=np.float64) for g in gradients] for frame in noise])
     shifts = np.linalg.solve(table, products.T).T
     energy = np.square(noise).sum(axis=(1, 2, 3), dtype=np.float64)
@@ -65,16 +66,16 @@ def refuse_shifted(images: Sequence[Picture], mean: Floats, noise: Floats) -> No
     if follows > SHIFTED_SHARE * energy[worst]:
         others = "the others" if len(noise) > 2 else images[0].path
         raise RequestError(
-            f"{images[worst].path} does not lie over {others}: {follows / energy[worst]:.0%} of "
-            f"the difference follows the picture's edges, of noise less than {SHIFTED_SHARE:.0%}; "
-            "something moved, or the view is another; give repeats from one place, or a --truth"
+            f"{images[worst].path} is not aligned with {others}: {follows / energy[worst]:.0%} of "
+            f"the difference follows edges, but of noise less than {SHIFTED_SHARE:.0%} would; "
+            "the camera or the scene moved. Give repeats from one position, or a --truth"
         )
 
 
 def refuse_other_scenes(images: Sequence[Picture], noise: Floats) -> None:
-    """See that no repeat differs from the others over wide areas, as another scene would.
+    """Check that no repeat differs from the others over wide areas, like another scene.
 
-    Images of less than 2x2 blocks are not judged.
+    Images of less than 2x2 blocks are not checked.
 
     Raises:
         RequestError: one does.
@@ -86,7 +87,7 @@ def refuse_other_scenes(images: Sequence[Picture], noise: Floats) -> None:
         frames, rows, BLOCK, columns, BLOCK, -1
     )
     means = whole.mean((2, 4), dtype=np.float64)
-    for axis in (1, 2):  # rows, columns and the brightness of a frame may have noise of their own
+    for axis in (1, 2):  # remove noise of rows and columns, and changes of brightness
         means -= means.mean(axis, keepdims=True)
     remaining = np.square(means).mean((1, 2, 3))
     worst = int(remaining.argmax())
@@ -96,12 +97,12 @@ def refuse_other_scenes(images: Sequence[Picture], noise: Floats) -> None:
         raise RequestError(
             f"{images[worst].path} does not show the same scene as {others}: averaged over "
             f"{BLOCK}x{BLOCK} pixels, {remaining[worst] / energy:.0%} of the difference remains, "
-            f"of noise less than {SCENE_SHARE:.0%} would; give repeats of one scene, or a --truth"
+            f"but of noise less than {SCENE_SHARE:.0%} would; give repeats of one scene, or --truth"
         )
 
 
 def refuse_truth_among_repeats(images: Sequence[Picture], noise: Floats) -> None:
-    """See that no repeat has much less noise than the others, as a truth among them would.
+    """Check that no repeat has much less noise than the others, like a ground truth.
 
     Raises:
         RequestError: one has.
@@ -112,5 +113,5 @@ def refuse_truth_among_repeats(images: Sequence[Picture], noise: Floats) -> None
     if len(images) > 2 and noise[0].size >= FEWEST and energy[least] < TRUTH_SHARE * others:
         raise RequestError(
             f"{images[least].path} has {energy[least] / others:.2g} times the others' noise; "
-            "if it is their clean truth, give it as --truth"
+            "if it is their clean ground truth, pass it with --truth"
         )

@@ -1,4 +1,4 @@
-"""The report of a measurement: the statistics of all channels, and its JSON form."""
+"""The report of a measurement: statistics of all channels, and its JSON form."""
 
 import math
 from collections.abc import Mapping
@@ -28,21 +28,19 @@ class NoiseReport:
     truth: str | None  # None: the mean of the images
     width: int
     height: int
-    share: float  # of the pixels (of a mosaic: of the samples) that count
+    share: float  # of valid pixels, or of valid samples in a mosaic
     edges: Doubles  # of the intensity bins
     channels: tuple[Channel, ...]
     correlations: Mapping[tuple[str, str], float]
-    covariances: Mapping[
-        str, Doubles
-    ]  # of red, green and blue, (3, 3), by the places; {} of mosaics
+    covariances: Mapping[str, Doubles]  # of red, green and blue, (3, 3), by area; {} for mosaics
     notes: tuple[str, ...]
-    iso: float | None = None  # where the images say it
-    bursts: int = 1  # whose noise is pooled
-    at_edges: float = math.nan  # rms of luma's noise at edges over that in flat places; of pictures
-    rounding: float = 0.0  # the part of every channel's variance that rounding in files has
+    iso: float | None = None  # None if the images do not state it
+    bursts: int = 1  # number of bursts whose noise is pooled
+    at_edges: float = math.nan  # of pictures: rms of luma's noise at edges over that in flat areas
+    rounding: float = 0.0  # the variance that rounding in files adds to each channel
 
     def record(self) -> dict[str, Any]:
-        """The report as JSON values; what could not be computed is null."""
+        """Return the report as JSON values; unknown values are null."""
         return {
             "kind": self.kind,
             "unit": UNITS[self.kind],
@@ -63,7 +61,7 @@ class NoiseReport:
 
 
 def json_number(value: float) -> float | None:
-    """A number as JSON can hold it: NaN becomes null."""
+    """Return a number for JSON, in which NaN becomes null."""
     return None if math.isnan(value) else float(value)
 
 
@@ -83,7 +81,7 @@ def curve_record(curve: NoiseCurve) -> dict[str, list[float]]:
 
 
 def channel_record(channel: Channel) -> dict[str, Any]:
-    """A channel as JSON values."""
+    """Return a channel as JSON values."""
     law, tails = channel.law, channel.tails
     whole = channel.whole_curve
     return {

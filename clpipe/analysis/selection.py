@@ -1,27 +1,27 @@
-"""Selection: the pixels that clipping does not distort."""
+"""Selects the pixels whose noise is not distorted by clipping."""
 
 import numpy as np
 
 from clpipe.analysis.intensity import bin_of
 from clpipe.base.types import Doubles, Floats, Mask
 
-# The share of a bin's samples from which clipping distorts its statistics: a choice;
-# tests/test_statistics.py shows what it selects.
+# If more than this share of a bin's samples are clipped, its statistics are distorted. The value is
+# a choice; tests/test_statistics.py shows what it selects.
 CLIPPED = 1e-3
 
 
 def select_unclipped(intensity: Floats, clipped: Mask, edges: Doubles, start: Mask) -> Mask:
-    """The pixels of ``start`` at intensities where clipping does not distort the noise.
+    """Return the pixels of ``start`` at intensities where clipping does not distort the noise.
 
-    Leaving out the clipped samples alone would leave a one-sided distribution. So an intensity bin
-    is left out where more than :data:`CLIPPED` of its samples are clipped; in the other bins, each
-    pixel that is clipped in any frame is left out.
+    Excluding only clipped samples would leave a one-sided distribution. Therefore an intensity bin
+    is excluded if more than :data:`CLIPPED` of its samples are clipped. In other bins, each pixel
+    that is clipped in any frame is excluded.
 
     Args:
         intensity: (height, width).
-        clipped: (frame, height, width), True where a sample is clipped.
-        edges: of the intensity bins.
-        start: (height, width), the pixels to select from.
+        clipped: True for clipped samples, (frame, height, width).
+        edges: edges of the intensity bins.
+        start: the pixels to select from, (height, width).
     """
     index = bin_of(intensity, edges)
     size = len(edges) - 1

@@ -1,7 +1,7 @@
-"""The noise of a finished picture, and the flat places where it is measured.
+"""The noise of a finished picture, and the flat areas in which it is measured.
 
-A picture is compared with its truth, or with the mean of many pictures of the same scene. Values
-are eight-bit levels, 0 to 255. :mod:`clpipe.analysis.matching.columns` has the figures.
+A picture is compared with its ground truth, or with the mean of many pictures of the same scene.
+Values are 8-bit levels, 0 to 255. :mod:`clpipe.analysis.matching.columns` computes statistics.
 """
 
 import numpy as np
@@ -9,35 +9,35 @@ from numpy.typing import NDArray
 
 from clpipe.base.types import Doubles, Mask
 
-DRIFT = 12.0  # px; what is smoother than this is no noise but light or focus that changed
-SMOOTH = 3.0  # px, of the picture in which flat places are looked for
+DRIFT = 12.0  # px; smoother differences are changes of light or focus, not noise
+SMOOTH = 3.0  # px: blur of the picture in which flat areas are found
 FLAT = 60  # percentile of the gradient
-BIN = 8  # levels; the noise of a bin is compared with that bin's sigma
-FEWEST = 200  # samples of a bin
+BIN = 8  # levels per bin of intensity
+FEWEST = 200  # samples in a bin
 DARKEST, BRIGHTEST = 30, 225  # luma
 
 LUMA = np.array([0.299, 0.587, 0.114])  # BT.601
 
 
 def luma(pixels: NDArray[np.number]) -> Doubles:
-    """BT.601 luma of (..., 3) levels."""
+    """Return BT.601 luma of (..., 3) levels."""
     return np.asarray(pixels @ LUMA, np.float64)
 
 
 def chroma(noise: Doubles, of_luma: Doubles) -> tuple[Doubles, Doubles]:
-    """Cb and Cr of (height, width, 3) noise whose luma is ``of_luma``."""
+    """Return Cb and Cr of (height, width, 3) noise whose luma is ``of_luma``."""
     return 0.564 * (noise[..., 2] - of_luma), 0.713 * (noise[..., 0] - of_luma)
 
 
 def flat_places(mean: NDArray[np.number], darkest: float = DARKEST) -> Mask:
-    """Where a picture without noise is flat and neither dark nor bright, (height, width).
+    """Return the pixels of a picture without noise that are flat, and not dark or bright.
 
-    Flat is below the 60th percentile of the gradient of the smoothed luma, and two pixels away from
-    what is not.
+    In flat pixels the gradient of smoothed luma is below its 60th percentile. They are at least two
+    pixels away from others. The result is a mask, (height, width).
 
     Args:
-        mean: (height, width, 3), 0 to 255.
-        darkest: the least luma that counts.
+        mean: the picture, (height, width, 3), 0 to 255.
+        darkest: the smallest valid luma.
     """
     from scipy import ndimage
 
@@ -49,13 +49,13 @@ def flat_places(mean: NDArray[np.number], darkest: float = DARKEST) -> Mask:
 
 
 def noise_of(picture: NDArray[np.number], mean: NDArray[np.number]) -> Doubles:
-    """The noise of a picture, (height, width, 3): its difference from the mean without slow drift.
+    """Return the noise of a picture, (height, width, 3): its difference from the mean, minus drift.
 
-    Drift is the difference under a Gaussian of 12 px. It is taken out in the cosine transform,
-    which continues the picture as its mirror image, and takes a fifth of the time.
+    Drift is the difference blurred with a Gaussian of 12 px. It is removed in the cosine transform,
+    which mirrors the picture at its edges, and needs a fifth of the time.
 
     Args:
-        picture: (height, width, 3), 0 to 255; in floats of the result's precision.
+        picture: (height, width, 3), 0 to 255, in floats of the result's precision.
         mean: the same scene without noise.
     """
     from scipy import fft

@@ -1,4 +1,4 @@
-"""The signal-to-noise ratio by intensity, over as many stops as there are."""
+"""The signal-to-noise ratio by intensity, over all stops of the images."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -10,8 +10,8 @@ from clpipe.analysis.measure import against
 from clpipe.analysis.pictures import Picture
 
 PER_STOP = 2  # steps of intensity
-FEWEST = 400  # samples of a step; the standard error of its ratio is then .3 dB
-STOPS = 24  # below the brightest, that are looked at
+FEWEST = 400  # samples in a step, for which the standard error of the ratio is 0.3 dB
+STOPS = 24  # the lowest step is this far below the brightest
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,9 @@ class SnrStep:
 
     Args:
         intensity: the mean, in the unit of the images.
-        stops: how many it is below the brightest step.
-        decibels: 20 log10 of mean over standard deviation, as EMVA 1288 has it.
-        samples: of which there are.
+        stops: stops below the brightest step.
+        decibels: 20 log10 of mean over standard deviation, like in EMVA 1288.
+        samples: the number of samples.
     """
 
     intensity: float
@@ -32,10 +32,10 @@ class SnrStep:
 
 
 def snr_curve(images: Sequence[Picture], truth: Picture | None = None) -> list[SnrStep]:
-    """The signal-to-noise ratio in steps of half a stop, from the darkest to the brightest.
+    """Return the signal-to-noise ratio in steps of half a stop, from the darkest to the brightest.
 
-    Noise is the difference from the truth, or from the mean of the images, as for
-    :func:`clpipe.analysis.measure.measure`; clipped samples are left out.
+    Noise is the difference from the truth, or from the mean of the images, see
+    :func:`clpipe.analysis.measure.measure`. Clipped samples are excluded.
 
     Raises:
         RequestError, ImageError: as there.
@@ -55,7 +55,7 @@ def snr_curve(images: Sequence[Picture], truth: Picture | None = None) -> list[S
         if int(own.sum()) * len(noise) < FEWEST:
             continue
         mean = float(light[own].mean())
-        # About its mean: a difference of tone is no noise.
+        # The mean is subtracted, because a difference of tone is not noise.
         sigma = float(noise[:, counts][:, own].std(dtype=np.float64))
         ratio = 20 * np.log10(mean / sigma) if sigma else np.inf
         stops = float(np.log2(brightest / mean))
@@ -64,5 +64,5 @@ def snr_curve(images: Sequence[Picture], truth: Picture | None = None) -> list[S
 
 
 def record_of(curve: Sequence[SnrStep]) -> list[dict[str, Any]]:
-    """A curve as JSON values."""
+    """Return a curve as JSON values."""
     return [asdict(step) for step in curve]

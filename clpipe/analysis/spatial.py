@@ -1,7 +1,7 @@
-"""Noise in space: its autocorrelation, what rows and columns share, what 2x2 averaging leaves.
+"""Noise in space: autocorrelation, row and column noise, and noise after averaging 2x2 pixels.
 
-Functions take noise of (frame, height, width) and ``mask`` (height, width), True where a pixel
-counts. A value that cannot be computed is NaN.
+Functions take noise, (frame, height, width), and ``mask``, (height, width), which is True for valid
+pixels. A value that cannot be computed is NaN.
 """
 
 import math
@@ -25,10 +25,10 @@ class LineNoise:
 
 
 def lag_sums(planes: NDArray[np.floating[Any]]) -> Doubles:
-    """The sum of products of all pairs of pixels at each lag, (17, 17): -8 to 8 down and right.
+    """Return the sums of products of pixel pairs at lags of -8 to 8 down and right, (17, 17).
 
-    They are computed by Fourier transform (Wiener-Khinchin), with a margin of zeros so that it does
-    not wrap around. ``planes`` is (frame, height, width).
+    They are computed by Fourier transform (Wiener-Khinchin), with a margin of zeros that prevents
+    wrapping. ``planes`` is (frame, height, width).
     """
     height, width = planes.shape[1:]
     shape = (height + LAGS, width + LAGS)
@@ -41,15 +41,15 @@ def lag_sums(planes: NDArray[np.floating[Any]]) -> Doubles:
 
 
 def count_pairs(mask: Mask) -> Doubles:
-    """The number of pairs of pixels at each lag of which both count, (17, 17)."""
+    """Return the number of pairs of valid pixels at each lag, (17, 17)."""
     return np.rint(lag_sums(mask[None].astype(np.float64)))
 
 
 def autocorrelation(standard: Floats, pairs: Doubles) -> Doubles:
-    """The autocorrelation of standardised noise, (17, 17): lags of -8 to 8 down and right.
+    """Return the autocorrelation of standardised noise, (17, 17): lags of -8 to 8 down and right.
 
     Args:
-        standard: (frame, height, width), 0 where a pixel does not count.
+        standard: (frame, height, width), 0 for invalid pixels.
         pairs: :func:`count_pairs` of the mask.
 
     >>> plane = np.random.default_rng(0).normal(size=(1, 200, 200)).astype(np.float32)
@@ -64,12 +64,12 @@ def autocorrelation(standard: Floats, pairs: Doubles) -> Doubles:
 
 
 def line_noise(noise: Floats, mask: Mask) -> LineNoise:
-    """The sigma of the offset that all pixels of a row share; transpose for columns.
+    """Return the sigma of the offset that all pixels of a row share; transpose for columns.
 
-    The variance of the offsets is the mean product of the noise at two places of a row. (The
-    variance of row means would also hold noise of the pixels.) Pairs at most 8 px apart are left
-    out, so that noise that processing has smeared does not count as shared. The limit is the root
-    of three standard errors of the variance.
+    The variance of the offsets is the mean product of the noise in two pixels of a row. The
+    variance of row means would include the noise of pixels. Pairs at most 8 px apart are excluded,
+    because processing may have correlated them. The limit is the root of three standard errors of
+    the variance.
     """
 
     def far_pairs(plane: NDArray[np.floating[Any]]) -> Doubles:
@@ -89,10 +89,10 @@ def line_noise(noise: Floats, mask: Mask) -> LineNoise:
 
 
 def energy_left(standard: NDArray[np.floating[Any]], mask: Mask) -> float:
-    """The share of the noise's energy that remains after averaging 2x2 pixels.
+    """Return the share of the noise's energy that remains after averaging 2x2 pixels.
 
     It is a quarter for independent noise and more for noise that processing has correlated (Bielova
-    et al., CVPR Workshops 2019). Blocks with a pixel that does not count are left out.
+    et al., CVPR Workshops 2019). Blocks with an invalid pixel are excluded.
     """
     height, width = (size // 2 * 2 for size in mask.shape)
     whole = mask[:height, :width].reshape(height // 2, 2, width // 2, 2).all((1, 3))

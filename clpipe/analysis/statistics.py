@@ -1,8 +1,7 @@
-"""All statistics of a channel's noise: by intensity, in space, its distribution.
+"""All statistics of a channel's noise: by intensity, in space, and its distribution.
 
-Noise is (frame, height, width), and ``mask`` (height, width) is True where a pixel counts.
-Standardised noise is noise over its sigma at that intensity. A value that cannot be computed is
-NaN.
+Noise is (frame, height, width). ``mask``, (height, width), is True for valid pixels. Standardised
+noise is noise divided by its sigma at that intensity. A value that cannot be computed is NaN.
 """
 
 import math
@@ -26,7 +25,7 @@ class Tails:
     skewness: float
     excess_kurtosis: float
     beyond: tuple[float, ...]  # share of the samples further from 0 than each of SIGMAS
-    histogram: NDArray[np.int64]  # counts between HISTOGRAM's edges; the end bins hold the rest
+    histogram: NDArray[np.int64]  # counts between HISTOGRAM's edges; the end bins have the rest
 
 
 @dataclass(frozen=True)
@@ -43,19 +42,19 @@ class Channel:
     autocorrelation: Doubles  # (17, 17), down and right from -8 to 8; [8, 8] is 1
     energy_left: float  # share, after averaging 2x2 pixels
     tails: Tails
-    whole_sigma: float = math.nan  # of every pixel, those that do not count, too
-    whole_curve: NoiseCurve | None = None  # of every pixel
-    size: int = 0  # samples, those that do not count, too
+    whole_sigma: float = math.nan  # of all pixels, including invalid ones
+    whole_curve: NoiseCurve | None = None  # of all pixels
+    size: int = 0  # number of samples, including invalid ones
 
     @property
     def right(self) -> float:
-        """The correlation of noise with that of the next pixel to the right."""
+        """The correlation of noise with that of the pixel to the right."""
         middle = len(self.autocorrelation) // 2
         return float(self.autocorrelation[middle, middle + 1])
 
 
 def tails(standard: Floats, mask: Mask) -> Tails:
-    """The distribution of standardised noise over the pixels that count."""
+    """Return the distribution of standardised noise over valid pixels."""
     values = standard[:, mask].astype(np.float64).ravel()
     ends = float(HISTOGRAM[0]), float(HISTOGRAM[-1])
     histogram = np.histogram(values.clip(*ends), len(HISTOGRAM) - 1, ends)[0]
@@ -68,7 +67,7 @@ def tails(standard: Floats, mask: Mask) -> Tails:
 
 
 def gaussian_beyond(sigmas: float) -> float:
-    """The share of a Gaussian that is further than ``sigmas`` from its mean, on both sides.
+    """Return the share of a Gaussian beyond ``sigmas`` from its mean, on both sides.
 
     >>> round(gaussian_beyond(2), 4)
     0.0455
@@ -77,7 +76,7 @@ def gaussian_beyond(sigmas: float) -> float:
 
 
 def correlation(one: Floats, two: Floats, mask: Mask) -> float:
-    """The correlation of two channels' standardised noise over the pixels that count."""
+    """Return the correlation of two channels' standardised noise over valid pixels."""
     first, second = one[:, mask].astype(np.float64), two[:, mask].astype(np.float64)
     size = math.sqrt(float((first**2).sum() * (second**2).sum()))
     return float((first * second).sum() / size) if size > 0 else math.nan
@@ -93,27 +92,27 @@ def channel_statistics(
     fits_line: bool,
     freedom: float = 1.0,
 ) -> Channel:
-    """All statistics of one channel.
+    """Return all statistics of one channel.
 
     Args:
-        name: of the channel.
+        name: the name of the channel.
         curve: its noise by intensity.
         noise: (frame, height, width), without the shift.
-        standard: the same, standardised.
-        mask: (height, width), the pixels that count; at least one.
+        standard: standardised noise, (frame, height, width).
+        mask: the valid pixels, (height, width); at least one.
         pairs: :func:`clpipe.analysis.spatial.count_pairs` of the mask.
-        fits_line: whether the variance is linear in the intensity, so that a line is fitted.
-        freedom: the degrees of freedom of a sample, below 1 where the truth is a mean of frames.
+        fits_line: whether to fit a line, because the variance is linear in the intensity.
+        freedom: the degrees of freedom of a sample, below 1 if the truth is a mean of frames.
     """
     table = autocorrelation(standard, pairs)
-    # A variance of correlated samples has the error of fewer independent ones, by the sum of
-    # squared correlations (Bartlett 1946).
+    # The error of a variance of correlated samples is that of fewer independent samples, by the sum
+    # of squared correlations (Bartlett 1946).
     independent = freedom / float(np.nansum(table**2)) if np.isfinite(table).any() else freedom
     samples = noise[:, mask].astype(np.float64)
     rows, columns = line_noise(noise, mask), line_noise(noise.swapaxes(1, 2), mask.T)
     law = fit_variance(curve, min(independent, freedom)) if fits_line else None
     if law:
-        # b holds the variance of the offsets of rows and columns. There is one offset in each, so
+        # b includes the variance of the offsets of rows and columns. Each has one offset, so
         # the error of that variance follows from their number.
         frames, height, width = noise.shape
         in_rows, in_columns = rows.sigma**2 * (2 / (frames * height)) ** 0.5, 0.0

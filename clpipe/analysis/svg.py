@@ -1,7 +1,7 @@
-"""Drawings for web pages, as SVG: lines, histograms and noise, in the colours of the page.
+"""Draws SVGs for web pages: lines, histograms and noise, in the colours of the page.
 
-Text stays text, in the page's font, and axes have the page's colour (``currentColor``), so that a
-drawing is readable on light and on dark ground, and in print.
+Text stays text in the page's font, and axes have the page's colour (``currentColor``). Drawings are
+therefore readable on light and dark backgrounds, and in print.
 """
 
 import io
@@ -30,10 +30,10 @@ from clpipe.analysis.spatial import LAGS
 from clpipe.base.text import one_line
 
 NEUTRAL = INK["mosaic"]
-PAGE_FILES = resources.files("clpipe.analysis") / "page"  # what reports and explorer share
-PAGE = "#010203"  # stands for the page's colour until the drawing is text
+PAGE_FILES = resources.files("clpipe.analysis") / "page"  # files that report and explorer share
+PAGE = "#010203"  # placeholder for the page's colour
 COLOURS = ("#1f8a8a", "#d9822b", "#7a5bb5", "#c8102e")
-LONG = 18  # characters of a name beside a bar
+LONG = 18  # characters of a name next to a bar
 SETTINGS = {
     "svg.fonttype": "none",
     "svg.hashsalt": "clpipe",
@@ -56,9 +56,9 @@ SETTINGS = {
 
 
 def _figure(width: float, height: float, right: float = 0.2) -> Figure:
-    """A figure without ground, in inches; ``right`` is free on that side.
+    """Return a figure without background, sized in inches; ``right`` is the margin on that side.
 
-    The margins are fixed: to fit it to the texts takes Matplotlib three times as long.
+    The margins are fixed, because fitting them to the text takes three times as long.
     """
     figure = Figure(figsize=(width, height))
     margins = {"left": 0.75 / width, "right": 1 - right / width}
@@ -71,7 +71,7 @@ def _figure(width: float, height: float, right: float = 0.2) -> Figure:
 
 
 def _text(figure: Figure, title: str) -> str:
-    """A figure as an ``<svg>`` element that takes the width that there is."""
+    """Return a figure as an ``<svg>`` element that fills the available width."""
     for axes in figure.axes:
         axes.patch.set_alpha(0)
     file = io.StringIO()
@@ -81,7 +81,7 @@ def _text(figure: Figure, title: str) -> str:
     for ink in (PAGE, NEUTRAL):
         text = text.replace(ink, "currentColor")
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    # Ids are the page's, where there may be several drawings.
+    # Ids must be unique in the page, which may have several drawings.
     own = f"d{zlib.crc32(text.encode()):x}"
     text = re.sub(r'(id="|url\(#|href="#)', rf"\g<1>{own}", text)
     text = re.sub(r'width="[\d.]+pt" height="[\d.]+pt"', 'width="100%"', text, count=1)
@@ -92,13 +92,13 @@ def _text(figure: Figure, title: str) -> str:
 def lines_svg(
     x: Sequence[float], lines: Mapping[str, Sequence[float]], labels: tuple[str, str], title: str
 ) -> str:
-    """Lines over x, from 0 on.
+    """Return lines over x, with axes that start at 0.
 
     Args:
-        x: values.
-        lines: as many values each, by their names.
-        labels: of the axes.
-        title: for those who cannot see it.
+        x: the values on the x axis.
+        lines: the values of each line, by name.
+        labels: labels of the axes.
+        title: a description for screen readers.
     """
     with mpl.rc_context(SETTINGS):
         figure = _figure(7, 2.6)
@@ -114,7 +114,7 @@ def lines_svg(
 def shares_svg(
     x: Sequence[float], shares: Mapping[str, Sequence[float]], label: str, title: str
 ) -> str:
-    """Shares that are 1 together, one above the other, over x."""
+    """Return stacked shares over x, which add up to 1."""
     with mpl.rc_context(SETTINGS):
         figure = _figure(7, 2.6, right=1.3)
         axes = figure.add_subplot()
@@ -128,7 +128,7 @@ def shares_svg(
 
 
 def histogram_svg(values: Sequence[float], label: str) -> str:
-    """How often values occur; bins are even in the logarithm where values span a factor of 30."""
+    """Return a histogram of values, with logarithmic bins if they span a factor of 30."""
     data = np.asarray(values, float)
     low, high = float(data.min()), float(data.max())
     logarithmic = low > 0 and high / low > 30
@@ -151,7 +151,7 @@ def histogram_svg(values: Sequence[float], label: str) -> str:
 
 
 def bars_svg(counts: Mapping[str, int], label: str) -> str:
-    """How often each of a few values occurs."""
+    """Return bars with the count of each value."""
     with mpl.rc_context(SETTINGS):
         figure = _figure(3.4, 1.9)
         figure.subplots_adjust(left=0.4)
@@ -164,7 +164,7 @@ def bars_svg(counts: Mapping[str, int], label: str) -> str:
 
 
 def noise_svg(report: NoiseReport) -> str:
-    """Sigma over intensity, autocorrelation, power spectrum and tails of finished pictures."""
+    """Return sigma over intensity, autocorrelation, power spectrum and tails of pictures."""
     with mpl.rc_context(SETTINGS):
         figure = _figure(11, 5.6, right=0.9)
         above, below = figure.subplots(2, 3)
@@ -174,7 +174,7 @@ def noise_svg(report: NoiseReport) -> str:
         draw_tails(below[0], report)
         figure.legend(*above[0].get_legend_handles_labels(), loc="center right")
         for axes in (above[0], below[0]):
-            axes.get_legend().remove()  # which would cover a curve
+            axes.get_legend().remove()  # it would cover a curve
         first = mapped(report)[0]
         picture = draw_autocorrelation(below[1], first, peak(first), report)
         figure.colorbar(picture, ax=below[1], shrink=0.8)
@@ -183,13 +183,13 @@ def noise_svg(report: NoiseReport) -> str:
 
 
 def law_svg(report: NoiseReport, a: float, b: float, title: str) -> str:
-    """The variance of a mosaic's sites over intensity, and the law a y + b that was asked.
+    """Return the variance of a mosaic's sites over intensity, and the requested law a y + b.
 
     Args:
-        report: of a mosaic in signal, 0 to 1.
-        a: in signal.
-        b: in signal squared.
-        title: for those who cannot see it.
+        report: the report of a mosaic in signal, 0 to 1.
+        a: a in signal units.
+        b: b in squared signal units.
+        title: a description for screen readers.
     """
     with mpl.rc_context(SETTINGS):
         figure = _figure(3.8, 2.4)
@@ -217,9 +217,9 @@ def _draw_lags(axes: Axes, report: NoiseReport) -> None:
 
 
 def _draw_spectrum(axes: Axes, report: NoiseReport) -> None:
-    """The power spectrum along rows: the Fourier transform of the autocorrelation, with a window.
+    """Draw the power spectrum along rows: the Fourier transform of the windowed autocorrelation.
 
-    A Hann window over the known lags keeps it from ringing; white noise is 1 everywhere.
+    A Hann window over the known lags prevents ringing. White noise is 1 everywhere.
     """
     frequency = np.linspace(0, 0.5, 65)
     lags = np.arange(1, LAGS + 1)

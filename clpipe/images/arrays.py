@@ -1,4 +1,4 @@
-"""Arrays that are given as images: taken where their meaning is plain, else refused with a way."""
+"""Arrays as images: converted if their meaning is unambiguous, otherwise rejected with advice."""
 
 from typing import Any
 
@@ -10,14 +10,14 @@ from clpipe.stage import Kind
 
 
 def as_array(value: Any, what: str) -> Array:
-    """A NumPy array of an array or of a tensor of any library with DLPack, whose memory it shares.
+    """Return a NumPy array that shares the memory of an array or DLPack tensor of any library.
 
     Args:
-        value: the array.
-        what: what it is called, for the message.
+        value: the array or tensor.
+        what: its name, for the message.
 
     Raises:
-        ImageError: it is neither, or its memory cannot be shared as it is.
+        ImageError: it is neither, or its memory cannot be shared.
     """
     if isinstance(value, np.ndarray):
         return value
@@ -38,14 +38,14 @@ def as_array(value: Any, what: str) -> Array:
 
 
 def as_image(value: Any, kind: Kind) -> Array:
-    """An image in a type that a chain can start on: float16, float32 or whole DN.
+    """Return an image in a type that a chain can start on: float16, float32 or whole DN.
 
     Args:
-        value: an array or tensor, (height, width, 3), or (height, width) of a mosaic.
-        kind: of image that the chain starts on.
+        value: an array or tensor, (height, width, 3), or (height, width) for a mosaic.
+        kind: the kind of image that the chain starts on.
 
     Raises:
-        ImageError: it is of another type or shape, or not finite; the message says what helps.
+        ImageError: the value has another type or shape, or is not finite; the message advises.
     """
     image = as_array(value, "image")
     check_shape(image.shape, kind)
@@ -77,10 +77,10 @@ def as_image(value: Any, kind: Kind) -> Array:
 
 
 def check_shape(shape: tuple[int, ...], kind: Kind) -> None:
-    """See that an array has the shape of one image of a kind.
+    """Check that an array has the shape of one image of a kind.
 
     Raises:
-        ImageError: it has not; the message has the line of code that gives it.
+        ImageError: it has not; the message contains code that converts it.
     """
     channels = len(kind.channels)
     expected = "(height, width, 3)" if channels > 1 else "(height, width)"

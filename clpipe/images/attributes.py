@@ -14,7 +14,7 @@ PREFIX = "clpipe:"  # of the names of clpipe's own attributes
 
 
 def own_attributes(spec: Any) -> dict[str, str]:
-    """clpipe's own attributes in an OpenImageIO spec, by their names without the prefix."""
+    """Return clpipe's own attributes in an OpenImageIO spec, by their names without the prefix."""
     return {
         attribute.name.removeprefix(PREFIX): str(attribute.value)
         for attribute in spec.extra_attribs
@@ -23,14 +23,14 @@ def own_attributes(spec: Any) -> dict[str, str]:
 
 
 def read_attributes(path: Path) -> dict[str, str]:
-    """clpipe's own attributes of a file; none where it is missing, unreadable or not clpipe's."""
+    """Return clpipe's own attributes of a file; {} if it is missing, unreadable or has none."""
     with contextlib.suppress(ImageError), open_image(path) as file:
         return own_attributes(file.spec())
     return {}
 
 
 def shot_attributes(spec: Any) -> dict[str, float]:
-    """What OpenEXR's standard attributes say of the shot; values that cannot be are left out.
+    """Return the shot from OpenEXR's standard attributes, without impossible values.
 
     The names are those of a render's camera (``[render]``): exposure_time in s, focal_length
     and sensor_width in mm.
@@ -46,14 +46,14 @@ def shot_attributes(spec: Any) -> dict[str, float]:
 
 
 def photograph_attributes(spec: Any) -> tuple[dict[str, str], dict[str, float]]:
-    """What the EXIF of a finished picture says of the shot; values that cannot be are left out.
+    """Return the shot from the EXIF of a finished picture, without impossible values.
 
-    The camera and its ISO are not among it: the picture goes through another one.
+    The camera and its ISO are omitted, because clpipe simulates another camera.
 
     Returns:
-        The attributes by which an image carries its tags and its orientation, and what they say of
-        the shot as :func:`shot_attributes` has it. The sensor's width is there where the equivalent
-        focal length on 35 mm film is.
+        The attributes that contain the tags and the orientation of an image, and the values of
+        :func:`shot_attributes`. The sensor's width is known if EXIF has the equivalent focal
+        length on 35 mm film.
     """
     named = {
         "exposure": spec.getattribute("ExposureTime"),

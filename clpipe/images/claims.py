@@ -1,4 +1,4 @@
-"""What a file says of its size, and the memory that reading it takes; no pixel is read."""
+"""The size that a file claims, and the memory to read it, found without reading pixels."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +16,26 @@ FLOAT = 4  # bytes
 
 @dataclass(frozen=True)
 class Claim:
-    """The size that a file claims; bytes of its image in memory, and the most while it is read.
+    """The size that a file claims in px, and the bytes of memory for its image and to read it.
 
-    The model is that of :mod:`clpipe.images.read`. At 24 MP, measured in bytes a pixel: EXR of
-    R, G and B in half 6.1 (here 6), in float 12.1 (12), with alpha 8.0 (14), with other layers 13.1
-    (18), converted from other primaries 24.1 (24), with another display window 11.9 (12); TIFF,
-    HDR, JPEG and PNG 24.0 (24); raws 9 (12).
+    The model follows :mod:`clpipe.images.read`. This table compares it with measurements at 24 MP,
+    in bytes per pixel:
+
+    | file | measured | model |
+    |---|---|---|
+    | EXR, R, G and B in half | 6.1 | 6 |
+    | the same in float | 12.1 | 12 |
+    | with alpha | 8.0 | 14 |
+    | with other layers | 13.1 | 18 |
+    | with other primaries | 24.1 | 24 |
+    | with another display window | 11.9 | 12 |
+    | TIFF, HDR, JPEG, PNG | 24.0 | 24 |
+    | raw | 9 | 12 |
+
+    Args:
+        width, height: the larger of data window and display window, in px.
+        image: bytes of the image in memory.
+        reading: the largest number of bytes while it is read.
     """
 
     width: int
@@ -31,17 +45,17 @@ class Claim:
 
     @property
     def megapixels(self) -> float:
-        """Its size."""
+        """The size in megapixels."""
         return self.width * self.height / 1e6
 
 
 def plain_claim(width: int, height: int) -> Claim:
-    """The claim of a mosaic which is read as it is and becomes floats."""
+    """Return the claim of a mosaic that is read in whole numbers and converted to floats."""
     return Claim(width, height, width * height * FLOAT, width * height * 3 * FLOAT)
 
 
 def display_size(path: Path) -> tuple[int, int]:
-    """The width and height of the picture that a file claims.
+    """Return the width and height in px of the picture that a file claims.
 
     Raises:
         ImageError: it cannot be opened.
@@ -52,11 +66,11 @@ def display_size(path: Path) -> tuple[int, int]:
 
 
 def claim_of(path: Path, mosaic: bool = False) -> Claim | None:
-    """What a file claims; None of one that cannot be opened.
+    """Return the claim of a file; None if it cannot be opened.
 
     Args:
         path: the file.
-        mosaic: whether a single channel is read of it.
+        mosaic: whether only a single channel is read.
     """
     try:
         if path.suffix.lower() in RAW_SUFFIXES:
@@ -75,7 +89,7 @@ def _claim(spec: Any, is_exr: bool, mosaic: bool) -> Claim:
     sample = 2 if is_exr and all(each.size() == 2 for each in own) else FLOAT
     image = sample * (1 if mosaic else 3)
     stored = sum(each.size() for each in formats)
-    # The package OpenEXR decodes all channels, of which those that are wanted are copied together.
+    # The package OpenEXR decodes all channels, from which the requested ones are copied.
     more = 0 if stored == image else min(stored, WASTE * image)
     reading = image + (more if is_exr else image)
     window = spec.x, spec.y, spec.width, spec.height
@@ -88,7 +102,7 @@ def _claim(spec: Any, is_exr: bool, mosaic: bool) -> Claim:
 
 
 def _is_converted(spec: Any, has_picture: bool) -> bool:
-    """Whether the picture is in other primaries than sRGB's."""
+    """Return whether the picture has other primaries than sRGB."""
     stated, neutral = spec.getattribute("chromaticities"), spec.getattribute("adoptedNeutral")
     if has_picture and stated is None and neutral is None:
         return False

@@ -9,7 +9,7 @@ from clpipe.base.types import Array, Floats
 
 # x and y of red, green, blue and white: ITU-R BT.709-6 (2015), which sRGB shares.
 SRGB = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-FARTHEST = 100.0  # from the origin, of x or y; those of wide colour spaces lie within -1 to 2
+FARTHEST = 100.0  # the largest absolute x or y; those of wide colour spaces are within -1 to 2
 CIE_XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
 
 # Cone response of the Bradford transform (Lam 1985), after B. Lindbloom, "Chromatic Adaptation".
@@ -42,21 +42,24 @@ def rgb_to_xyz(chromaticities: Sequence[float]) -> Array:
             if np.isfinite(matrix).all() and abs(np.linalg.det(matrix)) > 1e-6:
                 return matrix
     found = ", ".join(f"{value:g}" for value in chromaticities)
-    raise ImageError(f"its chromaticities, {found}, are not those of a red, green, blue and white")
+    raise ImageError(
+        f"its chromaticities, {found}, do not describe a red, green, blue and white; correct the "
+        "file's attribute"
+    )
 
 
 def _numbers(name: str, values: object, count: int) -> Array:
-    """An attribute of a file as an array of ``count`` numbers.
+    """Return an attribute of a file as an array of ``count`` numbers.
 
     Raises:
-        ImageError: it is not that.
+        ImageError: the attribute is anything else.
     """
     try:
         numbers = np.asarray(values, np.float64)
     except (TypeError, ValueError):
         numbers = np.empty(0)
     if numbers.shape != (count,):
-        raise ImageError(f"its attribute {name} is not {count} numbers")
+        raise ImageError(f"its attribute {name} must be {count} numbers, but is not")
     return numbers
 
 
@@ -74,10 +77,10 @@ def adaptation(source_white: Array, target_white: Array) -> Array:
 def to_linear_srgb(
     chromaticities: Sequence[float], neutral: Sequence[float] | None = None
 ) -> Floats | None:
-    """The 3x3 matrix from a file's RGB to linear sRGB; None where the file is in linear sRGB.
+    """Return the 3x3 matrix from a file's RGB to linear sRGB; None if the file is in linear sRGB.
 
-    The file's neutral colour stays neutral: ``neutral``, else the white of its chromaticities. CIE
-    XYZ itself has no white; its values count as seen under D65, as in the OpenEXR project's
+    The file's neutral colour stays neutral: ``neutral``, or the white of its chromaticities. CIE
+    XYZ itself has no white. Its values are taken as seen under D65, like in the OpenEXR project's
     definition of the conversion and its test image (openexr issue 686, 2020).
 
     >>> p3 = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.314, 0.351)

@@ -1,7 +1,7 @@
 """Digital Negatives (DNG): the raw of a chain as a file that any raw converter opens.
 
-After Adobe, Digital Negative (DNG) Specification 1.4.0.0, 2012: the first directory holds a preview
-and what applies to the whole file, a second one below it holds the mosaic.
+Source: Adobe, Digital Negative (DNG) Specification 1.4.0.0, 2012. The first directory holds a
+preview and fields of the whole file. A second directory below it holds the mosaic.
 """
 
 import struct
@@ -26,24 +26,28 @@ from clpipe.reference.filter_array import FilterArray
 from clpipe.reference.transfer import srgb_curve
 
 PREVIEW_SIDE = 512  # px, at most
-D65 = 21  # EXIF's LightSource of that illuminant
-NO_BLACK_RENDER = 1  # DefaultBlackRender: the converter takes nothing off near black
+D65 = 21  # EXIF's LightSource number of this illuminant
+NO_BLACK_RENDER = 1  # DefaultBlackRender: the converter subtracts nothing near black
 CURVE_POINTS = 33
 D50_XYZ = np.array([0.9642, 1.0, 0.8251])  # CIE XYZ of the white D50, Y = 1; sources differ by 1e-4
 
-# Tags of fields that point to other parts of the file; their values are known last.
+# Tags of fields that point to other parts of the file, filled in last.
 STRIP_OFFSETS, SUB_IFDS, EXIF_IFD = 273, 330, 34665
 
 
 @dataclass(frozen=True)
 class Negative:
-    """What a raw converter needs to know of a raw.
+    """The metadata of a raw that a converter needs.
 
-    ``step`` is the step of the chain whose image is the raw; None is the image that enters the
-    chain. Levels are in DN. ``array`` is its filter array, with the gains of white balance.
-    ``xyz_to_camera`` is the matrix from CIE XYZ under D65 to the raw's channels before white
-    balance: (channel, 3). ``noise`` is None where it is unknown. ``tone`` is the tone curve that
-    the raw is meant for: on linear sRGB, (height, width, 3), in units of the white level.
+    Args:
+        step: the step of the chain whose image is the raw; None is the image that enters the chain.
+        array: the filter array, with the gains of white balance.
+        black_level, white_level: in DN.
+        xyz_to_camera: the matrix from CIE XYZ under D65 to the raw's channels before white balance,
+            (channel, 3).
+        noise: the noise model; None if it is unknown.
+        tone: the tone curve for this raw, applied to linear sRGB, (height, width, 3), in units of
+            the white level.
     """
 
     step: str | None
@@ -55,15 +59,15 @@ class Negative:
     tone: Callable[[Floats], Floats]
 
 
-# What a DNG calls channels (CFAPattern).
+# The numbers of channels in a DNG (CFAPattern).
 CODES = {"R": 0, "G": 1, "B": 2, "C": 3, "M": 4, "Y": 5, "W": 6}
 
 
 def planes_of(array: FilterArray) -> list[str]:
-    """The channels of an array in the order of a DNG's planes.
+    """Return the channels of an array in the order of a DNG's planes.
 
-    What stands for green is in the middle, where converters that know red, green and blue alone
-    look for it.
+    The channel that replaces green is in the middle, where converters that know only red, green and
+    blue expect it.
     """
     own = list(array.channels)
     if "G" in own or not {*"RB"} <= {*own}:
@@ -71,52 +75,53 @@ def planes_of(array: FilterArray) -> list[str]:
     return ["R", *(letter for letter in own if letter not in "RB"), "B"]
 
 
-BEHIND = ", filter array "  # a model's name, where it has another one than it is known for
+BEHIND = ", filter array "  # follows a model's name if the array differs from the real camera's
 
 
 def array_suffix(array: FilterArray) -> str:
-    """What the name of a model ends in, to which converters attach what they know of its colours.
+    """Return the suffix of a model's name that contains its array; "" for a Bayer pattern.
 
-    Readers of periods that converters do not know find the array there, too.
+    The suffix keeps converters from using their colours of the real model. clpipe reads the array
+    from it if LibRaw does not know the pattern.
     """
     return "" if array.pattern in PATTERNS else f"{BEHIND}{array.pattern}"
 
 
 def check_array(array: FilterArray) -> None:
-    """See that a DNG can hold the raw of a filter array.
+    """Check that a DNG can hold the raw of a filter array.
 
     Raises:
-        RequestError: it has a channel that DNG does not know.
+        RequestError: the array has a channel that DNG does not define.
     """
     unknown = [letter for letter in array.channels if letter not in CODES]
     if unknown and not array.is_gray:
         raise RequestError(
-            f"--format dng: {array.name} has the channel {unknown[0]}, which DNG does not know; it "
-            f"knows {', '.join(CODES)}, and sensors of one channel"
+            f"--format dng: {array.name} has the channel {unknown[0]}, but DNG only allows "
+            f"{', '.join(CODES)}, and sensors of one channel; use --format npy"
         )
 
 
 def check_channels(array: FilterArray) -> None:
-    """See that converters open the DNG of a filter array; LibRaw opens none of two channels.
+    """Check that converters open the DNG of a filter array. LibRaw opens none with two channels.
 
     Raises:
         RequestError: they do not.
     """
     if len(array.channels) == 2:
         raise RequestError(
-            f"--format dng: {array.name} has the channels {' and '.join(array.channels)} only, and "
+            f"--format dng: {array.name} has only the channels {' and '.join(array.channels)}, but "
             "LibRaw opens no DNG of two channels; use --format npy, or --keep quantize"
         )
 
 
 def xyz_to_camera(colours: Doubles, array: FilterArray) -> Doubles:
-    """The ColorMatrix of a raw, (channel, 3): CIE XYZ under D65 to its channels, not balanced.
+    """Return a raw's ColorMatrix, (channel, 3): CIE XYZ under D65 to channels before white balance.
 
-    It maps the white D65 to AsShotNeutral, so a converter needs no chromatic adaptation. It is
-    scaled as Adobe's matrices: the white D50 becomes 1 in the strongest channel.
+    It maps the white D65 to AsShotNeutral, so a converter needs no chromatic adaptation. Its scale
+    is that of Adobe's matrices: the white D50 becomes 1 in the strongest channel.
 
     Args:
-        colours: 3x3, linear sRGB to the mosaic's colours after white balance.
+        colours: the 3x3 matrix from linear sRGB to the mosaic's colours after white balance.
         array: the filter array, with the gains of white balance.
 
     >>> from clpipe.camera.profile import load_camera
@@ -133,10 +138,10 @@ def xyz_to_camera(colours: Doubles, array: FilterArray) -> Doubles:
 
 
 def preview(dn: Array, negative: Negative) -> Array:
-    """A small sRGB picture of a mosaic, (height, width, 3) uint8, at most 512 pixels a side.
+    """Return a small sRGB picture of a mosaic, (height, width, 3) uint8, at most 512 px per side.
 
-    Each pixel is one period of the mosaic, the mean of each channel's sites, and has the tone
-    curve: RawTherapee makes its own curve so that its picture has as many dark and bright pixels.
+    A pixel is the mean of each channel in one period of the mosaic. It has the tone curve, because
+    RawTherapee matches the histogram of its own picture to that of the preview.
     """
     array = negative.array
     down, across = array.period
@@ -170,10 +175,10 @@ def preview(dn: Array, negative: Negative) -> Array:
 
 
 def tone_fields(negative: Negative) -> tiff.Directory:
-    """The tone curve for converters that take one from a DNG, as Adobe's do.
+    """Return the tone curve, for converters that read one from a DNG, like Adobe's.
 
-    There is no BaselineExposure: it is for cameras that expose otherwise than such a curve expects.
-    Adobe's software would clip the headroom for it, and the others that were tried ignore it.
+    BaselineExposure is not written. It is for cameras whose exposure does not fit such a curve.
+    Adobe's software would clip the headroom, and other converters that were tried ignore it.
     """
     light = np.linspace(0, 1, CURVE_POINTS, dtype=np.float32) ** 2  # curves bend most near black
     curve = negative.tone(np.repeat(light[None, :, None], 3, axis=-1))[0, :, 0]
@@ -186,14 +191,15 @@ def tone_fields(negative: Negative) -> tiff.Directory:
 def main_directory(
     small: Array, negative: Negative, tags: Tags, orientation: int
 ) -> tiff.Directory:
-    """The first directory: the preview, the camera, and what a converter needs for colour.
+    """Return the first directory: the preview, the camera, and fields for colour.
 
-    Its offsets are 0 until the file is laid out. Arguments as :func:`write_dng`, with the preview.
+    Its offsets are 0 until they are known. The arguments are those of :func:`write_dng`, and the
+    preview ``small``.
     """
     whole_name = tags.model if tags.model.startswith(tags.make) else f"{tags.make} {tags.model}"
     neutral = [negative.array.levels[letter] for letter in planes_of(negative.array)]
     colour: tiff.Directory = {}
-    if not negative.array.is_gray:  # which has no colours
+    if not negative.array.is_gray:
         colour = {
             50721: tiff.signed_rational(*negative.xyz_to_camera.ravel().round(7)),  # ColorMatrix1
             50728: tiff.rational(*neutral),  # AsShotNeutral
@@ -205,9 +211,9 @@ def main_directory(
         **tone_fields(negative),
         **({306: tiff.text(tags.taken)} if tags.taken else {}),  # DateTime
         271: tiff.text(tags.make),  # Make
-        # Model. It is not the real camera's name: for that one RawTherapee cuts off optically black
-        # columns and sets its own white level, and LibRaw uses its own matrix, even for a name that
-        # only begins like it.
+        # Model. It differs from the real camera's name, for which RawTherapee crops optically black
+        # columns and sets its own white level. LibRaw uses its own matrix even if a name only
+        # begins with that of a real camera.
         272: tiff.text(SIMULATED + tags.model),
         274: tiff.short(orientation),  # Orientation
         305: tiff.text(f"clpipe {__version__}"),  # Software
@@ -223,7 +229,7 @@ def main_directory(
 
 
 def raw_directory(dn: Array, negative: Negative) -> tiff.Directory:
-    """The directory of the mosaic, (height, width) in DN; its offset is 0 until it is known."""
+    """Return the directory of a mosaic, (height, width) in DN. Its offset is 0 at first."""
     array = negative.array
     filters: tiff.Directory = {}
     if not array.is_gray:
@@ -249,9 +255,9 @@ def raw_directory(dn: Array, negative: Negative) -> tiff.Directory:
 
 
 def noise_fields(negative: Negative) -> tiff.Directory:
-    """NoiseProfile: a and b for each colour; nothing where the noise is unknown.
+    """Return the field NoiseProfile, a and b for each colour; {} if the noise is unknown.
 
-    The specification puts it beside the mosaic, but Adobe's SDK looks for it in the first
+    The specification requires it in the mosaic's directory, but Adobe's SDK reads it from the first
     directory, so both have it.
     """
     noise = negative.noise
@@ -267,9 +273,9 @@ def write_dng(
     Args:
         path: the file.
         mosaic: (height, width), whole DN of 0 to 65535.
-        negative: what a converter needs to know of it.
+        negative: its metadata.
         tags: the camera, the ISO and the shot.
-        orientation: EXIF's; a converter turns the picture by it.
+        orientation: EXIF's value, by which a converter rotates the picture.
 
     Raises:
         ImageError: the file cannot be written, or a sample is not a whole DN of 0 to 65535.
@@ -278,7 +284,8 @@ def write_dng(
         dn = mosaic.astype("<u2")
     if not np.array_equal(dn, mosaic):
         raise ImageError(
-            f"{path}: holds samples that are not whole DN of 0 to 65535, which a DNG needs"
+            f"{path}: this raw has samples that are not whole DN from 0 to 65535, which a DNG "
+            "requires; use --format npy"
         )
     small = preview(dn, negative)
     main, raw = main_directory(small, negative, tags, orientation), raw_directory(dn, negative)

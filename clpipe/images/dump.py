@@ -1,4 +1,4 @@
-"""Headerless dumps of a sensor: the samples of one mosaic, row by row, and nothing else."""
+"""Headerless dumps of a sensor, which contain only the samples of one mosaic, row by row."""
 
 import math
 import re
@@ -28,7 +28,7 @@ MAX_SIDE = 65535
 
 @dataclass(frozen=True)
 class Dump:
-    """The format of a dump: its size in pixels, and its type of samples, of :data:`TYPES`."""
+    """The format of a dump: its width and height in px, and its sample type in :data:`TYPES`."""
 
     width: int
     height: int
@@ -40,19 +40,19 @@ class Dump:
         return int(self.width * self.height * TYPES[self.type])
 
     def check_size(self, count: int) -> None:
-        """See that a file of ``count`` bytes can be such a dump.
+        """Check that a file of ``count`` bytes can be such a dump.
 
         Raises:
-            ImageError: it cannot; the message says what would fit.
+            ImageError: it cannot; the message lists formats that fit.
         """
         if count != self.byte_count:
             raise ImageError(
-                f"{count} bytes, but {self.width}x{self.height} {self.type} has "
+                f"this file has {count} bytes, but {self.width}x{self.height} {self.type} has "
                 f"{self.byte_count}; {fitting_formats(count, self)}"
             )
 
     def unpack(self, data: bytes) -> Floats:
-        """The mosaic in DN, (height, width).
+        """Return the mosaic in DN, (height, width) float32.
 
         >>> Dump(4, 1, "raw10").unpack(bytes([0x80, 0, 0, 0xFF, 0b11_00_00_01])).tolist()
         [[513.0, 0.0, 0.0, 1023.0]]
@@ -60,7 +60,7 @@ class Dump:
         [[291.0, 2748.0]]
 
         Raises:
-            ImageError: the data has another size; the message says what would fit.
+            ImageError: the data has another size; the message lists formats that fit.
         """
         self.check_size(len(data))
         if self.type in ("uint16le", "uint16be"):
@@ -75,13 +75,13 @@ class Dump:
 
 
 def parse_dump(text: str) -> Dump:
-    """The format that the setting ``dump`` describes.
+    """Return the format that the setting ``dump`` describes.
 
     >>> parse_dump("768x512:uint16le").byte_count
     786432
 
     Raises:
-        RequestError: it is of another form, or a value is not allowed.
+        RequestError: the text has another form, or a value is not allowed.
     """
     match = re.fullmatch(r"(\d{1,5})x(\d{1,5}):(\w+)", text)
     if not match:
@@ -92,7 +92,9 @@ def parse_dump(text: str) -> Dump:
     if type_ not in TYPES:
         raise RequestError(f"dump: {one_of('type', type_, list(TYPES))}")
     if not (2 <= width <= MAX_SIDE and 2 <= height <= MAX_SIDE):
-        raise RequestError(f"dump: found {text!r}; width and height are 2 to {MAX_SIDE} pixels")
+        raise RequestError(
+            f"dump: found {text!r}; width and height must be from 2 to {MAX_SIDE} pixels"
+        )
     group = TYPES[type_].denominator
     if width % group:
         raise RequestError(
@@ -102,11 +104,11 @@ def parse_dump(text: str) -> Dump:
 
 
 def read_dump(path: Path, dump: Dump, max_pixels: int = USUAL_MAX_PIXELS) -> Floats:
-    """The mosaic of a dump in DN, (height, width).
+    """Return the mosaic of a dump in DN, (height, width) float32.
 
     Raises:
-        ImageError: the file cannot be read, or is too large, or has another size; the message says
-            what would fit.
+        ImageError: the file cannot be read, is too large, or has another size; the message lists
+            formats that fit.
     """
     check_size(path, dump.width, dump.height, max_pixels)
     try:
@@ -119,10 +121,10 @@ def read_dump(path: Path, dump: Dump, max_pixels: int = USUAL_MAX_PIXELS) -> Flo
 
 
 def _unpack_mipi(data: Array, count: int, low: int) -> Array:
-    """Samples of 8 + ``low`` bits from packed groups of ``count`` (MIPI Alliance, CSI-2).
+    """Return samples of 8 + ``low`` bits from packed groups of ``count`` (MIPI Alliance, CSI-2).
 
     A group holds the upper eight bits of each sample, then one byte with the ``low`` lower bits of
-    each, those of the first sample lowest.
+    each. Those of the first sample are the lowest in that byte.
     """
     groups = data.reshape(-1, count + 1).astype(np.uint16)
     shifts = np.arange(count, dtype=np.uint16) * low
@@ -131,7 +133,7 @@ def _unpack_mipi(data: Array, count: int, low: int) -> Array:
 
 
 def fitting_formats(count: int, dump: Dump) -> str:
-    """The formats of ``count`` bytes that share the size or the type of ``dump``, in words.
+    """Return a clause with the formats of ``count`` bytes that share the size or type of a dump.
 
     >>> fitting_formats(24, Dump(6, 4, "uint16le"))
     'it would fit 6x4 uint8, 3x4 uint16le, 4x3 uint16le, 6x2 uint16le, 2x6 uint16le'
@@ -143,7 +145,7 @@ def fitting_formats(count: int, dump: Dump) -> str:
 
 
 def fitting_sizes(count: int, dump: Dump) -> list[tuple[int, int]]:
-    """Widths and heights with ``count`` bytes in the type of ``dump``, most similar sizes first."""
+    """Return widths and heights with ``count`` bytes in a dump's type, most similar sizes first."""
     samples = count / TYPES[dump.type]
     if samples.denominator != 1:
         return []

@@ -1,4 +1,4 @@
-"""How pictures are encoded: the ``[output]`` table of a configuration."""
+"""The encoding of pictures: the ``[output]`` table of a configuration."""
 
 from typing import Annotated, Literal
 
@@ -15,4 +15,4 @@ class Encoding(BaseModel):
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 97
     jpeg_subsampling: Literal["4:4:4", "4:2:2", "4:2:0"] = "4:2:2"
     jpeg_progressive: bool = False
-    png_compression: Annotated[int, Field(ge=0, le=9)] = 4  # of noise, 6 leaves 1.5 % less, slowly
+    png_compression: Annotated[int, Field(ge=0, le=9)] = 4  # 6 saves 1.5 % of noise, but is slow

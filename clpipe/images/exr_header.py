@@ -1,6 +1,6 @@
-"""The header of a usual OpenEXR file: one flat part, in one size, without subsampled channels.
+"""Reads the header of a usual OpenEXR file: one flat part, in one size, without subsampling.
 
-What is unusual is for OpenImageIO. The layout of a file is that of "OpenEXR File Layout", in the
+OpenImageIO reads all others. The source for the layout is "OpenEXR File Layout", in the
 documentation of the OpenEXR project.
 """
 
@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 HEADER_BYTES = 1 << 16  # longer headers are unusual
-FLAGS = 0x600  # tiles, long names; others stand for several parts and for deep images
+FLAGS = 0x600  # tiles, long names; other flags mean several parts or deep images
 TYPES: dict[int, np.dtype[Any]] = {
     0: np.dtype(np.uint32),
     1: np.dtype(np.float16),
@@ -25,10 +25,13 @@ ROWS = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)  # of a chunk, by the number of th
 
 @dataclass(frozen=True)
 class ExrHeader:
-    """What a header says: the channels' types by their names, and the size of a chunk.
+    """The types of channels by name, and the layout of chunks.
 
-    ``columns`` is 0 where a chunk is as wide as the image. ``end`` is the header's length in bytes;
-    behind it is the table of the chunks' places.
+    Args:
+        channels: the type of each channel, by name.
+        columns: the width of a chunk in px; 0 if it is that of the image.
+        rows: the height of a chunk in px.
+        end: the header's length in bytes, after which the table of chunk offsets begins.
     """
 
     channels: dict[str, np.dtype[Any]]
@@ -38,7 +41,7 @@ class ExrHeader:
 
 
 def read_header(path: Path, shape: tuple[int, int]) -> ExrHeader | None:
-    """The header of a file; None where it is unusual, or chunks are missing or cut off.
+    """Return the header of a file; None if it is unusual, or chunks are missing or cut off.
 
     Args:
         path: the file.
@@ -53,7 +56,7 @@ def read_header(path: Path, shape: tuple[int, int]) -> ExrHeader | None:
 
 
 def _parsed(start: bytes) -> ExrHeader:
-    """The header at the start of a file.
+    """Return the header at the start of a file.
 
     Raises:
         LookupError, ValueError, struct.error: it is unusual, or damaged.
@@ -65,7 +68,7 @@ def _parsed(start: bytes) -> ExrHeader:
         name, at = _text(start, at)
         kind, at = _text(start, at)
         (size,) = struct.unpack_from("<I", start, at)
-        if kind == b"idmanifest":  # the package unpacks it, to a thousand times its size
+        if kind == b"idmanifest":  # the package decompresses it, to up to a thousand times its size
             raise ValueError
         values[name] = start[at + 4 : at + 4 + size]
         at += 4 + size
@@ -78,7 +81,7 @@ def _parsed(start: bytes) -> ExrHeader:
 
 
 def _channels(value: bytes) -> Iterator[tuple[str, np.dtype[Any]]]:
-    """Name and type of each channel.
+    """Yield the name and type of each channel.
 
     Raises:
         LookupError, ValueError, struct.error: one is subsampled, or the list is damaged.
@@ -94,16 +97,16 @@ def _channels(value: bytes) -> Iterator[tuple[str, np.dtype[Any]]]:
 
 
 def _text(data: bytes, at: int) -> tuple[bytes, int]:
-    """The text that begins at a place, and the place behind it."""
+    """Return the text that begins at an offset, and the offset after it."""
     end = data.index(0, at)
     return data[at:end], end + 1
 
 
 def _is_whole(file: BinaryIO, header: ExrHeader, shape: tuple[int, int]) -> bool:
-    """Whether the chunks lie in the file one behind the other, upwards or downwards, to the last.
+    """Return whether all chunks are in the file, in ascending or descending order.
 
     Raises:
-        LookupError, struct.error: they do not.
+        LookupError, struct.error: they are not.
     """
     height, width = shape
     columns, leader = (header.columns, 20) if header.columns else (width, 8)

@@ -1,4 +1,4 @@
-"""How a JPEG was encoded, and pictures as the same encoding leaves them."""
+"""Finds how a JPEG was encoded, and encodes other pictures in the same way."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -13,12 +13,12 @@ from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
 
 Subsampling = Literal["4:4:4", "4:2:2", "4:2:0"]
-SUBSAMPLINGS: tuple[Subsampling, ...] = ("4:4:4", "4:2:2", "4:2:0")  # as Pillow counts them
+SUBSAMPLINGS: tuple[Subsampling, ...] = ("4:4:4", "4:2:2", "4:2:0")  # Pillow's numbers 0 to 2
 
 
 @dataclass(frozen=True)
 class JpegEncoding:
-    """The quality of a JPEG, 1 to 100 as libjpeg counts it, and its chroma subsampling."""
+    """The quality of a JPEG on libjpeg's scale, 1 to 100, and its chroma subsampling."""
 
     quality: int
     subsampling: Subsampling
@@ -26,9 +26,9 @@ class JpegEncoding:
 
 @cache
 def luma_table(quality: int) -> Array:
-    """libjpeg's quantisation table for luma at a quality, sorted, (64,).
+    """Return libjpeg's quantisation table for luma at a quality, sorted, (64,).
 
-    Sorted, since the order of a table in memory is not the same in all versions of Pillow.
+    It is sorted, because the order depends on Pillow's version.
 
     >>> luma_table(50)[:3].tolist(), luma_table(100).max().item()
     ([10, 11, 12], 1)
@@ -41,9 +41,9 @@ def luma_table(quality: int) -> Array:
 
 
 def jpeg_encoding(path: Path) -> JpegEncoding | None:
-    """How a JPEG was encoded: the quality whose table is nearest to its own, and its subsampling.
+    """Return a JPEG's encoding: the quality whose table is nearest to its own, and its subsampling.
 
-    None where the file is no JPEG, or its subsampling is none that clpipe writes.
+    Return None if the file is not a JPEG, or clpipe does not write its subsampling.
 
     Raises:
         ImageError: the file cannot be read.
@@ -63,7 +63,7 @@ def jpeg_encoding(path: Path) -> JpegEncoding | None:
 
 
 def through_jpeg(pixels: Array, encoding: JpegEncoding) -> Array:
-    """A picture, (height, width, 3) uint8, as a JPEG of this encoding leaves it."""
+    """Return a picture, (height, width, 3) uint8, after encoding it as JPEG and decoding it."""
     file = BytesIO()
     Image.fromarray(pixels).save(
         file, "JPEG", quality=encoding.quality, subsampling=encoding.subsampling

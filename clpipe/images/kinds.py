@@ -1,10 +1,10 @@
-"""What the layers of a render hold, by their names."""
+"""Finds the kind of a render's layer from its name."""
 
 import re
 
 from clpipe.reference.carried import LayerKind, Vector
 
-# What layers hold, by their names in Blender, Mitsuba and elsewhere: lower case, letters alone.
+# Kinds of layers by their names in Blender, Mitsuba and others, in lower-case letters.
 NAMES: dict[LayerKind, tuple[str, ...]] = {
     "depth": ("depth", "z", "zdepth", "mist", "distance"),
     "label": (
@@ -26,10 +26,10 @@ NAMES: dict[LayerKind, tuple[str, ...]] = {
     "colour": ("albedo", "basecolor", "basecolour"),
 }
 
-CHANNELS: dict[LayerKind, int] = {"flow": 2, "normal": 3}  # at least
+CHANNELS: dict[LayerKind, int] = {"flow": 2, "normal": 3}  # the smallest number
 
 # Layers that renderers write next to the picture: data, and single components of the light. The
-# names are those in the manuals of Blender, LuxCore, RenderMan, Arnold, V-Ray, Houdini and Unreal;
+# names are from the manuals of Blender, LuxCore, RenderMan, Arnold, V-Ray, Houdini and Unreal, in
 # lower case, with _ between and around words.
 AOV = re.compile(
     "|".join(
@@ -65,7 +65,7 @@ AOV = re.compile(
 
 
 def kind_named(name: str) -> LayerKind | None:
-    """What a layer holds, by its name; None where that does not say it.
+    """Return the kind of a layer with this name; None if the name does not tell.
 
     >>> kind_named("ViewLayer.CryptoObject00"), kind_named("sh_normal"), kind_named("DiffCol")
     ('label', 'normal', None)
@@ -75,10 +75,10 @@ def kind_named(name: str) -> LayerKind | None:
 
 
 def is_aov(name: str) -> bool:
-    """Whether a layer's name says that the layer is an AOV, so not the finished picture.
+    """Return whether a layer is an AOV by its name, and so not the finished picture.
 
     Args:
-        name: without the names of parts and view layers before it.
+        name: the name, without those of parts and view layers before it.
 
     >>> [is_aov(name) for name in ("ALBEDO", "MaterialID", "crypto_asset00", "Noisy Image", "N")]
     [True, True, True, True, True]
@@ -90,14 +90,14 @@ def is_aov(name: str) -> bool:
 
 
 def vectors_of(name: str, channels: tuple[str, ...]) -> tuple[Vector, ...]:
-    """The vectors of a flow: of each the channels to the right and down, and their signs.
+    """Return the vectors of a flow layer: for each, the channels of x and y, and their signs.
 
-    They point right and down, to where a surface is seen in the other frame, but in Blender's
-    Vector, whose Y and W point up: X and Y go to the frame before, Z and W come from the next one.
+    Vectors point right and down, to the place of the surface in the other frame. Blender's Vector
+    differs: Y and W point up, X and Y lead to the previous frame, Z and W come from the next.
 
     Args:
-        name: of the layer.
-        channels: the names of its channels; one alone is no vector.
+        name: the name of the layer.
+        channels: the names of its channels.
 
     >>> vectors_of("Vector", ("X", "Y", "Z", "W"))
     (((0, 1), (1, -1)), ((2, -1), (3, 1)))

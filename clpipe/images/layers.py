@@ -1,4 +1,4 @@
-"""Parts, layers and channels: where in a file the picture is."""
+"""Finds the picture of a file among its parts, layers and channels."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -11,8 +11,8 @@ from clpipe.base.text import printable
 from clpipe.images.attributes import own_attributes
 from clpipe.images.kinds import is_aov
 
-# Names of layers that hold the finished picture, in order of preference: lower case, letters alone.
-# The first are channels R, G and B without a layer: Nuke, Arnold, V-Ray, Mitsuba, Octane, Unreal.
+# Names of layers that hold the finished picture, in order of preference, in lower-case letters. The
+# first are channels R, G and B without a layer: Nuke, Arnold, V-Ray, Mitsuba, Octane, Unreal.
 PICTURE_LAYERS = (
     "",
     "composite.combined",  # Blender, after its compositor
@@ -28,15 +28,20 @@ PICTURE_LAYERS = (
 )
 CONTAINED = ("rgba", "rgb", "color", "colour", "default", "main", "image")  # in layers of any kind
 
-MOST_PARTS = 1000  # each takes as long as there are parts before it
+MOST_PARTS = 1000  # the time to reach a part grows with the number of parts before it
 
 
 @dataclass(frozen=True)
 class PictureLocation:
-    """Where in a file a picture is: the part's number, the layer's name, the channels' numbers.
+    """The location of a picture in a file.
 
-    The channels are R, G and B, or X, Y and Z where ``xyz`` is set, or one alone. ``view`` is the
-    number of the view of a stereo picture, and ``name`` the layer's name without that of the view.
+    Args:
+        part: the number of the part.
+        layer: the name of the layer.
+        channels: the numbers of R, G and B, of X, Y and Z, or of a single channel.
+        xyz: whether the channels are X, Y and Z.
+        view: the number of the view in a stereo picture.
+        name: the name of the layer without that of the view.
     """
 
     part: int
@@ -48,7 +53,7 @@ class PictureLocation:
 
     @property
     def rank(self) -> tuple[bool, int, int]:
-        """The order of preference: colour first, then known names, then views. Others are equal."""
+        """A sort key: colour first, then known names, then views."""
         *above, last = (re.sub(r"[^a-z0-9]", "", part) for part in self.name.lower().split("."))
         candidates = (f"{above[-1] if above else ''}.{last}", last)
         places = [PICTURE_LAYERS.index(each) for each in candidates if each in PICTURE_LAYERS]
@@ -86,7 +91,9 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
         spec = file.spec()
         part += 1
         if part > MOST_PARTS:
-            raise ImageError(f"{path}: has more than {MOST_PARTS} parts")
+            raise ImageError(
+                f"{path}: this file has more than {MOST_PARTS} parts; split it into several files"
+            )
         if refusal := _refusal(spec, has_levels=file.seek_subimage(part - 1, 1)):
             refusals.append(refusal)
             continue
@@ -111,9 +118,9 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
         raise ImageError(f"{path}: {refusals[0]}")
     if not pictures:
         listed = ", ".join(name for name in channel_names[:20] if name) or "none"
-        missing = "no single channel with a mosaic" if mosaic else "no R, G and B channels"
+        missing = "several channels, but a mosaic has one" if mosaic else "no R, G and B channels"
         way = "" if mosaic else "To use its layers as ground truth of a picture, see --carry"
-        raise NoPictureError(f"{path}: {missing}; found {printable(listed)}", way)
+        raise NoPictureError(f"{path}: there are {missing}; found {printable(listed)}", way)
     best = _chosen(path, pictures) if layer is None else _of_layer(path, pictures, layer)
     file.seek_subimage(best.part, 0)
     file.geterror()  # clears it: the loop asked for parts and levels that do not exist
@@ -121,7 +128,7 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
 
 
 def _view_of(name: str, views: Sequence[str]) -> tuple[int, str]:
-    """The number of a layer's view, 0 where it has none, and the layer's name without it.
+    """Return the number of a layer's view, 0 if it has none, and the layer's name without it.
 
     >>> _view_of("rgba_right", ["left", "right"]), _view_of("beauty.left", ["left"])
     ((1, 'rgba'), (0, 'beauty'))
@@ -133,7 +140,7 @@ def _view_of(name: str, views: Sequence[str]) -> tuple[int, str]:
 
 
 def _whole_numbers(spec: Any, layer: str, channels: Sequence[int]) -> list[str]:
-    """Why channels of an OpenEXR file hold numbers of objects and no light; nothing if they may."""
+    """Return why channels of an OpenEXR file are IDs instead of light; [] if they may be light."""
     formats = spec.channelformats or [spec.format] * spec.nchannels
     types = dict.fromkeys(str(formats[i]) for i in channels)
     if "uint" not in types or spec.getattribute("openexr:lineOrder") is None:
@@ -146,11 +153,11 @@ def _whole_numbers(spec: Any, layer: str, channels: Sequence[int]) -> list[str]:
 
 
 def _chosen(path: Path, pictures: Sequence[PictureLocation]) -> PictureLocation:
-    """The picture among the layers that may be one.
+    """Return the preferred picture among the layers that may be one.
 
     Raises:
-        NoPictureError: all of them are AOVs by their names.
-        ImageError: there are several of one rank.
+        NoPictureError: all layers are AOVs by their names.
+        ImageError: several layers have the same rank.
     """
     candidates = [picture for picture in pictures if not picture.is_aov]
     if not candidates:
@@ -176,7 +183,7 @@ def _chosen(path: Path, pictures: Sequence[PictureLocation]) -> PictureLocation:
 
 
 def _of_layer(path: Path, pictures: list[PictureLocation], layer: str) -> PictureLocation:
-    """The picture in the layer of this name, in any case; of several parts, in the first.
+    """Return the picture in the first layer of this name, in any case.
 
     Raises:
         ImageError: there is none.
@@ -185,25 +192,26 @@ def _of_layer(path: Path, pictures: list[PictureLocation], layer: str) -> Pictur
     if not named:
         listed = ", ".join(dict.fromkeys(p.layer or "one without a name" for p in pictures))
         raise ImageError(
-            f"{path}: no layer {layer!r} with a picture; its layers: {printable(listed)}. Name one "
-            "of them with --layer"
+            f"{path}: there is no layer {layer!r} with a picture; its layers: {printable(listed)}. "
+            "Name one of them with --layer"
         )
     return named
 
 
 def _refusal(spec: Any, has_levels: bool) -> str:
-    """Why a part is not a picture, whatever its channels are called; "" where it may be one."""
+    """Return why a part cannot be a picture; "" if it may be one."""
     if spec.deep:
-        return "a deep image (many samples a pixel). Render or flatten it to a flat image first"
+        return "this is a deep image (many samples per pixel). Render or flatten it to a flat image"
     if has_levels:
         return (
-            "a texture (one image in several sizes), not a picture. Write its largest level alone"
+            "this is a texture (one image in several sizes), not a picture. Write only its largest "
+            "level"
         )
     return ""
 
 
 def full_name(part: str, layer: str) -> str:
-    """A layer's name with its part's name before it, unless it already begins with that.
+    """Return a layer's name with its part's name before it, unless it already begins with that.
 
     >>> full_name("left", ""), full_name("left", "beauty"), full_name("View", "View.Combined")
     ('left', 'left.beauty', 'View.Combined')
@@ -214,11 +222,11 @@ def full_name(part: str, layer: str) -> str:
 
 
 def _layers(names: Sequence[str], kept: bool) -> Iterator[tuple[str, tuple[int, ...], bool]]:
-    """The layers that can be a picture: name, channels, and whether these are X, Y and Z.
+    """Yield the layers that can be a picture: name, channels, and whether these are X, Y and Z.
 
-    Channels are called R, G and B, or red, green and blue, as Nuke does in layers. X, Y and Z are a
+    Channels are called R, G and B, or red, green and blue in Nuke's layers. X, Y and Z are a
     picture only in a layer without a name; in others they are positions or normals. Y is luminance
-    only where nothing but alpha and depth is beside it. ``kept`` images, those that clpipe wrote,
+    if the layer has no other channels except alpha and depth. ``kept`` images, which clpipe wrote,
     have neither.
 
     >>> list(_layers(["comp.red", "comp.green", "comp.blue"], kept=False))
@@ -243,13 +251,13 @@ def _layers(names: Sequence[str], kept: bool) -> Iterator[tuple[str, tuple[int, 
 
 
 def _channel(name: str) -> str:
-    """A channel's name in lower case, and one letter for a colour's name and alpha."""
+    """Return a channel's name in lower case; for red, green, blue and alpha, its first letter."""
     lower = name.lower()
     return lower[0] if lower in ("red", "green", "blue", "alpha") else lower
 
 
 def mosaic_channel(names: Sequence[str]) -> tuple[str, tuple[int]] | None:
-    """The layer ("") and number of the only channel that is neither alpha nor depth.
+    """Return the layer ("") and number of the only channel that is neither alpha nor depth.
 
     >>> mosaic_channel(["Raw"]), mosaic_channel(["A", "Y"]), mosaic_channel(["X", "Y"])
     (('', (0,)), ('', (1,)), None)
@@ -259,7 +267,7 @@ def mosaic_channel(names: Sequence[str]) -> tuple[str, tuple[int]] | None:
 
 
 def picture_channels(names: Sequence[str]) -> tuple[str, tuple[int, ...]] | None:
-    """The layer that holds the picture, and the numbers of its R, G and B; None without one.
+    """Return the picture's layer, and the numbers of its R, G and B; None if there is no picture.
 
     >>> picture_channels(["View.Depth.Z", "View.Combined.B", "View.Combined.G", "View.Combined.R"])
     ('View.Combined', (3, 2, 1))

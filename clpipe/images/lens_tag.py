@@ -1,4 +1,4 @@
-"""The lens's model in the EXIF of a JPEG or a PNG, where OpenImageIO does not write it."""
+"""Writes the lens's model to the EXIF of a JPEG or PNG, because OpenImageIO does not."""
 
 import zlib
 
@@ -10,10 +10,10 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def with_lens(file: bytes, lens: str) -> bytes:
-    """A picture's file with the model of a lens in its EXIF, which it must have.
+    """Return the bytes of a picture with the model of a lens added to its EXIF.
 
     Args:
-        file: a JPEG's or a PNG's.
+        file: the bytes of a JPEG or PNG that has EXIF.
         lens: the model.
     """
     start, end = _place(file)
@@ -31,7 +31,7 @@ def with_lens(file: bytes, lens: str) -> bytes:
 
 
 def _place(file: bytes) -> tuple[int, int]:
-    """Where the EXIF of a file begins and ends."""
+    """Return the offsets at which the EXIF of a file begins and ends."""
     if file.startswith(PNG):
         at = len(PNG)
         while True:

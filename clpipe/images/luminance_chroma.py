@@ -1,4 +1,4 @@
-"""OpenEXR files of luminance and subsampled chroma."""
+"""Reads OpenEXR files with luminance and subsampled chroma."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,15 +16,18 @@ from clpipe.images.openimageio import error_text
 from clpipe.images.pixels import check_size
 
 CHANNELS = ("Y", "RY", "BY")
-CHANNELS_AT_MOST = 8  # in all parts: these, alpha, depth and a few more
+CHANNELS_AT_MOST = 8  # in all parts: luminance, chroma, alpha, depth and a few more
 
 
 @dataclass(frozen=True)
 class DataWindow:
-    """A data window: RGB, (rows, columns, 3) float32, and its place in the display window.
+    """The data window of a file, and its place in the display window.
 
-    Its upper left pixel is at column ``x`` and row ``y`` of the display window, which is ``width``
-    x ``height`` px. ``attributes`` is the file's header.
+    Args:
+        pixels: RGB, (rows, columns, 3) float32.
+        x, y: column and row of its upper left pixel in the display window.
+        width, height: size of the display window in px.
+        attributes: the file's header.
     """
 
     pixels: Floats
@@ -36,14 +39,14 @@ class DataWindow:
 
 
 def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
-    """Read an EXR whose chroma is subsampled, which OpenImageIO cannot do.
+    """Return the data window of an EXR with subsampled chroma, which OpenImageIO cannot read.
 
     Raises:
         ImageError: the file is damaged, too large, deep, or has other subsampled channels.
     """
 
     def read(header_only: bool) -> tuple[Any, Any]:
-        """The first part, and all."""
+        """Return the first part, and all parts."""
         try:
             parts = open_exr(path, header_only).parts
             return parts[0], parts
@@ -56,8 +59,8 @@ def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
     is_flat = all(part.header["type"].name == "scanlineimage" for part in parts)
     if not set(CHANNELS) <= set(names) or not is_flat:
         raise ImageError(
-            f"{path}: has subsampled channels {printable(', '.join(names))}, but clpipe reads only "
-            f"{', '.join(CHANNELS)}. Write the picture as R, G and B"
+            f"{path}: this file has subsampled channels {printable(', '.join(names))}, but clpipe "
+            f"reads only {', '.join(CHANNELS)}. Write the picture as R, G and B"
         )
     (left, top), (right, bottom) = (corner.tolist() for corner in header["dataWindow"])
     (x, y), (x_end, y_end) = (corner.tolist() for corner in header["displayWindow"])
@@ -68,7 +71,7 @@ def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
     if sum(_samples(part.header) for part in parts) > CHANNELS_AT_MOST * max_pixels:
         raise ImageError(
             f"{path}: its parts and channels have more samples than {CHANNELS_AT_MOST} channels of "
-            f"{max_pixels} pixels (--max-pixels)"
+            f"{max_pixels} pixels. To read more, set --max-pixels"
         )
     channels = read(header_only=False)[0].channels
     luminance, red, blue = (channels[name] for name in CHANNELS)
@@ -77,22 +80,25 @@ def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
     half = tuple((n + 1) // 2 for n in size[::-1])
     shapes = [plane.shape for plane in planes]
     if sampling != [(1, 1), (2, 2), (2, 2)] or shapes != [size[::-1], half, half]:
-        raise ImageError(f"{path}: its chroma is not subsampled by 2")
+        raise ImageError(
+            f"{path}: its chroma is not subsampled by 2, the only factor that clpipe reads. Write "
+            "the picture as R, G and B"
+        )
     weights = rgb_to_xyz(header.get("chromaticities", SRGB))[1]
     return DataWindow(to_rgb(*planes, weights), left - x, top - y, *picture, header)
 
 
 def _samples(header: Mapping[str, Any]) -> int:
-    """The samples that a part has at most."""
+    """Return the largest possible number of samples in a part."""
     (left, top), (right, bottom) = (corner.tolist() for corner in header["dataWindow"])
     return max(right - left + 1, 0) * max(bottom - top + 1, 0) * len(header["channels"])
 
 
 def to_rgb(luminance: Array, red: Array, blue: Array, weights: Array) -> Floats:
-    """RGB, (height, width, 3) float32, from luminance and subsampled chroma.
+    """Return RGB, (height, width, 3) float32, from luminance and subsampled chroma.
 
-    RY = (R - Y) / Y and BY = (B - Y) / Y (OpenEXR, ImfRgbaYca.h) are given at even rows and columns
-    and interpolated linearly, which makes no new extremes of colour.
+    RY = (R - Y) / Y and BY = (B - Y) / Y (OpenEXR, ImfRgbaYca.h) are stored for even rows and
+    columns, and interpolated linearly, which creates no new extremes of colour.
 
     Args:
         luminance: Y, (height, width).
@@ -108,7 +114,7 @@ def to_rgb(luminance: Array, red: Array, blue: Array, weights: Array) -> Floats:
 
 
 def upsampled(plane: Array, shape: tuple[int, ...]) -> Floats:
-    """A plane of twice the rows and columns, cut to ``shape``, by linear interpolation.
+    """Return a plane upsampled by 2 with linear interpolation, cropped to ``shape``.
 
     >>> upsampled(np.array([[0, 1]]), (1, 4)).tolist()
     [[0.0, 0.5, 1.0, 1.0]]

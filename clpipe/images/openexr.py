@@ -1,7 +1,7 @@
-"""The OpenEXR package: it decodes in half of OpenImageIO's time and memory, and writes any types.
+"""Uses the OpenEXR package, which needs half of OpenImageIO's time and memory, and writes any type.
 
-Only this module imports it. The package decodes every channel of every part, and says on standard
-output, not with an exception, that a part is damaged.
+Only this module imports it. The package decodes every channel of every part. It reports a damaged
+part on standard output, and raises no exception.
 """
 
 import contextlib
@@ -17,19 +17,19 @@ from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.types import Array
 from clpipe.images.exr_header import read_header
 
-WASTE = 2  # all channels take at most so many times the memory of those that are wanted
+WASTE = 2  # all channels take at most this many times the memory of the requested ones
 
 
 def open_exr(path: Path, header_only: bool = False, separate: bool = True) -> Any:
-    """The file as an ``OpenEXR.File``, without the parts whose pixels are damaged.
+    """Return the file as an ``OpenEXR.File``, without parts whose pixels are damaged.
 
     Args:
         path: the file.
-        header_only: read no pixels.
-        separate: a plane for each channel; else R, G and B of a layer are interleaved.
+        header_only: whether to skip the pixels.
+        separate: whether each channel is a plane; otherwise, R, G and B of a layer are interleaved.
 
     Raises:
-        Exception: the file is damaged; exceptions of the C++ library arrive as many types.
+        Exception: the file is damaged. The C++ library raises many types of exceptions.
     """
     import OpenEXR
 
@@ -40,19 +40,19 @@ def open_exr(path: Path, header_only: bool = False, separate: bool = True) -> An
 
 
 def read_channels(path: Path, names: Sequence[str], shape: tuple[int, int]) -> Array | None:
-    """Channels of an OpenEXR file as stored: (rows, columns, channel), float16 or float32.
+    """Return channels of an OpenEXR file as stored: (rows, columns, channel), float16 or float32.
 
-    R, G and B without alpha are interleaved in memory; other channels are one plane behind the
-    other, of which the array is a view.
+    R, G and B without alpha are interleaved in memory. For other channels, the array is a view of
+    consecutive planes.
 
     Args:
-        path: the file, whose header was judged by OpenImageIO.
-        names: of the channels, as they are in the file.
+        path: the file, whose header OpenImageIO has accepted.
+        names: the names of the channels in the file.
         shape: rows and columns of its data window.
 
     Returns:
-        None where OpenImageIO must read it: it is unusual, or damaged, or other channels would take
-        too much time and memory.
+        The samples; None if OpenImageIO must read the file, because it is unusual or damaged, or
+        other channels would take too much time and memory.
     """
     header = read_header(path, shape)
     if header is None or not header.channels.keys() >= set(names):
@@ -72,13 +72,13 @@ def read_channels(path: Path, names: Sequence[str], shape: tuple[int, int]) -> A
             pixels = channels[layer.removesuffix(".") or "RGB"].pixels
         else:
             pixels = _joined(channels, names, dtype)
-    except Exception:  # OpenImageIO says what is wrong
+    except Exception:  # OpenImageIO reports the error
         return None
     return pixels if (pixels.shape, pixels.dtype) == ((*shape, len(names)), dtype) else None
 
 
 def _joined(channels: dict[str, Any], names: Sequence[str], dtype: np.dtype[Any]) -> Array:
-    """Planes as one array, (rows, columns, channel); each is dropped when it has been copied."""
+    """Return planes as one array, (rows, columns, channel). Each is freed after it is copied."""
     for name in channels.keys() - set(names):
         del channels[name]
     shape = channels[names[0]].pixels.shape
@@ -97,7 +97,7 @@ def write_channels(to: str, planes: Mapping[str, Array], attributes: Mapping[str
     Args:
         to: the path to write to.
         planes: (rows, columns) float16, float32 or uint32, by the names of the channels.
-        attributes: texts of the header.
+        attributes: text attributes of the header.
 
     Raises:
         OSError: the file cannot be written.
@@ -111,12 +111,12 @@ def write_channels(to: str, planes: Mapping[str, Array], attributes: Mapping[str
             OpenEXR.File(header, channels, num_threads=1).write(to)
     except OSError:
         raise
-    except Exception as error:  # exceptions of the C++ library arrive as many types
+    except Exception as error:  # the C++ library raises many types of exceptions
         raise OSError(0, str(error)) from None
 
 
 class _Stdout:
-    """Standard output, without what threads write in :func:`_silence`."""
+    """Standard output, except for the output of threads in :func:`_silence`."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
@@ -135,7 +135,7 @@ _silent: list[threading.Thread] = []
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """Keep from standard output what this thread writes there; others go on writing."""
+    """Discard what this thread writes to standard output. Other threads are not affected."""
     with _lock:
         if not _silent:
             sys.stdout = _Stdout(sys.stdout)

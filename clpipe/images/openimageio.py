@@ -21,8 +21,8 @@ from clpipe.images import pfm, radiance
 
 ERROR_LENGTH = 400  # characters; some repeat what they found, of any length
 
-# How a file of each format begins. OpenImageIO would try its readers for twenty more, which see
-# fewer damaged files than these do. A Targa file has no such bytes.
+# The first bytes of each format. OpenImageIO would try the readers of twenty more formats, which
+# are less tested with damaged files. A Targa file has no such bytes.
 BEGINNINGS = (
     b"v/1\x01",  # OpenEXR
     radiance.MAGIC,
@@ -37,7 +37,7 @@ TEXTS = (radiance.MAGIC, *pfm.MAGICS)
 TARGA = ".tga"
 READ = "OpenEXR, Radiance HDR, PFM, TIFF, PNG, JPEG, BMP, Targa and WebP"
 
-# Formats that are not read, by the bytes that they begin with and where these are.
+# Formats that are not read, by the offset and value of identifying bytes.
 OTHERS = {
     (0, b"GIF8"): "GIF",
     (0, b"\0\0\0\x0cjP"): "JPEG 2000",
@@ -63,17 +63,17 @@ class SubsampledError(ImageError):
 
 
 def set_codec_threads(count: int) -> None:
-    """Set how many threads OpenImageIO may use to read or write one file."""
+    """Set the number of threads with which OpenImageIO may read or write one file."""
     oiio.attribute("threads", count)
     oiio.attribute("exr_threads", count)
 
 
 @contextlib.contextmanager
 def open_image(path: Path) -> Iterator[Any]:
-    """The file open as an ``oiio.ImageInput``.
+    """Open a file as an ``oiio.ImageInput``.
 
     Raises:
-        ImageError: the file is missing, no file, empty, damaged, or of no known format.
+        ImageError: the file is missing, not a file, empty, damaged, or in an unknown format.
     """
     try:
         str(path).encode()
@@ -93,9 +93,9 @@ def open_image(path: Path) -> Iterator[Any]:
         raise ImageError(f"{path}: cannot be read as an image: {_unread(beginning)}")
     try:
         hints = oiio.ImageSpec()
-        hints.attribute("pnm:pfmflip", 1)  # else OpenImageIO 3.2 reads PFM upside down
-        hints.attribute("oiio:UnassociatedAlpha", 1)  # or encoded values are multiplied by it
-        has_text = beginning.startswith(TEXTS)  # in its header, which OpenImageIO may misread
+        hints.attribute("pnm:pfmflip", 1)  # without it, OpenImageIO 3.2 reads PFM upside down
+        hints.attribute("oiio:UnassociatedAlpha", 1)  # do not multiply encoded values by alpha
+        has_text = beginning.startswith(TEXTS)  # a text header, which OpenImageIO may misread
         with _readable(path, beginning, size) if has_text else nullcontext(path) as readable:
             file = oiio.ImageInput.open(str(readable), hints)
             if file is None:
@@ -110,7 +110,7 @@ def open_image(path: Path) -> Iterator[Any]:
 
 
 def _unread(beginning: bytes) -> str:
-    """Why a file that begins like this is not read."""
+    """Return why a file with these first bytes is not read."""
     if beginning.startswith(b"\x93NUMPY"):
         return "it is a NumPy array, not an image file; write its pixels as an OpenEXR file"
     for (place, mark), name in OTHERS.items():
@@ -124,7 +124,7 @@ def _unread(beginning: bytes) -> str:
 
 @contextlib.contextmanager
 def _readable(path: Path, beginning: bytes, size: int) -> Iterator[Path]:
-    """The file, or a temporary copy with another header where OpenImageIO misreads its own."""
+    """Yield the file, or a temporary copy with another header if OpenImageIO misreads its own."""
     header: radiance.RadianceHeader | pfm.PfmHeader | None = None
     if beginning.startswith(radiance.MAGIC):
         known = radiance_header(path)
@@ -145,10 +145,10 @@ def _readable(path: Path, beginning: bytes, size: int) -> Iterator[Path]:
 
 
 def radiance_header(path: Path) -> radiance.RadianceHeader:
-    """The header of a Radiance picture.
+    """Return the header of a Radiance picture.
 
     Raises:
-        ImageError: it is damaged, or the file cannot be read.
+        ImageError: the header is damaged, or the file cannot be read.
     """
     try:
         with path.open("rb") as file:
@@ -160,9 +160,9 @@ def radiance_header(path: Path) -> radiance.RadianceHeader:
 
 
 def error_text(text: str) -> str:
-    """An error of a library in one short line; it gives none for some damaged files."""
+    """Return a library's error in one short line. For some damaged files, the error is empty."""
     if not text or "could not find a format reader" in text:
-        return f"it is damaged, or of no known format; clpipe reads {READ}"
+        return f"it is damaged, or in an unknown format; clpipe reads {READ}"
     line = printable(text)
     return line if len(line) <= ERROR_LENGTH else f"{line[:ERROR_LENGTH]}..."
 
@@ -171,7 +171,7 @@ UNREAD_COMPRESSION = re.compile(r"(\w+) compression support is not configured|sc
 
 
 def damage_text(text: str) -> str:
-    """Why samples of an open file could not be read, by OpenImageIO's error.
+    """Return why samples of an open file could not be read, from OpenImageIO's error.
 
     >>> damage_text("TIFFReadEncodedStrip failed: LERC compression support is not configured")[:32]
     'its compression, LERC, cannot be'
@@ -179,23 +179,23 @@ def damage_text(text: str) -> str:
     if found := UNREAD_COMPRESSION.search(text):
         return (
             f"its compression, {found[1] or f'TIFF scheme {found[2]}'}, cannot be decoded by this "
-            "build of OpenImageIO. Write the file again with another one, such as ZIP or LZW, for "
-            "example with ImageMagick: magick IN -compress zip OUT"
+            "build of OpenImageIO. Write the file with another compression, such as ZIP or LZW, "
+            "for example with ImageMagick: magick IN -compress zip OUT"
         )
     return f"damaged: {error_text(text)}"
 
 
 def read_with_pillow(path: Path, spec: Any, part: int, type_: Any) -> Array | None:
-    """A TIFF of 8 bits whose compression OpenImageIO lacks, (height, width, channel).
+    """Read an 8-bit TIFF whose compression OpenImageIO lacks, (height, width, channel).
 
     Args:
         path: the file.
-        spec: OpenImageIO's of the page.
+        spec: OpenImageIO's spec of the page.
         part: the number of the page.
-        type_: ``oiio.FLOAT`` scales samples to 0..1; others leave them as they are.
+        type_: ``oiio.FLOAT`` scales samples to 0..1; other types do not change them.
 
     Returns:
-        None where Pillow cannot read it like that, either.
+        The samples; None if Pillow cannot read them either.
     """
     if spec.format.basetype != oiio.UINT8 or spec.getattribute("tiff:Compression") is None:
         return None
@@ -209,7 +209,7 @@ def read_with_pillow(path: Path, spec: Any, part: int, type_: Any) -> Array | No
 
 
 def read_grey(path: Path) -> Array:
-    """The first channel of a picture in whole numbers or floats, (height, width), as it is.
+    """Return the first channel of a picture as stored: (height, width), integers or floats.
 
     Raises:
         ImageError: the file cannot be read.

@@ -1,4 +1,4 @@
-"""What a render holds beside its picture: depth, normals, object numbers, motion, in layers."""
+"""Finds and reads the layers of a render other than its picture: depth, normals, IDs, motion."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from clpipe.images.samples import read_samples
 from clpipe.images.statements import statements
 from clpipe.reference.carried import LayerKind
 
-CRYPTOMATTE = "cryptomatte/"  # begins the names of attributes that say what its numbers stand for
+CRYPTOMATTE = "cryptomatte/"  # prefix of attributes that map Cryptomatte's numbers to names
 
 ORDER = "RGBAXYZWUV"  # of channels within a layer
 
@@ -27,10 +27,10 @@ FLOATS = {oiio.HALF: oiio.HALF, oiio.FLOAT: oiio.FLOAT, oiio.DOUBLE: oiio.FLOAT}
 
 @dataclass(frozen=True)
 class LayerLocation:
-    """Where in a file a layer is: the part's number, and the channels' numbers.
+    """The location of a layer in a file.
 
     Args:
-        name: of the layer; "" for channels whose names have no layer.
+        name: the name of the layer; "" for channels whose names have no layer.
         part: the number of its part.
         channels: the names of its channels, without the layer's.
         places: their numbers in the part.
@@ -45,7 +45,7 @@ class LayerLocation:
 
     @property
     def is_alone(self) -> bool:
-        """Whether it is one channel that belongs to no layer."""
+        """Whether it is a single channel without a layer."""
         return self.channels == (self.name,)
 
     @property
@@ -54,22 +54,22 @@ class LayerLocation:
         return {channel.upper() for channel in self.channels} >= set("RGB")
 
     def answers_to(self, name: str) -> bool:
-        """Whether a name means it: its own or the end of its own, in any case.
+        """Return whether a name is that of this layer, or the end of it, in any case.
 
-        All ranks of a Cryptomatte answer to the name without a number, and a Z alone to depth.
+        All ranks of a Cryptomatte match its name without a number. A single Z matches depth.
         """
         names = [self.name, self.without_rank, *(["depth"] if self.name in ("Z", "z") else [])]
         return any(f".{each}".lower().endswith(f".{name}".lower()) for each in names)
 
     @property
     def without_rank(self) -> str:
-        """The name, that of a Cryptomatte's layers without their number."""
+        """The name; for a layer of a Cryptomatte, without its number."""
         is_rank = "crypto" in self.name.lower() and self.name[-2:].isdigit()
         return self.name[:-2] if is_rank else self.name
 
 
 def kind_of(name: str, location: LayerLocation) -> LayerKind | None:
-    """What a layer holds, by the name that it is known by and its channels; None is unknown."""
+    """Return the kind of a layer, from its names and channels; None if it is not known."""
     if kind := kind_named(name) or kind_named(location.name):
         return kind
     if location.type not in FLOATS:
@@ -78,10 +78,10 @@ def kind_of(name: str, location: LayerLocation) -> LayerKind | None:
 
 
 def find_layers(path: Path) -> list[LayerLocation]:
-    """All layers of a file, in order; those without a name are its picture, or single channels.
+    """Return all layers of a file in order. Layers without a name are its picture.
 
     Raises:
-        ImageError: it is missing, damaged or no image.
+        ImageError: the file is missing, damaged or not an image.
     """
     found: list[LayerLocation] = []
     with open_image(path) as file:
@@ -98,7 +98,7 @@ def find_layers(path: Path) -> list[LayerLocation]:
 
 
 def _layers_in(part: int, part_name: str, spec: Any) -> Iterator[LayerLocation]:
-    """The layers of one part."""
+    """Yield the layers of one part."""
     types = spec.channelformats or [spec.format] * spec.nchannels
     for name, places in _grouped(spec.channelnames, bool(part_name)).items():
         own = {i: spec.channelnames[i].rpartition(".")[2] for i in places}
@@ -110,10 +110,11 @@ def _layers_in(part: int, part_name: str, spec: Any) -> Iterator[LayerLocation]:
 
 
 def _grouped(names: Sequence[str], in_part: bool = False) -> Mapping[str, list[int]]:
-    """The numbers of channels by their layers.
+    """Return the numbers of channels by layer.
 
-    Channels without a layer are one, called "". But beside R, G and B, and in a file of one part
-    also without them, a channel that is no colour and no coordinate of a vector is its own layer.
+    Colours and coordinates of a vector without a layer form the layer "". Any other channel without
+    a layer is a layer of its own. In a file of several parts, this requires that the part has R, G
+    and B as well.
 
     >>> _grouped(["R", "G", "B", "A", "Z", "id", "Normal.X"])
     {'': [0, 1, 2, 3], 'Z': [4], 'id': [5], 'Normal': [6]}
@@ -135,12 +136,12 @@ def _grouped(names: Sequence[str], in_part: bool = False) -> Mapping[str, list[i
 def read_layer(
     path: Path, location: LayerLocation, max_pixels: int
 ) -> tuple[Array, tuple[int, int], tuple[int, int]]:
-    """A layer of a file as stored: half, float32, or whole numbers as uint32.
+    """Read a layer of a file as stored: half, float32, or whole numbers as uint32.
 
     Args:
         path: the file.
-        location: of the layer in it.
-        max_pixels: a file that claims more is refused before memory is taken.
+        location: the location of the layer.
+        max_pixels: a file with more pixels is rejected before it is read.
 
     Returns:
         The samples of the data window, (rows, columns, channel); column and row of the first one in
@@ -160,7 +161,7 @@ def read_layer(
         if pixels.dtype.kind != "f":
             pixels = pixels.astype(np.uint32)
         stated = statements(path, file)
-        if stated.orientation != 1:  # no such file has windows
+        if stated.orientation != 1:  # such files have no data window
             turned = stated.upright(pixels)
             return turned, (0, 0), (turned.shape[1], turned.shape[0])
         return (
@@ -171,7 +172,7 @@ def read_layer(
 
 
 def cryptomatte_attributes(path: Path, part: int) -> dict[str, str]:
-    """What the header of a part says of the numbers in its Cryptomatte layers.
+    """Return the attributes of a part that describe its Cryptomatte layers.
 
     Raises:
         ImageError: the file is damaged.

@@ -1,4 +1,4 @@
-"""PFM pictures: the text at the start of the file."""
+"""Reads the text header of PFM pictures."""
 
 import re
 from dataclasses import dataclass
@@ -10,23 +10,23 @@ HEADER = re.compile(rb"(P[Ff])" + SPACE + rb"(\d+)" + SPACE + rb"(\d+)" + SPACE 
 
 @dataclass(frozen=True)
 class PfmHeader:
-    """A header that OpenImageIO reads for the samples of a file, which begin at ``end``."""
+    """A header that OpenImageIO reads correctly, and the offset ``end`` at which samples begin."""
 
     usual: bytes
     end: int
 
 
 def pfm_header(start: bytes, size: int) -> PfmHeader | None:
-    r"""The header of a PFM file whose lines end in CR and LF; None where it has no CR.
+    r"""Return the header of a PFM file whose lines end in CR and LF; None if it has no CR.
 
-    One character follows the number of scale, or CR and LF do: the file's length tells.
+    The scale is followed by one character, or by CR and LF. The file's length distinguishes them.
 
     >>> pfm_header(b"Pf\r\n1 1\r\n-1.0\r\n\0\0\x80\x3f", 19)
     PfmHeader(usual=b'Pf\n1 1\n-1.0\n', end=15)
 
     Args:
-        start: of the file.
-        size: of the file, bytes.
+        start: the first bytes of the file.
+        size: the size of the file in bytes.
     """
     if not (found := HEADER.match(start)) or b"\r" not in start[: found.end() + 1]:
         return None

@@ -1,4 +1,4 @@
-"""Arrays of pixels as files hold them: sizes, data windows, and values that are not finite."""
+"""Arrays of pixels from files: sizes, data windows, and values that are not finite."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -12,32 +12,34 @@ from clpipe.base.types import Array, Floats
 from clpipe.reference.geometry import NO_MARGINS, Margins
 
 MAX_PIXELS = 1_000_000_000  # the largest --max-pixels
-USUAL_MAX_PIXELS = 200_000_000  # its default: what a file may claim
+USUAL_MAX_PIXELS = 200_000_000  # the default of --max-pixels
 HALF_MAX = np.float32(65504)  # the largest half
-BLOCK = 1 << 18  # samples that are looked at while they are in a cache
+BLOCK = 1 << 18  # samples that fit into a cache
 
 
 def check_size(path: Path, width: int, height: int, max_pixels: int) -> None:
-    """See that an image has pixels, and not more than are read; call it before memory is taken.
+    """Check that an image has pixels, but not too many. Call it before allocating memory.
 
     Raises:
-        ImageError: it has none, or more.
+        ImageError: it has no pixels, or more than ``max_pixels``.
     """
     if width < 1 or height < 1:
         raise ImageError(f"{path}: damaged: its header states {width}x{height} pixels")
     if width * height > max_pixels:
         raise ImageError(
-            f"{path}: {width}x{height} pixels; at most {max_pixels} are read. To read more, set "
-            "--max-pixels"
+            f"{path}: this file has {width}x{height} pixels; at most {max_pixels} are read. To "
+            "read more, set --max-pixels"
         )
 
 
 def margins_of(x: int, y: int, data: Sequence[int], display: Sequence[int]) -> Margins:
-    """How far a data window goes on beyond the display window; nowhere where they do not meet.
+    """Return the overscan: how far the data window exceeds the display window on each side.
+
+    It is 0 if the windows do not overlap.
 
     Args:
-        x, y: the column and row of the display window in which the data window begins.
-        data, display: the width and height of each.
+        x, y: column and row of the data window's upper left pixel in the display window.
+        data, display: the width and height of each in px.
 
     >>> tuple(margins_of(-2, 1, (10, 6), (7, 7))), tuple(margins_of(7, 0, (3, 3), (7, 7)))
     ((2, 0, 1, 0), (0, 0, 0, 0))
@@ -57,7 +59,7 @@ def display_window(
     Args:
         data: the data window, (rows, columns, channel).
         x, y: column and row of its upper left pixel in the display window.
-        width, height: of the display window.
+        width, height: size of the display window in px.
         outside: the value of pixels outside the data window.
     """
     window = np.full((height, width, data.shape[2]), outside, data.dtype)
@@ -70,9 +72,9 @@ def display_window(
 
 @CpuTimer("convert")
 def by_rows(convert: Callable[[Array], Array], pixels: Array) -> Floats:
-    """A new image in float32, made of some rows of another one at a time.
+    """Return a new float32 image, converted a few rows at a time.
 
-    What is as large as several images in between never is there as a whole.
+    Intermediate results therefore never need the memory of whole images.
     """
     made = np.empty(pixels.shape, np.float32)
     rows = max(BLOCK // max(pixels[0].size, 1), 1)
@@ -83,7 +85,7 @@ def by_rows(convert: Callable[[Array], Array], pixels: Array) -> Floats:
 
 @CpuTimer("convert")
 def make_finite(pixels: Array) -> int:
-    """Set each NaN and infinity of an image to 0, in place, and count them."""
+    """Set each NaN and infinity of an image to 0, in place, and return their number."""
     infinity = np.array(np.inf, pixels.dtype)
     count = 0
     for block in _blocks_beyond(pixels, np.nextafter(infinity, pixels.dtype.type(0))):
@@ -95,7 +97,7 @@ def make_finite(pixels: Array) -> int:
 
 @CpuTimer("convert")
 def clip_to_half(pixels: Array) -> int:
-    """Clip float32 samples to the range of half, in place, and count those that were beyond."""
+    """Clip float32 samples to the range of half, in place, and return the number clipped."""
     count = 0
     for block in _blocks_beyond(pixels, HALF_MAX):
         count += int(np.count_nonzero(np.abs(block) > HALF_MAX))
@@ -104,9 +106,10 @@ def clip_to_half(pixels: Array) -> int:
 
 
 def _blocks_beyond(pixels: Array, limit: Any) -> Iterator[Array]:
-    """Views of an image, which may be planar in memory: blocks with samples beyond -limit..limit.
+    """Yield views of the blocks of an image that have samples outside -limit..limit.
 
-    Bits compare faster than floats. Those of floats from 0 on are in the floats' order, NaN last.
+    The image may be planar in memory. Bits compare faster than floats. The bits of non-negative
+    floats have the order of the floats, with NaN last.
     """
     whole = np.dtype(f"u{pixels.dtype.itemsize}")
     largest, without_sign = limit.view(whole), np.iinfo(whole).max >> 1

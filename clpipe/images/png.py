@@ -1,4 +1,4 @@
-"""What the chunks of a PNG say of its colours (PNG specification, third edition, 2025)."""
+"""Reads the colour chunks of a PNG (PNG specification, third edition, 2025)."""
 
 import struct
 from collections.abc import Iterator
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 MAGIC = b"\x89PNG\r\n\x1a\n"
-MOST_CHUNKS = 1000  # before the first of the samples
+MOST_CHUNKS = 1000  # before the first chunk of samples
 
 # ITU-T H.273 (2024), tables 2 and 3: x and y of red, green, blue and white; names of curves.
 PRIMARIES = {
@@ -24,10 +24,10 @@ class PngColours:
     """The colours that a PNG states.
 
     Args:
-        chromaticities: x and y of red, green, blue and white; None where none are stated.
-        curve: how light is encoded: "srgb", "linear" or another name; "" where it is not stated.
+        chromaticities: x and y of red, green, blue and white; None if they are not stated.
+        curve: how light is encoded: "srgb", "linear" or another name; "" if it is not stated.
         chunk: the chunk that states the curve.
-        unknown: primaries that are stated, but that clpipe does not know; "" where there are none.
+        unknown: the stated primaries if clpipe does not know them; otherwise "".
     """
 
     chromaticities: tuple[float, ...] | None = None
@@ -37,7 +37,7 @@ class PngColours:
 
 
 def png_colours(path: Path) -> PngColours:
-    """The colours that the chunks of a PNG state; of several, the one with the highest priority.
+    """Return the colours that the chunks of a PNG state, from the chunk of highest priority.
 
     Raises:
         OSError: the file cannot be read.
@@ -48,7 +48,7 @@ def png_colours(path: Path) -> PngColours:
         unknown = "" if primaries in PRIMARIES else f"primaries {primaries}"
         named = CURVES.get(number, f"number {number}")
         return PngColours(PRIMARIES.get(primaries), named, "cICP", unknown)
-    if b"iCCP" in chunks:  # named by its description
+    if b"iCCP" in chunks:  # OpenImageIO reads its description
         return PngColours()
     if b"sRGB" in chunks:
         return PngColours(PRIMARIES[1], "srgb", "sRGB")
@@ -65,7 +65,7 @@ def png_colours(path: Path) -> PngColours:
 
 
 def _chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
-    """Name and content of each short chunk before the samples."""
+    """Yield name and content of each chunk before the samples; b"" for a long content."""
     with path.open("rb") as file:
         file.seek(len(MAGIC))
         for _ in range(MOST_CHUNKS):

@@ -1,4 +1,4 @@
-"""Pictures to be looked at, in notebooks and in reports: small, or of eight bits."""
+"""Small 8-bit pictures for notebooks and reports."""
 
 import io
 import tempfile
@@ -16,16 +16,15 @@ from clpipe.reference.curve import to_8_bit
 from clpipe.reference.transfer import srgb_curve
 from clpipe.stage import Kind
 
-# What Pillow raises for a file that is damaged, or claims to be very large.
+# The exceptions that Pillow raises for a file that is damaged, or claims to be very large.
 DAMAGED = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
 
 
 def png_bytes(pixels: Array) -> bytes:
-    """A PNG of an image; larger ones than 1024 pixels keep every second, third, ... pixel.
+    """Return a PNG of an image. Images above 1024 px keep every second, third, ... pixel.
 
     Args:
-        pixels: (height, width) or (height, width, 3), uint8, or floats that show 0 as black and 1
-            as white.
+        pixels: (height, width) or (height, width, 3), uint8, or floats from 0 (black) to 1 (white).
 
     >>> png_bytes(np.zeros((2, 3), np.float32))[:4]
     b'\\x89PNG'
@@ -39,17 +38,17 @@ def png_bytes(pixels: Array) -> bytes:
 
 
 def jpeg_bytes(pixels: Array, quality: int = 93) -> bytes:
-    """A JPEG, whose chroma is not subsampled, of (height, width, 3) uint8."""
+    """Return a JPEG of (height, width, 3) uint8, without chroma subsampling."""
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, "JPEG", quality=quality, subsampling=0)
     return file.getvalue()
 
 
 def thumbnail(file: Path | io.BytesIO, name: str, side: int) -> Image.Image:
-    """Return a picture of eight bits, made at most ``side`` pixels wide and high.
+    """Return an 8-bit picture, reduced to at most ``side`` pixels in width and height.
 
     Raises:
-        ImageError: it cannot be read; the message has its name.
+        ImageError: it cannot be read; the message contains its name.
     """
     try:
         with Image.open(file) as picture:
@@ -62,12 +61,12 @@ def thumbnail(file: Path | io.BytesIO, name: str, side: int) -> Image.Image:
 
 
 def thumbnail_bytes(data: bytes, name: str, side: int) -> bytes:
-    """A small WebP of a picture, at most ``side`` pixels wide and high.
+    """Return a small WebP of a picture, at most ``side`` pixels wide and high.
 
     Args:
         data: the bytes of its file; see :func:`decoded`.
-        name: of the file.
-        side: in px.
+        name: the name of the file.
+        side: the largest width and height in px.
 
     Raises:
         ImageError: it cannot be read.
@@ -83,16 +82,16 @@ def thumbnail_bytes(data: bytes, name: str, side: int) -> bytes:
 
 
 def decoded(data: bytes, name: str) -> Array:
-    """A picture as eight bits a channel, (height, width, 3).
+    """Return a picture with 8 bits per channel, (height, width, 3).
 
-    Linear light is encoded by sRGB's curve, and so are mosaics, whose brightest sample is white.
+    Linear light is encoded with sRGB's curve. So are mosaics, whose brightest sample becomes white.
 
     Args:
         data: the bytes of a JPEG, PNG, TIFF, OpenEXR or ``.npy`` that clpipe wrote.
-        name: of the file, for its ending and for messages.
+        name: the name of the file, for its extension and for messages.
 
     Raises:
-        ImageError: it cannot be read, or is of another kind.
+        ImageError: the picture cannot be read, or is of another kind.
     """
     try:
         if name.endswith(".exr"):
@@ -109,7 +108,7 @@ def decoded(data: bytes, name: str) -> Array:
 
 
 def reduced(pixels: Array, by: int) -> Array:
-    """(height, width, 3) uint8, ``by`` x ``by`` pixels of which become one, their mean.
+    """Return (height, width, 3) uint8 in which each pixel is the mean of ``by`` x ``by`` pixels.
 
     >>> reduced(np.uint8([[[0, 0, 9], [2, 0, 9], [4, 4, 4]]]), 2).tolist()
     [[[1, 0, 9], [4, 4, 4]]]
@@ -119,14 +118,14 @@ def reduced(pixels: Array, by: int) -> Array:
 
 @cache
 def _light_table() -> Array:
-    """Eight bits of linear light by sRGB's curve, by the bits of a half float."""
+    """Return a table from the bits of a half float (linear light) to 8 bits on sRGB's curve."""
     halves = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float64)
     light = np.clip(np.nan_to_num(halves, posinf=1, neginf=0), 0, 1)
     return to_8_bit(srgb_curve(light).astype(np.float32))
 
 
 def encoded_light(image: Array) -> Array:
-    """Linear light, 0 is black and 1 white, as eight bits by sRGB's curve; half floats are enough.
+    """Return linear light from 0 (black) to 1 (white) as 8 bits on sRGB's curve, via half floats.
 
     >>> encoded_light(np.float32([[-1, 0, 0.5, 1, 9]])).tolist()
     [[0, 0, 188, 255, 255]]
@@ -145,9 +144,9 @@ def _decoded_exr(data: bytes) -> Array:
 
 
 def _shown(array: Array, is_display: bool) -> Array:
-    """An image as eight bits; see :func:`decoded`."""
+    """Return an image with 8 bits per channel; see :func:`decoded`."""
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3):
-        raise ValueError(f"it is an array of shape {array.shape}")
+        raise ValueError(f"its shape is {array.shape}, but a picture has 3 channels, a mosaic none")
     values = np.nan_to_num(array.astype(np.float64))
     if array.ndim == 2:
         values = np.stack([values / max(float(values.max(initial=0)), 1e-9)] * 3, axis=-1)

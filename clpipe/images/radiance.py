@@ -1,7 +1,7 @@
-"""Radiance pictures: what the text at the start of a .hdr file says of its samples.
+"""Reads the text header of Radiance pictures (.hdr), and converts their samples to light.
 
-The format is that of G. Ward, "Real Pixels", Graphics Gems II (1991), and of the file formats'
-description in the Radiance distribution.
+Sources: G. Ward, "Real Pixels", Graphics Gems II (1991), and the description of file formats in the
+Radiance distribution.
 """
 
 import re
@@ -17,7 +17,7 @@ MAGIC = b"#?"
 HEADER_BYTES = 1 << 16
 SIZE = re.compile(rb"([+-][XY]) +\d+ +([+-][XY]) +\d+ *\r?$")
 
-# EXIF's orientation by the directions of rows and of samples in a row.
+# EXIF's orientation, by the directions of rows and of samples in a row.
 ORIENTATIONS = {
     **{b"-Y+X": 1, b"-Y-X": 2, b"+Y-X": 3, b"+Y+X": 4},
     **{b"+X-Y": 5, b"-X-Y": 6, b"-X+Y": 7, b"+X+Y": 8},
@@ -29,14 +29,14 @@ class RadianceHeader:
     """The header of a Radiance picture.
 
     Args:
-        factors: by which red, green and blue were multiplied: the products of all EXPOSURE and
-            COLORCORR lines.
-        chromaticities: x and y of red, green, blue and white; None where none are stated.
+        factors: the factors of red, green and blue: the products of all EXPOSURE and COLORCORR
+            lines.
+        chromaticities: x and y of red, green, blue and white; None if they are not stated.
         pixel_aspect: height of a pixel over its width.
-        is_usual: whether OpenImageIO reads the file as it is.
-        orientation: EXIF's, of the samples as they are stored.
+        is_usual: whether OpenImageIO reads the file correctly.
+        orientation: EXIF's orientation of the stored samples.
         size: the line with the picture's size.
-        end: where in the file the samples begin.
+        end: the offset in the file at which the samples begin.
     """
 
     factors: tuple[float, float, float]
@@ -49,19 +49,19 @@ class RadianceHeader:
 
     @property
     def usual(self) -> bytes:
-        """A header for the same samples that OpenImageIO reads."""
+        """A header for the same samples that OpenImageIO reads correctly."""
         return b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n" + self.size + b"\n"
 
 
 def radiance_header(start: bytes) -> RadianceHeader:
-    r"""The header at the start of a file.
+    r"""Return the header at the start of a file.
 
     >>> start = b"#?RADIANCE\nEXPOSURE=2\nEXPOSURE=4\nFORMAT=32-bit_rle_rgbe\n\n-Y 6 +X 8\n"
     >>> radiance_header(start).factors
     (8.0, 8.0, 8.0)
 
     Raises:
-        ImageError: it is cut off, or a line in it is wrong; the message names no file.
+        ImageError: it is cut off, or a line in it is wrong; the message does not contain the file.
     """
     factors, aspect = np.ones(3), 1.0
     chromaticities: tuple[float, ...] | None = None
@@ -70,7 +70,7 @@ def radiance_header(start: bytes) -> RadianceHeader:
         line, newline, _ = start[at:].partition(b"\n")
         at += len(line) + 1
         if not newline:
-            raise ImageError("damaged: its header has no end")
+            raise ImageError("it is damaged: its header has no end")
         if not line.strip():
             break
         name, _, value = line.partition(b"=")
@@ -87,14 +87,14 @@ def radiance_header(start: bytes) -> RadianceHeader:
             format_ = value.strip()
     if format_ not in (b"", b"32-bit_rle_rgbe", b"32-bit_rle_xyze"):
         raise ImageError(
-            f"its FORMAT is {format_.decode(errors='replace')!r}; Radiance pictures have "
-            "32-bit_rle_rgbe or 32-bit_rle_xyze"
+            f"its FORMAT is {format_.decode(errors='replace')!r}, but must be 32-bit_rle_rgbe or "
+            "32-bit_rle_xyze"
         )
     size, newline, _ = start[at:].partition(b"\n")
     found = SIZE.match(size)
     orientation = ORIENTATIONS.get(found[1] + found[2]) if found else None
     if not newline or orientation is None:
-        raise ImageError("damaged: its header states no size, such as -Y 480 +X 640")
+        raise ImageError("it is damaged: its header states no size, such as -Y 480 +X 640")
     red, green, blue = factors.tolist()
     is_xyz = format_ == b"32-bit_rle_xyze"
     is_usual = format_ == b"32-bit_rle_rgbe" and b"\r" not in start[: at + len(size)]
@@ -110,10 +110,11 @@ def radiance_header(start: bytes) -> RadianceHeader:
 
 
 def _numbers(line: bytes, text: bytes, count: int, positive: bool = True) -> Floats:
-    """The numbers of a line.
+    """Return the numbers of a header's line.
 
     Raises:
-        ImageError: there are not ``count``, or one is not finite, or not positive where it must be.
+        ImageError: their number is not ``count``, or one is not finite, or is not positive although
+            ``positive`` is set.
     """
     try:
         numbers = np.array([float(each) for each in text.split()])
@@ -129,9 +130,9 @@ def _numbers(line: bytes, text: bytes, count: int, positive: bool = True) -> Flo
 
 
 def to_light(samples: Floats, header: RadianceHeader) -> Floats:
-    """Linear light of samples that are mantissa times power of two, (height, width, 3).
+    """Return linear light, (height, width, 3), from samples of mantissa times a power of two.
 
-    Writers cut the mantissas off, so Radiance takes each to mean the middle of its step.
+    Writers truncate mantissas, so Radiance interprets each as the middle of its step.
     """
     largest = samples.max(axis=-1, keepdims=True)
     _, exponent = np.frexp(largest)

@@ -33,20 +33,20 @@ RAW_SUFFIXES = (
 )
 
 LEAST_BITS = 0.25  # of a pixel; assumed to be less than any compressed raw has
-MOST_GAIN = 8.0  # of white balance, and the inverse of the least; no light asks a camera for more
+MOST_GAIN = 8.0  # of white balance; the smallest is its inverse. No light source needs more.
 
 # EXIF's orientation by LibRaw's flip (1: left to right, 2: upside down, 4: then transposed).
 ORIENTATIONS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
 
-# What stands before the EXIF in files that are not TIFF: in a CR3's boxes, in a RAF's JPEG.
+# The bytes before the EXIF in files that are not TIFF: in a CR3's boxes, in a RAF's JPEG.
 EXIF_MARKS = (b"CMT1", b"CMT2", b"Exif\0\0")
 MODEL = "Tag 0xC614"  # UniqueCameraModel of a DNG
 PARTS = ("EXIF", "Image")  # exifread's prefixes of tags, in order of preference
-EXIF_BYTES = 1 << 20  # the most that a tag has, and where in a file that is no TIFF a mark stands
-MOST_READS = 200_000  # by exifread, which reads each of a tag's values by itself; usual are 1,000
+EXIF_BYTES = 1 << 20  # largest size of a tag, and of the part of a file searched for EXIF_MARKS
+MOST_READS = 200_000  # by exifread, which reads each value separately; 1,000 are usual
 DATE_TAGS = ("DateTimeOriginal", "DateTime")
 COLOR_MATRICES = {"0xC622": "0xC65B", "0xC621": "0xC65A"}  # a DNG's, and their illuminants
-DUMP_HINT = "a dump of samples, not a camera's raw, is read with --dump WxH:TYPE"
+DUMP_HINT = "if it is a headerless dump of samples, add --dump WxH:TYPE"
 OTHERS = {b"\xff\xd8\xff": "a JPEG", b"\x89PNG": "a PNG", b"v/1\x01": "an OpenEXR image"}
 
 
@@ -54,7 +54,7 @@ OTHERS = {b"\xff\xd8\xff": "a JPEG", b"\x89PNG": "a PNG", b"v/1\x01": "an OpenEX
 class RawFacts:
     """The metadata of a raw file. Levels are in DN, gains relative to green = 1; None is unknown.
 
-    Implausible gains (outside 1/8 to 8) are None; ``as_shot`` holds what the file says.
+    Implausible gains (outside 1/8 to 8) are None; ``as_shot`` contains the file's own values.
     """
 
     make: str
@@ -62,21 +62,21 @@ class RawFacts:
     iso: float | None
     exposure: float | None  # s
     visible_area: tuple[int, int, int, int]  # of the sensor, px: left, top, width, height
-    pattern: str  # of the visible area: Bayer's, or rows of letters with / between
+    pattern: str  # of the visible area: a Bayer pattern, or rows of letters with / between them
     black_levels: tuple[int, int, int, int]  # of the pattern's four sites, row by row
     white_level: int
     as_shot: tuple[float, float, float]  # white balance multipliers of red, green, blue
     gains: tuple[float, float] | None  # red, blue, as shot
     xyz_to_camera: Matrix | None
     camera_to_srgb: Matrix | None  # of white-balanced RGB, linear
-    orientation: int  # as EXIF has it: 1 is upright
+    orientation: int  # EXIF's: 1 is upright
     aperture: float | None
     focal_length: float | None  # mm
     taken: str  # "YYYY:MM:DD HH:MM:SS", or ""
 
     @property
     def black_level(self) -> int:
-        """The common black level to which :func:`read_raw` shifts all four sites, DN."""
+        """The common black level in DN, to which :func:`read_raw` shifts all four sites."""
         return round(sum(self.black_levels) / 4)
 
 
@@ -85,10 +85,10 @@ def read_facts(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> RawFacts:
 
     Args:
         path: the file.
-        max_pixels: a file that claims more is refused before memory is taken.
+        max_pixels: a file with more pixels is rejected before it is read.
 
     Raises:
-        ImageError: the file is missing, damaged, not a raw or too large, or holds no Bayer mosaic.
+        ImageError: the file is missing, damaged, not a raw, too large, or not a mosaic.
     """
     exif = read_exif(path)
     with _opened(path, max_pixels) as raw:
@@ -97,14 +97,14 @@ def read_facts(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> RawFacts:
         iso = speed or exif.number("ISOSpeedRatings", 0)
         exposure = exif.number("ExposureTime", shutter)
         if not (exif.tags or iso or exposure):
-            raise ImageError(f"{path}: names no camera, ISO or exposure; {DUMP_HINT}")
+            raise ImageError(f"{path}: this raw states no camera, ISO or exposure; {DUMP_HINT}")
         size = raw.sizes
         by_colour = raw.black_level_per_channel
         cell = np.resize(_colours(raw)[:2, :2], 4)
         first, second, third, fourth = (int(by_colour[c]) for c in cell)
         red, green, blue = map(float, raw.camera_whitebalance[:3])
         matrix = _matrix(raw.rgb_xyz_matrix[:3])
-        # rawpy's color_matrix is the file's own, where it has one, else LibRaw's.
+        # rawpy's color_matrix is that of the file, or LibRaw's if the file has none.
         to_srgb = _matrix(raw.color_matrix[:, :3])
         if to_srgb is None and matrix is not None:
             to_camera = np.array(matrix) @ SRGB_TO_XYZ
@@ -130,7 +130,7 @@ def read_facts(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> RawFacts:
 
 
 def _gains(red: float, green: float, blue: float) -> tuple[float, float] | None:
-    """White balance multipliers as gains of red and blue (green = 1); None if implausible.
+    """Return white balance multipliers as gains of red and blue (green = 1); None if implausible.
 
     >>> _gains(1024.0, 512.0, 768.0), _gains(-2.0, 1.0, 1.5), _gains(2.0, 1.0, 100.0)
     ((2.0, 1.5), None, None)
@@ -141,7 +141,7 @@ def _gains(red: float, green: float, blue: float) -> tuple[float, float] | None:
 
 
 def _matrix(rows: Any) -> Matrix | None:
-    """A 3x3 matrix, rounded to six digits; None where it is not finite or singular."""
+    """Return a 3x3 matrix, rounded to six digits; None if it is not finite, or singular."""
     values = np.asarray(rows, np.float64).round(6)
     if not np.isfinite(values).all() or abs(np.linalg.det(values)) < 1e-6:
         return None
@@ -155,19 +155,21 @@ def read_raw(path: Path, facts: RawFacts, max_pixels: int = USUAL_MAX_PIXELS) ->
     The sites of each colour are shifted to the common ``facts.black_level``.
 
     Raises:
-        ImageError: as :func:`read_facts`; or the file holds no pixels.
+        ImageError: as for :func:`read_facts`, or the file has no pixels.
     """
     with _opened(path, max_pixels) as raw:
         mosaic = np.array(raw.raw_image_visible, np.float32)
         blacks = np.array(raw.black_level_per_channel, np.float32)[_colours(raw)]
     # For a file whose pixels were removed, LibRaw returns whatever was in memory.
     if path.stat().st_size * 8 < LEAST_BITS * mosaic.size or mosaic.min() == mosaic.max():
-        raise ImageError(f"{path}: holds no pixels, only metadata")
+        raise ImageError(
+            f"{path}: this raw has only metadata and no pixels; use the original file of the camera"
+        )
     return mosaic + np.float32(facts.black_level) - blacks
 
 
 def check_raw(path: Path) -> None:
-    """See that LibRaw can read all of a raw, of whatever kind.
+    """Check that LibRaw can read all of a raw, of any kind.
 
     Raises:
         ImageError: it cannot.
@@ -177,7 +179,7 @@ def check_raw(path: Path) -> None:
 
 
 def raw_size(path: Path) -> tuple[int, int]:
-    """The width and height of the mosaic that a raw file claims.
+    """Return the width and height in px of the mosaic that a raw file claims.
 
     Raises:
         ImageError: the file is missing, damaged or not a raw.
@@ -188,7 +190,7 @@ def raw_size(path: Path) -> tuple[int, int]:
 
 @contextmanager
 def _opened(path: Path, max_pixels: int) -> Iterator[Any]:
-    """The file as rawpy opens it.
+    """Open a file with rawpy.
 
     Raises:
         ImageError: it cannot be opened or decoded, or is too large.
@@ -204,7 +206,7 @@ def _opened(path: Path, max_pixels: int) -> Iterator[Any]:
         for mark, what in OTHERS.items():
             if start.startswith(mark):
                 raise ImageError(
-                    f"{path}: it is {what}, not a camera raw. Give it the extension of its format"
+                    f"{path}: this is {what}, not a camera raw. Give it the extension of its format"
                 )
         with rawpy.imread(str(path)) as raw:
             check_size(path, raw.sizes.raw_width, raw.sizes.raw_height, max_pixels)
@@ -213,14 +215,14 @@ def _opened(path: Path, max_pixels: int) -> Iterator[Any]:
         reason = error.args[0].decode() if isinstance(error.args[0], bytes) else str(error)
         hint = f"; {DUMP_HINT}" if path.suffix.lower() == ".raw" else ""
         raise ImageError(
-            f"{path}: damaged, or not a raw that LibRaw knows: {reason}{hint}"
+            f"{path}: it is damaged, or not a raw that LibRaw knows: {reason}{hint}"
         ) from None
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
 def _shot(raw: Any) -> tuple[float, float, float, float]:
-    """ISO, exposure time (s), f-number and focal length (mm) as LibRaw has them; 0 is unknown."""
+    """Return ISO, exposure time (s), f-number and focal length (mm) from LibRaw; 0 is unknown."""
     try:
         other = raw.other
     except (ValueError, OverflowError, OSError):  # rawpy fails on an impossible date
@@ -229,29 +231,29 @@ def _shot(raw: Any) -> tuple[float, float, float, float]:
 
 
 def _colours(raw: Any) -> Array:
-    """The number of each pixel's colour in the visible area, as LibRaw counts them."""
+    """Return LibRaw's number of each pixel's colour in the visible area, (height, width)."""
     colours = np.asarray(raw.raw_colors_visible)
     return np.zeros_like(colours) if raw.num_colors == 1 else colours
 
 
 def _pattern(path: Path, raw: Any, exif: "Exif") -> str:
-    """The filter array of the visible area: a Bayer pattern, or rows of letters.
+    """Return the filter array of the visible area: a Bayer pattern, or rows of letters.
 
     Raises:
         ImageError: there is none, or it has colours besides red, green and blue.
     """
     if raw.raw_type.name != "Flat" or raw.raw_pattern is None:
         raise ImageError(
-            f"{path}: has every colour at every pixel (a LinearRaw DNG of three colours), but "
-            "clpipe develops mosaics. Develop it to a TIFF elsewhere and use -c unprocess"
+            f"{path}: this file has all colours at each pixel (a LinearRaw DNG of three colours), "
+            "but clpipe develops mosaics. Develop it to a TIFF elsewhere and use -c unprocess"
         )
     if raw.num_colors == 1:
         return MONO
-    own = exif.text(MODEL).partition(BEHIND)[2]  # which LibRaw may take for another one
+    own = exif.text(MODEL).partition(BEHIND)[2]  # LibRaw may misread this array
     if {*own} - {*"RGB/"}:
         raise ImageError(
-            f"{path}: its filter array is {own}. clpipe reads DNG files whose array has red, green "
-            "and blue only. Keep the mosaic as EXR (--keep mosaic) to read it again"
+            f"{path}: its filter array is {own}. clpipe only reads DNG files whose array has red, "
+            "green and blue. Keep the mosaic as EXR (--keep mosaic) to read it again"
         )
     if own:
         return own
@@ -270,17 +272,17 @@ def _pattern(path: Path, raw: Any, exif: "Exif") -> str:
 
 @dataclass(frozen=True)
 class Exif:
-    """The EXIF of a file, by exifread's names."""
+    """The EXIF tags of a file, by exifread's names."""
 
     tags: dict[str, Any]
 
     def text(self, name: str) -> str:
-        """The text of a tag in the first part that has it; "" where none does."""
+        """Return the text of a tag in the first part that has it; "" if none has."""
         both = (str(self.tags.get(f"{part} {name}", "")).strip("\0 ") for part in PARTS)
         return next((text for text in both if text), "")
 
     def number(self, name: str, default: float) -> float | None:
-        """The first number of a tag, else ``default``; None where it is not above 0 or infinite."""
+        """Return a tag's first number, or ``default``; None unless it is finite and above 0."""
         value = default
         for part in PARTS:
             if tag := self.tags.get(f"{part} {name}"):
@@ -292,7 +294,7 @@ class Exif:
         return value if 0 < value < math.inf else None
 
     def color_matrix(self) -> Matrix | None:
-        """The ColorMatrix of a DNG for D65, from CIE XYZ; None where there is none."""
+        """Return the ColorMatrix of a DNG for D65, from CIE XYZ; None if there is none."""
         for name, illuminant in COLOR_MATRICES.items():
             if self.number(f"Tag {illuminant}", 0) == D65 and f"Image Tag {name}" in self.tags:
                 with suppress(TypeError, ValueError, ZeroDivisionError):
@@ -302,7 +304,7 @@ class Exif:
 
 
 def read_exif(path: Path) -> Exif:
-    """The EXIF of a file; without tags where the file has none.
+    """Return the EXIF of a file, which may be empty.
 
     Raises:
         ImageError: the file cannot be read.
@@ -324,7 +326,7 @@ def read_exif(path: Path) -> Exif:
 
 
 class _Metered:
-    """A file that ends the reading of one whose tags claim more values than there can be."""
+    """Wraps a file, and stops reading if its tags claim more values than are plausible."""
 
     def __init__(self, file: Any) -> None:
         self._file = file
@@ -341,7 +343,7 @@ class _Metered:
 
 
 def _tags(file: Any) -> dict[str, Any]:
-    """The EXIF tags of an open file; none where it is damaged, which LibRaw reports better."""
+    """Return the EXIF tags of an open file; {} if it is damaged, which LibRaw reports better."""
     import exifread
 
     logging.getLogger("exifread").setLevel(logging.CRITICAL)

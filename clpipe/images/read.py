@@ -40,18 +40,24 @@ WHOLE = (oiio.UINT8, oiio.UINT16, oiio.UINT32, oiio.INT8, oiio.INT16, oiio.INT32
 
 @dataclass(frozen=True)
 class SourceImage:
-    """An image as it came from a file.
+    """An image that was read from a file.
 
-    ``pixels`` is (height, width, 3) linear RGB or a (height, width) mosaic, float16 or float32,
-    finite. It is C-contiguous, or planar: a transposed view of a C-contiguous (3, height, width)
-    array. ``layer`` and ``part`` are the name of the layer that was read and the number of its part
-    in the file, from 0. ``attributes`` are clpipe's own, which
-    a kept image has, and a photograph's tags. ``shot`` is what the file says of exposure_time (s),
-    focal_length and sensor_width (mm). ``subframes`` are the names and SHA-256 of files that were
-    averaged, and ``later`` what further exposures see than that of ``pixels``, which are alike.
-    ``depth`` is there where the chain needs it. ``margins`` say how far ``pixels``, and depth, go
-    on beyond the picture. ``envmap`` is OpenImageIO's name of the map that the file says it is, and
-    ``panorama`` what an atlas of several views is one of.
+    Args:
+        pixels: linear RGB, (height, width, 3), or a mosaic, (height, width): float16 or float32,
+            finite. The array is C-contiguous, or a transposed view of a C-contiguous
+            (3, height, width) array.
+        sha256: the digest of the file, or of all its files together.
+        layer: the name of the layer that was read.
+        warnings: sentences about the file.
+        attributes: clpipe's own attributes of a kept image, or the tags of a photograph.
+        shot: exposure_time (s), focal_length and sensor_width (mm), as far as the file states them.
+        subframes: the names and digests of the files that were averaged.
+        later: the images of further exposures, shaped like ``pixels``.
+        depth: the depth, if the chain needs it.
+        margins: the overscan of ``pixels`` and depth.
+        envmap: OpenImageIO's name of the environment map that the file states; otherwise "".
+        panorama: the panorama, if ``pixels`` is an atlas of several views.
+        part: the number of the layer's part in the file, from 0.
     """
 
     pixels: Array
@@ -78,25 +84,24 @@ def read_image(
 ) -> SourceImage:
     """Read the picture of a file as linear sRGB, in its display window, with finite samples.
 
-    The picture is R, G and B by name, else X, Y and Z, else luminance, which becomes grey. Other
-    primaries than sRGB's are converted, the orientation is applied, and straight alpha multiplies
-    the light, as if the picture stood before black. Half samples stay half unless they are
-    converted. Depth and other layers are not read. NaN and infinity become 0, with a warning.
-    Pixels of the display window outside the data window are black. What the file states and
-    clpipe does not apply is in the warnings.
+    The picture is the channels R, G and B. Without them it is X, Y and Z, or luminance, which
+    becomes grey. Primaries other than sRGB's are converted, and the orientation is applied.
+    Straight alpha multiplies the light, which composites the picture over black. Half samples stay
+    half unless they are converted. NaN and infinity become 0, with a warning. Pixels outside the
+    data window are black. Warnings list what the file states but clpipe does not apply.
 
     Args:
         path: the file.
-        mosaic: read a single channel instead, which may also hold whole numbers of 16 or 32 bits.
+        mosaic: whether to read a single channel instead, which may have integers of 16 or 32 bits.
         layer: the layer or part that is the picture; None chooses, see
             :data:`clpipe.images.layers.PICTURE_LAYERS`.
-        max_pixels: a file that claims more is refused before memory is allocated.
-        overscan: read what the data window has beyond the display window, too, as margins.
+        max_pixels: a file with more pixels is rejected before it is read.
+        overscan: whether to read the part of the data window outside the display window as margins.
 
     Raises:
         ImageError: the file is missing, empty, damaged, not an image, not linear float, deep, a
-            texture or too large, or it lacks the channels or the layer; the message
-            names the file and the reason.
+            texture or too large, or lacks the channels or the layer. The message contains the file
+            and the reason.
     """
     try:
         image, stated = _decode(path, mosaic, layer, max_pixels, overscan)
@@ -115,17 +120,19 @@ def read_image(
     elif not mosaic:
         pixels, said = _in_srgb(path, pixels, stated)
         warnings += said
-    # Beyond half it is so bright that nothing is lost, and no stage's squares overflow.
+    # Values beyond half are so bright that clipping loses nothing, and squares cannot overflow.
     if not mosaic and pixels.dtype == np.float32 and (beyond := clip_to_half(pixels)):
-        warnings.append(f"{beyond} samples beyond {HALF_MAX:g}, the range of half, were clipped")
+        samples = "1 sample" if beyond == 1 else f"{beyond} samples"
+        were = "was" if beyond == 1 else "were"
+        warnings.append(f"{samples} beyond {HALF_MAX:g}, the range of half, {were} clipped")
     return replace(image, pixels=pixels, warnings=tuple(warnings))
 
 
-GREY = "it holds luminance alone; the picture is grey"
+GREY = "the file has only luminance, so the picture is grey"
 
 
 def _in_srgb(path: Path, light: Array, stated: Statements) -> tuple[Array, list[str]]:
-    """Light in linear sRGB, from the primaries that the file states, and what was done.
+    """Return light in linear sRGB, converted from the file's primaries, and warnings.
 
     Raises:
         ImageError: the colours that the file states are impossible.
@@ -148,11 +155,13 @@ TRANSFERS: dict[str, Callable[[Doubles], Doubles]] = {
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """How files are read.
+    """Options for reading files.
 
-    ``layer``, ``max_pixels`` and, for linear RGB, ``overscan`` are those of :func:`read_image`.
-    ``transfer``, one of :data:`TRANSFERS`, is how renders in whole numbers (PNG, TIFF and others)
-    are encoded; None rejects them.
+    Args:
+        layer, max_pixels: see :func:`read_image`.
+        transfer: a key of :data:`TRANSFERS`: the encoding of renders in whole numbers (PNG, TIFF
+            and others); None rejects them.
+        overscan: see :func:`read_image`; only for linear RGB.
     """
 
     layer: str | None = None
@@ -165,7 +174,7 @@ def read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
     """Read a file as the kind of image that a chain starts on.
 
     Raises:
-        ImageError: the file cannot be read, or holds another kind.
+        ImageError: the file cannot be read, or contains another kind.
     """
     try:
         return _read_source(path, kind, options)
@@ -174,7 +183,7 @@ def read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
 
 
 def _read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
-    """See :func:`read_source`; errors do not name options."""
+    """Do the same as :func:`read_source`, but without naming options in errors."""
     transfer = options.transfer if kind is Kind.RGB else None
     if transfer and (encoded := _read_encoded(path, options.max_pixels)):
         return _as_light(path, encoded, transfer)
@@ -187,15 +196,15 @@ def _read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
     image = read_image(path, False, options.layer, options.max_pixels)
     if image.attributes.get("kind") != kind.label:
         raise ImageError(
-            f"{path}: holds linear light, but the chain starts on finished pictures, such as a "
-            "JPEG or PNG. For a render, leave out -c unprocess"
+            f"{path}: this file contains linear light, but the chain starts on finished pictures, "
+            "such as a JPEG or PNG. For a render, remove -c unprocess"
         )
     return image
 
 
 @dataclass(frozen=True)
 class _Encoded:
-    """A picture in whole numbers: RGB, (height, width, 3), and alpha, both in 0..1 as stored."""
+    """A picture in whole numbers: RGB, (height, width, 3), and alpha, both scaled to 0..1."""
 
     image: SourceImage
     alpha: Floats | None
@@ -205,10 +214,10 @@ class _Encoded:
 
 @CpuTimer("decode")
 def _read_encoded(path: Path, max_pixels: int) -> _Encoded | None:
-    """The picture of a file in whole numbers; None where its samples are something else.
+    """Return the picture of a file in whole numbers; None if its samples have another type.
 
     Raises:
-        ImageError: as :func:`read_finished`.
+        ImageError: as for :func:`read_finished`.
     """
     with open_image(path) as file:
         spec = file.spec()
@@ -233,10 +242,10 @@ def _read_encoded(path: Path, max_pixels: int) -> _Encoded | None:
 
 
 def _as_light(path: Path, encoded: _Encoded, transfer: str) -> SourceImage:
-    """An encoded render as linear sRGB over black.
+    """Return an encoded render as linear sRGB over black.
 
-    Alpha multiplies light, not encoded values. Encoded values that it has multiplied already, as an
-    associated alpha channel says, are divided by it first.
+    Alpha multiplies light, not encoded values. If the alpha channel is associated, encoded values
+    are divided by it first.
 
     Raises:
         ImageError: the colours that the file states are impossible.
@@ -261,15 +270,15 @@ def read_finished(
 ) -> SourceImage | None:
     """Read a finished picture (JPEG, PNG, TIFF): display values, (height, width, 3), 0..1.
 
-    Alpha is not applied; a warning says so where a pixel is not opaque.
+    Alpha is not applied, and there is a warning if a pixel is not opaque.
 
     Args:
         path: the file.
-        max_pixels: that of :func:`read_image`.
-        grey: read a picture in grey, too, which may as well be a mosaic.
+        max_pixels: see :func:`read_image`.
+        grey: whether to read grey pictures, which may also be mosaics.
 
     Returns:
-        None where the file does not hold whole numbers; then it is one for :func:`read_image`.
+        The picture; None if the samples are not whole numbers, so that :func:`read_image` applies.
 
     Raises:
         ImageError: the file is missing, empty, damaged, not an image or too large.
@@ -289,9 +298,9 @@ def read_finished(
 def _decode(
     path: Path, mosaic: bool, layer: str | None, max_pixels: int, overscan: bool
 ) -> tuple[SourceImage, Statements]:
-    """Return the picture of a file that OpenImageIO reads, not converted, and its header's facts.
+    """Return the unconverted picture of a file that OpenImageIO reads, and the file's statements.
 
-    Arguments and errors are those of :func:`read_image`.
+    The arguments and errors are those of :func:`read_image`.
 
     Raises:
         SubsampledError: the channels differ in size.
@@ -339,7 +348,7 @@ def _decode_luminance_chroma(
 
 
 def _srgb_matrix(path: Path, stated: Statements) -> Array | None:
-    """The 3x3 matrix to linear sRGB; None where the file is in linear sRGB or does not say.
+    """Return the 3x3 matrix to linear sRGB; None if it is not needed, or nothing is stated.
 
     Raises:
         ImageError: the colours that the file states are impossible.

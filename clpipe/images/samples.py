@@ -1,4 +1,4 @@
-"""Reads samples and single facts from image files, and computes digests of the files."""
+"""Reads samples and single values from image files, and computes digests of the files."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,8 +18,8 @@ from clpipe.images.openimageio import damage_text, open_image, read_with_pillow
 from clpipe.images.pixels import USUAL_MAX_PIXELS, check_size, display_window
 from clpipe.reference.geometry import Margins
 
-LARGE_FILE = 4 << 20  # bytes; to start a thread takes as long as the SHA-256 of a small one
-READ_AT_ONCE = 8  # channels; those of a picture may lie hundreds apart
+LARGE_FILE = 4 << 20  # bytes; for smaller files, starting a thread takes longer than the SHA-256
+READ_AT_ONCE = 8  # channels; those of a picture may be hundreds apart
 
 
 def read_samples(path: Path, file: Any, part: int, channels: Sequence[int], type_: Any) -> Array:
@@ -31,7 +31,8 @@ def read_samples(path: Path, file: Any, part: int, channels: Sequence[int], type
     spec = file.spec()
     if spec.depth > 1:
         raise ImageError(
-            f"{path}: a volume of {spec.depth} images, not a picture. Write each of them as a file"
+            f"{path}: this file is a volume of {spec.depth} images, not a picture. Write each "
+            "image to its own file"
         )
     first, last = min(channels), max(channels) + 1
     if last - first > READ_AT_ONCE:
@@ -80,7 +81,7 @@ def read_part(
     width, height = margins.around(spec.full_width, spec.full_height)
     check_size(path, width, height, max_pixels)
     check_size(path, spec.width, spec.height, max_pixels)
-    # Whole numbers are read as they are: as float, OpenImageIO would scale them to 0..1.
+    # Whole numbers keep their type, because OpenImageIO would scale them to 0..1 as floats.
     type_ = types.pop() if whole else oiio.HALF if types == {oiio.HALF} else oiio.FLOAT
     pixels = None
     if file.format_name() == "openexr" and not whole:
@@ -106,15 +107,15 @@ def read_whole_numbers(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> Array:
         spec = file.spec()
         if spec.format.basetype not in (oiio.UINT8, oiio.UINT16):
             raise ImageError(
-                f"{path}: has samples of type {spec.format}, but whole numbers of 8 or 16 bits are "
-                "expected"
+                f"{path}: this file has samples of type {spec.format}, but integers of 8 or 16 "
+                "bits are expected. Convert it to an 8- or 16-bit PNG or TIFF"
             )
         check_size(path, spec.width, spec.height, max_pixels)
         return read_samples(path, file, 0, (0,), spec.format.basetype)[..., 0]
 
 
 def photograph_facts(path: Path) -> tuple[float | None, int]:
-    """Return the ISO in a finished picture's EXIF, or None if it has none, and the bits a sample.
+    """Return the ISO in a finished picture's EXIF, or None, and the number of bits per sample.
 
     Raises:
         ImageError: the file is missing, empty, damaged or not an image.
@@ -139,7 +140,7 @@ def holds_mosaic(path: Path) -> bool:
 
 
 def with_digest(path: Path, read: Callable[[], Array]) -> tuple[Array, str]:
-    """Return what a function reads from a file, and the file's SHA-256.
+    """Return the array that a function reads from a file, and the file's SHA-256.
 
     The digest of a large file is computed at the same time, in another thread.
 

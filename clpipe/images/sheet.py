@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from clpipe.images.preview import thumbnail
 
-SHOWN = (".jpg", ".png", ".tif")  # endings of pictures that can be on a sheet
+SHOWN = (".jpg", ".png", ".tif")  # extensions of pictures that can be on a sheet
 
 THUMBNAIL = 240  # px, the longer side
 TEXT = 14  # px high
@@ -19,12 +19,12 @@ BACKGROUND, INK = (250, 250, 250), (30, 30, 30)
 def contact_sheet(
     rows: Sequence[Sequence[Path]], names: Sequence[str], titles: Sequence[str]
 ) -> bytes:
-    """A JPEG of pictures.
+    """Return a JPEG with a grid of pictures.
 
     Args:
-        rows: pictures of 8 bits, as many in each row; each stands in the same column.
-        names: of the rows.
-        titles: of the columns.
+        rows: 8-bit pictures; each row has one for each column.
+        names: the names of the rows.
+        titles: the titles of the columns.
 
     Raises:
         ImageError: a picture cannot be read.

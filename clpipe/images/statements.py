@@ -1,4 +1,4 @@
-"""What a file states about its samples: colours, light, alpha, orientation, and what is unused."""
+"""Reads what a file states about its samples: colours, transfer curve, alpha, orientation."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,15 +22,16 @@ class Statements:
     """What a file states about its samples.
 
     Args:
-        chromaticities: x and y of red, green, blue and white; None: linear sRGB's.
+        chromaticities: x and y of red, green, blue and white; None means linear sRGB.
         neutral: x and y of OpenEXR's adoptedNeutral.
-        orientation: EXIF's, of the samples as they are stored; 1 is upright.
-        alpha: the number of the alpha channel by which colours are yet to be multiplied; -1: none.
-        is_associated: whether colours were already multiplied by an alpha channel.
-        curve: how light is encoded, see :class:`clpipe.images.png.PngColours`; "": not stated.
-        is_inverted: whether 0 is white, which OpenImageIO applies to samples of 8 bits only.
-        header: of a Radiance picture.
-        warnings: statements that are not applied.
+        orientation: EXIF's orientation of the stored samples; 1 is upright.
+        alpha: the number of a straight alpha channel, by which colours must be multiplied; -1 if
+            there is none.
+        is_associated: whether colours are already multiplied by an alpha channel.
+        curve: how light is encoded, see :class:`clpipe.images.png.PngColours`; "" if not stated.
+        is_inverted: whether 0 is white, which OpenImageIO applies only to 8-bit samples.
+        header: the header of a Radiance picture.
+        warnings: sentences about statements that are not applied.
     """
 
     chromaticities: Any = None
@@ -44,29 +45,30 @@ class Statements:
     warnings: tuple[str, ...] = ()
 
     def warnings_with(self, transfer: str) -> tuple[str, ...]:
-        """The warnings where samples are taken for light that was encoded with a curve."""
+        """Return the warnings if samples are decoded with a transfer curve."""
         if self.curve in ("", transfer):
             return self.warnings
-        return (*self.warnings, f"it states the transfer curve {self.curve}; read as {transfer}")
+        said = f"its transfer curve {self.curve} is not applied; it is read as {transfer}"
+        return (*self.warnings, said)
 
     def light(self, pixels: Array) -> Array:
-        """Linear light from the samples of a Radiance picture; those of others are light."""
+        """Return linear light: converted from a Radiance picture's samples, otherwise unchanged."""
         if (header := self.header) is None:
             return pixels
         return by_rows(lambda rows: radiance.to_light(rows, header), pixels)
 
     def upright(self, pixels: Array) -> Array:
-        """Pixels as they are looked at."""
+        """Return pixels rotated upright."""
         return pixels if self.orientation == 1 else upright(pixels, self.orientation)
 
 
 def statements(path: Path, file: Any, xyz: bool = False) -> Statements:
-    """What a file states about the samples of the part that it is at.
+    """Return what a file states about the samples of its current part.
 
     Args:
         path: the file.
         file: the open ``oiio.ImageInput``.
-        xyz: whether its channels are X, Y and Z.
+        xyz: whether the channels are X, Y and Z.
 
     Raises:
         ImageError: the file cannot be read.
@@ -76,15 +78,17 @@ def statements(path: Path, file: Any, xyz: bool = False) -> Statements:
     aspect = spec.getattribute("PixelAspectRatio")
     header = radiance_header(path) if format_ == "hdr" else None
     if header:
-        aspect = 1 / header.pixel_aspect  # of its height to its width
+        aspect = 1 / header.pixel_aspect  # Radiance states height over width
     if isinstance(aspect, float) and abs(aspect - 1) > 1e-3:
         warnings.append(
-            f"its pixel aspect ratio of {aspect:.4g} is not applied; its pixels are read as square"
+            f"its pixel aspect ratio of {aspect:.4g} is not applied; pixels are read as square"
         )
     if nits := spec.getattribute("whiteLuminance"):
         warnings.append(f"its whiteLuminance of {nits:g} cd/m2 is not used; 1.0 is white")
     if profile := _profile(spec):
-        warnings.append(f"its ICC profile, {printable(profile)}, is not applied; read as sRGB")
+        warnings.append(
+            f"its ICC profile, {printable(profile)}, is not applied; it is read as sRGB"
+        )
     is_inverted = spec.getattribute("tiff:PhotometricInterpretation") == 0
     if is_inverted and spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
         warnings.append("it states that 0 is white (MinIsWhite), which is not applied to floats")
@@ -104,10 +108,10 @@ def statements(path: Path, file: Any, xyz: bool = False) -> Statements:
         else:
             curve = colours.curve
         if colours.unknown:
-            warnings.append(f"its cICP chunk states {colours.unknown}, not known; read as sRGB")
+            warnings.append(f"its cICP chunk states unknown {colours.unknown}; it is read as sRGB")
     stated = spec.getattribute("Orientation") if format_ != "openexr" else 1
     if header:
-        stated = header.orientation  # OpenImageIO 3.2 takes two of the eight for each other
+        stated = header.orientation  # OpenImageIO 3.2 swaps two of the eight orientations
     is_straight = bool(spec.getattribute("oiio:UnassociatedAlpha"))
     alpha = spec.alpha_channel
     return Statements(
@@ -124,7 +128,7 @@ def statements(path: Path, file: Any, xyz: bool = False) -> Statements:
 
 
 def png_colours(path: Path) -> png.PngColours:
-    """The colours that a PNG states.
+    """Return the colours that a PNG states.
 
     Raises:
         ImageError: the file cannot be read.
@@ -136,7 +140,7 @@ def png_colours(path: Path) -> png.PngColours:
 
 
 def _profile(spec: Any) -> str:
-    """The name of an ICC profile; "" where there is none, or where it is sRGB's."""
+    """Return the name of an ICC profile; "" if there is none, or if it is sRGB's."""
     if spec.getattribute("ICCProfile") is None:
         return ""
     name = str(spec.getattribute("ICCProfile:profile_description") or "without a name")
@@ -144,5 +148,5 @@ def _profile(spec: Any) -> str:
 
 
 def over_black(light: Array, alpha: Array) -> Floats:
-    """Linear light, (height, width[, 3]), times alpha: the picture before black, as in OpenEXR."""
+    """Return linear light, (height, width[, 3]), times alpha, which composites it over black."""
     return light * (alpha if light.ndim == 2 else alpha[..., np.newaxis])

@@ -1,4 +1,4 @@
-"""Tags: what goes into a picture's EXIF, and how an image carries it from stage to stage."""
+"""Tags: the values in a picture's EXIF, and the attributes that store them in kept images."""
 
 import json
 import math
@@ -16,22 +16,22 @@ from clpipe.camera.gain_stage import Positive
 from clpipe.camera.optics import FILM_DIAGONAL
 from clpipe.images.encoding import Encoding
 
-TAG_ATTRIBUTES = ("exif", "orientation")  # the attributes by which an image carries its tags
-DATE = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")  # as EXIF has it
-NOT_CARRIED = ("sensor_width", "encoding")  # the fields of tags that no image carries
-DAMAGED = "its attributes clpipe:exif and clpipe:orientation are damaged"
+TAG_ATTRIBUTES = ("exif", "orientation")  # attributes that contain an image's tags
+DATE = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")  # EXIF's format
+NOT_CARRIED = ("sensor_width", "encoding")  # fields of tags that attributes do not contain
+DAMAGED = "its attributes clpipe:exif and clpipe:orientation are damaged; write the file again"
 
 
 @dataclass(frozen=True)
 class Tags:
-    """What goes into a picture's EXIF, and how the picture is encoded; None is unknown."""
+    """The values for a picture's EXIF, and the picture's encoding; None is unknown."""
 
     make: str
     model: str
     iso: Positive
     exposure: Positive | None = None  # s
     aperture: Positive | None = None  # f-number
-    bias: float | None = None  # EV over the render as it is
+    bias: float | None = None  # EV relative to the render
     focal_length: Positive | None = None  # mm
     lens: str = ""  # its model
     focus_distance: Positive | None = None  # m
@@ -41,21 +41,21 @@ class Tags:
 
     @property
     def shot(self) -> dict[str, float]:
-        """Exposure time and focal length where known, by the names that a render's camera has."""
+        """Exposure time and focal length, if known, by the names of a render's camera."""
         values = {"exposure_time": self.exposure, "focal_length": self.focal_length}
         return {name: value for name, value in values.items() if value}
 
 
 def exif(tags: Tags, height: int, width: int) -> dict[str, float | str]:
-    """EXIF tags (EXIF 2.3, 2010) by their names.
+    """Return EXIF tags (EXIF 2.3, 2010) by name.
 
-    The equivalent focal length is by the ratio of diagonals (CIPA DCG-001, 2018), as
-    structure-from-motion tools take it; EXIF holds whole mm.
+    The equivalent focal length follows from the ratio of diagonals (CIPA DCG-001, 2018), which is
+    also what structure-from-motion tools expect. EXIF stores it in whole mm.
 
     Args:
-        tags: what is known; EXIF holds an ISO of at most 65535.
-        height: of the image, px.
-        width: of the image, px.
+        tags: the known values; EXIF limits the ISO to 65535.
+        height: height of the image in px.
+        width: width of the image in px.
 
     >>> tags = Tags("", "", 800, focal_length=24.0, sensor_width=24.0)
     >>> for name, value in exif(tags, 4000, 6000).items():
@@ -94,26 +94,26 @@ def exif(tags: Tags, height: int, width: int) -> dict[str, float | str]:
 
 
 def to_attributes(tags: Tags, orientation: int) -> dict[str, str]:
-    """The attributes by which an image carries its tags and its orientation (EXIF's, 1 to 8)."""
+    """Return the attributes that contain an image's tags and orientation (EXIF's, 1 to 8)."""
     values = {name: value for name, value in asdict(tags).items() if name not in NOT_CARRIED}
     return shot_to_attributes(values, orientation)
 
 
 def shot_to_attributes(shot: Mapping[str, float | str], orientation: int) -> dict[str, str]:
-    """As :func:`to_attributes`, of those fields of :class:`Tags` that the image says itself."""
+    """Return the attributes for the fields of :class:`Tags` that an image states itself."""
     return {"exif": json.dumps(shot), "orientation": str(orientation)}
 
 
 def exposed_attributes(attributes: Mapping[str, str], tags: Tags) -> dict[str, str]:
-    """The attribute of an image's tags with the exposure that it was given since."""
+    """Return the attribute of an image's tags with the exposure that the chain has applied."""
     said = {"exposure": tags.exposure, "bias": tags.bias}
     return {"exif": json.dumps({**json.loads(attributes.get("exif", "{}")), **said})}
 
 
 def from_attributes(attributes: Mapping[str, str], default: Tags) -> tuple[Tags, int]:
-    """The tags and the orientation that an image carries.
+    """Return the tags and the orientation in an image's attributes.
 
-    What it does not say is that of ``default``, and upright.
+    Missing tags are those of ``default``. A missing orientation is upright.
 
     Raises:
         ImageError: the attributes are damaged.
@@ -128,13 +128,13 @@ def from_attributes(attributes: Mapping[str, str], default: Tags) -> tuple[Tags,
 
 @cache
 def _adapter() -> TypeAdapter[Tags]:
-    return TypeAdapter(Tags)  # which takes a millisecond to make
+    return TypeAdapter(Tags)  # cached, because it takes a millisecond
 
 
 def sensor_width(focal_length: float, equivalent: float, height: int, width: int) -> float:
-    """The longer side of a sensor, in mm, from a focal length and what it is on 35 mm film.
+    """Return the longer side of a sensor in mm, from a focal length and its 35 mm equivalent.
 
-    The equivalent is by the ratio of diagonals, as in :func:`exif`.
+    The equivalent follows from the ratio of diagonals, see :func:`exif`.
 
     >>> round(sensor_width(24.0, 36.0, 4000, 6000), 1)
     24.0
@@ -144,7 +144,7 @@ def sensor_width(focal_length: float, equivalent: float, height: int, width: int
 
 
 def orientation_of(attributes: Mapping[str, str]) -> int:
-    """The orientation that an image carries (EXIF's, 1 to 8), else 1 (upright).
+    """Return the orientation in an image's attributes (EXIF's, 1 to 8); 1 (upright) without one.
 
     Raises:
         ImageError: the attribute is damaged.
@@ -155,8 +155,8 @@ def orientation_of(attributes: Mapping[str, str]) -> int:
     return int(orientation)
 
 
-# By EXIF's orientation: whether to flip left to right, whether to flip upside down, and whether
-# then to transpose.
+# For each EXIF orientation: whether to flip left to right, to flip upside down, and then to
+# transpose.
 FLIPS = {
     1: (False, False, False),
     2: (True, False, False),
@@ -170,7 +170,7 @@ FLIPS = {
 
 
 def upright(image: Array, orientation: int) -> Array:
-    """An image, (height, width[, channel]), turned upright by EXIF's orientation, 1 to 8.
+    """Return an image, (height, width[, channel]), rotated upright by EXIF's orientation, 1 to 8.
 
     >>> upright(np.array([[1, 2], [3, 4]]), 6).tolist()  # its right side is now at the bottom
     [[3, 1], [4, 2]]

@@ -1,6 +1,6 @@
 """The bytes of a TIFF file: fields and directories, little-endian (TIFF 6.0, 1992).
 
-What is named after a TIFF type makes a field of that type from its values.
+A function named after a TIFF type makes a field of that type from its values.
 """
 
 import struct
@@ -48,13 +48,13 @@ double = partial(_numbers, 12, "d")
 
 
 def text(value: str) -> Field:
-    """ASCII: text, with ? for other characters, and a NUL at its end."""
+    """Return an ASCII field: text, with ? for other characters, and a final NUL."""
     data = value.encode("ascii", "replace") + b"\0"
     return Field(2, len(data), data)
 
 
 def fraction(value: float) -> tuple[int, int]:
-    """The numerator and denominator nearest to a number that fit into 31 bits each.
+    """Return the fraction nearest to a number, with 31 bits for numerator and denominator.
 
     >>> fraction(1 / 2.77), fraction(-0.4618), fraction(1e7)
     ((100, 277), (-2309, 5000), (10000000, 1))
@@ -65,12 +65,12 @@ def fraction(value: float) -> tuple[int, int]:
 
 
 def directory_size(fields: Directory) -> int:
-    """The bytes of a directory and of the values behind it."""
+    """Return the size in bytes of a directory and the values after it."""
     return 6 + 12 * len(fields) + sum(field.padded for field in fields.values())
 
 
 def directory_bytes(fields: Directory, offset: int) -> bytes:
-    """A directory at ``offset`` in the file, followed by the values of its fields."""
+    """Return the bytes of a directory at ``offset`` in the file, and of the values after it."""
     head, values = struct.pack("<H", len(fields)), b""
     values_offset = offset + 6 + 12 * len(fields)
     for tag, field in sorted(fields.items()):
@@ -83,7 +83,7 @@ def directory_bytes(fields: Directory, offset: int) -> bytes:
 
 
 def image_fields(pixels: Array, subfile_type: int, photometric: int) -> Directory:
-    """The fields that any uncompressed image needs; the offset of its strip is 0 until it is known.
+    """Return the fields of an uncompressed image. The offset of its strip is 0 until it is known.
 
     Args:
         pixels: (height, width[, channel]).
@@ -108,7 +108,7 @@ def image_fields(pixels: Array, subfile_type: int, photometric: int) -> Director
 
 
 def exif_fields(tags: Mapping[str, float | str]) -> Directory:
-    """The EXIF directory; ``tags`` are those of :func:`clpipe.images.tags.exif`."""
+    """Return the EXIF directory; ``tags`` are those of :func:`clpipe.images.tags.exif`."""
     types: dict[str, tuple[int, Callable[..., Field]]] = {
         "ExposureTime": (33434, rational),
         "FNumber": (33437, rational),

@@ -1,4 +1,4 @@
-"""Whether a picture's file is whole, or only a part of one, as a loss of power may leave it."""
+"""Checks whether a picture's file is complete; a power loss may leave only a part of it."""
 
 from pathlib import Path
 
@@ -15,10 +15,10 @@ NPY = b"\x93NUMPY"
 
 
 def is_whole(path: Path) -> bool:
-    """Whether all of a picture can be read.
+    """Return whether all of a picture can be read.
 
-    What is in no format of clpipe's, or too large to be looked at, counts as whole: somebody may
-    want it.
+    A file in a format that clpipe does not write, or too large to be checked, counts as complete,
+    because it may be valuable.
 
     Raises:
         OSError: the file cannot be read.

@@ -1,4 +1,4 @@
-"""Writing pictures: JPEG, PNG and TIFF with EXIF and an ICC profile, and float OpenEXR."""
+"""Writes pictures: JPEG, PNG and TIFF with EXIF and an ICC profile, float OpenEXR, and ``.npy``."""
 
 import errno
 import mmap
@@ -29,14 +29,14 @@ from clpipe.images.tags import Tags, exif
 from clpipe.reference.geometry import NO_MARGINS, Margins
 
 JPEG_MAX_SIDE = 65500
-# Without it, OpenImageIO puts in the time of writing, and no two runs make the same bytes.
-LENS, NO_LENS = "Exif:LensModel", ("jpg", "png")  # whose EXIF OpenImageIO leaves it out of
+LENS, NO_LENS = "Exif:LensModel", ("jpg", "png")  # OpenImageIO omits the tag in these formats
+# Without a time, OpenImageIO adds the current one, and the bytes would differ in each run.
 NO_TIME = "1970:01:01 00:00:00"
 
 
 @cache
 def srgb_profile() -> bytes:
-    """An ICC profile of sRGB, the same bytes at every call."""
+    """Return an ICC profile of sRGB, with the same bytes in each call."""
     profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
     profile[24:36] = bytes(12)  # the date of creation
     return bytes(profile)
@@ -45,9 +45,9 @@ def srgb_profile() -> bytes:
 def write_display(path: Path, pixels: Array, tags: Tags) -> Stored:
     """Write a picture, (height, width[, 3]), as JPEG, PNG or TIFF, with EXIF.
 
-    Whole numbers of 8 or 16 bits get an sRGB profile; float samples (TIFF) do not.
-    ``tags.encoding`` says how a JPEG and a PNG are encoded. The EXIF of a TIFF lacks the ISO, which
-    OpenImageIO cannot write.
+    Integers of 8 or 16 bits get an sRGB profile, and float samples (TIFF) do not.
+    ``tags.encoding`` sets the encoding of a JPEG or PNG. The EXIF of a TIFF lacks the ISO, because
+    OpenImageIO cannot write it.
 
     Raises:
         ImageError: the file cannot be written.
@@ -72,7 +72,7 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> Stored:
     spec.attribute("Software", f"clpipe {__version__}")
     for name, value in exif(tags, height, width).items():
         if name == "ExposureTime":
-            # OpenImageIO cuts off after the sixth digit, and 0.01 is 0.0099999998 as float32.
+            # OpenImageIO truncates after the sixth digit, and 0.01 is 0.0099999998 as float32.
             above = float(np.nextafter(np.float32(value), np.float32(np.inf)))
             spec.attribute(name, above)
         else:
@@ -96,9 +96,9 @@ def write_exr(
         path: the file.
         pixels: the samples.
         channels: the names of the channels.
-        attributes: clpipe's own; their names get clpipe's prefix in the file.
-        half: as half floats: 11 bits, clipped to -65504..65504.
-        margins: how far the image goes on beyond the picture, which is the display window.
+        attributes: clpipe's own attributes; their names get clpipe's prefix in the file.
+        half: whether to write half floats: 11 bits, clipped to -65504..65504.
+        margins: the overscan of the image. The display window excludes it.
 
     Raises:
         ImageError: the file cannot be written.
@@ -119,7 +119,7 @@ def write_exr(
 def write_npy(path: Path, array: Array) -> Stored:
     """Write an array as NumPy's ``.npy``, version 1.0 (NEP 1), C-contiguous.
 
-    Behind the header's dictionary, which Python reads, a comment says that clpipe wrote it.
+    After the header's dictionary, which Python reads, a comment names clpipe.
 
     Raises:
         ImageError: the file cannot be written.
@@ -138,7 +138,7 @@ def write_planes(path: Path, planes: Mapping[str, Array], attributes: Mapping[st
     Args:
         path: the file.
         planes: (height, width) float16, float32 or uint32, by the names of the channels.
-        attributes: of the header, by their whole names.
+        attributes: attributes of the header, by their full names.
 
     Raises:
         ImageError: the file cannot be written.
@@ -151,7 +151,7 @@ def write_planes(path: Path, planes: Mapping[str, Array], attributes: Mapping[st
 
 
 def write_grey_png(path: Path, pixels: Array) -> Stored:
-    """Write whole numbers, (height, width), of 8 or 16 bits, as PNG.
+    """Write integers of 8 or 16 bits, (height, width), as PNG.
 
     Raises:
         ImageError: the file cannot be written.
@@ -172,18 +172,18 @@ def _write(path: Path, spec: Any, pixels: Array) -> Stored:
 
 
 def _stored(path: Path, size: int, encode: Callable[[str], None]) -> Stored:
-    """Write what an encoder makes.
+    """Encode a picture, and write it as a whole.
 
     Args:
         path: the file.
-        size: of the samples, in bytes.
-        encode: writes to a path; an OSError says why it cannot.
+        size: the size of the samples in bytes.
+        encode: encodes to a path; raises OSError if it cannot.
 
     Raises:
         ImageError: the file cannot be written.
     """
-    # The encoders do not notice all that a full disk refuses, and libjpeg then ends the process; so
-    # they write to memory, or where there is room enough.
+    # Encoders do not notice every error of a full disk, and libjpeg then ends the process. They
+    # therefore write to memory, or to a disk with enough space.
     try:
         _check_file_limit(2 * size)
         with passing_file(2 * size) as to:
@@ -199,7 +199,7 @@ def _stored(path: Path, size: int, encode: Callable[[str], None]) -> Stored:
 
 
 def _check_file_limit(size: int) -> None:
-    """See that the process may write files of a size (``ulimit -f``), which holds in memory, too.
+    """Check that the process may write files of a size (``ulimit -f``), which also limits memory.
 
     Raises:
         OSError: it may not.
@@ -214,7 +214,7 @@ def _encode(format_: str, to: str, spec: Any, pixels: Array) -> None:
     """Encode pixels to a file.
 
     Args:
-        format_: its ending.
+        format_: the extension of the format.
         to: the path to write to.
         spec: the ``oiio.ImageSpec``.
         pixels: (height, width, channel).
@@ -234,5 +234,5 @@ def _encode(format_: str, to: str, spec: Any, pixels: Array) -> None:
 
 @cache
 def versions() -> dict[str, str]:
-    """The versions of the libraries that read and write pictures."""
+    """Return the versions of the libraries that read and write pictures."""
     return {name: version(name) for name in ("OpenImageIO", "OpenEXR", "Pillow", "rawpy")}

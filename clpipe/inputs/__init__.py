@@ -1,5 +1,5 @@
-"""Inputs: which files a run is about, and how each enters a chain.
+"""Inputs: the files that a run processes, and the chain that each enters.
 
-Folders, globs and manifests become jobs; renders, camera raws, dumps and kept images become pixels
-with a chain. Nothing is developed or written here. This room imports ``chain`` and below.
+Folders, globs and manifests become jobs. Renders, camera raws, dumps and intermediate images become
+pixels with a chain. Nothing is developed or written here. This package imports ``chain`` and below.
 """

@@ -1,4 +1,4 @@
-"""Annotations of renders, in the format that a file or a folder is of."""
+"""What the readers of annotation formats (COCO, KITTI, BOP) share: types, limits and errors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,21 +10,21 @@ from clpipe.base.reading import parse_json, read_named
 
 LARGEST = 1 << 30  # bytes of a file
 
-FARTHEST = 1e5  # px from the corner of a render, of a place in it or beside it
+FARTHEST = 1e5  # px: the largest coordinate that is accepted, inside or outside the render
 
-MOST_PIXELS = 10**10  # of a render, as FARTHEST squared
+MOST_PIXELS = 10**10  # of a render: FARTHEST squared
 
 Record = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class AnnotatedRender:
-    """What is annotated of a render.
+    """The annotations of one render.
 
     Args:
-        name: of its file, as the annotations have it.
-        size: width and height in px; None where they do not say it.
-        content: of the format.
+        name: the render's file name in the annotations.
+        size: width and height in px; None if the format does not state them.
+        content: the annotations, in a type of the format's own.
     """
 
     name: str
@@ -33,34 +33,43 @@ class AnnotatedRender:
 
 
 class Annotations(Protocol):
-    """Annotations of renders, of some format."""
+    """The annotations of several renders, in any supported format."""
 
     @property
     def file(self) -> Path:
-        """Where they are from."""
+        """The file or folder that they were read from."""
         ...
 
     @property
     def renders(self) -> Sequence[AnnotatedRender]:
-        """All renders that they name."""
+        """The annotated renders."""
         ...
 
 
 def parsed(path: Path) -> Any:
-    """The values of a JSON file.
+    """Return the values of a JSON file.
 
     Raises:
-        RequestError: it cannot be read, or is no JSON.
+        RequestError: the file cannot be read, or is not JSON.
     """
     text = read_named("--annotations", path, LARGEST)
     try:
         return parse_json(text)
     except ValueError as error:
-        raise RequestError(f"--annotations {path}: no valid JSON ({error})") from None
+        raise RequestError(
+            f"--annotations {path}: this is not valid JSON ({error}); give COCO's .json, BOP's "
+            "scene_gt.json, or a folder of KITTI labels"
+        ) from None
 
 
 def refuse(path: Path, place: str, found: Any, expected: str) -> NoReturn:
-    """Refuse what a file says somewhere.
+    """Reject a value of an annotation file.
+
+    Args:
+        path: the file.
+        place: where the value is in the file.
+        found: the value.
+        expected: what is allowed, in words.
 
     Raises:
         RequestError: always.

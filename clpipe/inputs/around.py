@@ -1,4 +1,4 @@
-"""What is seen all around, in several files or one: grouped, read, and put into one image."""
+"""Panoramas: groups the files of a cube or camera rig, reads them, and builds one atlas image."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -31,19 +31,19 @@ from clpipe.stages.projection import Wide
 
 FACES = 6
 RIGHT_ANGLE = 90.0
-ONE_POINT = 1e-6  # of the largest distance: views of one point are this near to each other
+ONE_POINT = 1e-6  # cameras may be this far apart, relative to their largest coordinate
 
 CUBE_MAP, LATITUDE_LONGITUDE = "CubeFace Environment", "LatLong Environment"
 
 
 @dataclass(frozen=True)
 class Rig:
-    """The views that files of one place are, by what stands at the end of their names.
+    """The cameras of views from one point. Each file's name ends in the name of its view.
 
     Args:
-        views: their cameras, as a file has them; None are faces of a cube.
-        angle: of a cube's face, in degrees.
-        source: the file that says it, for messages.
+        views: for each view, its rotation, and fx, fy, cx and cy in px, or None for a cube's face.
+        angle: the field of view of a cube's face, in degrees.
+        source: the file that defines the rig, for messages.
     """
 
     views: dict[str, tuple[Rotation, tuple[float, float, float, float] | None]]
@@ -51,14 +51,14 @@ class Rig:
     source: str = ""
 
     def view(self, name: str, width: int, height: int) -> View:
-        """The view of a file of some size."""
+        """Return the view called ``name`` of a file with this width and height in px."""
         rotation, camera = self.views[name]
         if camera is None:
             return View.of_angle(rotation, width, height, self.angle)
         return View(rotation, *camera, width, height)
 
     def called(self, path: Path) -> tuple[str, str] | None:
-        """The name before a view's, and that; None of another file.
+        """Split a file's stem into its own name and that of its view; None if it has no view.
 
         >>> Rig({"front": ()}).called(Path("a/view00_front.exr"))
         ('view00', 'front')
@@ -71,7 +71,7 @@ class Rig:
 
 
 def wide_of(settings: Settings) -> Wide | None:
-    """The wide lens that makes pictures of what is all around; None where there is none."""
+    """Return the wide lens of the chain, which views panoramas; None if there is none."""
     name = stage_in(StageRole.VIEW).name
     if name not in settings.step_names:
         return None
@@ -80,10 +80,11 @@ def wide_of(settings: Settings) -> Wide | None:
 
 
 def rig_of(wide: Wide) -> Rig:
-    """The rig of a wide lens: of ``views``, else a cube.
+    """Return the rig of a wide lens: the one in its file ``views``, or a cube.
 
     Raises:
-        RequestError: the file of views cannot be read, or they are no rig.
+        RequestError: the file cannot be read, lacks a camera's values, or its cameras are not at
+            one point.
     """
     if wide.views is None:
         return Rig({name: (turn, None) for name, turn in CUBE.items()}, _angle(wide))
@@ -98,7 +99,7 @@ def rig_of(wide: Wide) -> Rig:
         known = each.values
         camera = tuple(float(known.get(key, 0)) for key in ("fx", "fy", "cx", "cy"))
         if each.problem or not all(camera[:2]) or "rotation" not in known:
-            why = each.problem or "its fx, fy, cx, cy and its pose are needed"
+            why = each.problem or "fx, fy, cx, cy or its pose is missing; add them to the file"
             raise RequestError(f"{place} {path}: view {each.name}: {why}")
         of_camera = np.array(known["rotation"], float)
         points.append(-of_camera.T @ np.array(known["translation"], float))
@@ -107,8 +108,8 @@ def rig_of(wide: Wide) -> Rig:
     spread = np.ptp(points, 0).max()
     if spread > ONE_POINT * max(abs(np.array(points)).max(), 1):
         raise RequestError(
-            f"{place} {path}: its cameras are up to {spread:g} apart; a picture is made of views "
-            "from one point"
+            f"{place} {path}: its cameras are up to {spread:g} apart, but the views of a panorama "
+            "are taken from one point; render them all from the same position"
         )
     return Rig(views, source=str(path))
 
@@ -118,12 +119,13 @@ def _angle(wide: Wide) -> float:
 
 
 def grouped(jobs: Sequence[Job], wide: Wide | None) -> list[Job]:
-    """The jobs with the files of one place made one, which is called as they are but for the view.
+    """Return the jobs, with the files of one panorama joined into one job.
 
-    Files that are no view are jobs of their own.
+    That job has the files' name without the name of the view. A file that is not a view stays a job
+    of its own.
 
     Raises:
-        RequestError: they are sub-frames, or what is known of them differs.
+        RequestError: the files are sub-frames, or their values differ.
     """
     if wide is None:
         return list(jobs)
@@ -144,7 +146,7 @@ def grouped(jobs: Sequence[Job], wide: Wide | None) -> list[Job]:
         check_values([first, *(job for _, job in others)], "seen from the same point")
         if any(job.subframes for _, job in own):
             raise RequestError(
-                f"{first.path}: views of one point cannot be sub-frames, too; set "
+                f"{first.path}: a view of a panorama cannot also be a sub-frame; set "
                 f"{stage_in(StageRole.SHUTTER).name}.subframes=1"
             )
         key = PurePosixPath(first.key)
@@ -161,12 +163,12 @@ def grouped(jobs: Sequence[Job], wide: Wide | None) -> list[Job]:
 
 
 def read_around(job: Job, read: Callable[[Path], SourceImage], wide: Wide) -> SourceImage:
-    """The image of a job that a wide lens looks at: an atlas, and what it is one of.
+    """Return the image of a job for a wide lens: an atlas of all views, with its panorama.
 
-    A render that is no panorama by its file or name stays as it is.
+    A render that is not a panorama, according to its header and name, is returned unchanged.
 
     Raises:
-        ImageError: a file cannot be read, or is of another size than the first.
+        ImageError: a file cannot be read, or its size differs from that of the first.
     """
     sources: list[SourceImage] = []
     for path in job.paths:
@@ -175,9 +177,10 @@ def read_around(job: Job, read: Callable[[Path], SourceImage], wide: Wide) -> So
     first = sources[0]
     for path, other in zip(job.paths, sources, strict=True):
         if other.pixels.ndim != 3 or other.pixels.shape != first.pixels.shape:
-            size = "a mosaic" if other.pixels.ndim != 3 else _size(other.pixels)
+            size = "is a mosaic" if other.pixels.ndim != 3 else f"has {_size(other.pixels)} pixels"
             raise ImageError(
-                f"{path}: it is {size}, and {job.path}, of the same place, {_size(first.pixels)}"
+                f"{path}: this view {size}, but {job.path}, from the same point, has "
+                f"{_size(first.pixels)}; render all views in colour at one size"
             )
     panorama = panorama_of(job.paths, wide, first.envmap, *first.pixels.shape[1::-1])
     if panorama is None:
@@ -190,13 +193,13 @@ def read_around(job: Job, read: Callable[[Path], SourceImage], wide: Wide) -> So
 def panorama_of(
     paths: Sequence[Path], wide: Wide, envmap: str, width: int, height: int
 ) -> Panorama | None:
-    """What files of some size are; None of a single view, as which any render can be seen.
+    """Return the panorama that files form; None for a single view, which any render can be.
 
     Args:
         paths: the files.
-        wide: how they are looked at.
-        envmap: what the first file says of itself.
-        width, height: of each.
+        wide: the lens that views them.
+        envmap: OpenEXR's attribute of the first file, "" if it has none.
+        width, height: the size of each file, in px.
 
     Raises:
         ImageError: a cube map is not six squares.
@@ -206,8 +209,8 @@ def panorama_of(
     if envmap == CUBE_MAP:
         if height != FACES * width or width < 2:
             raise ImageError(
-                f"{paths[0]}: a cube map of {width}x{height} pixels; its faces are squares, one "
-                "below the other"
+                f"{paths[0]}: this cube map has {width}x{height} pixels, but its height must be "
+                f"{FACES} times its width, for six faces stacked vertically"
             )
         place = (width - 1) / 2, (width - 1) / 2, width / 2, width / 2
         return Views(tuple(View(turn, *place, width, width) for turn in OPENEXR_CUBE))
@@ -219,7 +222,7 @@ def panorama_of(
 
 
 def pieces(panorama: Panorama, image: Array) -> Iterator[Array]:
-    """The views in a file's image: one, or those of a cube map."""
+    """Yield the views in a file's image: the image itself, or the six faces of a cube map."""
     is_cube = isinstance(panorama, Views) and len(image) == FACES * panorama.views[0].height
     yield from np.split(image, FACES) if is_cube else [image]
 

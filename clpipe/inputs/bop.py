@@ -1,7 +1,7 @@
-"""Annotations in BOP's format: scene_gt.json, with what lies beside it.
+"""Annotations in BOP's format: scene_gt.json, and the files next to it.
 
-scene_gt_info.json has boxes and visibility, scene_camera.json cameras, and the folders mask and
-mask_visib a PNG for each object of each image:
+scene_gt_info.json contains boxes and visibility, scene_camera.json contains cameras. The folders
+mask and mask_visib contain a PNG for each object of each image:
 https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md.
 """
 
@@ -23,9 +23,9 @@ from clpipe.inputs.annotations import (
 POSES, INFOS, CAMERAS = "scene_gt.json", "scene_gt_info.json", "scene_camera.json"
 MASKS = ("mask", "mask_visib")
 BOXES = ("bbox_obj", "bbox_visib")
-DIGITS = 6  # of an image's number in the names of files
+DIGITS = 6  # of an image's number in file names
 LAST = 10**9 - 1  # the largest number of an image
-COUNTS = ("px_count_all", "px_count_valid")  # which change with the size of a mask
+COUNTS = ("px_count_all", "px_count_valid")  # they scale with the size of a mask
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class BopObject:
     """An object in an image.
 
     Args:
-        pose: its record in scene_gt.json, which stays.
-        info: that in scene_gt_info.json; empty where there is none.
-        masks: the PNGs of the whole object and of what is seen, by their folders' names.
+        pose: its record in scene_gt.json, which no stage changes.
+        info: its record in scene_gt_info.json; empty if there is none.
+        masks: the PNGs of the whole object and of its visible part, by the name of their folder.
     """
 
     pose: Record
@@ -49,8 +49,8 @@ class Bop:
 
     Args:
         file: scene_gt.json.
-        renders: a list of :class:`BopObject` for each image, which is called by its number.
-        cameras: of images, by their numbers, as scene_camera.json has them.
+        renders: a list of :class:`BopObject` for each image. The name of an image is its number.
+        cameras: the records of scene_camera.json, by the numbers of the images.
     """
 
     file: Path
@@ -59,10 +59,10 @@ class Bop:
 
 
 def read_bop(path: Path) -> Bop:
-    """Read a scene.
+    """Return a scene, from the path of its scene_gt.json.
 
     Raises:
-        RequestError: a file cannot be read, or is of another form; the message says where.
+        RequestError: a file cannot be read or is not in BOP's format; the message says where.
     """
     poses = _by_image(path)
     infos = _by_image(beside) if (beside := path.with_name(INFOS)).is_file() else {}
@@ -82,7 +82,8 @@ def read_bop(path: Path) -> Bop:
             masks = {kind: file for kind, file in files.items() if file.is_file()}
             if found and masks.keys() != found[0].masks.keys():
                 kind = min({*masks} ^ {*found[0].masks})
-                refuse(path, f"{image}[{number}]", f"no {files[kind]}", "masks of all or of none")
+                expected = "masks for all objects of an image, or for none"
+                refuse(path, f"{image}[{number}]", f"no {files[kind]}", expected)
             found.append(BopObject(pose, info, masks))
         renders.append(AnnotatedRender(f"{image:0{DIGITS}d}", None, found))
     for image, camera in cameras.items():
@@ -93,17 +94,18 @@ def read_bop(path: Path) -> Bop:
 
 
 def is_by_image(values: Any) -> bool:
-    """Whether values are of BOP's form: images by their numbers."""
+    """Return whether values have BOP's form: a dict whose keys are numbers of images."""
     return isinstance(values, dict) and bool(values) and all(key.isdecimal() for key in values)
 
 
 def _by_image(path: Path) -> dict[int, Record]:
     values = parsed(path)
     if not is_by_image(values):
-        refuse(path, "it", values, "images by their numbers")
+        refuse(path, "the file", values, "an object whose keys are numbers of images")
     for key in values:
         if not 0 <= whole_number(key) <= LAST:
-            refuse(path, "image", key, f"its number, from 0 to {LAST}; renumber this image")
+            expected = f"a number from 0 to {LAST}; renumber this image"
+            refuse(path, "the number of an image", key, expected)
     return {int(key): value for key, value in values.items()}
 
 

@@ -1,4 +1,4 @@
-"""Layers that go along with a picture: found in its file or beside it, and moved as its pixels."""
+"""Carried layers: read from a render's file or its companions, and warped like its pixels."""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -27,14 +27,14 @@ from clpipe.reference.geometry import Composition, Geometry, Orientation
 
 @dataclass(frozen=True)
 class Aov:
-    """A layer as it goes along with a picture.
+    """A layer that was warped like its picture.
 
     Args:
-        name: as it was asked for.
-        kind: what it holds.
-        channels: the names of its channels, with the layer's.
-        pixels: (height, width, channel) as the picture is.
-        record: what a sidecar says of it: where it is from, and how it was resampled.
+        name: its name in ``--carry``.
+        kind: the meaning of its values, such as depth; it decides how the layer is resampled.
+        channels: the full names of its channels, each with the layer's name.
+        pixels: (height, width, channel), with the picture's height and width.
+        record: its entry in a sidecar: its file, and how it was resampled.
     """
 
     name: str
@@ -46,12 +46,12 @@ class Aov:
 
 @dataclass(frozen=True)
 class Aovs:
-    """All layers that go along with a picture.
+    """All carried layers of a picture.
 
     Args:
-        layers: in the order in which they were asked for.
-        valid: (height, width), 1 where all of them are known, else 0.
-        attributes: what goes with them, such as the names of a Cryptomatte's objects.
+        layers: the layers, in the order of ``--carry``.
+        valid: (height, width): 1 where all layers are known, otherwise 0.
+        attributes: EXR attributes of the layers, such as the names of a Cryptomatte's objects.
     """
 
     layers: tuple[Aov, ...]
@@ -59,25 +59,25 @@ class Aovs:
     attributes: Mapping[str, str]
 
     def changed(self, change: Callable[[Array], Array]) -> "Aovs":
-        """Layers whose pixels are changed, as those of a patch are cut out."""
+        """Return the layers after a function was applied to each array, such as a crop."""
         layers = (replace(layer, pixels=change(layer.pixels)) for layer in self.layers)
         return replace(self, layers=tuple(layers), valid=change(self.valid))
 
     def check_turns(self) -> None:
-        """See that layers can be flipped and turned, which vectors are not by moving their pixels.
+        """Check that moving pixels is enough to flip and rotate the layers.
 
         Raises:
-            RequestError: one holds vectors.
+            RequestError: a layer contains vectors, whose values would have to change too.
         """
         for layer in self.layers:
             if layer.kind in ("normal", "flow"):
                 raise RequestError(
-                    f"--carry {layer.name}: augment flips and turns patches, but not the "
-                    f"directions that a layer of {layer.kind} holds; leave one of them out"
+                    f"--carry {layer.name}: augment flips and rotates patches, but cannot rotate "
+                    f"the vectors in a layer of {layer.kind}; omit augment or this layer"
                 )
 
     def arrays(self) -> dict[str, Array]:
-        """The layers as they were asked for, (height, width, channel); a Cryptomatte's in one."""
+        """Return each layer by its name, (height, width, channel); a Cryptomatte is one array."""
         names = dict.fromkeys(layer.name for layer in self.layers)
         return {
             name: np.concatenate([each.pixels for each in self.layers if each.name == name], -1)
@@ -93,19 +93,20 @@ def carry(
     max_pixels: int,
     orientation: int = 1,
 ) -> Aovs:
-    """The layers of an image that go along with its picture.
+    """Return the layers of an image, warped like its picture.
 
     Args:
-        path: of the image.
+        path: the image file.
         source: the image.
-        chain: what moves its pixels.
-        layers: which.
-        max_pixels: a file that claims more is refused before memory is taken.
-        orientation: EXIF's, by which the picture is turned in the end; normals are not turned.
+        chain: the chain whose stages move pixels.
+        layers: the layers to carry.
+        max_pixels: a file with more pixels is rejected before it is read.
+        orientation: EXIF's value by which the picture is rotated at the end. Normals keep their
+            directions.
 
     Raises:
-        ImageError: a layer or a companion is missing or damaged, is not as large as the image, or
-            does not say what it holds.
+        ImageError: a layer or companion is missing or damaged, differs from the image in size, or
+            its kind is not known.
     """
     whole = source.pixels.shape[1::-1]
     width, height = source.margins.inside(*whole)
@@ -128,16 +129,16 @@ def carry(
 def read_found(
     layer: FoundLayer, path: Path, size: tuple[int, int], max_pixels: int
 ) -> tuple[Array, tuple[int, int]]:
-    """The samples of a layer, (rows, columns, channel), and where the first of them is.
+    """Return the samples of a layer, (row, column, channel), and the x and y of the first one.
 
     Args:
         layer: the layer.
-        path: of the image.
-        size: of the image.
-        max_pixels: a file that claims more is refused before memory is taken.
+        path: the image file.
+        size: width and height of the image in px.
+        max_pixels: a file with more pixels is rejected before it is read.
 
     Raises:
-        ImageError: it is damaged, or of another size than the image.
+        ImageError: the layer is damaged, or differs from the image in size.
     """
     with unchanged(layer.file):
         pixels, place, own = read_layer(layer.file, layer.location, max_pixels)
@@ -150,11 +151,12 @@ def read_found(
 
 
 def joined(of_moments: Mapping[str, Aovs], named: bool) -> Aovs:
-    """The layers of several moments of an exposure as those of one.
+    """Return the layers of several moments of an exposure in one object.
 
     Args:
-        of_moments: by the names of the moments.
-        named: whether names and channels say the moment, but for the middle's.
+        of_moments: the layers, by the name of the moment.
+        named: whether to add the moment to the names of layers and channels, except for the
+            middle's.
     """
     layers: list[Aov] = []
     for moment, own in of_moments.items():
@@ -176,14 +178,14 @@ def joined(of_moments: Mapping[str, Aovs], named: bool) -> Aovs:
 
 
 def geometry_of(chain: Chain, orientation: int) -> Geometry | None:
-    """How the pixels of an image move on their way into a picture that is turned upright."""
+    """Return how pixels move from an image to its upright picture; None if they do not move."""
     parts = chain.geometry.parts if chain.geometry else ()
     turned = (Orientation(*FLIPS[orientation]),) if orientation != 1 else ()
     return Composition((*parts, *turned)) if parts or turned else None
 
 
 def record_of(path: Path, layer: FoundLayer) -> dict[str, Any]:
-    """What the sidecar of the image ``path`` says of a layer that goes along."""
+    """Return the entry of a carried layer in the sidecar of the image ``path``."""
     return {
         "layer": layer.name,
         "kind": layer.kind,
@@ -194,7 +196,7 @@ def record_of(path: Path, layer: FoundLayer) -> dict[str, Any]:
 
 
 def file_record(path: Path, file: Path) -> dict[str, Any]:
-    """What the sidecar of the image ``path`` says of a file that belongs to it."""
+    """Return the entry of a companion file in the sidecar of the image ``path``."""
     size, modified = stamp_of(file)
     sha256 = digests([str(file)]).get(str(file), "")
     name = os.path.relpath(file, path.parent)

@@ -1,4 +1,4 @@
-"""Layers that go along with a picture of a panorama: put into one image, and moved."""
+"""Carried layers of panoramas: put into one atlas, and warped like the picture."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,22 +32,23 @@ def carry_around(
     max_pixels: int,
     orientation: int = 1,
 ) -> Aovs:
-    """The layers of a panorama that go along with its picture.
+    """Return the layers of a panorama, warped like its picture.
 
-    Depth along the axes of views becomes depth along that of the picture, which is 0 and below
-    beside and behind the camera; with it goes the distance, as a channel "Distance". The depth of a
-    map is distance already. Normals are those of the world, and stay.
+    Depth along the axis of each view becomes depth along the picture's axis. It is 0 at right
+    angles to that axis, and negative beyond. The distance is added, as a channel "Distance". The
+    depth of a latitude-longitude map is a distance already. Normals are in world space and do not
+    change.
 
     Args:
-        paths: the files.
+        paths: the files of the panorama.
         source: the image, an atlas.
-        chain: what moves its pixels.
-        layers: which.
-        max_pixels: a file that claims more is refused before memory is taken.
-        orientation: EXIF's, by which the picture is turned in the end.
+        chain: the chain whose stages move pixels.
+        layers: the layers to carry.
+        max_pixels: a file with more pixels is rejected before it is read.
+        orientation: EXIF's value by which the picture is rotated at the end.
 
     Raises:
-        ImageError: as :func:`clpipe.inputs.carry.carry`, or the files' layers differ.
+        ImageError: as for :func:`clpipe.inputs.carry.carry`, or the files have different layers.
     """
     panorama, projection = source.panorama, projection_of(chain)
     assert panorama
@@ -56,7 +57,10 @@ def carry_around(
     names = [[(each.name, each.kind, each.channels) for each in found] for found in of_files]
     for path, own in zip(paths, names, strict=True):
         if own != names[0]:
-            raise ImageError(f"{path}: its layers are not those of {paths[0]}; render all alike")
+            raise ImageError(
+                f"{path}: the layers of this file differ from those of {paths[0]}; render all "
+                "views of a panorama with the same layers"
+            )
     size = file_size(panorama, len(paths))
     read = []
     for same in zip(*of_files, strict=True):
@@ -94,7 +98,7 @@ def carry_around(
 
 
 def file_size(panorama: Panorama, files: int) -> tuple[int, int]:
-    """The width and height of each of so many files of a panorama."""
+    """Return the width and height in px of each file, for a panorama in that many files."""
     if isinstance(panorama, LatitudeLongitude):
         return panorama.width, panorama.height
     assert isinstance(panorama, Views)
@@ -103,7 +107,7 @@ def file_size(panorama: Panorama, files: int) -> tuple[int, int]:
 
 
 def _ahead(geometry: Geometry | None, projection: Projection, size: tuple[int, int]) -> Array:
-    """(height, width): the depth of what is 1 away from the camera, for each pixel."""
+    """Return the depth of a point at distance 1 from the camera: (height, width)."""
     assert isinstance(geometry, Composition)
     columns, rows = geometry.size(*size)
     y, x = np.mgrid[:rows, :columns] + 0.5

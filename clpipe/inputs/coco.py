@@ -1,4 +1,4 @@
-"""Annotations of renders in COCO's format, read and checked.
+"""Reads and checks annotations in COCO's format.
 
 https://cocodataset.org/#format-data
 """
@@ -19,9 +19,9 @@ class Coco:
     """Annotations of renders, see :class:`~clpipe.inputs.annotations.Annotations`.
 
     Args:
-        file: where they are from.
-        values: the whole of it.
-        of_image: the annotations of each image, by its id.
+        file: the JSON file.
+        values: all of its values.
+        of_image: the annotations of each image, by the image's id.
     """
 
     file: Path
@@ -30,7 +30,7 @@ class Coco:
 
     @property
     def renders(self) -> list[AnnotatedRender]:
-        """The records of the images."""
+        """The annotated renders, each with its record in the file."""
         return [
             AnnotatedRender(image["file_name"], (image["width"], image["height"]), image)
             for image in self.values["images"]
@@ -38,15 +38,18 @@ class Coco:
 
 
 def read_coco(path: Path, values: Any) -> Coco:
-    """Annotations in COCO's format, from the values of a file.
+    """Return annotations in COCO's format, from the values of a file.
 
     Raises:
-        RequestError: they are of another form; the message says where.
+        RequestError: the values are not in COCO's format; the message says where.
     """
     lists = [values.get(name) if isinstance(values, dict) else None for name in LISTS]
     for name, found in zip(LISTS, lists, strict=True):
         if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
-            raise RequestError(f"--annotations {path}: has no list '{name}', as COCO's format has")
+            raise RequestError(
+                f"--annotations {path}: the list '{name}' is missing; COCO's format has the lists "
+                f"{', '.join(LISTS)}"
+            )
     images, annotations, _ = lists
     assert images is not None and annotations is not None
     of_image: dict[Any, list[Record]] = {}
@@ -59,9 +62,11 @@ def read_coco(path: Path, values: Any) -> Coco:
             refuse(path, f"images[{number}]", f"width and height {sizes}", allowed)
         _check_id(path, f"images[{number}].id", image.get("id"))
         if not isinstance(image.get("file_name"), str) or image["id"] in of_image:
-            refuse(path, f"images[{number}]", "no file_name, or an id that is there twice", "both")
+            found = "no file_name, or an id that another image has"
+            refuse(path, f"images[{number}]", found, "a file_name and a unique id")
         if image["file_name"] in sizes_of:
-            refuse(path, f"images[{number}]", f"{image['file_name']} a second time", "it once")
+            found = f"the file_name {image['file_name']} of an earlier image"
+            refuse(path, f"images[{number}]", found, "one entry for each file")
         sizes_of[image["file_name"]] = (image["width"], image["height"])
         of_image[image["id"]] = []
         names[image["id"]] = image["file_name"]
@@ -69,24 +74,31 @@ def read_coco(path: Path, values: Any) -> Coco:
         place = f"annotations[{number}]"
         _check_id(path, f"{place}.image_id", each.get("image_id"))
         if each["image_id"] not in of_image:
-            refuse(path, place, f"image_id {each['image_id']!r}", "that of an image")
+            expected = "the id of an image in the list images"
+            refuse(path, place, f"image_id {each['image_id']!r}", expected)
         _check(path, place, each, sizes_of[names[each["image_id"]]])
         of_image[each["image_id"]].append(each)
     return Coco(path, values, of_image)
 
 
 def _check_id(path: Path, place: str, found: Any) -> None:
-    """Check that a value can identify an image.
+    """Check that a value can be the id of an image.
 
     Raises:
-        RequestError: it is neither a number nor a text.
+        RequestError: it is neither a number nor a string.
     """
     if not isinstance(found, int | float | str):
-        refuse(path, place, found, "the id of an image, a number or a text")
+        refuse(path, place, found, "the id of an image, a number or a string")
 
 
 def _check(path: Path, place: str, annotation: Record, size: tuple[int, int]) -> None:
-    """See that the geometry of an annotation is of COCO's form, in an image of that size.
+    """Check that the geometry of an annotation is in COCO's format.
+
+    Args:
+        path: the file, for messages.
+        place: where the annotation is in the file.
+        annotation: its record.
+        size: width and height of its image in px.
 
     Raises:
         RequestError: it is not.
@@ -96,7 +108,7 @@ def _check(path: Path, place: str, annotation: Record, size: tuple[int, int]) ->
     if box is not None and not (_numbers(box) and len(box) == 4):
         refuse(path, f"{place}.bbox", box, "x, y, width and height")
     if not _numbers(points) or len(points) % 3:
-        refuse(path, f"{place}.keypoints", points, "x, y and visibility of each")
+        refuse(path, f"{place}.keypoints", points, "x, y and visibility of each keypoint")
     if isinstance(outline, dict):
         if not {"size", "counts"} <= outline.keys():
             refuse(path, f"{place}.segmentation", list(outline), "size and counts")
@@ -104,20 +116,21 @@ def _check(path: Path, place: str, annotation: Record, size: tuple[int, int]) ->
     elif not isinstance(outline, list) or not all(
         _numbers(part) and len(part) >= 6 and len(part) % 2 == 0 for part in outline
     ):
-        refuse(path, f"{place}.segmentation", outline, "outlines of three places and more")
+        refuse(path, f"{place}.segmentation", outline, "polygons of three points or more")
     if box is None and not outline:
         refuse(path, place, "neither bbox nor segmentation", "one of them")
 
 
 def _check_mask(path: Path, place: str, mask: Record, size: tuple[int, int]) -> None:
-    """See that a run-length encoded mask is one of an image of that size.
+    """Check that a run-length encoded mask has the size of its image.
 
     Raises:
-        RequestError: it is not.
+        RequestError: it has not, or is damaged.
     """
     width, height = size
     if mask["size"] != [height, width]:
-        refuse(path, f"{place}.size", mask["size"], f"{[height, width]}, height and width")
+        expected = f"{[height, width]}, the height and width of its image"
+        refuse(path, f"{place}.size", mask["size"], expected)
     try:
         runs = runs_of(mask["counts"])
     except ValueError as error:
@@ -127,30 +140,30 @@ def _check_mask(path: Path, place: str, mask: Record, size: tuple[int, int]) -> 
 
 
 def runs_of(counts: Any) -> list[int]:
-    """The lengths of the runs of a mask, from both of COCO's forms.
+    """Return the run lengths of a mask, in px, from either of COCO's forms.
 
-    In the compressed one each number has five bits a character from "0" on, least first, and a
-    sixth that says whether there are more; from the fourth on it is the difference to the last but
-    one (cocoapi, maskApi.c).
+    In the compressed form a character holds six bits, counted from "0". Five are bits of a number,
+    lowest first. The sixth tells whether the number continues. From the fourth number on, the
+    difference to the number two places before is stored (cocoapi, maskApi.c).
 
     Raises:
-        ValueError: it is none.
+        ValueError: the counts are of neither form.
 
     >>> runs_of([3, 2, 4]), runs_of("08Q1"), runs_of("0805")
     ([3, 2, 4], [0, 8, 33], [0, 8, 0, 13])
     """
     if isinstance(counts, list):
         if not all(type(n) is int and 0 <= n <= MOST_PIXELS for n in counts):
-            raise ValueError(f"whole numbers from 0 to {MOST_PIXELS}")
+            raise ValueError(f"each must be a whole number from 0 to {MOST_PIXELS}")
         return counts
     if not isinstance(counts, str):
-        raise ValueError("a list or a text")
+        raise ValueError("they must be a list or a string")
     runs: list[int] = []
     value = shift = 0
     for letter in counts:
         bits = ord(letter) - ord("0")
         if not 0 <= bits < 64 or shift > 30:
-            raise ValueError(f"found {letter!r}")
+            raise ValueError(f"they contain the character {letter!r}")
         value |= (bits & 31) << shift
         shift += 5
         if bits & 32:
@@ -158,10 +171,10 @@ def runs_of(counts: Any) -> list[int]:
         value -= (1 << shift) if bits & 16 else 0
         runs.append(value + (runs[-2] if len(runs) > 2 else 0))
         if runs[-1] < 0:
-            raise ValueError(f"found {runs[-1]}")
+            raise ValueError(f"they contain {runs[-1]}")
         value = shift = 0
     if shift:
-        raise ValueError("it is cut off")
+        raise ValueError("they are incomplete")
     return runs
 
 

@@ -1,4 +1,4 @@
-"""Layers of an image: found in its file, or in files that belong to it by their names."""
+"""Finds the layers of an image: in its file, or in companion files, which are named after it."""
 
 import os
 from bisect import bisect_left
@@ -15,16 +15,16 @@ from clpipe.images.kinds import CHANNELS, kind_named, vectors_of
 from clpipe.images.passes import LayerLocation, find_layers, kind_of
 from clpipe.reference.carried import RESAMPLING, LayerKind, Vector
 
-CARRIED = "carried"  # what stands behind an image's name in that of its carried layers
+CARRIED = "carried"  # in file names: the carried layers of NAME are in NAME.carried.exr
 
-SUFFIXES = (".exr", ".pfm", ".tif", ".tiff", ".png")  # of companions, the preferred one first
+SUFFIXES = (".exr", ".pfm", ".tif", ".tiff", ".png")  # of companions, in order of preference
 
-SEPARATORS = "_.-"  # between an image's name and what its companion holds
+SEPARATORS = "_.-"  # between an image's name and that of a layer, in the name of a companion
 
 
 @dataclass(frozen=True)
 class FoundLayer:
-    """Where a layer that was asked for is, and what it holds."""
+    """A requested layer: its name, kind, file, place in that file, and full channel names."""
 
     name: str
     kind: LayerKind
@@ -34,16 +34,16 @@ class FoundLayer:
 
     @property
     def vectors(self) -> tuple[Vector, ...]:
-        """The vectors in it; none where it is no flow."""
+        """The vectors that its channels hold; empty unless its kind is flow."""
         own = vectors_of(self.location.name or self.name, self.location.channels)
         return own if self.kind == "flow" else ()
 
 
 def find_all(path: Path, layers: Sequence[AovSpec]) -> list[FoundLayer]:
-    """All layers of an image that are asked for; see :meth:`Finder.find`.
+    """Return all requested layers of an image; see :meth:`Finder.find`.
 
     Raises:
-        ImageError: one is missing, or a channel is carried twice.
+        ImageError: a layer is missing, or a channel is carried twice.
     """
     found: list[FoundLayer] = []
     for layer in layers:
@@ -53,7 +53,7 @@ def find_all(path: Path, layers: Sequence[AovSpec]) -> list[FoundLayer]:
 
 
 def _check_names(path: Path, found: Sequence[FoundLayer]) -> None:
-    """See that no channel is carried twice.
+    """Check that no channel is carried twice.
 
     Raises:
         ImageError: one is.
@@ -64,29 +64,30 @@ def _check_names(path: Path, found: Sequence[FoundLayer]) -> None:
             other = owners.setdefault(channel, each)
             if other is not each:
                 raise ImageError(
-                    f"{path}: --carry {other.name} and {each.name} both name the channel "
-                    f"{channel}. Name it once"
+                    f"{path}: --carry {other.name} and {each.name} both contain the channel "
+                    f"{channel}; omit one of them"
                 )
 
 
 @dataclass(frozen=True)
 class Finder:
-    """Finds layers of an image, in its file and then in its companions.
+    """Finds layers of an image, first in its file and then in its companions.
 
     Args:
-        path: of the image.
-        patterns: of the names of companions; none are those that :func:`companions_of` finds.
+        path: the image file.
+        patterns: patterns of companion names; without any, :func:`companions_of` finds companions.
+        layers: the layers of each file that has been read so far.
     """
 
     path: Path
     patterns: Sequence[str] = ()
-    layers: dict[Path, list[LayerLocation]] = field(default_factory=dict)  # of the files so far
+    layers: dict[Path, list[LayerLocation]] = field(default_factory=dict)
 
     def find(self, asked: AovSpec) -> list[FoundLayer]:
-        """A layer that is asked for; of a Cryptomatte each rank.
+        """Return where a requested layer is: one place, or one for each rank of a Cryptomatte.
 
         Raises:
-            ImageError: it is not there, its name means several, or what it holds is unknown.
+            ImageError: there is no such layer, its name is ambiguous, or its kind is not known.
         """
         for file in self._files(asked.name):
             locations = self._of(file)
@@ -95,8 +96,8 @@ class Finder:
                 if len(locations) != 1:
                     listed = ", ".join(each.name or "one without a name" for each in locations)
                     raise ImageError(
-                        f"{file}: has no layer called {asked.name}, but several others ({listed}). "
-                        "Name one of them in --carry"
+                        f"{file}: this file has no layer called {asked.name}, but several others "
+                        f"({listed}). Name one of them in --carry"
                     )
                 named = locations
             if named:
@@ -110,13 +111,13 @@ class Finder:
         where = f"the file and {', '.join(files)} have" if files else "the file has"
         expected = f"{self.path.stem}_{one_line(asked.name)}.exr"
         raise ImageError(
-            f"{self.path}: --carry: no layer '{one_line(asked.name)}'{hint}; {where} "
+            f"{self.path}: --carry: there is no layer '{one_line(asked.name)}'{hint}; {where} "
             f"{', '.join(map(one_line, names)) or 'no layers besides the picture'}, and there is "
             f"no {expected} next to it; render the layer into one of them"
         )
 
     def _check_alone(self, name: str, file: Path) -> None:
-        """See that no other companion of the same format holds a layer, which may differ.
+        """Check that no other companion of the same format has this layer, which might differ.
 
         Raises:
             ImageError: there is one.
@@ -133,12 +134,12 @@ class Finder:
             if is_second:
                 pattern = f"{{name}}{file.name.removeprefix(self.path.stem)}"
                 raise ImageError(
-                    f"{self.path}: --carry {name}: {file.name} and {other.name} both have it. "
-                    f"Name the right one, such as --carry {name}={pattern}"
+                    f"{self.path}: --carry {name}: {file.name} and {other.name} both have this "
+                    f"layer. Choose one, for example with --carry {name}={pattern}"
                 )
 
     def _files(self, name: str) -> Iterator[Path]:
-        """Where a layer may be, in the order in which it is looked for."""
+        """Yield the files that may contain a layer, in the order in which they are searched."""
         if self.path.suffix.lower() in SUFFIXES:
             yield self.path
         companions = companions_of(self.path, self.patterns)
@@ -147,13 +148,13 @@ class Finder:
         yield from (f for f in companions if f not in called and self._holds_no_colour(f))
 
     def _is_called(self, file: Path, name: str) -> bool:
-        """Whether a companion's name, or its pattern, says that it holds a layer."""
+        """Return whether a companion holds a layer according to its name or pattern."""
         if file == self.path:
             return False
         return bool(self.patterns) or _tail(self.path, file.name).lower() == name.lower()
 
     def _holds_no_colour(self, file: Path) -> bool:
-        """Whether a file can be read, and is no picture of its own."""
+        """Return whether a file can be read and has no picture of its own."""
         try:
             return not any(each.is_colour and not each.name for each in self._of(file))
         except ImageError:
@@ -168,14 +169,15 @@ class Finder:
         kind = asked.kind or kind_of(asked.name, location)
         if kind is None:
             raise ImageError(
-                f"{file}: the name of its layer {asked.name} does not tell what it holds. Add its "
-                f"kind: --carry {asked.name}:KIND, where KIND is {', '.join(RESAMPLING)}"
+                f"{file}: the kind of its layer {asked.name} is not known from the name. Add it: "
+                f"--carry {asked.name}:KIND, where KIND is one of {', '.join(RESAMPLING)}"
             )
         least = CHANNELS.get(kind, 1)
         if len(location.channels) < least:
             raise ImageError(
-                f"{file}: its layer {asked.name} has {len(location.channels)} channel, but {kind} "
-                f"has {least} or more"
+                f"{file}: its layer {asked.name} has {len(location.channels)} "
+                f"channel{'s' * (len(location.channels) > 1)}, but a layer of {kind} needs {least} "
+                f"or more; choose another kind with --carry {asked.name}:KIND"
             )
         is_named = location.name and not (location.is_alone and file != self.path)
         layer = location.name if is_named else asked.name
@@ -185,32 +187,38 @@ class Finder:
 
 
 def _named(file: Path, name: str, locations: Sequence[LayerLocation]) -> list[LayerLocation]:
-    """The layers that a name means: one, or the ranks of one Cryptomatte.
+    """Return the layers with a name: one, or the ranks of one Cryptomatte.
 
     Raises:
-        ImageError: it means several.
+        ImageError: several layers have that name.
     """
     found = [each for each in locations if each.answers_to(name)]
     exact = [each for each in found if each.name.lower() == name.lower()]
     names = sorted({each.without_rank for each in found})
     if len(names) > 1 and len(exact) != 1:
-        raise ImageError(f"{file}: --carry {name}: it may be {', '.join(names)}; name one in full")
+        raise ImageError(
+            f"{file}: --carry {name} is ambiguous: it may be {', '.join(names)}; give the full "
+            "name of one"
+        )
     return exact or found
 
 
 def companions_of(path: Path, patterns: Sequence[str] = ()) -> list[Path]:
-    """The files beside an image that belong to it.
+    """Return the companions of an image: files next to it that contain its layers.
 
-    Without patterns these are called as the image, with a ``_``, ``.`` or ``-`` and something more
-    before the ending: ``view00_depth.exr`` beside ``view00.exr``.
+    Without patterns, a companion has the image's name, then ``_``, ``.`` or ``-``, and more before
+    the extension: ``view00_depth.exr`` is a companion of ``view00.exr``.
 
     Raises:
-        ImageError: a pattern names a file that is missing.
+        ImageError: a file that a pattern names is missing.
     """
     named = [path.parent / pattern.replace("{name}", path.stem) for pattern in patterns]
     for file, pattern in zip(named, patterns, strict=True):
         if not file.is_file():
-            raise ImageError(f"{path}: it has no companion {file} (--carry ...={pattern})")
+            raise ImageError(
+                f"{path}: its companion {file} does not exist; correct the pattern in "
+                f"--carry ...={pattern}, or render the file"
+            )
     if patterns:
         return named
     names = _names_in(str(path.parent), stamp_of(path.parent)[1])
@@ -225,7 +233,7 @@ def companions_of(path: Path, patterns: Sequence[str] = ()) -> list[Path]:
 
 @lru_cache(maxsize=8)
 def _names_in(folder: str, _modified: int) -> list[str]:
-    """The names in a folder, sorted; none where it cannot be read."""
+    """Return the names in a folder, sorted; an empty list if it cannot be read."""
     try:
         return sorted(os.listdir(folder or "."))
     except OSError:
@@ -233,7 +241,7 @@ def _names_in(folder: str, _modified: int) -> list[str]:
 
 
 def _tail(path: Path, name: str) -> str:
-    """What a companion's name says that it holds; "" for the name of another image.
+    """Return the layer's name in the name of a companion; "" if the file is not a companion.
 
     >>> _tail(Path("in/a.exr"), "a_depth.exr"), _tail(Path("in/a.exr"), "ab.exr")
     ('depth', '')
@@ -243,7 +251,7 @@ def _tail(path: Path, name: str) -> str:
 
 
 def owner_of(path: Path) -> str | None:
-    """The path, without an ending, of the image whose companion a file is by its name.
+    """Return the path, without extension, of the image that a file is a companion of, or None.
 
     >>> owner_of(Path("in/view00_depth.exr")), owner_of(Path("in/view_00.exr"))
     ('in/view00', None)

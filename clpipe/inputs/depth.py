@@ -1,4 +1,4 @@
-"""The depth that a step needs: found in an image's file or beside it."""
+"""Reads the depth that a step needs, from an image's file or a companion."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +15,7 @@ from clpipe.inputs.companions import Finder, FoundLayer
 from clpipe.reference.defocus import Depth, checked_depth
 from clpipe.reference.geometry import Margins
 
-USUAL = ("Depth", "Z", "ZDepth", "Distance")  # layers, in the order in which they are looked for
+USUAL = ("Depth", "Z", "ZDepth", "Distance")  # names of layers, in order of preference
 
 
 def read_depth(
@@ -27,18 +27,18 @@ def read_depth(
     carried: Sequence[AovSpec],
     max_pixels: int,
 ) -> Depth:
-    """The depth of an image.
+    """Return the depth of an image, as float32 in metres, (height, width).
 
     Args:
-        path: of the image.
-        chain: with a step that needs depth.
-        width, height: of the image, with its margins.
-        margins: how far it goes on beyond the picture.
-        carried: layers that go along with it, whose patterns say where it may be.
-        max_pixels: a file that claims more is refused before memory is taken.
+        path: the image file.
+        chain: a chain with a step that needs depth.
+        width, height: size of the image with its overscan, in px.
+        margins: the overscan on each side.
+        carried: the carried layers. Their patterns name companions that are searched as well.
+        max_pixels: a file with more pixels is rejected before it is read.
 
     Raises:
-        ImageError: it is missing, damaged, of another size, NaN or negative.
+        ImageError: the depth is missing, damaged, of another size, NaN or negative.
     """
     step, method = next(iter(depth_steps(chain).items()))
     layer = _find(path, step, method.layer, [each.pattern for each in carried if each.pattern])
@@ -54,15 +54,15 @@ def read_depth(
 
 
 def _find(path: Path, step: str, name: str, patterns: Sequence[str]) -> FoundLayer:
-    """The layer of that name; of "" the first of the usual ones that is there."""
+    """Return the layer called ``name``; for "", the first of the usual names that exists."""
     errors = []
     for asked in (name,) if name else USUAL:
         try:
             return Finder(path, patterns).find(AovSpec(asked, "depth"))[0]
         except ImageError as error:
             errors.append(str(error))
-    usual = "" if name else f" (nor {', '.join(USUAL[1:])})"
+    usual = "" if name else f" ({', '.join(USUAL[1:])} were looked for as well)"
     raise ImageError(
-        f"{errors[0].replace('--carry', f'{step} needs depth')}{usual}; name it with "
-        f"{step}.layer, or turn {step} off with {step}.method=none"
+        f"{errors[0].replace('--carry', f'{step} needs depth')}{usual}; to use another layer, set "
+        f"{step}.layer; to turn {step} off, set {step}.method=none"
     )

@@ -25,11 +25,11 @@ T = TypeVar("T")
 
 log = logging.getLogger(__name__)
 
-# What files are that are no images, by their endings, and what to do with them.
+# By extension: why a file is not an image, and which option or command takes it.
 NO_IMAGES = {
-    ".json": "it is JSON, no image; to make the picture of a sidecar again, use 'clpipe replay'",
-    ".toml": "it is a configuration or a camera, no image; name it with -c or --camera",
-    ".blend": "it is a scene of Blender, no image; to render and develop it, use 'clpipe dataset'",
+    ".json": "this is JSON, not an image; to recompute a sidecar's picture, use 'clpipe replay'",
+    ".toml": "this is a configuration or a camera, not an image; pass it with -c or --camera",
+    ".blend": "this is a Blender scene, not an image; to render it, use 'clpipe dataset'",
 }
 
 FINISHED = (
@@ -44,18 +44,18 @@ class Job:
 
     Args:
         path: the file.
-        key: its name among the inputs, from which draws and the names of outputs follow.
-        name: the path of its outputs in the output folder, without an ending; "" follows the key.
-        listed: whether it was named, matched or in a manifest, and not found in a folder.
-        values: settings that hold for it alone, nested as in a configuration.
-        frames: how many frames are made of it; None is what the request says.
-        place: the manifest and the row that it stands in; "" where it is in none.
-        renditions: those to make; None is all.
-        written: the path as the user wrote it, where ``path`` has been made absolute.
+        key: its name among the inputs. Random draws and the names of outputs depend on it.
+        name: the path of its outputs in the output directory, without extension; "" uses the key.
+        listed: whether the user named it, by path, glob or manifest, rather than by its folder.
+        values: settings of this image only, nested like a configuration.
+        frames: the number of frames; None uses that of the request.
+        place: its manifest and row; "" if it is not in a manifest.
+        renditions: the renditions to make; None is all.
+        written: the path as the user wrote it, if ``path`` has been made absolute.
         subframes: further files of the same exposure.
-        size: the width and height in px that it must have; None is any.
-        around: whether its files are views of one place, and no sub-frames.
-        problem: why it cannot be made, as far as that is known before it is read.
+        size: the width and height in px that the image must have; None allows any.
+        problem: why it cannot be made, if that is known before it is read.
+        around: whether its files are views of a panorama and not sub-frames.
     """
 
     path: Path
@@ -73,10 +73,10 @@ class Job:
     around: bool = False
 
     def check(self) -> None:
-        """See that nothing is known that keeps it from being made.
+        """Check that no problem of this job is known.
 
         Raises:
-            ImageError: there is.
+            ImageError: one is.
         """
         if self.problem:
             raise ImageError(f"{self.label}: {self.problem}")
@@ -87,31 +87,31 @@ class Job:
         return (self.path, *self.subframes)
 
     def at(self, moment: str) -> Path:
-        """The file of its exposure at a moment of it: "start", "middle" or "end".
+        """Return the file at a moment of its exposure: "start", "middle" or "end".
 
-        Of an even number of files the middle one is the last before the middle.
+        The middle of an even number of files is the last file of the first half.
         """
         places = {"start": 0, "middle": (len(self.paths) - 1) // 2, "end": -1}
         return self.paths[places[moment]]
 
     @property
     def shown(self) -> str:
-        """The file as messages and logs name it: by its URL where it has one."""
+        """The file's name in messages and logs: its URL if it has one, otherwise its path."""
         return url_of(self.path) or str(self.path)
 
     @property
     def input(self) -> str:
-        """The path as it is stored and printed."""
+        """The path that is stored and printed: as the user wrote it, if that is known."""
         return self.written or self.shown
 
     @cached_property
     def stem(self) -> str:
-        """The path of its outputs in the output folder, without an ending."""
+        """The path of its outputs in the output directory, without extension."""
         return self.name or str(Path(self.key).with_suffix(""))
 
     @property
     def label(self) -> str:
-        """The job as an error names it."""
+        """The job's name in errors: its file, with its manifest and row."""
         return f"{self.shown} ({self.place})" if self.place else self.shown
 
 
@@ -121,24 +121,23 @@ def find_jobs(
     endings: Sequence[str] = (*RENDER_SUFFIXES, *RAW_SUFFIXES),
     exclude: Sequence[str] = (),
 ) -> list[Job]:
-    """The jobs of a run, in the order of its inputs.
+    """Return the jobs of a run, in the order of its inputs.
 
-    The key of a file in a folder is its path relative to that folder; that of a file which is
-    named or matches a glob is its name; a manifest's rows have their own. A row whose file is
-    missing is a job, which fails later without the others.
+    The key of a file in a folder is its path relative to that folder. The key of a file that is
+    named, or matches a glob, is its name. Rows of a manifest have their own keys. A row whose file
+    is missing becomes a job that fails later, without affecting others. Companions are not jobs,
+    see :func:`without_companions`.
 
     Args:
         inputs: files, folders (all images in them, at any depth), globs and manifests.
-        output: the output folder; where it lies inside an input folder, its files are no inputs.
-        endings: of the files that are taken from folders.
-        exclude: patterns of what is not taken from folders and globs, see :class:`Exclusion`.
-
-    A file that goes with another one, see :func:`without_companions`, is no job.
+        output: the output directory. If it is inside an input folder, its files are skipped.
+        endings: extensions of the files that are taken from folders.
+        exclude: patterns of files to skip in folders and globs, see :class:`Exclusion`.
 
     Raises:
-        RequestError: no input, an empty name, a folder without images, or one that cannot be read,
-            a glob that no file matches, or a manifest that is wrong.
-        MissingError: a file that is named does not exist.
+        RequestError: there is no input, an input is empty, a folder has no images or cannot be
+            read, no file matches a glob, or a manifest is wrong.
+        MissingError: a named file does not exist.
     """
     jobs: list[Job] = []
     if not inputs:
@@ -161,7 +160,7 @@ def find_jobs(
         elif glob.has_magic(text) and not os.path.exists(text):
             matches = sorted(m for m in glob.glob(text, recursive=True) if os.path.isfile(m))
             if not matches:
-                raise RequestError(f"{text}: no file matches")
+                raise RequestError(f"{text}: no file matches this pattern; correct it")
             jobs += [Job(Path(m), Path(m).name) for m in matches if m not in excluded]
         else:
             check_input(path)
@@ -169,34 +168,35 @@ def find_jobs(
                 raise RequestError(f"{path}: {no_image}")
             jobs.append(Job(path, path.name))
     for pattern in excluded.unused:
-        log.warning("--exclude %s: matches nothing", pattern)
+        log.warning("--exclude %s matches no file", pattern)
     jobs = without_companions(jobs)
     if not jobs:
-        raise RequestError("every file is excluded")
+        raise RequestError("every file is excluded by --exclude; use a narrower pattern")
     return jobs
 
 
 def without_companions(jobs: Sequence[Job]) -> list[Job]:
-    """The jobs but for those of files that belong to another job's image by their names.
+    """Return the jobs without companions of other jobs' images, according to their names.
 
-    So ``view00_depth.exr`` is no image beside ``view00.exr``. What a manifest lists is an image.
+    For example, ``view00_depth.exr`` is skipped if ``view00.exr`` is a job. Files that a manifest
+    lists always stay.
     """
     stems = {str(job.path.with_suffix("")) for job in jobs}
     found = [job for job in jobs if not job.place and owner_of(job.path) in stems]
     if found:
-        goes = "1 file goes" if len(found) == 1 else f"{len(found)} files go"
+        are = "1 file is a companion" if len(found) == 1 else f"{len(found)} files are companions"
         first = printable(str(found[0].path))
-        log.info("%s with an image beside, such as %s; see --carry", goes, first)
+        log.info("%s of another image, such as %s; to warp layers, use --carry", are, first)
     others = {id(job) for job in found}
     return [job for job in jobs if id(job) not in others]
 
 
 class Exclusion:
-    """Patterns (* ? []) of paths relative to an input folder, or of names of files or folders."""
+    """Patterns (* ? []) of what to skip: paths in an input folder, or names of files or folders."""
 
     def __init__(self, patterns: Sequence[str] = ()) -> None:
         self._patterns = patterns
-        self.unused = dict.fromkeys(patterns)  # those that have matched nothing yet
+        self.unused = dict.fromkeys(patterns)  # patterns that have matched nothing so far
 
     def __bool__(self) -> bool:
         return bool(self._patterns)
@@ -210,10 +210,10 @@ class Exclusion:
 
 
 def _jobs_behind(url: str, endings: Sequence[str], excluded: Exclusion) -> list[Job]:
-    """The jobs of a URL: of a file, of all images below it, or of those that a glob matches.
+    """Return the jobs of a URL: one file, all images below it, or all files that match a glob.
 
     Raises:
-        RequestError: it cannot be listed, or there are none.
+        RequestError: the URL cannot be listed, or has no images.
     """
     is_pattern = is_glob(url)
     if not is_pattern and Path(url).suffix.lower() in endings:  # one that is missing fails alone
@@ -230,24 +230,27 @@ def _jobs_behind(url: str, endings: Sequence[str], excluded: Exclusion) -> list[
         try:
             path = path_of(each)
         except RequestError as error:
-            log.warning("%s; it is left out", error)
+            log.warning("%s; this file is skipped", error)
             continue
         jobs.append(Job(path, key, listed=not is_below))
     if not jobs:
-        raise RequestError(f"{url}: no image is there (looked for {', '.join(endings[:6])} ...)")
+        raise RequestError(
+            f"{url}: there are no images at this URL; clpipe looked for {', '.join(endings[:6])} "
+            "and more"
+        )
     return jobs
 
 
 def images_in(
     folder: Path, output: Path, endings: Sequence[str], excluded: Exclusion
 ) -> list[Path]:
-    """The images in a folder at any depth, sorted; how many other files there are is logged.
+    """Return the images in a folder, at any depth, sorted. The number of other files is logged.
 
-    Hidden files and the output folder are left out. A link that leads nowhere is an image, too: it
+    Hidden files and the output directory are skipped. A dangling link counts as an image, which
     fails later.
 
     Raises:
-        RequestError: a folder cannot be read, or there is no image.
+        RequestError: a folder cannot be read, or there are no images.
     """
     images: list[Path] = []
     others: Counter[str] = Counter()
@@ -276,16 +279,18 @@ def images_in(
             text += f". {FINISHED}"
         raise RequestError(text)
     if others:
-        are, were = ("file is", "was") if others.total() == 1 else ("files are", "were")
-        log.info("%s: %d %s no image and %s ignored: %s", folder, others.total(), are, were, listed)
+        is_one = others.total() == 1
+        not_images = "file is not an image" if is_one else "files are not images"
+        were = "was" if is_one else "were"
+        log.info("%s: %d %s and %s skipped: %s", folder, others.total(), not_images, were, listed)
     return sorted(images)
 
 
 def _walk(folder: Path, output: Path, excluded: Exclusion) -> Iterator[tuple[str, list[str]]]:
-    """Each folder below one, with the names of its files. Links are followed after all folders.
+    """Yield each folder below one, with the names of its files. Links are followed last.
 
-    So a file that can be reached by a link, too, has the path without it, whatever the order of
-    the folder is on disk.
+    A file that is also reachable through a link therefore gets its path without the link, whatever
+    the order on disk.
 
     Raises:
         RequestError: a folder cannot be read.
@@ -314,13 +319,13 @@ def _refuse(error: OSError) -> None:
 
 @dataclass(frozen=True)
 class Shard:
-    """One part of a run: every ``of``-th job or tar, from the ``number``-th on, counted from 1."""
+    """A part of a run: every ``of``-th job or tar, starting with the ``number``-th, from 1."""
 
     number: int = 1
     of: int = 1
 
     def take(self, jobs: Sequence[T]) -> list[T]:
-        """The items of this part.
+        """Return the items of this part.
 
         >>> [job.key for job in Shard(2, 3).take([Job(Path(k), k) for k in "abcde"])]
         ['b', 'e']
@@ -329,7 +334,7 @@ class Shard:
 
 
 def parse_shard(text: str) -> Shard:
-    """A shard from I/N.
+    """Return a shard from a text of the form I/N.
 
     >>> parse_shard("2/3")
     Shard(number=2, of=3)
@@ -339,5 +344,5 @@ def parse_shard(text: str) -> Shard:
     """
     number, of = map(whole_number, text.partition("/")[::2])
     if not 1 <= number <= of <= 1_000_000:
-        raise RequestError(f"--shard: found {text!r}; expected I/N, such as 1/8, I from 1 to N")
+        raise RequestError(f"--shard: found {text!r}; expected I/N with I from 1 to N, such as 1/8")
     return Shard(number, of)

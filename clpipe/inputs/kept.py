@@ -1,6 +1,6 @@
-"""Kept images: the attributes that they carry, and how one enters the chain again.
+"""Kept images, which are intermediate images of a chain: their attributes, and how they re-enter.
 
-A mosaic from elsewhere enters in the same way, without attributes.
+A mosaic from another program enters in the same way, without attributes.
 """
 
 import json
@@ -21,18 +21,18 @@ from clpipe.images.attributes import read_attributes
 from clpipe.images.read import SourceImage
 from clpipe.inputs.plausibility import input_warnings
 
-# The attribute of an image without sensor noise: "none", or "clean" where it is of --truth clean.
+# The attribute of an image without sensor noise: "clean" for --truth clean, otherwise "none".
 NOISE = "sensor_noise"
 
 
 def attributes_of(step: Step, chain: Chain, key: str, frame: int | None = None) -> dict[str, str]:
-    """The attributes of the kept image of a step, with which a chain can go on from it.
+    """Return the attributes of a step's kept image, which allow a chain to resume from it.
 
     Args:
         step: the step.
         chain: its chain.
         key: the image key.
-        frame: the number of the frame in a burst; None is no burst.
+        frame: the number of the frame in a burst; None if there is no burst.
     """
     is_noisy = step.method.next_context(step.context).noise is not None
     settings = chain.settings
@@ -48,14 +48,14 @@ def attributes_of(step: Step, chain: Chain, key: str, frame: int | None = None) 
 
 
 def embedded_settings(attributes: Mapping[str, str], folder: Path | None = None) -> Settings | None:
-    """The settings that a kept image was made with; None where it has no such attribute.
+    """Return the settings that a kept image was made with; None if it has no such attribute.
 
     Args:
-        attributes: of the image.
-        folder: where names of files in them start; None is the working directory.
+        attributes: the image's attributes.
+        folder: the folder that file names in them are relative to; None is the working directory.
 
     Raises:
-        RequestError: they are damaged, or hold a name or value that is not allowed.
+        RequestError: the settings are damaged, or contain a name or value that is not allowed.
     """
     if "settings" not in attributes:
         return None
@@ -64,17 +64,18 @@ def embedded_settings(attributes: Mapping[str, str], folder: Path | None = None)
     except ValueError as error:
         raise RequestError(str(error)) from None
     if not isinstance(values, dict):
-        raise RequestError(f"found {values!r}")
+        raise RequestError(f"they are {values!r}, but must be an object")
     return settings_from(values, folder)
 
 
 @dataclass(frozen=True)
 class KeptLoader:
-    """The entry of kept images into the chain of a request that has ``start_at``.
+    """Makes the chains for kept images, for a request that has ``start_at``.
 
     Args:
         request: the request.
-        folder: where names of files start that an image carries; None is the working directory.
+        folder: the folder that file names in attributes are relative to; None is the working
+            directory.
     """
 
     request: Request
@@ -82,15 +83,15 @@ class KeptLoader:
 
     @property
     def start_at(self) -> str:
-        """The step that it enters at."""
+        """The step at which images enter."""
         assert self.request.start_at is not None
         return self.request.start_at
 
     def first_chain(self, path: Path) -> Chain:
-        """The chain of the first image, read early so that a wrong request is refused early.
+        """Return the chain of the first image, to reject a wrong request before the run starts.
 
         Raises:
-            RequestError: it cannot be made.
+            RequestError: the chain cannot be made.
         """
         try:
             return self._chain(self.request, embedded_settings(read_attributes(path), self.folder))
@@ -100,20 +101,19 @@ class KeptLoader:
     def enter(
         self, path: Path, source: SourceImage, key: str, is_listed: bool
     ) -> tuple[Chain, SourceImage, str] | None:
-        """The chain for an image, the image with its warnings, and its image key.
+        """Return the chain for an image, the image with its warnings, and its image key.
 
-        None where the image was found in a folder, and was kept after another step than the one
-        before ``start_at``.
+        Return None for an image from a folder that was not kept right before ``start_at``.
 
         Args:
-            path: of the image, for messages.
+            path: the image file, for messages.
             source: the image.
-            key: the image key, where the image does not carry one.
-            is_listed: whether the image was named, and not found in a folder.
+            key: the image key if its attributes have none.
+            is_listed: whether the user named the image, rather than its folder.
 
         Raises:
-            ImageError: the settings that it carries cannot be used.
-            KindError: it is of another kind than the step reads.
+            ImageError: the settings in its attributes cannot be used.
+            KindError: the step at ``start_at`` does not read this kind of image.
         """
         key = source.attributes.get("image_key", key)
         request = self.request.for_image(name_in(key), self.request.image)  # draws the same
@@ -123,8 +123,8 @@ class KeptLoader:
             if not is_listed:
                 return None
             warnings.append(
-                f"was kept after {source.attributes.get('stage')}; "
-                f"entering at {self.start_at} repeats stages or leaves some out"
+                f"this image was kept after {source.attributes.get('stage')}; "
+                f"entering at {self.start_at} repeats or skips stages"
             )
         if source.attributes.get("kind", chain.source.label) != chain.source.label:
             raise KindError(path, source.attributes)
@@ -135,7 +135,9 @@ class KeptLoader:
         try:
             chain = self._chain(request, embedded_settings(attributes, self.folder))
         except RequestError as error:
-            raise ImageError(f"{path}: what it was made with cannot be used: {error}") from None
+            raise ImageError(
+                f"{path}: the settings in its attributes cannot be used: {error}"
+            ) from None
         noise = attributes.get(NOISE)
         if noise == CLEAN and not any(step.adds_noise for step in chain.steps):
             return chain.cleaned()
@@ -143,17 +145,17 @@ class KeptLoader:
 
     @staticmethod
     def _chain(request: Request, embedded: Settings | None) -> Chain:
-        """The chain of a request; a configuration that is named replaces what an image carries."""
+        """Return the chain of a request. Its configuration, if any, replaces embedded settings."""
         return request.chain(embedded if request.config is None else None)
 
     def _is_next(self, chain: Chain, attributes: Mapping[str, str]) -> bool:
-        """Whether an image was kept right before ``start_at``, as far as it says."""
+        """Return whether an image was kept right before ``start_at``, or has no known step."""
         before = chain.names.index(self.start_at) - 1
         return attributes.get("stage") in (None, chain.names[before] if before >= 0 else None)
 
 
 def _without_input_noise(chain: Chain) -> Chain:
-    """The chain for an image without sensor noise: only its own steps add any."""
+    """Return the chain for an image without sensor noise: only the chain's steps add noise."""
     steps: list[Step] = []
     noise = None
     for step in chain.steps:
@@ -163,13 +165,13 @@ def _without_input_noise(chain: Chain) -> Chain:
 
 
 def kind_message(error: KindError, chain: Chain, start_at: str | None) -> str:
-    """The message for a kept image of the wrong kind: what is read, and where it could enter."""
+    """Return the message for a kept image of the wrong kind: what is needed, and what fits."""
     reads = f", but {start_at} reads {chain.source.label}" if start_at else ""
     return f"{error}{reads}; {_entries_of(error.attributes['kind'], chain)}"
 
 
 def _entries_of(kind: str, chain: Chain) -> str:
-    """The steps at which an image of a kind can enter a chain, in words."""
+    """Return a sentence with the steps at which an image of a kind can enter a chain."""
     stages = {name: all_stages()[base_name(name)] for name in chain.names}
     names = [
         name

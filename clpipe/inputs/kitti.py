@@ -1,8 +1,8 @@
-"""Annotations in KITTI's format: a folder of labels, with the calibration beside it.
+"""Annotations in KITTI's format: a folder of labels, with the calibration in a folder next to it.
 
-A line of a label is type, truncated, occluded, alpha, the box (left, top, right, bottom, in px from
-the centre of the first pixel), height, width and length, x, y and z, rotation_y, and in results a
-score: https://www.cvlibs.net/datasets/kitti (the object development kit's readme).
+A line of a label lists type, truncated, occluded, alpha, the box, height, width, length, x, y, z
+and rotation_y. Results add a score. The box is left, top, right and bottom, in px from the centre
+of the first pixel: https://www.cvlibs.net/datasets/kitti (the object development kit's readme).
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,10 +16,10 @@ from clpipe.base.reading import read_named
 from clpipe.base.types import Doubles
 from clpipe.inputs.annotations import FARTHEST, LARGEST, AnnotatedRender, refuse
 
-FIELDS = 15  # of a line, but for a score
-CALIBRATION = "calib"  # the folder beside that of the labels
-MATRICES = ("P0", "P1", "P2", "P3")  # of cameras, of which the labels' is the third
-CENTRE = 0.5  # px: where the first pixel's centre is from the corner
+FIELDS = 15  # of a line, without a score
+CALIBRATION = "calib"  # the folder next to that of the labels
+MATRICES = ("P0", "P1", "P2", "P3")  # of cameras; labels use the third
+CENTRE = 0.5  # px from the image's corner to the first pixel's centre
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class KittiObject:
     """A line of a label.
 
     Args:
-        words: all of it.
-        truncated: the share of the object beyond the picture; below 0 is not said.
-        box: left, top, right and bottom, in px from the corner.
+        words: all words of the line.
+        truncated: the share of the object outside the picture; unknown if negative.
+        box: left, top, right and bottom, in px from the image's corner.
     """
 
     words: tuple[str, ...]
@@ -44,7 +44,8 @@ class Kitti:
     Args:
         file: the folder.
         renders: a list of :class:`KittiObject` for each image.
-        calibrations: of each image, by its name: lines that are none, and matrices, by their names.
+        calibrations: for each image, by its name, the numbers of each line of its calibration, by
+            the name of the line.
     """
 
     file: Path
@@ -53,15 +54,17 @@ class Kitti:
 
 
 def read_kitti(folder: Path) -> Kitti:
-    """Read a folder of labels.
+    """Return the labels and calibrations of a folder.
 
     Raises:
-        RequestError: there is none, or a file is of another form; the message says where.
+        RequestError: the folder has no labels, or a file is not in KITTI's format; the message
+            says where.
     """
     files = sorted(folder.glob("*.txt"))
     if not files:
         raise RequestError(
-            f"--annotations {folder}: has no labels; a folder of KITTI's has NAME.txt of each image"
+            f"--annotations {folder}: this folder has no labels; KITTI's format has a file "
+            "NAME.txt for each image NAME"
         )
     renders, calibrations = [], {}
     for path in files:
@@ -76,7 +79,7 @@ def _lines(path: Path) -> list[str]:
     try:
         return read_named("--annotations", path, LARGEST).decode().splitlines()
     except UnicodeDecodeError:
-        raise RequestError(f"--annotations {path}: it is no text") from None
+        raise RequestError(f"--annotations {path}: this file is not text in UTF-8") from None
 
 
 def _objects(path: Path) -> list[KittiObject]:
@@ -112,6 +115,6 @@ def _calibration(path: Path) -> dict[str, Doubles]:
         except ValueError:
             values = np.empty(0)
         if name in MATRICES and (values.size != 12 or not np.isfinite(values).all()):
-            refuse(path, f"line {number}", line, "12 numbers of a matrix")
+            refuse(path, f"line {number}", line, "the 12 numbers of a 3x4 matrix")
         found[name] = values
     return found

@@ -1,4 +1,4 @@
-"""What is to be said of the lenses that a run names."""
+"""Notes about lenses that a run names incompletely."""
 
 from collections.abc import Sequence
 
@@ -8,10 +8,10 @@ from clpipe.inputs.find import Job
 
 
 def lens_notes(settings: Settings, jobs: Sequence[Job]) -> list[str]:
-    """A note for each lens that settings or jobs name by a part of its name.
+    """Return a note for each lens that settings or jobs name by only a part of its name.
 
     Raises:
-        KeyedError: as :func:`clpipe.camera.lens.name_note`.
+        KeyedError: as for :func:`clpipe.camera.lens.name_note`.
     """
     named = [*settings.names_of("lens"), *(job.values.get("lens") for job in jobs if job.values)]
     names = dict.fromkeys(name for name in named if isinstance(name, str) and name)

@@ -1,4 +1,4 @@
-"""Images as pixels with a chain: renders, camera raws and dumps, and kept images."""
+"""Loads images, and makes the chain for each: renders, camera raws, dumps and kept images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -50,7 +50,7 @@ from clpipe.stages.shutter import Rows
 
 @dataclass(frozen=True)
 class LoadedImage:
-    """An image with its warnings, the chain for it, and its image key."""
+    """An image, which contains its warnings, with the chain for it and its image key."""
 
     chain: Chain
     source: SourceImage
@@ -63,27 +63,28 @@ class ImageLoader:
 
     Args:
         request: the request.
-        folder: where names of files start that an image carries; None is the working directory.
+        folder: the folder that file names in attributes are relative to; None is the working
+            directory.
     """
 
     request: Request
     folder: Path | None = None
 
     def for_job(self, job: Job, draw_key: str = "") -> "ImageLoader":
-        """The loader for one job; the same one where the job has no values of its own.
+        """Return the loader for one job: this loader, if the job has no values of its own.
 
         Args:
             job: the job.
-            draw_key: what draws belong to; "" is the job's key.
+            draw_key: the key that seeds random draws; "" is the job's key.
 
         Raises:
-            ImageError: the job cannot be made.
+            ImageError: the job has a problem, or its values are not allowed.
         """
         job.check()
         return self._for_values(job, draw_key)
 
     def has_own_values(self, job: Job) -> bool:
-        """Whether settings hold for one job alone."""
+        """Return whether a job has settings of its own."""
         return bool(job.values) or self.has_draws
 
     def _for_values(self, job: Job, draw_key: str = "") -> "ImageLoader":
@@ -93,22 +94,22 @@ class ImageLoader:
 
     @cached_property
     def settings(self) -> Settings:
-        """The settings of an image that carries none."""
+        """The settings of an image without embedded settings."""
         return self.request.settings()
 
     @cached_property
     def has_draws(self) -> bool:
-        """Whether settings are drawn, so that each image has its own."""
+        """Whether some settings are drawn at random for each image."""
         return bool(self.settings.draws)
 
     @cached_property
     def chain(self) -> Chain:
-        """The chain of an image that carries no settings."""
+        """The chain of an image without embedded settings."""
         return self.request.chain_from(self.settings, self.request.start_at)
 
     @cached_property
     def reads(self) -> Kind:
-        """The kind of image that is read, raws apart."""
+        """The kind of image that is read, except for raws."""
         start_at = self.request.start_at
         if start_at is None:
             return entry(self.settings)
@@ -120,31 +121,31 @@ class ImageLoader:
 
     @property
     def kept(self) -> KeptLoader | None:
-        """The entry of kept images; None where images enter at the first step."""
+        """The loader of kept images; None if images enter at the first step."""
         return None if self.request.start_at is None else KeptLoader(self.request, self.folder)
 
     @cached_property
     def reads_overscan(self) -> bool:
-        """Whether what a render has beyond its picture is read, too."""
+        """Whether the overscan of renders is read."""
         return self.kept is not None or steps_of_overscan(self.chain) > 0
 
     @cached_property
     def raw(self) -> RawLoader:
-        """The entry of raws and dumps."""
+        """The loader of raws and dumps."""
         return RawLoader(self.request, self.settings.dump_format)
 
     def endings(self) -> tuple[str, ...]:
-        """The endings of the files that are taken from folders."""
+        """Return the extensions of the files that are taken from folders."""
         if self.request.start_at is None and self.reads is Kind.DISPLAY:
             return PICTURE_SUFFIXES
         pictures = PICTURE_SUFFIXES if self.request.transfer else ()
         return (*RENDER_SUFFIXES, *pictures, *RAW_SUFFIXES)
 
     def first_chain(self, jobs: Sequence[Job]) -> Chain:
-        """The chain of the first image, made early so that a wrong request is refused early.
+        """Return the chain of the first image, to reject a wrong request before the run starts.
 
         Raises:
-            RequestError: it cannot be made.
+            RequestError: the chain cannot be made.
         """
         first = next((job for job in jobs if not job.problem), jobs[0])
         loader, path = self._for_values(first), first.path
@@ -154,10 +155,10 @@ class ImageLoader:
         return loader.kept.first_chain(path) if loader.kept else loader.chain
 
     def exposures(self, jobs: Sequence[Job]) -> list[Job]:
-        """The jobs, with files that are one exposure together made one.
+        """Return the jobs, with the files of one exposure or panorama joined into one job.
 
         Raises:
-            RequestError: they cannot be.
+            RequestError: the files do not fit together.
         """
         if self.kept:
             return list(jobs)
@@ -165,19 +166,19 @@ class ImageLoader:
         if wide and shutter and shutter.layer_of_light:
             raise RequestError(
                 f"{stage_in(StageRole.SHUTTER).name}.flicker_layer: found "
-                f"{shutter.layer_of_light}, but what is seen through a wide lens has no layers of "
-                "light; without it, all light flickers"
+                f"{shutter.layer_of_light}, but panoramas have no light layers; remove this "
+                "parameter, and all light flickers"
             )
         return grouped(exposures(jobs, self.settings), wide)
 
     def check(self, jobs: Sequence[Job]) -> None:
-        """See that the values of single images are allowed.
+        """Check that the values of single images are allowed.
 
         Raises:
-            RequestError: they are not; the message says in which row.
+            RequestError: they are not; the message names the row.
         """
         carries = self.raw.takes if self.kept is None else lambda path: True
-        # What is only of a camera's file was checked when it was found there.
+        # Values from a file of cameras were checked when they were read.
         if rows := [job for job in jobs if job.place or job.values.keys() - {RENDER}]:
             check_rows(rows, self.settings, carries)
         checked = {id(job) for job in rows}
@@ -185,9 +186,10 @@ class ImageLoader:
             check_cameras(self.settings)
 
     def claim(self, job: Job) -> Claim:
-        """The claim of a job's file, before it is read; nothing where reading refuses it.
+        """Return the size and memory that a job's files claim, without reading pixels.
 
-        Of one that cannot be opened each byte is taken for a pixel.
+        The claim is 0 if the file has too many pixels to be read. If the file cannot be opened, it
+        counts one pixel for each byte.
         """
         most = self.request.max_pixels or USUAL_MAX_PIXELS
         dump = self.settings.dump_format
@@ -203,16 +205,16 @@ class ImageLoader:
         return Claim(claim.width, claim.height * files, claim.image * files, claim.reading * files)
 
     def opens(self, job: Job) -> bool:
-        """Whether the header of a job's file can be read."""
+        """Return whether the header of a job's file can be read."""
         is_dump = self.settings.dump_format is not None and may_be_dump(job.path)
         return is_dump or claim_of(job.path) is not None
 
     def read(self, job: Job) -> SourceImage:
-        """The image of a job.
+        """Return the image of a job.
 
         Raises:
-            ImageError: it cannot be read, is of another kind or size, or is written to at the same
-                time.
+            ImageError: it cannot be read, has another kind or size than expected, or changes while
+                it is read.
         """
         wide = None if self.kept else wide_of(self.settings)
         shutter = None if wide else self.shutter(job)
@@ -228,19 +230,20 @@ class ImageLoader:
                 source = self._read(job.path)
         if source.envmap == CUBE_MAP:
             raise ImageError(
-                f"{job.path}: a cube map, not a picture. To view it through a wide lens, add --set "
-                f"{stage_in(StageRole.VIEW).name}.method=kannala_brandt"
+                f"{job.path}: this is a cube map, not a picture. To view it through a wide lens, "
+                f"add --set {stage_in(StageRole.VIEW).name}.method=kannala_brandt"
             )
         width, height = source.margins.inside(*source.pixels.shape[1::-1])
         if job.size and job.size != (width, height):
             raise ImageError(
-                f"{job.path}: has {width}x{height} pixels, but its camera in --poses has "
-                f"{job.size[0]}x{job.size[1]}. Correct the camera's size, or render at that size"
+                f"{job.path}: this image has {width}x{height} pixels, but its camera in --poses "
+                f"has {job.size[0]}x{job.size[1]}. Correct the camera's size, or render at that "
+                "size"
             )
         return source
 
     def shutter(self, job: Job) -> Rows | None:
-        """What a job's image is made with as it is read; None where it stays as in its file."""
+        """Return the shutter that combines a job's files or layers; None if nothing is combined."""
         shutter = shutter_of(self.settings)
         is_render = self.kept is None and not self.raw.takes(job.path)
         is_lit = shutter is not None and bool(shutter.layer_of_light) and is_render
@@ -259,13 +262,13 @@ class ImageLoader:
         return read_source(path, self.reads, options)
 
     def enter(self, job: Job, source: SourceImage) -> LoadedImage | None:
-        """An image with the chain for it.
+        """Return an image with the chain for it.
 
-        None for one that was found in a folder of kept images and is not the one to go on from.
+        Return None for a kept image from a folder that was not kept right before ``start_at``.
 
         Raises:
-            ImageError: it cannot enter there, or has no depth, which its chain needs.
-            RequestError: its chain cannot be made.
+            ImageError: the image cannot enter the chain, or lacks depth that the chain needs.
+            RequestError: the chain cannot be made.
         """
         loaded = self._entered(job, source)
         if loaded is None:
@@ -294,7 +297,7 @@ class ImageLoader:
         return LoadedImage(own.chain, source, loaded.key)
 
     def _entered(self, job: Job, source: SourceImage) -> LoadedImage | None:
-        """See :meth:`enter`; without depth."""
+        """Return an image with its chain, as :meth:`enter` does, but without depth."""
         key = image_key(job.key, source.sha256)
         if isinstance(source, RawImage):
             chain, source = self.raw.enter(job.path, source)
@@ -303,20 +306,23 @@ class ImageLoader:
             entered = self.kept.enter(job.path, source, key, job.listed)
             return LoadedImage(*entered) if entered else None
         if stage := source.attributes.get("stage"):
-            warning = f"was kept after {stage}; is it a render? See --start-at"
+            warning = (
+                f"this image was kept after {stage}, but is processed as a render; to resume from "
+                "it, use --start-at"
+            )
             source = replace(source, warnings=(*source.warnings, warning))
         return LoadedImage(self.chain, source, key)
 
     def aovs(self, job: Job, loaded: LoadedImage, orientation: int = 1) -> Aovs:
-        """The layers that go along with a job's picture, of the moments that are asked for.
+        """Return the carried layers of a job's picture, at the requested moments.
 
         Args:
-            job: the image.
-            loaded: it, as :meth:`enter` gave it.
-            orientation: EXIF's, by which the picture is turned in the end.
+            job: the image's job.
+            loaded: the image that :meth:`enter` returned.
+            orientation: EXIF's value by which the picture is rotated at the end.
 
         Raises:
-            ImageError: one is missing, or does not fit the image.
+            ImageError: a layer is missing, or does not fit the image.
         """
         request = self.request
         most = request.max_pixels or USUAL_MAX_PIXELS
@@ -331,12 +337,12 @@ class ImageLoader:
         return joined(of_moments, named=len(moments) > 1)
 
     def is_left_out(self, job: Job, error: Exception) -> bool:
-        """Whether an image that cannot enter was only found in a folder, beside others that can."""
+        """Return whether an image that cannot enter is skipped, as its folder was named."""
         is_of_other_step = isinstance(error, KindError) and self.kept is not None
         return not job.listed and (is_of_other_step or isinstance(error, NoPictureError))
 
     def error_text(self, job: Job, error: Exception) -> str:
-        """The message of an error, with the file, and with what can be done."""
+        """Return the message of an error, with the name of the file and a way to correct it."""
         if isinstance(error, KindError):
             return kind_message(error, self.chain, self.request.start_at)
         message = str(error) or "there is not enough memory for it"
@@ -344,5 +350,5 @@ class ImageLoader:
         return message if job.shown in message else f"{job.shown}: {message}"
 
     def __getstate__(self) -> dict[str, Any]:
-        # Cached values stay with the process: they may hold classes of stage files.
+        # Cached values are not pickled, because they may contain classes of stage files.
         return {each.name: getattr(self, each.name) for each in fields(self)}

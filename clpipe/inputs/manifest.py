@@ -1,4 +1,4 @@
-"""Manifests: images in a table, .csv or .jsonl, with values that hold for each alone."""
+"""Manifests: tables of images (.csv or .jsonl), with settings for each image."""
 
 import csv
 import io
@@ -23,7 +23,7 @@ from clpipe.chain.toml import toml_value, value_text
 from clpipe.inputs.tables import OWN, PLAIN, TEXTS, csv_records, json_records
 
 MANIFEST_SUFFIXES = (".csv", ".jsonl")
-ALONE = ("seed", "noise_key")  # values that no other depends on, and often differ by row
+ALONE = ("seed", "noise_key")  # no other setting depends on these, and they often differ by row
 MANIFEST_BYTES = 256 * 2**20  # enough for two million rows
 
 
@@ -34,9 +34,9 @@ class Row:
     Args:
         path: the file.
         key: its name among the inputs.
-        name: the path of its outputs in the output folder, without an ending; "" follows the key.
-        values: its settings, nested as in a configuration.
-        frames: how many frames are made of it; None is what the request says.
+        name: the path of its outputs in the output directory, without extension; "" uses the key.
+        values: its settings, nested like a configuration.
+        frames: the number of frames; None uses that of the request.
         place: the manifest and the row, for messages.
     """
 
@@ -49,29 +49,31 @@ class Row:
 
     @property
     def stem(self) -> str:
-        """The path of its outputs in the output folder, without an ending."""
+        """The path of its outputs in the output directory, without extension."""
         return self.name or str(PurePosixPath(self.key).with_suffix(""))
 
 
 def read_manifest(path: Path) -> list[Row]:
-    """The images of a manifest.
+    """Return the rows of a manifest.
 
-    A .csv has a header, commas and UTF-8; its cells are TOML values, else text, and an empty cell
-    sets nothing. A .jsonl has an object in each line, nested as a configuration or with dotted
-    keys, and null sets nothing. Columns are ``path``, ``name``, ``frames``, ``iso``, ``camera``,
-    ``lens``, ``focal_length``, ``aperture``, ``focus_distance``, ``seed``, ``noise_key``, ``skip``
-    (names with spaces between, or a list) and any ``stage.parameter``, also of stage files that are
-    loaded. Names of files are relative to the manifest.
+    A .csv has a header, and commas between cells, in UTF-8. A cell is a TOML value, or text if it
+    is not valid TOML. An empty cell sets nothing. A .jsonl has one object per line, nested like a
+    configuration or with dotted keys, and null sets nothing.
 
-    The key is the name where there is one; else the path relative to the manifest's folder
-    where it lies below that; else the file's name.
+    Columns are ``path``, ``name``, ``frames``, ``iso``, ``camera``, ``lens``, ``focal_length``,
+    ``aperture``, ``focus_distance``, ``seed``, ``noise_key`` and ``skip`` (a list, or names with
+    spaces between them). Any ``stage.parameter`` is a column, including those of loaded stage
+    files. File names are relative to the manifest.
+
+    The key of a row is its name. Without one, it is the path relative to the manifest's folder, or
+    the file's name if the file is outside that folder.
 
     Args:
         path: the manifest.
 
     Raises:
-        RequestError: it cannot be read, has a column that does not exist, or a row is wrong; the
-            message is that of the first wrong row, with the number of others.
+        RequestError: the manifest cannot be read, has an unknown column, or has a wrong row. The
+            message describes the first wrong row, and counts the others.
     """
     text = _text(path)
     read = json_records if path.suffix.lower() == ".jsonl" else csv_records
@@ -86,24 +88,25 @@ def read_manifest(path: Path) -> list[Row]:
             other = makers.setdefault(row.stem, row)
             if other is not row:
                 raise RequestError(
-                    f"it would make the same outputs as row {other.place.rpartition(' ')[2]}, "
-                    f"{row.stem}; tell them apart in a column called name"
+                    f"this row would write the same outputs as row "
+                    f"{other.place.rpartition(' ')[2]}, {row.stem}; give them different names in a "
+                    "column called name"
                 )
             rows.append(row)
         except RequestError as error:
             faults.append(f"{place}: {error}")
     _report(faults)
     if not rows:
-        raise RequestError(f"{path}: it has no rows, so there is nothing to do")
+        raise RequestError(f"{path}: this manifest has no rows; add one for each image")
     return rows
 
 
 def manifest_text(folder: Path, rows: Sequence[Row]) -> bytes:
-    """A .csv that :func:`read_manifest` reads back as these rows.
+    """Return the bytes of a .csv that :func:`read_manifest` reads back as these rows.
 
     Args:
-        folder: where it will lie.
-        rows: with values as they are when read, names of files joined to a folder.
+        folder: the folder that the manifest will be in.
+        rows: the rows. File names in their values include their folder.
     """
     records: list[dict[str, str]] = []
     for row in rows:
@@ -126,7 +129,7 @@ def manifest_text(folder: Path, rows: Sequence[Row]) -> bytes:
 
 
 def _cell(value: Any) -> str:
-    """A value as :func:`clpipe.inputs.tables.csv_records` reads it back.
+    """Return the cell that :func:`clpipe.inputs.tables.csv_records` reads back as this value.
 
     >>> _cell("gain"), _cell("100"), _cell(0.5)
     ('gain', '"100"', '0.5')
@@ -136,7 +139,7 @@ def _cell(value: Any) -> str:
 
 
 class HasValues(Protocol):
-    """An image with values that hold for it alone, such as a :class:`Row`."""
+    """An image with settings of its own, such as a :class:`Row`."""
 
     @property
     def path(self) -> Path: ...
@@ -151,22 +154,22 @@ def check_rows(
     settings: Settings,
     carries: Callable[[Path], bool] = lambda path: False,
 ) -> list[Settings]:
-    """The settings of each row, every value checked and nothing drawn.
+    """Return the settings of each row, with every value checked and nothing drawn.
 
     Args:
-        rows: of a manifest, or jobs made of them.
-        settings: what holds where a row sets nothing.
-        carries: whether an image carries settings of its own, as a raw does; it may then have
-            another camera and other stages.
+        rows: rows of a manifest, or jobs made from them.
+        settings: the settings for what a row does not set.
+        carries: returns whether an image has settings of its own, like a raw. Such an image may
+            have another camera and other stages.
 
     Raises:
-        RequestError: a value that is not allowed, a camera or ISO that does not exist, or a stage
-            that is not in the chain; the message is as for :func:`read_manifest`.
+        RequestError: a value is not allowed, a camera or ISO does not exist, or a stage is not in
+            the chain. The message is as for :func:`read_manifest`.
     """
     steps = settings.step_names
     faults: list[str] = []
     checked: list[Settings] = []
-    known: dict[tuple[str, bool], Settings] = {}  # rows may share their values
+    known: dict[tuple[str, bool], Settings] = {}  # for rows with equal values
     for row in rows:
         carried = carries(row.path)
         alone = {
@@ -195,10 +198,10 @@ def check_rows(
 
 
 def _report(faults: Sequence[str]) -> None:
-    """Raise the first fault, where there is one, with the number of others."""
+    """Raise the first fault, if there is one, with the number of others."""
     if faults:
         more = len(faults) - 1
-        rest = f"; and {more} more {'rows are' if more > 1 else 'row is'} wrong" if more else ""
+        rest = f"; {more} more {'rows are' if more > 1 else 'row is'} also wrong" if more else ""
         raise RequestError(faults[0] + rest)
 
 
@@ -208,16 +211,18 @@ def _text(path: Path) -> str:
     try:
         data = read_bytes(path, MANIFEST_BYTES)
     except OSError as error:
-        raise RequestError(f"{path}: cannot read this manifest: {error.strerror}") from None
+        raise RequestError(f"{path}: this manifest cannot be read: {error.strerror}") from None
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
-        raise RequestError(f"{path}, line {line}: not a text in UTF-8") from None
+        raise RequestError(
+            f"{path}, line {line}: this is not UTF-8; save the manifest as UTF-8 text"
+        ) from None
 
 
 def _check_column(name: str) -> None:
-    """See that a column exists.
+    """Check that a column exists.
 
     Raises:
         RequestError: it does not.
@@ -226,7 +231,9 @@ def _check_column(name: str) -> None:
     stage = all_stages().get(base_name(step))
     if not dot and name not in (*OWN, *PLAIN):
         if stage or step in TABLES:
-            raise RequestError(f"{name}: its parameters have columns of their own: {name}.NAME")
+            raise RequestError(
+                f"{name} is not a column, but each of its parameters is; use {name}.PARAMETER"
+            )
         raise RequestError(one_of("column", name, (*OWN, *PLAIN)) + ", or stage.parameter")
     if dot and step not in TABLES:
         if stage is None:
@@ -241,13 +248,13 @@ def _check_column(name: str) -> None:
 def _row(
     folder: Path, place: str, record: Mapping[str, Any], alike: dict[str, Mapping[str, Any]]
 ) -> Row:
-    """A row from its values by column.
+    """Return a row, from its values by column.
 
     Args:
-        folder: of the manifest.
+        folder: the folder of the manifest.
         place: the manifest and the row.
         record: the values.
-        alike: values of other rows, which are shared where they are the same.
+        alike: values of earlier rows. Rows with equal values share one object.
 
     Raises:
         RequestError: path, name or frames are not allowed.
@@ -256,7 +263,7 @@ def _row(
         _check_text(column, record.get(column, ""))
     path, name, frames = record.get("path", ""), record.get("name", ""), record.get("frames")
     if os.path.basename(path) in ("", ".", ".."):
-        raise RequestError(f"path: found {path!r}, which names no image")
+        raise RequestError(f"path: found {path!r}, but expected the path of an image")
     _check_name(name)
     if frames is not None and not OPTIONS["frames"].allows(frames):
         raise RequestError(f"frames: found {frames!r}, but it is {OPTIONS['frames'].allowed}")
@@ -276,16 +283,17 @@ def _row(
 
 
 def check_output_name(name: str) -> None:
-    """Check that a name of outputs stays in the output folder; "" is allowed.
+    """Check that a name of outputs stays in the output directory; "" is allowed.
 
     Raises:
         RequestError: it does not.
     """
     parts = name.replace(os.sep, "/").split("/")
-    has_drive = os.path.splitdrive(name)[0]  # as in C:name, on Windows
+    has_drive = os.path.splitdrive(name)[0]  # for example C:name, on Windows
     if name and ("\0" in name or has_drive or not {"", ".", ".."}.isdisjoint(parts)):
         raise RequestError(
-            f"name: found {name!r}, but it is a path in the output folder, such as a/frame_0001"
+            f"name: found {name!r}, but expected a path in the output directory, such as "
+            "a/frame_0001"
         )
 
 
@@ -295,36 +303,39 @@ def _check_name(name: str) -> None:
     Hidden pictures are rejected because reports and later runs do not see them.
 
     Raises:
-        RequestError: it leaves the output folder, or a part of it is hidden or looks like another
-            path.
+        RequestError: the name leaves the output directory, contains a backslash, or has a part that
+            begins with a period or ~.
     """
     check_output_name(name)
     if "\\" in name or any(part.startswith((".", "~")) for part in name.split("/")):
         raise RequestError(
-            f"name: found {name!r}, but a name has no backslash, and no part begins with a "
-            "period or ~; choose another, such as a/frame_0001"
+            f"name: found {name!r}, but a name may not contain a backslash, and no part may begin "
+            "with a period or ~; choose another, such as a/frame_0001"
         )
 
 
 def _check_text(column: str, value: Any) -> None:
-    """See that a value can be a part of a file's name.
+    """Check that a value can be part of a file name.
 
     Raises:
         RequestError: it cannot.
     """
     if not isinstance(value, str):
-        raise RequestError(f"{column}: found {value!r}, but it is text")
+        raise RequestError(f"{column}: found {value!r}, but expected text; put it in quotes")
     try:
         value.encode()
     except UnicodeEncodeError:
-        raise RequestError(f"{column}: found {value!r}, which is no text in UTF-8") from None
+        raise RequestError(
+            f"{column}: found {value!r}, but expected characters that UTF-8 can encode"
+        ) from None
     if "\0" in value:
-        raise RequestError(f"{column}: found {value!r}, but a file's name has no NUL")
+        raise RequestError(f"{column}: found {value!r}, but a file name may not contain NUL")
 
 
 def key_of(folder: Path, path: Path) -> str:
-    """The key of an image without a name: its path where it lies below a manifest's folder; else
-    the name of the file.
+    """Return the key of an image without a name.
+
+    It is the path relative to the manifest's folder, or the file's name if it is outside.
 
     >>> key_of(Path("a"), Path("a/b/../c/x.exr")), key_of(Path("a"), Path("x.exr"))
     ('c/x.exr', 'x.exr')

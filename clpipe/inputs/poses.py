@@ -1,4 +1,4 @@
-"""Finds the camera of each render of a run in a file that has those of all."""
+"""Finds the camera of each render of a run, in a file that lists all cameras."""
 
 import os
 import re
@@ -18,28 +18,30 @@ from clpipe.chain.render_camera import RenderCamera
 from clpipe.inputs.find import Job
 from clpipe.inputs.render_cameras import View, read_views
 
-ENDING = re.compile(r"\.[A-Za-z]\w{1,4}$")  # of an image's name; frame.0001 has none
+ENDING = re.compile(r"\.[A-Za-z]\w{1,4}$")  # the extension of an image; frame.0001 has none
 
 
 def with_views(
     jobs: Sequence[Job], path: Path | None, settings: RenderCamera, truth_at: Moments = "middle"
 ) -> list[Job]:
-    """The jobs of a run, each with the camera that a file has for it.
+    """Return the jobs of a run, each with its camera from a file.
 
-    A view and a render belong together where their paths are equal but for their endings, that of
-    the render below the input folder; else where the end of the view's path is the render's; else
-    by the names of the files, where no other view and no other render is called so. A job without a
-    view, or with one that cannot be, has a ``problem``. Of an exposure of several files the camera
-    is that of one moment; where each file has a pose of its own, it has all of them, too.
+    A view belongs to a render if their paths are equal without extensions. The render's path is
+    relative to its input folder. If no such view exists, the end of the view's path may equal the
+    render's path. Otherwise their file names must be equal, and no other view or render may have
+    that name. A job without a valid view gets a ``problem``.
+
+    If an exposure has several files, its camera is that of one moment. If each file has a pose, the
+    job gets all of them.
 
     Args:
-        jobs: all of the run.
-        path: the file, or COLMAP's folder; None leaves the jobs as they are.
-        settings: what holds for all renders.
-        truth_at: which moment of an exposure the camera is that of; "all" is its middle.
+        jobs: all jobs of the run.
+        path: the file, or COLMAP's folder; None leaves the jobs unchanged.
+        settings: the camera settings of all renders.
+        truth_at: the moment of an exposure whose camera is used; "all" uses the middle.
 
     Raises:
-        RequestError: the file cannot be read, or is of none of the forms, or has a view for no job.
+        RequestError: the file cannot be read, is in an unknown format, or has no view of any job.
     """
     if path is None:
         return list(jobs)
@@ -62,16 +64,16 @@ def with_views(
         except RequestError as error:
             given.append(replace(job, problem=f"--poses {path}: {error}"))
     if all(job.problem for job in given):
-        more = f"; and so for all {len(given)} images" if len(given) > 1 else ""
+        more = f"; none of the {len(given)} images has a view" if len(given) > 1 else ""
         raise RequestError(f"{given[0].path}: {given[0].problem}{more}")
     return given
 
 
 def _with_view(job: Job, view: View, settings: RenderCamera) -> Job:
-    """A job with the values of a view.
+    """Return a job with the values of a view.
 
     Raises:
-        RequestError: the view cannot be a render's, or something else says otherwise.
+        RequestError: the view is not valid, or contradicts the configuration or the manifest.
     """
     try:
         if view.problem:
@@ -87,17 +89,17 @@ def _with_view(job: Job, view: View, settings: RenderCamera) -> Job:
             place = job.place if key in own else "the configuration"
             raise RequestError(
                 f"view {view.name} has {key} {value}, but {place} has {RENDER}.{key} {other}; "
-                "leave one of them out"
+                "remove one of them"
             )
     values = {**job.values, RENDER: {**own, **view.values}}
     return replace(job, values=values, size=view.size)
 
 
 def _with_motion(job: Job, views: Sequence[View]) -> Job:
-    """A job of an exposure during which its camera moves, with the poses of its files.
+    """Return a job with the poses of all its files, if its camera moves during the exposure.
 
     Raises:
-        RequestError: a view cannot be a render's.
+        RequestError: a view is not valid.
     """
     poses = []
     for view in views:
@@ -110,7 +112,7 @@ def _with_motion(job: Job, views: Sequence[View]) -> Job:
 
 
 class Views:
-    """The views of a file, to be found by the paths of renders without their endings."""
+    """The views of a file, looked up by the paths of renders without extensions."""
 
     def __init__(self, views: Sequence[View]) -> None:
         self._by_path: dict[str, list[View]] = defaultdict(list)
@@ -124,21 +126,21 @@ class Views:
         self._ends = sorted(self._by_end)
 
     def get(self, stem: str, called: Mapping[str, int]) -> View | None:
-        """As :meth:`find`; None where there is none, or are several."""
+        """Return the view that :meth:`find` returns, or None if there is none or several."""
         try:
             return self.find(stem, called)
         except RequestError:
             return None
 
     def find(self, stem: str, called: Mapping[str, int]) -> View:
-        """The view of a render, by its path without its ending.
+        """Return the view of a render.
 
         Args:
-            stem: the path.
-            called: how many renders have the name of a file, without its ending.
+            stem: the path of the render, without extension.
+            called: the number of renders for each file name, without extension.
 
         Raises:
-            RequestError: there is none, or there are several.
+            RequestError: there is no view of this render, or there are several.
         """
         name = PurePosixPath(stem).name
         is_named = stem not in self._by_path and (stem == name or stem not in self._by_end)
@@ -147,25 +149,29 @@ class Views:
             place = bisect_left(self._ends, name)
             ends = self._ends[max(place - 2, 0) : place + 2]
             near = dict.fromkeys(self._by_end[end][0] for end in ends)
-            raise RequestError(f"has no view {stem}; the nearest are {', '.join(near)}")
+            raise RequestError(
+                f"this file has no view {stem}; the most similar names are {', '.join(near)}"
+            )
         if len(found) > 1:
             raise RequestError(
-                f"{stem} may be any of the views {', '.join(found[:3])}; name the input folder so "
-                "that paths below it are theirs"
+                f"{stem} may be any of the views {', '.join(found[:3])}; choose an input folder "
+                "whose relative paths match those of the views"
             )
         if is_named and called[name] > 1:
             raise RequestError(
-                f"has no view {stem}, and {called[name]} images are called {name}, so that its "
-                f"view {found[0]} may be another's"
+                f"this file has no view {stem}, and its view {found[0]} may belong to any of the "
+                f"{called[name]} images called {name}; add their folders to the names of the views"
             )
         views = self._by_path[found[0]]
         if any(view != views[0] for view in views):
-            raise RequestError(f"view {views[0].name} is there {len(views)} times, each another")
+            raise RequestError(
+                f"this file has {len(views)} different views called {views[0].name}; keep one"
+            )
         return views[0]
 
 
 def stem_of(name: str) -> str:
-    """The path of an image without its ending.
+    """Return the normalized path of an image without its extension.
 
     >>> stem_of("./images/frame.0001"), stem_of("a/b.exr"), stem_of("../x/c.png")
     ('images/frame.0001', 'a/b', '../x/c')

@@ -1,7 +1,7 @@
-"""Camera raws and headerless dumps: read, and given the chain that their own facts ask for.
+"""Loads camera raws and headerless dumps, and makes their chains from their metadata.
 
 A raw enters at the first step that reads DN, so no noise is added to it. Configuration and options
-win over what the file says.
+override the metadata.
 """
 
 from dataclasses import dataclass, field, replace
@@ -28,20 +28,20 @@ from clpipe.reference.cfa import PATTERNS
 from clpipe.reference.filter_array import parse_array
 from clpipe.stage import Kind, StageRole
 
-UNKNOWN_COLOURS = "its colour matrix is unknown; its colours stay those of the sensor"
+UNKNOWN_COLOURS = "its colour matrix is unknown, so colours stay in the sensor's own space"
 
 
 @dataclass(frozen=True)
 class RawImage(SourceImage):
-    """A mosaic in DN, (height, width), and what its file says, or what was set for a dump."""
+    """A mosaic in DN, (height, width), with its metadata, or with the settings of a dump."""
 
     facts: RawFacts | Dump = field(kw_only=True)
 
 
 def may_be_dump(path: Path) -> bool:
-    """Whether a file is a dump, where the geometry of dumps is set, by the ending of its name.
+    """Return whether a file is a dump according to its extension, if dumps are configured.
 
-    It is for .raw, and for any ending that no other image has.
+    Dumps have the extension .raw, or one that no other image format has.
     """
     others = (*RENDER_SUFFIXES, *(ending for ending in RAW_SUFFIXES if ending != ".raw"))
     return path.suffix.lower() not in others
@@ -49,13 +49,13 @@ def may_be_dump(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class RawLoader:
-    """Loads raws, and dumps where their geometry is set, and makes the chain for each."""
+    """Loads raws, and dumps if their geometry is set, and makes the chain for each."""
 
     request: Request
     dump: Dump | None = None
 
     def takes(self, path: Path) -> bool:
-        """Whether a file is a raw or a dump, by the ending of its name."""
+        """Return whether a file is a raw or a dump, according to its extension."""
         is_dump = self.dump is not None and may_be_dump(path)
         return path.suffix.lower() in RAW_SUFFIXES or is_dump
 
@@ -69,10 +69,10 @@ class RawLoader:
         return self.request.max_pixels or USUAL_MAX_PIXELS
 
     def read(self, path: Path) -> RawImage:
-        """A raw or a dump.
+        """Return the image of a raw or dump.
 
         Raises:
-            ImageError: it cannot be read, or holds no Bayer mosaic.
+            ImageError: it cannot be read, or does not contain a mosaic.
         """
         facts, most = self._facts(path), self._max_pixels
         if isinstance(facts, Dump):
@@ -86,10 +86,10 @@ class RawLoader:
         return RawImage(pixels, digest, "", (), {}, facts=facts)
 
     def first_chain(self, path: Path) -> Chain:
-        """The chain of the first raw, made early so that a wrong request is refused early.
+        """Return the chain of the first raw, to reject a wrong request before the run starts.
 
         Raises:
-            RequestError: it cannot be made.
+            RequestError: the chain cannot be made.
         """
         try:
             return self._chain(path, self._facts(path))[0]
@@ -97,10 +97,10 @@ class RawLoader:
             return self._chain_from(self.request.settings())
 
     def enter(self, path: Path, image: RawImage) -> tuple[Chain, RawImage]:
-        """The chain for a raw, and the raw with its warnings and what it carries to the output.
+        """Return the chain for a raw, and the raw with its warnings and output attributes.
 
         Raises:
-            ImageError: it cannot enter there, or its levels cannot be right.
+            ImageError: the raw cannot enter this chain, or its levels are impossible.
             RequestError: the chain cannot be made.
         """
         chain, warnings = self._chain(path, image.facts)
@@ -110,7 +110,7 @@ class RawLoader:
         warnings += brightness_warnings(image, chain)
         white = getattr(chain.steps[0].method, "white_level", 65535.0)
         if np.count_nonzero(image.pixels >= white) > image.pixels.size / 2:
-            warnings.append(f"most of its samples are not below the white level of {white:g} DN")
+            warnings.append(f"most samples are at or above the white level of {white:g} DN")
         attributes = to_attributes(tags_of(image.facts, chain), image.facts.orientation)
         return chain, replace(image, warnings=tuple(warnings), attributes=attributes)
 
@@ -118,15 +118,15 @@ class RawLoader:
         return self.request.chain_from(settings, self.request.start_at or first_raw_step(settings))
 
     def _chain(self, path: Path, facts: RawFacts | Dump) -> tuple[Chain, list[str]]:
-        """The chain for a raw, and warnings about what its file does not say, or says wrongly."""
+        """Return the chain for a raw, and warnings about missing or wrong metadata."""
         embedded, warnings = settings_of(facts)
         parameters = dict(embedded.parameters)
-        own = self.request.settings().drawn("")  # an example, where there is no image yet
+        own = self.request.settings().drawn("")  # an example of settings that may be drawn
         balance = name_of(StageRole.BALANCE)
         if balance in warnings and own.parameters.get(balance):
-            del parameters[balance]  # the user's own replaces what stands in for the file's
+            del parameters[balance]  # the user's setting replaces the fallback
         settings = self.request.settings(replace(embedded, parameters=parameters)).drawn("")
-        if isinstance(facts, RawFacts):  # whose DN are linear, whatever a render's become
+        if isinstance(facts, RawFacts):  # its DN are linear, even if those of renders are not
             made = [name for name in settings.parameters if writes_raw(name)]
             left = {k: own for k, own in settings.parameters.items() if k not in made}
             settings = replace(settings, parameters=left)
@@ -136,8 +136,8 @@ class RawLoader:
         is_of_file = isinstance(facts, RawFacts) and settings.iso == facts.iso
         if is_of_file and iso != settings.iso:
             warnings["iso"] = (
-                f"its ISO of {settings.iso:g} is beyond camera {camera.name}, "
-                f"{low:g} to {high:g}; {iso:g} is taken for denoising"
+                f"its ISO of {settings.iso:g} is outside the range of camera {camera.name}, "
+                f"{low:g} to {high:g}; denoising uses {iso:g}"
             )
             settings = replace(settings, iso=iso)
         chain = self._chain_from(settings)
@@ -145,42 +145,42 @@ class RawLoader:
         return chain, _remaining(warnings, chain, embedded)
 
     def _check(self, path: Path, facts: RawFacts | Dump, chain: Chain) -> None:
-        """See that a chain can take a raw.
+        """Check that a chain can process a raw.
 
         Raises:
-            ImageError: it does not start on DN, or with another pattern, or the levels of the file
-                cannot be right and none are set.
+            ImageError: the chain does not start on DN or has another pattern, or the file's levels
+                are impossible and none are set.
         """
         settings = chain.settings
         if chain.source is not Kind.RAW:
             raise ImageError(
                 f"{path}: a camera raw starts at {first_raw_step(settings)}, but --start-at "
-                f"{self.request.start_at} reads {chain.source.label}. Leave out --start-at"
+                f"{self.request.start_at} reads {chain.source.label}. Remove --start-at"
             )
         name = name_of(StageRole.PATTERN)
         own = settings.parameters.get(name, {})
         pattern = own.get("array") or own.get("pattern", "RGGB")
         if parse_array(pattern).rows != chain.steps[0].context.filters.rows:
             raise ImageError(
-                f"{path}: its pattern is {pattern}, which the {name} stage says, but the chain has "
-                f"none; list {name} and what makes DN first (they are not run on a raw)"
+                f"{path}: its CFA pattern is {pattern}, but the chain has no {name} stage to set "
+                f"it. Add {name} and the stages that produce DN; they do not run on a raw"
             )
         name = name_of(StageRole.LEVELS)
         levels = settings.parameters.get(name, {})
         if isinstance(facts, RawFacts) and not {"black_level", "white_level"} <= levels.keys():
             raise ImageError(
-                f"{path}: its levels cannot be right: black {facts.black_level}, white "
-                f"{facts.white_level} (--set {name}.black_level, {name}.white_level)"
+                f"{path}: its levels are impossible: black {facts.black_level}, white "
+                f"{facts.white_level}; set {name}.black_level and {name}.white_level"
             )
 
 
 def _remaining(warnings: dict[str, str], chain: Chain, embedded: Settings) -> list[str]:
-    """The warnings that still hold: not about what the user set, or what no step of the chain uses.
+    """Return the warnings that still apply: not those about settings that are set or not used.
 
     Args:
-        warnings: by what they are about.
+        warnings: the warnings, by topic.
         chain: the chain for the raw.
-        embedded: the settings that the raw carries.
+        embedded: the settings from the raw's metadata.
     """
     settings, stages = chain.settings, {step.stage.name for step in chain.steps}
     is_denoised = chain.step_in(StageRole.DENOISING) is not None
@@ -195,12 +195,12 @@ def _remaining(warnings: dict[str, str], chain: Chain, embedded: Settings) -> li
 
 
 def writes_raw(step: str) -> bool:
-    """Whether a step makes DN, so that a raw enters after it."""
+    """Return whether a step produces DN, so that a raw enters after it."""
     return all_stages()[base_name(step)].writes is Kind.RAW
 
 
 def first_raw_step(settings: Settings) -> str:
-    """The first step that reads a raw.
+    """Return the name of the first step that reads a raw.
 
     >>> first_raw_step(Settings())
     'normalize'
@@ -211,22 +211,24 @@ def first_raw_step(settings: Settings) -> str:
     for name in settings.stages:
         if all_stages()[name].reads is Kind.RAW and name not in settings.skip:
             return name
-    raise RequestError(f"no stage of the chain reads a raw; {name_of(StageRole.LEVELS)} does")
+    raise RequestError(
+        f"no stage of the chain reads a raw; add {name_of(StageRole.LEVELS)}, which does"
+    )
 
 
 def name_of(role: StageRole) -> str:
-    """The name of the stage that has a role, under which a raw carries its parameters."""
+    """Return the name of the stage that has a role."""
     return stage_in(role).name
 
 
 def settings_of(facts: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
-    """The settings that a raw carries, and warnings by what they are about."""
+    """Return the settings from a raw's metadata, and warnings by topic."""
     balance, colours = name_of(StageRole.BALANCE), name_of(StageRole.COLOURS)
     unseen: dict[str, dict[str, Any]] = {name_of(StageRole.COLOURS_OF_LIGHT): {"method": "none"}}
     if isinstance(facts, Dump):
         gray_world = {balance: {"method": "gray_world"}}
         return Settings(parameters=gray_world | unseen), {
-            balance: "it does not say its white balance; gray_world estimates it",
+            balance: "the file does not state its white balance; gray_world estimates it",
             colours: UNKNOWN_COLOURS,
         }
     warnings: dict[str, str] = {}
@@ -236,11 +238,11 @@ def settings_of(facts: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
         same = facts.model.casefold().startswith(facts.make.casefold())
         name = facts.model if same else f"{facts.make} {facts.model}"
         warnings["camera"] = (
-            f"there is no profile of {name}; denoising takes the noise of {camera} (--camera)"
+            f"there is no profile of {name}; denoising uses the noise of {camera} (--camera)"
         )
     iso = facts.iso or Settings().iso
     if not facts.iso:
-        warnings["no_iso"] = f"it does not say its ISO; {iso:g} is taken for denoising (--iso)"
+        warnings["no_iso"] = f"the file does not state its ISO; denoising uses {iso:g} (--iso)"
     is_bayer = facts.pattern in PATTERNS
     laid = {"pattern": facts.pattern} if is_bayer else {"method": "array", "array": facts.pattern}
     parameters = unseen | {name_of(StageRole.PATTERN): laid}
@@ -259,7 +261,7 @@ def settings_of(facts: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
         parameters[balance] = {"method": "gray_world"}
         multipliers = ", ".join(f"{x:.4g}" for x in facts.as_shot)
         warnings[balance] = (
-            f"its white balance as shot cannot be right, with multipliers {multipliers}; "
+            f"its as-shot white balance is impossible, with multipliers {multipliers}; "
             "gray_world estimates it"
         )
     if facts.camera_to_srgb:
@@ -273,7 +275,7 @@ def settings_of(facts: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
 
 
 def camera_named(make: str, model: str) -> Camera | None:
-    """The built-in profile of a camera by what its EXIF calls it; None if there is none.
+    """Return the built-in profile of a camera, by its make and model in EXIF, or None.
 
     >>> camera_named("SONY", "ILCE-7RM2").name, camera_named("Canon", "EOS-1") is None
     ('sony-a7r2', True)
@@ -283,7 +285,7 @@ def camera_named(make: str, model: str) -> Camera | None:
 
 
 def tags_of(facts: RawFacts, chain: Chain) -> Tags:
-    """The EXIF of a picture that is made of a raw; the ISO is the user's, where one is set."""
+    """Return the EXIF of the picture of a raw. Its ISO is the file's, unless the user set one."""
     low, high = chain.camera.iso_range
     is_of_file = facts.iso is not None and chain.iso == min(max(facts.iso, low), high)
     return Tags(

@@ -1,5 +1,5 @@
-"""The cameras of renders, as files hold them: a cameras.json as clpipe writes it, a transforms.json
-of NeRF's or nerfstudio's, or a folder with COLMAP's text model.
+"""Reads the cameras of renders: clpipe's cameras.json, NeRF's or nerfstudio's transforms.json, or a
+folder with COLMAP's text model.
 """
 
 import math
@@ -17,7 +17,7 @@ from clpipe.base.types import Array
 from clpipe.inputs.manifest import MANIFEST_BYTES
 from clpipe.reference.pose import from_opengl, from_quaternion
 
-# The parameters before the coefficients of those of COLMAP's models that can be a pinhole's.
+# For the models of COLMAP's that can be a pinhole: the parameters before their coefficients.
 FOCAL_LENGTHS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -32,13 +32,13 @@ COEFFICIENT = re.compile(r"[kp][1-6]")
 
 @dataclass(frozen=True)
 class View:
-    """A render's camera, as a file says it.
+    """The camera of a render, read from a file.
 
     Args:
-        name: of the image, as the file has it.
-        values: by the keys of :class:`~clpipe.chain.render_camera.RenderCamera`.
-        size: width and height in px; None where it does not say them.
-        problem: why it can be no render's; "" where it can.
+        name: the name of the image in the file.
+        values: values by the keys of :class:`~clpipe.chain.render_camera.RenderCamera`.
+        size: width and height in px; None if they are not stated.
+        problem: why it is not valid; "" if it is.
     """
 
     name: str
@@ -48,23 +48,23 @@ class View:
 
 
 def read_views(path: Path) -> list[View]:
-    """The views of a file.
+    """Return the views of a file or of COLMAP's folder.
 
     Raises:
-        RequestError: it cannot be read, is of none of the forms, or has no view.
+        RequestError: it cannot be read, is in an unknown format, or has no view.
     """
     if path.is_dir():
         views = list(_from_colmap(path))
         if not views:
-            raise RequestError(f"--poses {path}: its images.txt has no image")
+            raise RequestError(f"--poses {path}: its images.txt lists no images")
         return views
     text = read_named("--poses", path, MANIFEST_BYTES)
     try:
         values = parse_json(text)
     except ValueError as error:
         raise RequestError(
-            f"--poses {path}: no valid JSON ({error}); it is a cameras.json, a transforms.json, or "
-            "a folder with COLMAP's cameras.txt and images.txt"
+            f"--poses {path}: this is not valid JSON ({error}); give a cameras.json, a "
+            "transforms.json, or a folder with COLMAP's cameras.txt and images.txt"
         ) from None
     for key, parse in FORMS.items():
         listed = values.get(key) if isinstance(values, dict) else None
@@ -73,8 +73,8 @@ def read_views(path: Path) -> list[View]:
                 _parsed(path, number, each, values, parse) for number, each in enumerate(listed)
             ]
     raise RequestError(
-        f"--poses {path}: has neither a list 'views', as a cameras.json, nor 'frames', as a "
-        "transforms.json"
+        f"--poses {path}: this file has neither the list 'views' of a cameras.json nor the list "
+        "'frames' of a transforms.json; give one of these files, or COLMAP's folder"
     )
 
 
@@ -82,15 +82,17 @@ Parser = Callable[[Mapping[str, Any], Mapping[str, Any]], View]
 
 
 def _parsed(path: Path, number: int, record: Any, common: Mapping[str, Any], parse: Parser) -> View:
-    """A view of a JSON.
+    """Return a view, from its record in a JSON file.
 
     Raises:
-        RequestError: it does not say what image it is of.
+        RequestError: the record does not name its image.
     """
     key = "file_path" if parse is _from_frame else "file"
     name = record.get(key) if isinstance(record, dict) else None
     if not isinstance(name, str) or not name:
-        raise RequestError(f"--poses {path}: view {number + 1} has no '{key}', the image's name")
+        raise RequestError(
+            f"--poses {path}: view {number + 1} has no '{key}'; add the name of its image"
+        )
     try:
         return replace(parse(record, common), name=name)
     except ValueError as error:
@@ -98,10 +100,10 @@ def _parsed(path: Path, number: int, record: Any, common: Mapping[str, Any], par
 
 
 def _from_view(view: Mapping[str, Any], common: Mapping[str, Any]) -> View:
-    """A view of a cameras.json.
+    """Return a view of a cameras.json.
 
     Raises:
-        ValueError: a value is not allowed; the message says which.
+        ValueError: a value is not allowed; the message names it.
     """
     own = {**common, **view}
     values: dict[str, Any] = {}
@@ -109,30 +111,30 @@ def _from_view(view: Mapping[str, Any], common: Mapping[str, Any]) -> View:
         k = numbers("K", own["K"], (3, 3))
         if k[0, 1] or k[1, 0] or k[2].tolist() != [0, 0, 1]:
             raise ValueError(
-                f"K: found {k.tolist()}, but it is [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+                f"K: found {k.tolist()}, but expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
             )
         values = dict(
             zip(("fx", "fy", "cx", "cy"), k[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True)
         )
     if ("R" in own) != ("t" in own):
-        raise ValueError("R and t belong together, and one of them is missing")
+        raise ValueError("R or t is missing; give both or neither")
     if "R" in own:
         values["rotation"] = numbers("R", own["R"], (3, 3)).tolist()
         values["translation"] = numbers("t", own["t"], (3,)).tolist()
     coefficients = own.get("distortion") or {}
     if not isinstance(coefficients, dict):
         raise ValueError(
-            f"distortion: found {coefficients!r}, but it is coefficients by their names"
+            f"distortion: found {coefficients!r}, but expected an object of coefficients by name"
         )
     _check_pinhole(str(own.get("model") or "PINHOLE"), coefficients)
     return View("", values, _size(own, "width", "height"))
 
 
 def _from_frame(frame: Mapping[str, Any], common: Mapping[str, Any]) -> View:
-    """A frame of a transforms.json; what it does not say itself is that of all frames.
+    """Return a frame of a transforms.json. Values that the frame lacks are those of all frames.
 
     Raises:
-        ValueError: a value is not allowed; the message says which.
+        ValueError: a value is not allowed; the message names it.
     """
     own = {**common, **frame}
     names = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "camera_angle_x": "camera_angle_x"}
@@ -158,18 +160,18 @@ FORMS: dict[str, Parser] = {"views": _from_view, "frames": _from_frame}
 
 
 def _from_colmap(folder: Path) -> Iterator[View]:
-    """The images of COLMAP's text model, in a folder or in sparse/0 below it.
+    """Yield the images of COLMAP's text model, in a folder or its sparse/0.
 
     Raises:
-        RequestError: it cannot be read.
+        RequestError: the model cannot be read.
     """
     places = [
         place for place in (folder, folder / "sparse" / "0") if (place / "images.txt").exists()
     ]
     if not places:
         raise RequestError(
-            f"--poses {folder}: has no images.txt, nor has its sparse/0; of a binary model, write "
-            "the text: colmap model_converter --output_type TXT"
+            f"--poses {folder}: there is no images.txt in this folder or its sparse/0; to convert "
+            "a binary model, run colmap model_converter --output_type TXT"
         )
     cameras = {}
     for line in _lines(places[0] / "cameras.txt"):
@@ -180,7 +182,7 @@ def _from_colmap(folder: Path) -> Iterator[View]:
     for line in lines:
         if not line or line.startswith("#"):
             continue
-        next(lines, "")  # the places of points in it
+        next(lines, "")  # skip the line of 2D points
         _, *fields = line.split(maxsplit=9)
         if len(fields) != 9:
             raise RequestError(
@@ -198,23 +200,23 @@ def _lines(path: Path) -> Iterator[str]:
     try:
         text = read_named("--poses", path, MANIFEST_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise RequestError(f"--poses {path}: not a text in UTF-8") from None
+        raise RequestError(f"--poses {path}: this file is not text in UTF-8") from None
     return iter([line.strip() for line in text.split("\n")])
 
 
 def _from_image(name: str, pose: Sequence[str], camera: Sequence[str]) -> View:
-    """An image of COLMAP's.
+    """Return the view of an image in COLMAP's model.
 
     Args:
-        name: of the file.
-        pose: quaternion and translation.
-        camera: model, width, height and parameters, as in cameras.txt.
+        name: the image's file name.
+        pose: quaternion and translation, seven numbers.
+        camera: model, width, height and parameters, from cameras.txt.
 
     Raises:
-        ValueError: a value is not allowed; the message says which.
+        ValueError: a value is not allowed; the message names it.
     """
     if len(camera) < 4:
-        raise ValueError("it has no camera in cameras.txt")
+        raise ValueError("its camera is missing in cameras.txt")
     model, width, height, *texts = camera
     q, t = np.split(numbers("QW QX QY QZ TX TY TZ", [_number(text) for text in pose], (7,)), [4])
     if not q.any():
@@ -223,7 +225,7 @@ def _from_image(name: str, pose: Sequence[str], camera: Sequence[str]) -> View:
     parameters = numbers("PARAMS", [_number(text) for text in texts], None).tolist()
     if names and len(parameters) < len(names):
         raise ValueError(
-            f"its camera has {len(parameters)} parameters; {model} has {' '.join(names)}"
+            f"its camera has {len(parameters)} parameters, but {model} needs {' '.join(names)}"
         )
     rest = {f"parameter {i + 1}": value for i, value in enumerate(parameters) if i >= len(names)}
     _check_pinhole(model, rest)
@@ -242,10 +244,10 @@ def _number(text: str) -> Any:
 
 
 def numbers(name: str, value: Any, shape: tuple[int, ...] | None) -> Array:
-    """A value as finite float64 of a shape, or of one axis where that is None.
+    """Return a value as a finite float64 array of a shape; None allows any length of one axis.
 
     Raises:
-        ValueError: it is something else; the message names it.
+        ValueError: the value is anything else; the message contains its name.
     """
     try:
         array = np.array(value, np.float64)
@@ -255,36 +257,37 @@ def numbers(name: str, value: Any, shape: tuple[int, ...] | None) -> Array:
         size = "numbers" if shape is None else " rows of ".join(map(str, shape)) + " numbers"
         found = repr(value)
         shown = f"{found[:200]}..." if len(found) > 200 else found
-        raise ValueError(f"{name}: found {shown}, but it is {'a number' if shape == () else size}")
+        expected = "a number" if shape == () else size
+        raise ValueError(f"{name}: found {shown}, but expected {expected}")
     return array
 
 
 def _size(values: Mapping[str, Any], *names: str) -> tuple[int, int] | None:
-    """Width and height by their names; None where they are missing.
+    """Return width and height, by their names; None if one is missing.
 
     Raises:
-        ValueError: they are no sizes.
+        ValueError: they are not whole numbers above 0.
     """
     if not set(names) <= values.keys():
         return None
     width, height = (numbers(name, values[name], ()).item() for name in names)
     if not (width == int(width) > 0 and height == int(height) > 0):
         raise ValueError(
-            f"found {width:g}x{height:g} pixels, but a size is of whole numbers above 0"
+            f"found {width:g}x{height:g} pixels, but width and height are whole numbers above 0"
         )
     return int(width), int(height)
 
 
 def _check_pinhole(model: str, coefficients: Mapping[str, Any]) -> None:
-    """See that a camera has no distortion, as a render has none.
+    """Check that a camera has no distortion, because renders have none.
 
     Raises:
         ValueError: it has.
     """
     bent = ", ".join(f"{k} {v}" for k, v in coefficients.items() if v)
     if bent or model not in FOCAL_LENGTHS:
-        what = f"has distortion ({bent})" if bent else f"is of the model {model}"
+        what = f"has distortion ({bent})" if bent else f"has the model {model}"
         raise ValueError(
-            f"its camera {what}, but a render is straight; take it out of the file, and have "
-            "clpipe bend the picture: clpipe stages distortion"
+            f"its camera {what}, but renders have no lens distortion; remove it from the file, and "
+            "let clpipe warp the picture (see clpipe stages distortion)"
         )

@@ -1,4 +1,4 @@
-"""Series: each image with several cameras and ISOs, each in a folder of its own."""
+"""Series: several cameras and ISOs for each image, with a folder for each combination."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,12 +16,14 @@ from clpipe.inputs.find import Job
 
 @dataclass(frozen=True)
 class Series:
-    """Cameras and ISOs, each with each; fewer than two of either are no series of it.
+    """All combinations of some cameras and ISOs.
+
+    Cameras or ISOs get folders only if there are several, unless ``always`` is set.
 
     Args:
         cameras: names or profiles.
-        isos: sensitivities.
-        always: whether one camera or ISO that is named has a folder, too, so that others may come.
+        isos: ISO values.
+        always: whether a single camera or ISO gets a folder as well, so that others can be added.
     """
 
     cameras: tuple[str, ...] = ()
@@ -30,12 +32,12 @@ class Series:
 
     @property
     def common(self) -> dict[str, Any]:
-        """The settings of all images: one camera and one ISO that have no directory."""
+        """The settings that all images share: a single camera or ISO without a folder."""
         lists = {"camera": self.cameras, "iso": self.isos}
         return {k: v[0] for k, v in lists.items() if len(v) == 1 and not self.always}
 
     def under(self, output: Path) -> list[Path]:
-        """The folders that its pictures go to, the output folder itself where there is no series.
+        """Return the folders of its pictures: the output directory itself if there is no series.
 
         >>> Series(("sony-a7r2",), (100.0, 800.0)).under(Path("out"))
         [PosixPath('out/iso100'), PosixPath('out/iso800')]
@@ -46,15 +48,15 @@ class Series:
         return [output / folder for folder, _ in self._members()]
 
     def jobs(self, jobs: Sequence[Job], settings: Settings) -> list[Job]:
-        """Each job once for each camera and ISO, one after the other.
+        """Return each job once for each combination of camera and ISO.
 
         Args:
             jobs: the images.
-            settings: of all of them.
+            settings: the settings of all images.
 
         Raises:
-            RequestError: a camera does not exist, is there twice or has not an ISO, or a row of a
-                manifest says what a series is of.
+            RequestError: a camera does not exist, is listed twice or lacks an ISO, or a row of a
+                manifest sets the camera or ISO as well.
         """
         members = list(self._members())
         if members == [("", {})]:
@@ -65,7 +67,8 @@ class Series:
             for key in members[0][1]:
                 if key in job.values:
                     raise RequestError(
-                        f"{job.label}: it says its {key}, and --{key} has several; leave one out"
+                        f"{job.label}: this row sets {key}, but --{key} lists several; remove one "
+                        "of them"
                     )
         return [
             replace(
@@ -78,14 +81,14 @@ class Series:
         ]
 
     def _members(self) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Folders, and the settings of what is in them."""
+        """Yield the folders, each with the settings of its pictures."""
         cameras: list[tuple[str, dict[str, Any]]] = [("", {})]
         several = 0 if self.always else 1
         if len(self.cameras) > several:
             names = [load_camera(camera).name for camera in self.cameras]
             for name in names:
                 if names.count(name) > 1:
-                    raise RequestError(f"--camera: found {name} twice; give it once")
+                    raise RequestError(f"--camera: {name} is listed twice; list it once")
             cameras = [
                 (f"{name}/", {"camera": camera})
                 for name, camera in zip(names, self.cameras, strict=True)
@@ -100,14 +103,14 @@ class Series:
 def split_series(
     settings: Mapping[str, Any], always: bool = False
 ) -> tuple[Series, dict[str, Any]]:
-    """Take the cameras and ISOs from settings: a series, and the settings that all images share.
+    """Split settings into a series of cameras and ISOs, and the settings that all images share.
 
     >>> split_series({"camera": ["a", "b"], "iso": 800, "seed": 1})[1]
     {'seed': 1, 'iso': 800.0}
 
     Args:
-        settings: nested values, in which a camera is one name or several, and an ISO is a number,
-            several, or a text such as "100,800". A draw of either stays.
+        settings: nested values. A camera is one name or several; an ISO is a number, several, or a
+            text such as "100,800". Random draws of either stay in the settings.
         always: as for :class:`Series`.
 
     Raises:
@@ -139,9 +142,12 @@ def check_isos(isos: float | str | Sequence[float]) -> tuple[float, ...]:
     except ValueError:
         numbers = (math.nan,)
     if not all(math.isfinite(iso) and iso > 0 for iso in numbers):
-        raise RequestError(f"--iso: found {found}; expected numbers above 0, such as 100,800,3200")
+        raise RequestError(
+            f"--iso: found {found}; expected numbers above 0 with commas between them, such as "
+            "100,800,3200"
+        )
     names = [f"{iso:g}" for iso in numbers]
     for name in names:
         if names.count(name) > 1:
-            raise RequestError(f"--iso: found {found}, with {name} twice; give it once")
+            raise RequestError(f"--iso: found {found}, which lists {name} twice; list it once")
     return numbers

@@ -1,4 +1,4 @@
-"""Exposures that a renderer gives as several frames: grouped, and averaged without loading all."""
+"""Exposures rendered as several frames: groups the frames, and averages them one at a time."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -22,18 +22,18 @@ from clpipe.stages.shutter import Rows
 
 
 def shutter_of(settings: Settings) -> Rows | None:
-    """The shutter that has files averaged, or a layer's light flicker; None where files are taken
-    as they are.
+    """Return the shutter if it averages files or makes a light layer flicker, otherwise None.
 
     Raises:
-        RequestError: how many frames it averages is drawn.
+        RequestError: the number of sub-frames is drawn at random.
     """
     name = stage_in(StageRole.SHUTTER).name
     if name not in settings.step_names:
         return None
     if f"{name}.subframes" in settings.draws:
         raise RequestError(
-            f"{name}.subframes: found a draw; it says how files are grouped, so it is one number"
+            f"{name}.subframes: found a random draw, but files are grouped by this number; set one "
+            "whole number"
         )
     shutter = settings.method(name)
     if not isinstance(shutter, Rows):
@@ -42,13 +42,14 @@ def shutter_of(settings: Settings) -> Rows | None:
 
 
 def exposures(jobs: Sequence[Job], settings: Settings) -> list[Job]:
-    """The jobs with so many in a row made one as a shutter averages; it is named by the first.
+    """Return the jobs, with the sub-frames of one exposure joined into one job.
 
-    Files of one folder belong together, in their order; rows of a manifest likewise, which must
-    have the same values.
+    Consecutive files of one folder form an exposure, which has the name of the first. The same
+    holds for consecutive rows of a manifest, whose values must be equal.
 
     Raises:
-        RequestError: there are too few or too many files in a folder, or rows differ.
+        RequestError: the number of files in a folder is not a multiple of the number of sub-frames,
+            or rows differ.
     """
     shutter = shutter_of(settings)
     if shutter is None or shutter.subframes == 1 or any(job.subframes for job in jobs):
@@ -59,8 +60,8 @@ def exposures(jobs: Sequence[Job], settings: Settings) -> list[Job]:
         files = list(own)
         if len(files) % count:
             raise RequestError(
-                f"{folder}: {stage_in(StageRole.SHUTTER).name}.subframes is {count}, but there are "
-                f"{len(files)} images; give a multiple of {count}"
+                f"{folder}: {stage_in(StageRole.SHUTTER).name}.subframes is {count}, but this "
+                f"folder has {len(files)} images; provide a multiple of {count}"
             )
         for start in range(0, len(files), count):
             first, *others = files[start : start + count]
@@ -75,30 +76,32 @@ def average(
     shutter: Rows,
     spans: tuple[Span, ...],
 ) -> SourceImage:
-    """The exposure of a job: the mean of its frames, for each row over the time that it is exposed.
+    """Return the image of an exposure: for each row, the mean of the frames while it is exposed.
 
-    One frame is held at a time, beside the sum in float32 of each exposure.
+    Memory holds one frame at a time, and a float32 sum for each exposure.
 
     Args:
-        job: its files.
-        read: reads one, or a layer of it.
-        shutter: which part of each row's exposure a frame stands for; how long that is, the first
-            frame may say.
-        spans: of the exposures of a sensor that takes several in a row.
+        job: the job, with the files of all frames.
+        read: reads a file, or one layer of it.
+        shutter: weights the frames for each row. The first frame may state the exposure time.
+        spans: the exposures of a sensor that takes several in a row.
 
     Raises:
-        ImageError: one cannot be read, is no picture in linear light, or is of another size.
+        ImageError: a frame cannot be read, is not in linear light, or has another size.
     """
     found: list[SourceImage] = []
     totals: Floats = np.empty(0, np.float32)
-    weights: list[tuple[Doubles, Doubles]] = []  # of all, and of more of the light that flickers
+    weights: list[tuple[Doubles, Doubles]] = []  # of a frame, and in addition of its light layer
     for number, path in enumerate(job.paths):
         with unchanged(path):
             source = read(path, None)
             light = read(path, shutter.layer_of_light) if shutter.layer_of_light else None
         pixels = source.pixels
         if pixels.ndim != 3:
-            raise ImageError(f"{path}: a mosaic; subframes are averaged of renders")
+            raise ImageError(
+                f"{path}: this is a mosaic, but only renders can be sub-frames; set "
+                f"{stage_in(StageRole.SHUTTER).name}.subframes=1"
+            )
         if not found:
             time = source.shot.get("exposure_time")
             shutter = shutter.with_defaults(exposure_time=time)
@@ -110,8 +113,9 @@ def average(
             totals = np.zeros((len(spans), *pixels.shape), np.float32)
         elif (pixels.shape, source.margins) != (totals.shape[1:], found[0].margins):
             raise ImageError(
-                f"{path}: it is {_size(source, pixels)}, and {job.path}, a part of the same "
-                f"exposure, {_size(found[0], totals[0])}"
+                f"{path}: the size of this frame is {_size(source, pixels)}, but that of "
+                f"{job.path}, in the same exposure, is {_size(found[0], totals[0])}; render all "
+                "frames at one size"
             )
         for total, (plain, more) in zip(totals, weights, strict=True):
             _add(total, plain[number], pixels)
@@ -124,9 +128,9 @@ def average(
 
 
 def of_files(image: SourceImage, job: Job, sources: Sequence[SourceImage]) -> SourceImage:
-    """An image that was made of a job's files, with their digests and what is to be said of each.
+    """Return an image made of a job's files, with their digests and the warnings of each.
 
-    Of one file it has them already.
+    The image of a single file is returned unchanged, because it has them already.
     """
     if len(sources) == 1:
         return image
@@ -146,20 +150,25 @@ def of_files(image: SourceImage, job: Job, sources: Sequence[SourceImage]) -> So
 
 
 def check_values(jobs: Sequence[Job], why: str) -> None:
-    """See that the same is known of jobs that become one.
+    """Check that jobs that will be joined have equal values.
+
+    Args:
+        jobs: the jobs.
+        why: what their files have in common, for the message.
 
     Raises:
-        RequestError: it differs.
+        RequestError: the values differ.
     """
     first = jobs[0]
     if different := next((job for job in jobs if job.values != first.values), None):
         raise RequestError(
-            f"{different.label}: its values differ from those of {first.label}, which is {why}"
+            f"{different.label}: its values differ from those of {first.label}, which is {why}; "
+            "give both the same values"
         )
 
 
 def _add(total: Floats, weights: Doubles, pixels: Array) -> None:
-    """Add an image to a sum, times a number for each row."""
+    """Add an image to a sum, multiplied by a weight for each row."""
     seen = np.flatnonzero(weights)
     if seen.size:
         rows = slice(int(seen[0]), int(seen[-1]) + 1)
@@ -169,9 +178,10 @@ def _add(total: Floats, weights: Doubles, pixels: Array) -> None:
 def weights_of(
     shutter: Rows, frames: int, rows: int, margins: Margins, lit: bool = False
 ) -> Doubles:
-    """The weights of frames for each row, (frame, row); see :meth:`Rows.weights`.
+    """Return the weights of frames for each row, (frame, row); see :meth:`Rows.weights`.
 
-    Rows beyond the picture are exposed with its first or its last one, as frames last no longer.
+    Overscan rows have the weights of the picture's first or last row, because there are no frames
+    from before or after.
     """
     _, height = margins.inside(0, rows)
     in_picture = np.clip(np.arange(rows) - margins.top, 0, height - 1)
@@ -179,7 +189,7 @@ def weights_of(
 
 
 def _size(source: SourceImage, pixels: Array) -> str:
-    """The size of a picture in words, with what its image has beyond it."""
+    """Return the size of a picture and its overscan as text."""
     width, height = source.margins.inside(*pixels.shape[1::-1])
     beyond = f" with {tuple(source.margins)} px of overscan" if source.margins else ""
     return f"{width}x{height}{beyond}"

@@ -1,4 +1,4 @@
-"""Tables of a manifest: CSV and JSONL, as values by column.
+"""Reads the tables of manifests, CSV and JSONL, as values by column.
 
 A row is parsed only when its record is called, so that one wrong row does not hide the others.
 """
@@ -19,18 +19,18 @@ from clpipe.chain.toml import toml_value
 
 Record = Callable[[], dict[str, Any]]  # the values of a row by column, or a RequestError
 
-TEXTS = ("path", "name")  # columns that are text, whatever they look like
+TEXTS = ("path", "name")  # columns that are never parsed as TOML values
 
-OWN = (*TEXTS, "frames")  # columns that are no settings
+OWN = (*TEXTS, "frames")  # columns that are not settings
 
-# Columns of settings that stand in no table.
+# Columns of settings that are not in a table.
 PLAIN = tuple(key for key in KEYS if key not in (CODE, "dump", "stages"))
 
 
 def csv_records(
     path: Path, text: str, check_column: Callable[[str], None]
 ) -> Iterator[tuple[int, Record]]:
-    """The rows of a CSV, each with the line on which it begins.
+    """Yield the rows of a CSV, each with the number of its first line.
 
     Args:
         path: the file, for messages.
@@ -52,13 +52,15 @@ def csv_records(
                 yield line, partial(_by_column, columns, cells)
             line = reader.line_num + 1
     except csv.Error as error:
-        raise RequestError(f"{path}, row {line}: not valid CSV: {error}") from None
+        raise RequestError(f"{path}, row {line}: this is not valid CSV: {error}") from None
     if columns is None:
-        raise RequestError(f"{path}: it is empty; its first row names columns, such as path")
+        raise RequestError(
+            f"{path}: this manifest is empty; its first row must name columns, such as path"
+        )
 
 
 def _check_header(place: str, columns: Sequence[str], check_column: Callable[[str], None]) -> None:
-    """See that a header names each column once, and only columns that exist.
+    """Check that a header names each column once, and only columns that exist.
 
     Raises:
         RequestError: it does not.
@@ -66,9 +68,9 @@ def _check_header(place: str, columns: Sequence[str], check_column: Callable[[st
     counts = Counter(columns)
     for number, column in enumerate(columns, 1):
         if not column:
-            raise RequestError(f"{place}: column {number} has no name")
+            raise RequestError(f"{place}: column {number} has no name; name or remove it")
         if counts[column] > 1:
-            raise RequestError(f"{place}: there are two columns '{column}'")
+            raise RequestError(f"{place}: there are two columns '{column}'; remove one of them")
     if "path" not in columns:
         commas = "" if len(columns) > 1 else "; columns are separated by commas"
         message = one_of("column", "path", columns).replace("unknown", "there is no")
@@ -81,7 +83,7 @@ def _check_header(place: str, columns: Sequence[str], check_column: Callable[[st
 
 
 def _by_column(columns: Sequence[str], cells: Sequence[str]) -> dict[str, Any]:
-    """The cells of a row by their columns, without empty ones.
+    """Return the values of a row by column, without empty cells.
 
     Raises:
         RequestError: there are more or fewer cells than columns.
@@ -90,7 +92,7 @@ def _by_column(columns: Sequence[str], cells: Sequence[str]) -> dict[str, Any]:
         listed = ", ".join(columns)
         raise RequestError(
             f"found {len(cells)} cells, but there are {len(columns)} columns ({listed}); "
-            "a cell with commas stands in quotes"
+            "put a cell that contains commas in quotes"
         )
     pairs = zip(columns, cells, strict=True)
     filled = {column: cell for column, cell in pairs if cell.strip()}
@@ -100,29 +102,32 @@ def _by_column(columns: Sequence[str], cells: Sequence[str]) -> dict[str, Any]:
 def json_records(
     path: Path, text: str, check_column: Callable[[str], None]
 ) -> Iterator[tuple[int, Record]]:
-    """The lines of a JSONL that are not empty, with their numbers; arguments as for a CSV."""
+    """Yield the lines of a JSONL that are not empty, with their numbers.
+
+    The arguments are those of :func:`csv_records`.
+    """
     for number, line in enumerate(text.split("\n"), 1):
         if line.strip():
             yield number, partial(_from_json, line, check_column)
 
 
 def _from_json(line: str, check_column: Callable[[str], None]) -> dict[str, Any]:
-    """The values of a JSON object by dotted columns, without null.
+    """Return the values of a JSON object by dotted columns, without null.
 
     Raises:
-        RequestError: it is no object, has a key twice, or a column that does not exist.
+        RequestError: the line is not an object, or has a repeated key or an unknown column.
     """
     try:
         row = json.loads(line, parse_constant=_refuse_constant, object_pairs_hook=_unique)
     except json.JSONDecodeError as error:
-        message = f"not valid JSON: {error.msg} at character {error.colno}"
+        message = f"this is not valid JSON: {error.msg} at character {error.colno}"
         raise RequestError(message) from None
     except RequestError:
         raise
     except (ValueError, RecursionError) as error:
-        raise RequestError(f"not valid JSON: {error}") from None
+        raise RequestError(f"this is not valid JSON: {error}") from None
     if not isinstance(row, dict):
-        raise RequestError(f"found {line.strip()[:40]}, but a row is an object: {{...}}")
+        raise RequestError(f"found {line.strip()[:40]}, but expected an object: {{...}}")
     pairs: list[tuple[str, Any]] = []
     for key, value in row.items():
         if isinstance(value, dict) and "." not in key and key not in (*OWN, *PLAIN):
@@ -135,17 +140,18 @@ def _from_json(line: str, check_column: Callable[[str], None]) -> dict[str, Any]
 
 
 def _refuse_constant(constant: str) -> None:
-    raise ValueError(f"found {constant}, which is no number")
+    raise ValueError(f"{constant} is not a number in JSON")
 
 
 def _unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """Pairs as a dict.
+    """Return pairs as a dict.
 
     Raises:
-        RequestError: a key is there twice.
+        RequestError: a key occurs twice.
     """
     values = dict(pairs)
     if len(values) < len(pairs):
         names = [name for name, _ in pairs]
-        raise RequestError(f"'{next(n for n in names if names.count(n) > 1)}' is there twice")
+        twice = next(n for n in names if names.count(n) > 1)
+        raise RequestError(f"'{twice}' occurs twice; remove one of them")
     return values

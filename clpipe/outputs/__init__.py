@@ -1,11 +1,13 @@
-"""What is written of an image: which pictures, in which formats, with which sidecar.
+"""Outputs: the pictures of an image, their formats, and their sidecars.
 
-:mod:`~clpipe.outputs.plan` names the files that a run writes, :mod:`~clpipe.outputs.recipes` says
-how each picture is made, :mod:`~clpipe.outputs.existing` finds what is there already, and
-:mod:`~clpipe.outputs.writer` writes the rest. :mod:`~clpipe.outputs.sidecar` reads and writes
-sidecars, :mod:`~clpipe.outputs.record` says what is in them. ``photographs`` and ``annotations``
-read an output folder by its sidecars.
+- :mod:`~clpipe.outputs.plan` names the files that a run writes.
+- :mod:`~clpipe.outputs.recipes` lists the chain of each picture.
+- :mod:`~clpipe.outputs.existing` finds files that exist already.
+- :mod:`~clpipe.outputs.writer` writes the rest.
+- :mod:`~clpipe.outputs.sidecar` reads and writes sidecars.
+- :mod:`~clpipe.outputs.record` makes the contents of sidecars.
+- ``photographs`` and ``annotations`` read the sidecars of an output directory.
 
-The room decides names and contents, and leaves encoding to ``images``. It imports ``inputs`` and
-below, and starts no threads.
+This package decides names and contents, and leaves encoding to ``images``. It imports ``inputs``
+and below, and starts no threads.
 """

@@ -1,4 +1,4 @@
-"""Annotations in COCO's form moved as pixels are: boxes, outlines, masks and keypoints."""
+"""Warps annotations like the pixels of their pictures: boxes, polygons, masks and keypoints."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,21 +20,21 @@ from clpipe.reference.geometry import (
 )
 from clpipe.reference.intrinsics import Intrinsics
 
-STEP = 2.0  # px, of the pieces in which an outline is mapped
-SIMPLER = 0.05  # px, by which a mapped outline may be off to have fewer corners
-MOST_PLACES = 4096  # of a mask, by which it is known how much of it is cut off
-LEAST = 0.5  # px^2: what is left of a smaller object is left out
+STEP = 2.0  # px: the length of the segments into which an outline is divided
+SIMPLER = 0.05  # px: the tolerance with which a mapped outline is simplified
+MOST_PLACES = 4096  # of a mask, sampled to find how much of it is cut off
+LEAST = 0.5  # px^2: an object whose visible area is smaller is dropped
 
 
 @dataclass(frozen=True)
 class Way:
-    """How places of a render come into a picture.
+    """The mapping from points of a render to points of a picture.
 
     Args:
-        geometry: how pixels move; None leaves them.
-        width, height: of the render.
-        margins: how far it goes on beyond that.
-        after: width and height of the picture.
+        geometry: how pixels move; None if they do not.
+        width, height: size of the render in px, without overscan.
+        margins: the overscan of the render.
+        after: width and height of the picture in px.
     """
 
     geometry: Geometry | None
@@ -44,7 +44,11 @@ class Way:
     after: tuple[int, int]
 
     def places(self, points: Array) -> Doubles:
-        """Where places of the render, (point, 2), are; NaN where the picture cannot show them."""
+        """Return the picture's x and y of points of the render; NaN if they cannot be shown.
+
+        Args:
+            points: x and y in px from the render's corner, (point, 2).
+        """
         corner = np.array([self.margins.left, self.margins.top])
         at = (np.asarray(points, np.float64) + corner).T
         if self.geometry is None:
@@ -55,7 +59,12 @@ class Way:
         return np.stack(there, -1)
 
     def shows(self, points: Array, there: Doubles) -> Mask:
-        """Whether places are in the render and in the picture."""
+        """Return whether each point is inside both the render and the picture.
+
+        Args:
+            points: x and y in the render, (point, 2).
+            there: x and y in the picture, (point, 2).
+        """
         left, top, right, bottom = self.margins
         low, high = [-left, -top], [self.width + right, self.height + bottom]
         with np.errstate(invalid="ignore"):
@@ -64,31 +73,31 @@ class Way:
 
     @property
     def is_turned(self) -> bool:
-        """Whether the picture is flipped or turned."""
+        """Whether the picture is flipped or rotated."""
         parts = self.geometry.parts if isinstance(self.geometry, Composition) else ()
         return any(isinstance(part, Orientation) for part in parts)
 
     def camera(self, before: Intrinsics) -> Intrinsics | None:
-        """Return the intrinsics of the picture; None if they are not known, or it is turned.
+        """Return the intrinsics of the picture; None if they are unknown, or if it is rotated.
 
         Args:
-            before: those of the render.
+            before: the intrinsics of the render.
 
         Raises:
-            RequestError: what moves pixels contradicts them.
+            RequestError: a stage that moves pixels contradicts them.
         """
         size = self.margins.around(self.width, self.height)
         return self.geometry.intrinsics(before, *size) if self.geometry else before
 
 
 def mapped_annotation(annotation: Record, way: Way) -> Record | None:
-    """What changes of an annotation; None where nothing of its object is in the picture.
+    """Return the values of an annotation that change; None if its object is not in the picture.
 
-    A box is made again of the mapped outline or mask, where there is one; else it is the box around
-    its own mapped edges. ``truncated`` is the share of the object that the picture does not show.
+    The box is that of the mapped outline or mask. Without either, it encloses the mapped edges of
+    the old box. ``truncated`` is the share of the object outside the picture.
 
     Raises:
-        ImageError: a mask is of another size than its image.
+        ImageError: a mask differs from its image in size.
     """
     outline = annotation.get("segmentation") or None
     changed: Record = {}
@@ -114,9 +123,9 @@ def mapped_annotation(annotation: Record, way: Way) -> Record | None:
 
 
 def mapped_box(box: Sequence[float], way: Way) -> tuple[list[float], float] | None:
-    """The box around a box's mapped edges in the picture, and the share of it there.
+    """Return the box around the mapped edges of a box, and the share of it in the picture.
 
-    None where nothing of it is in the picture.
+    Return None if nothing of the box is in the picture. Boxes are x, y, width and height in px.
     """
     clipped = _mapped_outline([_box_outline(box)], way)
     if clipped is None:
@@ -126,14 +135,14 @@ def mapped_box(box: Sequence[float], way: Way) -> tuple[list[float], float] | No
 
 
 def _bounds(outlines: Sequence[Array]) -> list[float]:
-    """The box of outlines: x, y, width and height."""
+    """Return the bounding box of outlines: x, y, width and height."""
     low = np.min([part.min(0) for part in outlines], 0)
     high = np.max([part.max(0) for part in outlines], 0)
     return [*low.round(3).tolist(), *(high - low).round(3).tolist()]
 
 
 def moved_mask(mask: Array, way: Way) -> Array:
-    """A mask of the render, (height, width) of 0 and 1, in the picture."""
+    """Return a mask of the render, (height, width) of 0 and 1, warped into the picture."""
     layer = Layer("label", mask[..., None], way.margins.left, way.margins.top)
     (moved,), _ = warp([layer], way.geometry, *way.margins.around(way.width, way.height))
     return np.asarray(moved[..., 0])
@@ -145,13 +154,13 @@ def _box_outline(box: Sequence[float]) -> Array:
 
 
 def _area(outline: Array) -> float:
-    """The signed area of an outline, (corner, 2), in px^2."""
+    """Return the signed area in px^2 of an outline, (corner, 2)."""
     x, y = outline.T
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
 
 
 def _mapped_outline(parts: Sequence[Array], way: Way) -> tuple[list[Array], float] | None:
-    """Outlines in the picture, and the share of their area in it; None where nothing is."""
+    """Return outlines in the picture, and the share of their area in it; None if none is."""
     from shapely import Polygon, box, make_valid
     from shapely.ops import unary_union
 
@@ -172,13 +181,13 @@ def _mapped_outline(parts: Sequence[Array], way: Way) -> tuple[list[Array], floa
 
 
 def _polygons(shape: Any) -> list[Any]:
-    """The polygons of a shape of shapely's."""
+    """Return the polygons in a shape of shapely's."""
     parts = getattr(shape, "geoms", [shape])
     return [each for each in parts if each.geom_type == "Polygon" and each.area > 0]
 
 
 def _mapped(shape: Any, way: Way) -> tuple[float, list[Any]]:
-    """The area of a shape where it comes to lie, with what cannot be shown, and its polygons."""
+    """Return the area of a shape after mapping, with its hidden parts, and its visible polygons."""
     from shapely import Polygon, make_valid
 
     area, found = 0.0, []
@@ -200,10 +209,10 @@ def _mapped(shape: Any, way: Way) -> tuple[float, list[Any]]:
 
 
 def _mapped_mask(encoded: Record, way: Way) -> Record | None:
-    """A run-length encoded mask in the picture, its area and box; None where nothing is in it.
+    """Return a run-length encoded mask in the picture, with its area and box; None if it is empty.
 
     Raises:
-        ImageError: it is of another size than its image.
+        ImageError: the mask differs from its image in size.
     """
     from pycocotools import mask as coder
 
@@ -232,7 +241,7 @@ def _mapped_mask(encoded: Record, way: Way) -> Record | None:
 
 
 def _mapped_keypoints(points: Sequence[float], way: Way) -> Record:
-    """Keypoints in the picture; those beside it are not labelled there."""
+    """Return keypoints in the picture. Those outside it become unlabelled: 0, 0, 0."""
     found = np.reshape(np.asarray(points, np.float64), (-1, 3))
     there = way.places(found[:, :2])
     inside = way.shows(found[:, :2], there) & (found[:, 2] > 0)

@@ -1,4 +1,4 @@
-"""Files of annotations, in the format that those of the renders have: COCO's, KITTI's or BOP's."""
+"""Writes annotations of pictures in the format of the renders' annotations: COCO, KITTI or BOP."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -23,32 +23,32 @@ from clpipe.reference.intrinsics import PINHOLE, Intrinsics
 
 ANNOTATIONS = "annotations.json"
 LABELS = "label_2"
-NOTHING = [-1, -1, -1, -1]  # BOP's box of what is not seen
-CAMERA_MATRIX = (0, 4, 2, 5)  # of fx, fy, cx and cy among the nine numbers of one
-TURNED = "flipped and turned patches have no poses; leave --augment out"
+NOTHING = [-1, -1, -1, -1]  # BOP's box of an invisible object
+CAMERA_MATRIX = (0, 4, 2, 5)  # the indices of fx, fy, cx and cy in a camera matrix of nine numbers
+TURNED = "flipped and rotated patches have no poses; run without --augment"
 
 
 class Files(Protocol):
-    """The annotations of a folder's pictures, as they are collected."""
+    """Collects the annotations of an output directory's pictures, and writes them."""
 
     def add(self, file: str, way: Way, render: AnnotatedRender) -> int:
-        """Add those of a picture.
+        """Add the annotations of a picture.
 
         Args:
-            file: the picture, from the folder.
-            way: how the render's places come into it.
-            render: what is annotated of its render.
+            file: the picture's path in the folder.
+            way: the mapping from the render to the picture.
+            render: the annotations of its render.
 
         Returns:
-            How many there are.
+            The number of objects in the picture.
 
         Raises:
-            ImageError: they cannot be mapped.
+            ImageError: the annotations cannot be mapped.
         """
         ...
 
     def write(self, folder: Path) -> list[Path]:
-        """Write all; the files, or folders of them.
+        """Write all annotations, and return the files and folders that were written.
 
         Raises:
             ImageError: a file cannot be written.
@@ -57,7 +57,7 @@ class Files(Protocol):
 
 
 def files_for(annotations: Annotations) -> Files:
-    """What collects annotations in the format of the renders' own."""
+    """Return an empty collection in the format of the renders' annotations."""
     if isinstance(annotations, Kitti):
         return KittiFiles(annotations)
     if isinstance(annotations, Bop):
@@ -67,7 +67,7 @@ def files_for(annotations: Annotations) -> Files:
 
 
 class CocoFiles:
-    """One file of all pictures, see :class:`Files`."""
+    """COCO: one file for all pictures, see :class:`Files`."""
 
     def __init__(self, coco: Coco) -> None:
         self._coco = coco
@@ -98,10 +98,10 @@ class CocoFiles:
 
 
 class KittiFiles:
-    """A label, and a calibration where the render has one, for each picture; see :class:`Files`.
+    """KITTI: for each picture a label, and a calibration if its render has one; see :class:`Files`.
 
-    Places in space and the angles there are the camera's, and stay; what is less than half a pixel
-    in the picture is left out.
+    Positions and angles are in camera space and do not change. Objects that cover less than half a
+    square pixel of the picture are dropped.
     """
 
     def __init__(self, kitti: Kitti) -> None:
@@ -127,7 +127,7 @@ class KittiFiles:
 
 
 def _kitti_line(known: KittiObject, way: Way) -> str:
-    """A line of a label; "" where its box is not in the picture."""
+    """Return a line of a label; "" if its box is not in the picture."""
     left, top, right, bottom = known.box
     found = mapped_box([left, top, right - left, bottom - top], way)
     if found is None:
@@ -136,7 +136,7 @@ def _kitti_line(known: KittiObject, way: Way) -> str:
     words = list(known.words)
     if known.truncated >= 0:
         words[1] = f"{1 - (1 - known.truncated) * shown:.2f}"
-    # KITTI's places are centres of pixels, of which the picture has none beyond its outermost.
+    # KITTI's coordinates count from the centre of the first pixel, so the last one is width - 1.
     corners = np.reshape([x, y, x + width, y + height], (2, 2)) - CENTRE
     edges = np.clip(corners, 0, np.array(way.after) - 1)
     words[4:8] = [f"{edge:.2f}" for edge in edges.ravel()]
@@ -157,10 +157,10 @@ def _kitti_calibration(known: Mapping[str, Doubles], way: Way) -> str:
 
 
 class BopFiles:
-    """scene_gt.json, scene_gt_info.json, scene_camera.json and masks; see :class:`Files`.
+    """BOP: scene_gt.json, scene_gt_info.json, scene_camera.json and masks; see :class:`Files`.
 
-    Poses are the camera's, and stay. Images are numbered as the renders where each has one picture,
-    else one after the other; scene_camera.json says which file an image is.
+    Poses are in camera space and do not change. Images have the numbers of their renders if each
+    render has one picture. Otherwise they are numbered from 0. scene_camera.json lists their files.
     """
 
     def __init__(self, bop: Bop) -> None:
@@ -177,7 +177,7 @@ class BopFiles:
             if "cam_K" in known:
                 after = _camera_of(known["cam_K"], way)
                 camera["cam_K"] = _matrix_of(after).ravel().tolist()
-                if after.model != PINHOLE:  # which BOP has no word for
+                if after.model != PINHOLE:  # BOP itself cannot describe distortion
                     camera |= lens_record(after)
         seen = [_Seen(each, way) for each in render.content]
         self._pictures.append((file, render, camera, seen))
@@ -212,8 +212,8 @@ class _Seen:
     """An object of BOP's in a picture.
 
     Args:
-        known: it in the render.
-        way: how places come into the picture.
+        known: the object in the render.
+        way: the mapping from the render to the picture.
     """
 
     def __init__(self, known: BopObject, way: Way) -> None:
@@ -246,22 +246,22 @@ class _Seen:
 
 
 def _mask(path: Path, way: Way) -> Array:
-    """A mask, (height, width) of 0 and 1.
+    """Return a mask from a file: (height, width) of 0 and 1.
 
     Raises:
-        ImageError: it cannot be read, or is of another size than the render.
+        ImageError: the file cannot be read, or differs from the render in size.
     """
     mask = read_grey(path)
     if mask.shape[1::-1] != (way.width, way.height):
         raise ImageError(
-            f"{path}: a mask of {mask.shape[1]}x{mask.shape[0]} pixels of a render of "
-            f"{way.width}x{way.height}"
+            f"{path}: this mask has {mask.shape[1]}x{mask.shape[0]} pixels, but its render has "
+            f"{way.width}x{way.height}; render both at one size"
         )
     return (mask > 0).astype(np.uint8)
 
 
 def _box_of(mask: Array) -> list[int]:
-    """The box of a mask, by whole pixels: x, y, width and height."""
+    """Return the bounding box of a mask in whole pixels: x, y, width and height."""
     rows, columns = np.nonzero(mask)
     if not rows.size:
         return NOTHING
@@ -270,16 +270,18 @@ def _box_of(mask: Array) -> list[int]:
 
 
 def _camera_of(matrix: Sequence[float] | Array, way: Way) -> Intrinsics:
-    """The picture's camera, from the render's matrix, whose pixels count from their centres.
+    """Return the picture's camera, from the matrix of its render.
+
+    In both, (0, 0) is the centre of the first pixel.
 
     Raises:
-        ImageError: it is not known.
+        ImageError: the camera is not known.
     """
     fx, fy, cx, cy = (float(matrix[i]) for i in CAMERA_MATRIX)
     before = Intrinsics(way.width, way.height, fx, fy, cx + CENTRE, cy + CENTRE)
     found = way.camera(before)
     if found is None:
-        raise ImageError("the picture's camera is not known")
+        raise ImageError("the intrinsics of the picture are not known")
     return replace(simplest(found), cx=found.cx - CENTRE, cy=found.cy - CENTRE)
 
 

@@ -1,6 +1,7 @@
-"""Annotations of renders as those of their pictures.
+"""Converts annotations of renders to annotations of their pictures.
 
-They go through what moves the pixels (distortion, resizing, patches), as the sidecars say it.
+The stages that move pixels (distortion, resizing, patches) warp annotations as well. Sidecars
+contain their settings.
 """
 
 from collections import Counter
@@ -31,18 +32,18 @@ from clpipe.reference.geometry import (
     Orientation,
 )
 
-LENGTHS = ("focal_length", "sensor_width")  # that an image may say of itself
+LENGTHS = ("focal_length", "sensor_width")  # values that an image may state itself
 
 
 def write_annotations(folder: Path, annotations: Annotations) -> list[str]:
-    """Write the annotations of all noisy pictures of a folder, in the format that they have.
+    """Write the annotations of all noisy pictures of a folder, in the format of the renders' own.
 
     Args:
-        folder: of a run, or of one of its series.
-        annotations: of the renders.
+        folder: the output directory of a run, or the folder of one member of its series.
+        annotations: the annotations of the renders.
 
     Returns:
-        Lines for people: what was written, and what could not be.
+        Lines to print: the files that were written, and warnings.
 
     Raises:
         ImageError: a file cannot be written.
@@ -69,17 +70,19 @@ def write_annotations(folder: Path, annotations: Annotations) -> list[str]:
                 found += files.add(file.relative_to(folder).as_posix(), way, render)
                 pictures += 1
         except (ClpipeError, KeyError, TypeError, ValueError) as error:
-            lines.append(f"warning: {path}: its annotations are left out: {error}")
+            lines.append(f"warning: {path}: its annotations are not written: {error}")
     if unnamed:
+        pictures_are = "1 picture is" if unnamed == 1 else f"{unnamed} pictures are"
         lines.append(
-            f"warning: {unnamed} pictures are of renders that {annotations.file} does not name"
+            f"warning: {pictures_are} not annotated, because {annotations.file} does not list the "
+            "render"
         )
     written = ", ".join(map(str, files.write(folder)))
     return [f"wrote {written}: {found} annotations of {pictures} pictures", *lines]
 
 
 def _sidecars(folder: Path) -> Iterator[tuple[Path, Mapping[str, Any]]]:
-    """The sidecars of noisy pictures, sorted."""
+    """Yield the sidecars of noisy pictures with their values, sorted."""
     for path in sorted(sidecar_files(folder)):
         try:
             values = values_at(path)
@@ -92,28 +95,27 @@ def _sidecars(folder: Path) -> Iterator[tuple[Path, Mapping[str, Any]]]:
 def _pictures(
     path: Path, values: Mapping[str, Any], own: tuple[int, int]
 ) -> Iterator[tuple[Path, Way]]:
-    """The pictures of a sidecar: each file, and how a render's places come into it.
+    """Yield the picture files of a sidecar, each with the mapping from its render.
 
     Args:
-        path: of the sidecar.
+        path: the sidecar.
         values: its values.
-        own: width and height of the render.
+        own: width and height of the render in px.
 
     Raises:
-        ImageError: the render is of another size than the annotations say.
+        ImageError: the render has another size than its annotations state.
         KeyError, TypeError, ValueError: the values are damaged.
-        ClpipeError: the chain cannot be made again.
+        ClpipeError: the chain cannot be made from the sidecar.
     """
     chain = chain_of(values)
     if "panorama" in values:
-        raise ImageError("annotations of what is seen all around do not go through a wide lens")
+        raise ImageError("annotations of panoramas cannot be warped by a wide lens")
     parts = chain.geometry.parts if chain.geometry else ()
     size = chain.size(*chain.margins.around(*own))
     if size != (values["width"], values["height"]):
         raise ImageError(
-            f"the annotations are of {own[0]}x{own[1]} pixels, of which a "
-            f"picture of {size[0]}x{size[1]} would be made, but it has "
-            f"{values['width']}x{values['height']}"
+            f"the annotations are for a render of {own[0]}x{own[1]} pixels, whose picture would "
+            f"have {size[0]}x{size[1]}, but the picture has {values['width']}x{values['height']}"
         )
     if "patches" not in values:
         file = picture_of(path, values)
@@ -132,10 +134,10 @@ def _pictures(
 
 
 def chain_of(values: Mapping[str, Any]) -> Chain:
-    """The chain of a picture, as its sidecar says it.
+    """Return the chain of a picture, from the values of its sidecar.
 
     Raises:
-        ClpipeError: it cannot be made again.
+        ClpipeError: the chain cannot be made.
         KeyError, TypeError, ValueError: the values are damaged.
     """
     request = Request.from_record(values["request"])

@@ -1,7 +1,7 @@
-"""The strength of a baseline's noise, which matches that of a noisy picture made before it.
+"""Finds the strength of a baseline's noise that matches the noise of the noisy picture.
 
-The variance of each channel is matched in the finished pictures, where values are clipped at black
-and at white.
+A baseline is a simple noise model for comparison. The variance of each channel is matched in the
+finished pictures, where values are clipped at black and at white.
 """
 
 from dataclasses import dataclass, field
@@ -20,22 +20,22 @@ from clpipe.stages.picture_noise import CHANNELS, IidGaussian, IntensityDependen
 
 LARGEST = 1.0  # of full scale, the largest sigma
 CURVE = 65  # intensities at which the sigma of INTENSITY is known
-FINE = 1024  # intensities of the clean picture that are told apart
+FINE = 1024  # bins of the histogram of the clean picture
 QUANTILES = np.array([NormalDist().inv_cdf((i + 0.5) / 64) for i in range(64)])
 QUANTILES /= QUANTILES.std()
-INDEPENDENT_LEFT = 0.25  # the share of independent noise's variance that averaging 2x2 leaves
-ROUNDS = 8  # of trying noise on the picture; most need four
-CLOSE = 0.003  # relative error of a variance that is good enough
+INDEPENDENT_LEFT = 0.25  # averaging 2x2 leaves this share of the variance of independent noise
+ROUNDS = 8  # of applying noise to the picture, at most; four are usually enough
+CLOSE = 0.003  # relative error of a variance at which the search stops
 
 
 @dataclass(eq=False)
 class Spread:
-    """The noise of a noisy picture, and the intensities of its clean one; they come one by one.
+    """The noise of a noisy picture, and the intensities of its clean one, taken one by one.
 
     Args:
-        renditions: that they are measured on: the noisy picture, its truth as it is developed, and
-            its clean truth, in the order in which they come.
-        matching: where, and on what, the baseline's noise is matched.
+        renditions: the pictures to measure, in the order of :meth:`take`: the noisy picture, its
+            ground truth of development, and its clean ground truth.
+        matching: in which pixels, and on which encoding, the baseline's noise is matched.
         encoding: how the pictures are encoded.
     """
 
@@ -43,17 +43,17 @@ class Spread:
     matching: NoNoise
     encoding: Encoding
     _noisy: Floats | None = None
-    _clean: Floats | None = None  # where noise must be tried on it
-    _mask: Mask | None = None  # the pixels where noise is matched; None is all
+    _clean: Floats | None = None  # only if noise has to be applied to it
+    _mask: Mask | None = None  # the pixels in which noise is matched; None is all
     _covariance: Doubles = field(default_factory=lambda: np.zeros((3, 3)))
     _curves: list[Doubles] = field(default_factory=list)
     _intensities: list[Array] = field(default_factory=list)
 
     def take(self, rendition: Rendition, picture: Floats) -> None:
-        """Take what is to be known of a picture; others are left alone.
+        """Measure a picture. Renditions that are not needed are ignored.
 
         Args:
-            rendition: which it is.
+            rendition: the rendition of the picture.
             picture: (height, width, 3) display values, float32.
         """
         noisy, developed, clean = self.renditions
@@ -77,28 +77,28 @@ class Spread:
             ]
 
     def _shown(self, picture: Floats) -> Floats:
-        """A picture as it is shown: cut off at black and white, or as its JPEG leaves it."""
+        """Return a picture as users see it: clipped at black and white, or after JPEG encoding."""
         if not self.matching.jpeg:
             return np.clip(picture, 0, 1)
         encoding = JpegEncoding(self.encoding.jpeg_quality, self.encoding.jpeg_subsampling)
         return np.asarray(through_jpeg(to_8_bit(picture), encoding) / np.float32(255), np.float32)
 
     def _selected(self, picture: Floats) -> Floats:
-        """The pixels where noise is matched, (pixel, 3)."""
+        """Return the pixels in which noise is matched, (pixel, 3)."""
         return picture.reshape(-1, 3) if self._mask is None else picture[self._mask]
 
     def _covariance_of(self, noise: Floats) -> Doubles:
-        """The covariance of red, green and blue where noise is matched."""
+        """Return the 3x3 covariance of red, green and blue in the pixels that are matched."""
         if self.matching.match == HALVED:
             return covariance(halved(noise[None]))
         return covariance(self._selected(noise)[None, None])
 
     def method(self, baseline: str) -> tuple[IidGaussian | IntensityDependent, dict[str, float]]:
-        """The noise of a baseline, one of :data:`clpipe.chain.rendition.BASELINES`.
+        """Return the noise of a baseline, one of :data:`clpipe.chain.rendition.BASELINES`.
 
         Returns:
-            The method, and what was reached where it had to be tried: the variance over that of the
-            picture's noise, by name; else {}.
+            The method. If its noise had to be applied to the picture, also the ratio of its
+            variance to that of the picture's noise, by name; otherwise {}.
         """
         wanted = np.diag(self._covariance)
         curves = [np.ones(2)] * 3 if baseline == IID else self._curves
@@ -108,8 +108,8 @@ class Spread:
         method = self._with_strength(baseline, strengths)
         if self._clean is None or not (wanted > 0).all():
             return method, {}
-        # Channels are coupled by JPEG's luma and chroma, so a channel's error is not of its own
-        # strength alone: Broyden's method (1965), in logarithms, from the unit matrix on.
+        # JPEG's luma and chroma couple the channels, so the error of a channel depends on all
+        # strengths. Broyden's method (1965) in logarithms, starting from the unit matrix.
         clean, best, reached, least = self._shown(self._clean), method, np.ones(3), np.inf
         slope, step, before = np.eye(3), np.zeros(3), np.zeros(3)
         for _ in range(ROUNDS):
@@ -129,7 +129,7 @@ class Spread:
         return best, dict(zip(names, reached.round(4).tolist(), strict=True))
 
     def _with_strength(self, baseline: str, strengths: Doubles) -> IidGaussian | IntensityDependent:
-        """The noise of a baseline with factors of its sigma in red, green and blue."""
+        """Return the noise of a baseline, with factors for its sigma in red, green and blue."""
         correlation = 0.0, 0.0, 0.0
         if self.matching.correlated:
             sigma = np.sqrt(np.maximum(np.diag(self._covariance), 1e-12))
@@ -149,12 +149,12 @@ class Spread:
 
 
 def curve_of(truth: Floats, noise: Floats) -> Doubles:
-    """Sigma at :data:`CURVE` intensities from 0 to 1 of noise that is then clipped.
+    """Return sigma before clipping at :data:`CURVE` intensities from 0 to 1.
 
-    Between intensities that occur it is a line.
+    It is interpolated linearly between intensities that occur.
 
     Args:
-        truth, noise: of a channel, (pixel,).
+        truth, noise: values of one channel, (pixel,).
     """
     place = np.rint(truth * (CURVE - 1)).astype(np.intp)
     noise = noise.astype(np.float64)
@@ -167,7 +167,7 @@ def curve_of(truth: Floats, noise: Floats) -> Doubles:
 
 
 def unclipped(sigmas: Doubles) -> Doubles:
-    """The sigma at each of :data:`CURVE` intensities whose noise has that sigma after clipping."""
+    """Return the sigmas before clipping that give ``sigmas`` after it, at :data:`CURVE` points."""
     v = np.linspace(0, 1, CURVE)[:, None]
     low, high = np.zeros(CURVE), np.full(CURVE, LARGEST)
     for _ in range(40):
@@ -178,12 +178,12 @@ def unclipped(sigmas: Doubles) -> Doubles:
 
 
 def strength_for(variance: float, curve: Doubles, intensities: Array) -> float:
-    """The factor of a sigma curve that gives a picture's noise a variance, after clipping.
+    """Return the factor of a sigma curve with which a picture's noise has a given variance.
 
     Args:
-        variance: of the finished noise.
+        variance: the variance after clipping.
         curve: relative sigmas at intensities evenly spaced from 0 to 1.
-        intensities: how often each of :data:`FINE` intensities from -0.5 to 1.5 occurs.
+        intensities: a histogram of the picture in :data:`FINE` bins from -0.5 to 1.5.
     """
     v = (np.arange(FINE) + 0.5) * 2 / FINE - 0.5
     relative = np.interp(v, np.linspace(0, 1, len(curve)), curve)

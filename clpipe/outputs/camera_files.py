@@ -1,7 +1,7 @@
-"""The views of an output folder, from its sidecars: cameras.json, COLMAP's text model and
-nerfstudio's transforms.json.
+"""Writes the cameras of an output directory: cameras.json, COLMAP's text model and nerfstudio's
+transforms.json.
 
-The pictures are sorted by their names, so the same sidecars make the same bytes in any order.
+The cameras come from sidecars. Pictures are sorted by name, so the bytes depend on nothing else.
 """
 
 import os
@@ -31,12 +31,12 @@ FILES = tuple(
 
 @dataclass(frozen=True)
 class Written:
-    """What was written of a folder's views.
+    """The camera files that were written for a folder.
 
     Args:
-        files: by their paths in the folder; none where no picture's intrinsics are known.
-        pictures: how many are in them.
-        left_out: what is not in all of them and why, as texts.
+        files: their paths in the folder; empty if no picture has known intrinsics.
+        pictures: the number of pictures in them.
+        left_out: sentences about pictures that are missing in some files, and why.
     """
 
     files: tuple[str, ...]
@@ -44,7 +44,7 @@ class Written:
     left_out: tuple[str, ...]
 
     def lines(self, folder: Path) -> list[str]:
-        """The same for people; ``folder`` is the one that it was written to."""
+        """Return lines to print about files written to ``folder``."""
         warnings = [f"warning: {each}" for each in self.left_out]
         if not self.files:
             return warnings
@@ -54,28 +54,28 @@ class Written:
 
 
 def check_camera_files(folder: Path) -> None:
-    """See that the files of a folder's views may be written.
+    """Check that the camera files of a folder may be written.
 
     Raises:
-        ImageError: one of their names is somebody else's.
+        ImageError: a file of the same name exists that clpipe did not write.
     """
     for path in (folder / name for name in FILES):
         if os.path.lexists(path) and not (is_marked(path) or _is_taken(path)):
             raise ImageError(
                 f"{path}: clpipe did not write this file, and would overwrite it with the cameras "
-                "of this folder's pictures; move it, or choose another output folder"
+                "of this folder's pictures; move it, or choose another output directory"
             )
 
 
 def write_camera_files(folder: Path, splits: Mapping[str, str] = MappingProxyType({})) -> Written:
-    """Write the views of an output folder, as its sidecars say them.
+    """Write the cameras of an output directory, from its sidecars.
 
     Args:
-        folder: the output folder, or a part of it.
-        splits: what pictures are for, by the names that sidecars have.
+        folder: the output directory, or a folder in it.
+        splits: "train", "val" or "test" for each picture, by its name in sidecars.
 
     Raises:
-        ImageError: a file cannot be written or is somebody else's.
+        ImageError: a file cannot be written, or was not written by clpipe.
     """
     check_camera_files(folder)
     left_out: dict[str, list[str]] = defaultdict(list)
@@ -94,14 +94,14 @@ def write_camera_files(folder: Path, splits: Mapping[str, str] = MappingProxyTyp
             write_whole(path, texts[name].encode())
             keep_names(path.parent)
         elif texts:
-            path.unlink(missing_ok=True)  # of pictures that have gone
+            path.unlink(missing_ok=True)  # its pictures have been removed
     reasons = tuple(
-        f"{why}: {len(files)} picture{'s' * (len(files) > 1)}, such as {min(files)}"
+        f"{len(files)} picture{'s' * (len(files) > 1)} {why}, such as {min(files)}"
         for why, files in left_out.items()
         if files
     )
     reasons += tuple(
-        f"{folder / name} is the sidecar of a picture, so the cameras are not written there; give "
+        f"{folder / name} is the sidecar of a picture, so the cameras are not written to it; give "
         "that image another name"
         for name in taken
         if name in texts
@@ -116,12 +116,12 @@ def texts_of(
     left_out: Mapping[str, list[str]],
     splits: Mapping[str, str],
 ) -> dict[str, str]:
-    """The files of pictures of one kind, by their names.
+    """Return the texts of the camera files for pictures of one kind, by file name.
 
     Args:
-        pictures: sorted.
-        model: the folder that the files are for, below the pictures' own.
-        left_out: gets the names of those that are not in all of them, by the reason.
+        pictures: the pictures, sorted.
+        model: the folder of these files, relative to the output directory.
+        left_out: receives the names of pictures that are missing in some files, by reason.
         splits: see :func:`write_camera_files`.
     """
     if not pictures:
@@ -129,7 +129,7 @@ def texts_of(
     up = "../" * model.count("/")
     posed = [each for each in pictures if each.pose]
     if posed:
-        left_out[f"no pose, so not in {TRANSFORMS} and images.txt"] += [
+        left_out[f"without a pose, so not in {TRANSFORMS} and images.txt"] += [
             each.file for each in pictures if not each.pose
         ]
     texts = {CAMERAS: cameras_json(pictures, up), **colmap(pictures, posed, left_out)}
@@ -139,7 +139,7 @@ def texts_of(
 
 
 def _is_taken(path: Path) -> bool:
-    """Whether a file of the views would take the place of a picture's sidecar."""
+    """Return whether a camera file would overwrite the sidecar of a picture."""
     try:
         return is_sidecar(read_bytes(path))
     except OSError:

@@ -1,4 +1,4 @@
-"""Writes the layers that go along with a picture: one EXR of all, and PNGs of depth and labels."""
+"""Writes carried layers: all of them to one EXR, and depth and labels to PNGs on request."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,17 +20,17 @@ MM = 1000  # in a metre
 
 
 def write_carried(path: Path, carried: Aovs, layer: str = "") -> Stored:
-    """Write all carried layers as an EXR, or one of them, a depth in metres or labels, as a PNG.
+    """Write all carried layers as an EXR, or one layer (depth in metres, or labels) as a PNG.
 
-    The EXR has the layers' own channels, in their own types, and the channel :data:`VALID`.
+    The EXR contains the channels of all layers in their types, and the channel :data:`VALID`.
 
     Args:
         path: the file.
         carried: the layers.
-        layer: the name of that for a PNG.
+        layer: the name of the layer to write as a PNG; "" writes the EXR.
 
     Raises:
-        ImageError: the file cannot be written, or cannot hold the labels.
+        ImageError: the file cannot be written, or a PNG cannot hold the labels.
     """
     if layer:
         pixels = carried.arrays()[layer][..., 0]
@@ -47,7 +47,7 @@ def write_carried(path: Path, carried: Aovs, layer: str = "") -> Stored:
 
 
 def png_ending(layer: str) -> str:
-    """What stands behind an image's name in that of a layer's PNG.
+    """Return what follows the image's name in the name of a layer's PNG.
 
     >>> png_ending("Object Index")
     'Object_Index.png'
@@ -68,23 +68,23 @@ def carried_files(values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def numbers(path: Path, labels: Array) -> Array:
-    """Labels as uint16.
+    """Return labels as uint16.
 
     Raises:
-        ImageError: they are no whole numbers from 0 to 65535.
+        ImageError: the labels are not whole numbers from 0 to 65535.
     """
     with np.errstate(invalid="ignore"):
         whole = np.rint(labels).clip(0, 65535).astype(np.uint16)
     if not np.array_equal(whole, labels):
         raise ImageError(
-            f"{path}: a PNG of labels holds whole numbers from 0 to 65535; leave :png out, and the "
-            "EXR has them as they are"
+            f"{path}: these labels are not whole numbers from 0 to 65535, which a PNG requires; "
+            "remove :png from --carry, since the EXR contains them unchanged"
         )
     return whole
 
 
 def millimetres(depth: Array) -> Array:
-    """Depth in metres as whole millimetres, uint16: 0 where it is unknown, or beyond 65.535 m.
+    """Return depth in metres as uint16 millimetres: 0 if it is unknown or above 65.535 m.
 
     >>> millimetres(np.array([1.5, 65.535, 70, 1e10, -1, np.nan, np.inf])).tolist()
     [1500, 65535, 0, 0, 0, 0, 0]

@@ -1,4 +1,4 @@
-"""What exists in the output folder: finished pictures, files of ours to replace, others' files."""
+"""Finds what the output directory contains: finished pictures, and files of clpipe or others."""
 
 import json
 import os
@@ -29,32 +29,32 @@ from clpipe.outputs.sidecar import (
     values_at,
 )
 
-MARKED = 1 << 16  # bytes at either end of a file, in which a format of clpipe names clpipe
+MARKED = 1 << 16  # bytes at either end of a file in which clpipe's mark is searched
 
-OVERWRITTEN = "would be overwritten; move it, choose another output folder, or say --redo all"
+OVERWRITTEN = "would be overwritten; move it, choose another output directory, or use --redo all"
 
-# The tag Software of clpipe, or an attribute of its own. The camera of a DNG is called clpipe, too,
-# and converters repeat it in what they make.
+# clpipe's Software tag, or an attribute of its own. The name clpipe alone is not enough: a DNG's
+# camera has it as well, and converters copy it to their output.
 MARK = re.compile(rb"clpipe \d+\.\d|clpipe:\w")
 
 
 class Found(Enum):
     """What exists of a rendition."""
 
-    NOTHING = "nothing that fits, or is whole"
-    OLD = "all, but made by another program"
-    DONE = "all"
+    NOTHING = "nothing that matches and is complete"
+    OLD = "all files, but made by another program"
+    DONE = "all files"
 
 
 class Redo(Enum):
-    """Which existing pictures are made again. Each choice includes those before it.
+    """Which existing pictures are recomputed. Each choice includes those before it.
 
-    Pictures that are missing, or were made by another request, are always made.
+    Pictures that are missing, or were made by another request, are always computed.
     """
 
     MISSING = "missing"  # none
-    OLD = "old"  # those that another program made
-    DAMAGED = "damaged"  # damaged ones, which are found by reading all files
+    OLD = "old"  # pictures that another program made
+    DAMAGED = "damaged"  # damaged pictures, which are found by reading all files
     ALL = "all"  # all, even if clpipe did not write the files
 
     @property
@@ -80,14 +80,14 @@ def find(
     written. Otherwise its SHA-256 decides.
 
     Args:
-        files: of the rendition.
+        files: the files of the rendition.
         job: the image.
         request: the record of the request for the image.
-        verify: let the SHA-256 of each file, and of the input, decide.
-        is_ours: whether the files are in a folder where nobody else has files.
+        verify: whether to check the SHA-256 of each file and of the input.
+        is_ours: whether only clpipe writes to this folder.
 
     Raises:
-        ImageError: a file that would be written is somebody else's.
+        ImageError: a file of the same name exists that clpipe did not write.
     """
     try:
         values = read_sidecar(files.sidecar)
@@ -112,13 +112,13 @@ def find(
 
 
 def _is_intact(path: Path, was: Mapping[str, Any], written: int, verify: bool) -> bool:
-    """Return whether a file is what a sidecar says of it.
+    """Return whether a file matches its entry in a sidecar.
 
     Args:
         path: the file.
-        was: its size and SHA-256.
+        was: its entry, with size and SHA-256.
         written: when the sidecar was written, in ns since 1970.
-        verify: compare the SHA-256 in any case.
+        verify: whether to compare the SHA-256 in any case.
     """
     try:
         status = os.lstat(path)
@@ -131,25 +131,25 @@ def _is_intact(path: Path, was: Mapping[str, Any], written: int, verify: bool) -
 
 
 def _check_own(path: Path, sidecar: Path | None, written: int) -> None:
-    """Check that a file that would be overwritten is clpipe's.
+    """Check that clpipe wrote a file that would be overwritten.
 
     Args:
-        path: the file, which is not as a sidecar says.
-        sidecar: the one that lists it; None if there is none.
+        path: the file, which does not match a sidecar.
+        sidecar: the sidecar that lists it; None if there is none.
         written: when the sidecar was written, in ns since 1970.
 
     Raises:
-        ImageError: it is somebody else's, or somebody changed it.
+        ImageError: clpipe did not write the file, or somebody changed it.
     """
     if not is_marked(path):
         raise ImageError(
-            f"{path}: clpipe did not write this file, or it was changed since, and {OVERWRITTEN}"
+            f"{path}: clpipe did not write this file, or it was changed later, and {OVERWRITTEN}"
         )
-    # If nobody has touched the file since, the disk has damaged it.
+    # A file that differs but was not touched was damaged by the disk.
     if sidecar and os.lstat(path).st_ctime_ns > written and is_whole(path):
         raise ImageError(
-            f"{path}: was changed since clpipe wrote it (its SHA-256 is not that in "
-            f"{sidecar.name}), and {OVERWRITTEN}"
+            f"{path}: this file was changed after clpipe wrote it (its SHA-256 differs from that "
+            f"in {sidecar.name}), and {OVERWRITTEN}"
         )
 
 
@@ -165,9 +165,9 @@ def _written(path: Path) -> int:
 def found_in(
     values: Mapping[str, Any], job: Job, request: Mapping[str, Any], verify: bool = False
 ) -> Found:
-    """Return whether a sidecar's values are of the same input, the same request and this program.
+    """Return whether a sidecar has the same input and request, and names this program.
 
-    Arguments as for :func:`find`.
+    The arguments are those of :func:`find`.
     """
     if not _same_request(values.get("request"), request) or not _same_input(values, job, verify):
         return Found.NOTHING
@@ -175,18 +175,18 @@ def found_in(
 
 
 def _same_input(values: Mapping[str, Any], job: Job, verify: bool) -> bool:
-    """Return whether a sidecar is of a job's files, see :func:`_is_same`."""
+    """Return whether a sidecar lists a job's files unchanged, see :func:`_is_same`."""
     try:
         return all(_is_same(path, was, verify) for path, was in inputs_in(values, job.paths))
-    except (KeyError, TypeError, ValueError):  # the sidecar is damaged, or of more files
+    except (KeyError, TypeError, ValueError):  # damaged, or for another number of files
         return False
 
 
 def _is_same(path: Path, was: Mapping[str, Any], verify: bool) -> bool:
-    """Return whether an input file is what a sidecar says of it.
+    """Return whether an input file matches its entry in a sidecar.
 
-    A file with the same size and time of change counts as the same, and a URL always by these.
-    Otherwise, and with ``verify``, the SHA-256 decides.
+    A file with the same size and modification time counts as unchanged. For URLs, nothing else is
+    compared. Otherwise, and with ``verify``, the SHA-256 decides.
 
     Raises:
         KeyError, TypeError: the sidecar is damaged.
@@ -215,7 +215,7 @@ def _same_request(one: Any, other: Mapping[str, Any]) -> bool:
 
 
 def is_marked(path: Path) -> bool:
-    """Return whether a file has clpipe's tags, or only zeros, which a loss of power may leave."""
+    """Return whether a file has clpipe's mark, or only zeros, which a power loss may leave."""
     try:
         with open(open_plain(path, os.O_RDONLY), "rb") as file:
             status = os.fstat(file.fileno())
@@ -230,15 +230,15 @@ def is_marked(path: Path) -> bool:
 
 
 def pictures_without_input(plan: OutputPlan, jobs: Sequence[Job], inputs: Sequence[str]) -> int:
-    """Return how many pictures of the output folder are of inputs that were removed or renamed.
+    """Return the number of pictures in the output directory whose input was removed or renamed.
 
-    An input counts only if it was in a folder that is an input now, or next to an input: names in
-    sidecars are relative to the folder in which that run was started.
+    An input counts only if it was in a current input folder, or next to a current input. Names in
+    sidecars are relative to the working directory of their run, which may be another.
 
     Args:
-        plan: of the run.
-        jobs: all of it.
-        inputs: as the user gave them.
+        plan: the plan of the run.
+        jobs: all jobs of the run.
+        inputs: the inputs as the user wrote them.
     """
     own = {plan.path(job, SIDECAR, each) for job in jobs for each in plan.renditions_of(job)}
     beside = {Path(text) for text in {os.path.dirname(job.input) for job in jobs}}

@@ -1,4 +1,4 @@
-"""The output folder: made, locked against other runs, and cleared of unfinished files."""
+"""The output directory: created, locked against other runs, and cleared of unfinished files."""
 
 import contextlib
 import errno
@@ -15,24 +15,23 @@ from clpipe.base.system import HOLDABLE, hold, let_go, open_plain, reserve
 from clpipe.inputs.find import Job, Shard
 from clpipe.outputs.patches import without_patch
 
-RESUMABLE = "what is finished is there, and the same command goes on"
+RESUMABLE = "finished pictures are kept, and the same command resumes"
 
 
-LEAST_FREE = 8 * 2**20  # bytes; a disk with less counts as full
+LEAST_FREE = 8 * 2**20  # bytes; a disk with less free space counts as full
 
 LOCK = ".clpipe.lock"
 
-UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # as whole_file names them
+UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # names that whole_file gives
 
-# Locks of this process: the file, its descriptor, and the first byte and the length of the part
-# that is held.
+# Locks of this process: the file, its descriptor, and the first byte and length of the locked part.
 _held: set[tuple[Path, int, int, int]] = set()
 
 
 def write_problem(folder: Path, with_space: bool = True) -> str:
-    """Why nothing can be written to a folder, "" where it can.
+    """Return why nothing can be written to a folder; "" if it can be written to.
 
-    Without ``with_space`` a full disk will do, as for a run that may find all done.
+    Without ``with_space``, a full disk is accepted, because a run may find all pictures finished.
     """
     probe = folder / f".clpipe.{secrets.token_hex(8)}"
     try:
@@ -41,7 +40,7 @@ def write_problem(folder: Path, with_space: bool = True) -> str:
                 reserve(file, LEAST_FREE)
     except OSError as error:
         needed = f" ({in_words(LEAST_FREE)} are needed)" if error.errno == errno.ENOSPC else ""
-        return f"cannot write there: {error.strerror}{needed}"
+        return f"cannot write to this directory: {error.strerror}{needed}"
     finally:
         with contextlib.suppress(OSError):
             probe.unlink()
@@ -50,20 +49,23 @@ def write_problem(folder: Path, with_space: bool = True) -> str:
 
 @contextlib.contextmanager
 def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
-    """Make the folder, see that files can be made in it, and lock it against other runs.
+    """Create the output directory, check that it is writable, and lock it against other runs.
 
-    Shards of one run share the lock. It is the system's, so it ends with the process.
+    Shards of one run share the lock. The operating system releases it when the process ends.
 
     Raises:
-        RequestError: it cannot be written to, or another run is writing there.
+        RequestError: the directory cannot be written to, or another run has locked it.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RequestError(f"{folder}: cannot write there: {error.strerror}") from None
+        raise RequestError(
+            f"{folder}: this directory cannot be created: {error.strerror}; choose another output "
+            "directory"
+        ) from None
     if reason := write_problem(folder, with_space=False):
         raise RequestError(f"{folder}: {reason}")
-    # Each shard holds its part of a file in which nothing is ever written.
+    # Each shard locks its part of a file that stays empty.
     first = HOLDABLE * (shard.number - 1) // shard.of
     share = HOLDABLE * shard.number // shard.of - first
     held = folder / LOCK, _locked(folder / LOCK, share, first), first, share
@@ -76,9 +78,10 @@ def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
 
 
 def release_folders() -> None:
-    """Remove the lock files that no other process holds; call it just before exiting.
+    """Remove the lock files that no other process holds. Call it just before exiting.
 
-    It is for an exit that skips the end of :func:`output_folder`. A signal handler may call it.
+    It is needed for an exit that skips the end of :func:`output_folder`. Signal handlers may call
+    it.
     """
     while _held:
         with contextlib.suppress(OSError):
@@ -86,16 +89,16 @@ def release_folders() -> None:
 
 
 def _locked(path: Path, length: int, first: int) -> int:
-    """Open the lock file and hold a part of it, ``length`` bytes from ``first`` on.
+    """Open the lock file, lock ``length`` bytes starting at ``first``, and return its descriptor.
 
     Raises:
-        RequestError: another process holds it.
+        RequestError: another process has locked that part.
     """
     while True:
         try:
             lock = open_plain(path, os.O_RDWR | os.O_CREAT)
         except OSError as error:
-            raise RequestError(f"{path}: cannot be locked: {error.strerror}") from None
+            raise RequestError(f"{path}: this file cannot be locked: {error.strerror}") from None
         try:
             is_ours = hold(lock, first, length)
         except OSError:
@@ -103,17 +106,17 @@ def _locked(path: Path, length: int, first: int) -> int:
         if not is_ours:
             os.close(lock)
             raise RequestError(
-                f"{path.parent}: another run is writing there; wait for it, or choose another "
-                "output folder"
+                f"{path.parent}: another run is writing to this directory; wait until it ends, or "
+                "choose another output directory"
             )
         with contextlib.suppress(OSError):
             if os.fstat(lock).st_ino == path.stat().st_ino:
                 return lock
-        os.close(lock)  # its last holder has removed it in between
+        os.close(lock)  # its last holder removed the file after it was opened
 
 
 def remove_unfinished(folder: Path, jobs: Iterable[Job], patches: bool = False) -> None:
-    """Remove the unfinished files that a killed run left of these jobs, or of their patches."""
+    """Remove the unfinished files of these jobs, or of their patches, that a killed run left."""
     named = (os.path.split(job.stem) for job in jobs)
     stems = {os.path.join(folder, shortened(name)) for folder, name in named}
 

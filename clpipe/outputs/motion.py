@@ -1,4 +1,4 @@
-"""How a camera moves while its shutter is open, as sidecars and transforms.json say it."""
+"""The motion of a camera while its shutter is open, for sidecars and transforms.json."""
 
 from typing import Any
 
@@ -12,16 +12,17 @@ from clpipe.reference.pose import from_quaternion, to_quaternion
 from clpipe.stage import StageRole
 from clpipe.stages.shutter import Rows
 
-Moved = tuple[Doubles, Doubles]  # a quaternion, and where the camera stands in the world
+Moved = tuple[Doubles, Doubles]  # a quaternion, and the camera's position in the world
 
 
 def motion_records(chain: Chain, source: SourceImage) -> dict[str, Any]:
-    """The poses of an exposure's files, and those of its first and last row, as JSON values.
+    """Return the poses of an exposure's files and of its first and last row, as JSON values.
 
-    Times are in s from the start of the first row's exposure. Each file stands for an equal part
-    of the time until the last row's last exposure ends, and its pose is that of the part's middle;
-    a row's is that of the middle of its own (first) exposure, between these (shortest arc,
-    Shoemake 1985). Nothing where the camera does not move, or no shutter is in the chain.
+    Times are in seconds from the start of the first row's exposure. The files divide the time until
+    the last row's last exposure ends into equal parts, and the pose of a file is that of the middle
+    of its part. The pose of a row is that of the middle of its first exposure, interpolated
+    between files (shortest arc, Shoemake 1985). The result is empty if the camera does not move, or
+    the chain has no shutter.
     """
     poses, step = chain.settings.render.motion, chain.step_in(StageRole.SHUTTER)
     if poses is None or step is None or not isinstance(step.method, Rows):
@@ -45,7 +46,7 @@ def motion_records(chain: Chain, source: SourceImage) -> dict[str, Any]:
 
 
 def _between(moved: list[Moved], times: Doubles, time: float) -> Moved:
-    """The pose at a time, between those of others, or in the direction of the nearest two."""
+    """Return the pose at a time, interpolated or extrapolated from the nearest two."""
     after = int(np.clip(np.searchsorted(times, time), 1, len(times) - 1))
     (q, place), (p, there) = moved[after - 1], moved[after]
     share = (time - times[after - 1]) / (times[after] - times[after - 1])
@@ -59,6 +60,6 @@ def _between(moved: list[Moved], times: Doubles, time: float) -> Moved:
 
 
 def _record(time: float, q: Doubles, place: Doubles) -> dict[str, Any]:
-    """A pose at a time, as JSON values."""
+    """Return a pose at a time, as JSON values."""
     r = from_quaternion(q.tolist())
     return {"time": float(time), "R": r.tolist(), "t": (-(r @ place) + 0.0).tolist()}

@@ -1,4 +1,4 @@
-"""The raw of a chain as a negative: what a DNG stores beside the samples."""
+"""The raw of a chain as a negative: the metadata that a DNG stores with the samples."""
 
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -19,10 +19,10 @@ MOST_DN = 2**16 - 1
 
 
 def negative_of(chain: Chain) -> Negative:
-    """The raw of a chain: what its last stage that gives DN makes, else the raw that enters it.
+    """Return the raw of a chain: that of its last stage that produces DN, or the raw that enters.
 
-    Its tone curve is ``neutral``, whatever the chain does behind the raw: others lay a curve over
-    colours in their own way, and what is steeper would saturate them.
+    Its tone curve is ``neutral``, whatever the chain does after the raw. Converters apply a curve
+    to colours in their own way, and a steeper curve would saturate them.
 
     Raises:
         RequestError: the chain has no raw, or one that DNG cannot hold.
@@ -30,30 +30,30 @@ def negative_of(chain: Chain) -> Negative:
     is_input = chain.maker_of_raw is None
     if is_input and chain.source is not Kind.RAW:
         raise RequestError(
-            "--format dng writes the raw in DN that quantize makes, but this chain starts on "
-            f"{chain.source.label} and has no quantize; put it in, or use another format"
+            "--format dng writes the raw in DN that quantize produces, but this chain starts on "
+            f"{chain.source.label} and has no quantize; add quantize, or use another format"
         )
     context, end = chain.context_of_raw, chain.context_after
     is_balanced = is_input and chain.step_in(StageRole.BALANCE) is not None
     gains = end.applied_gains if is_balanced else context.gains
-    # normalize has the levels of a raw that enters
+    # The levels of a raw that enters are those of normalize.
     levels = chain.steps[0].method if is_input else context
     black = _level(levels, "black_level", chain.camera.black_level)
     white = _level(levels, "white_level", chain.camera.white_level)
     if white != int(white):
         raise RequestError(
-            f"--format dng: found a white level of {white:g}, but DNG wants whole DN; "
+            f"--format dng: found a white level of {white:g}, but DNG needs whole DN; use "
             f"--set {chain.maker_of_raw or chain.step_names[0]}.white_level={white:.0f}"
         )
     if context.knots:
         raise RequestError(
-            "--format dng: the raw has fewer DN by a curve, which converters do not take; use "
-            "--format npy, or keep it as an EXR"
+            "--format dng: a curve compresses the DN of this raw, which converters cannot read; "
+            "use --format npy, or keep the raw as an EXR"
         )
     if white > MOST_DN:
         raise RequestError(
-            f"--format dng: found a white level of {white:.0f}, but it holds DN of 16 bits; use "
-            "--format npy, or fewer bits"
+            f"--format dng: found a white level of {white:.0f}, but a DNG holds at most "
+            f"{MOST_DN}; use --format npy, or fewer bits"
         )
     undone = end.colours if is_input and end.colours != context.colours else None
     array = _balanced(context.filters, gains)
@@ -70,10 +70,10 @@ def negative_of(chain: Chain) -> Negative:
 
 
 def dng_of(chain: Chain) -> Negative:
-    """The raw of a chain, as :func:`negative_of`, to be written as a DNG.
+    """Return the raw of a chain as :func:`negative_of` does, if converters can open its DNG.
 
     Raises:
-        RequestError: as there, or converters would not open it.
+        RequestError: as for :func:`negative_of`, or converters cannot open the DNG.
     """
     negative = negative_of(chain)
     check_channels(negative.array)
@@ -81,7 +81,7 @@ def dng_of(chain: Chain) -> Negative:
 
 
 def _of_white(context: Context) -> NoiseModel | None:
-    """The noise in units of the white level, near black."""
+    """Return the noise of a raw near black, in units of the white level."""
     noise, full = context.noise, context.full_scale
     if noise is None or full == 1:
         return noise
@@ -93,20 +93,20 @@ def _level(owner: object, name: str, default: float) -> float:
     return default if value is None else float(value)
 
 
-@lru_cache(maxsize=64)  # one object, whose channels are found once
+@lru_cache(maxsize=64)  # equal arguments share an object, which finds its channels once
 def _balanced(array: FilterArray, gains: tuple[float, float]) -> FilterArray:
     return replace(array, gains=gains, is_balanced=True)
 
 
 @lru_cache(maxsize=64)
 def _xyz_to_camera(colours: Matrix, undone: Matrix | None, array: FilterArray) -> Doubles:
-    """The ColorMatrix of a raw, see :func:`~clpipe.images.dng.xyz_to_camera`.
+    """Return the ColorMatrix of a raw, see :func:`~clpipe.images.dng.xyz_to_camera`.
 
     Args:
-        colours: linear sRGB to the mosaic's own colours, white-balanced: what was done to a render
-            before the mosaic.
-        undone: for a raw that enters, what is done to it later, of which this is the inverse.
-        array: its filter array.
+        colours: the matrix from linear sRGB to the mosaic's colours after white balance, which was
+            applied to a render.
+        undone: for a raw that enters, the matrix that is applied to it later; its inverse is used.
+        array: the filter array.
     """
     own = np.array(colours)
     return xyz_to_camera(own if undone is None else own @ np.linalg.inv(undone), array)

@@ -1,4 +1,4 @@
-"""Where the noise of a picture is measured: in flat areas, everywhere, or after averaging 2x2.
+"""Selects where a picture's noise is measured: flat areas, everywhere, or after averaging 2x2.
 
 The constants are choices. tests/test_statistics.py shows what they select.
 """
@@ -9,13 +9,13 @@ from clpipe.base.types import Doubles, Floats, Mask
 
 PICTURE, FLAT, HALVED = PLACES = ("picture", "flat", "halved")
 
-WINDOW = 5  # px, in which a flat place has to be flat
-FLATTEST = 0.25  # share of a picture that counts as flat whatever its noise
-MAD_TO_SIGMA = 1.4826  # of a normal distribution
+WINDOW = 5  # px: side of the window that decides whether a pixel is flat
+FLATTEST = 0.25  # share of a picture that always counts as flat
+MAD_TO_SIGMA = 1.4826  # sigma over the median absolute deviation of a normal distribution
 
 
 def covariance(noise: Floats) -> Doubles:
-    """The covariance of the channels' noise over all pixels of all frames, (channel, channel).
+    """Return the covariance of the channels' noise over all frames, (channel, channel).
 
     Args:
         noise: (frame, height, width, channel).
@@ -25,7 +25,7 @@ def covariance(noise: Floats) -> Doubles:
     """
     channels = noise.shape[-1]
     products, total = np.zeros((channels, channels)), np.zeros(channels)
-    for frame in noise:  # doubles of all at once would take much memory
+    for frame in noise:  # one at a time, because all frames as doubles take too much memory
         samples = frame.reshape(-1, channels).astype(np.float64)
         products += samples.T @ samples
         total += samples.sum(0)
@@ -35,8 +35,9 @@ def covariance(noise: Floats) -> Doubles:
 
 
 def halved(noise: Floats) -> Floats:
-    """Noise, (frame, height, width, channel), averaged over 2x2 pixels; an odd last row or column
-    is left out.
+    """Return noise, (frame, height, width, channel), averaged over 2x2 pixels.
+
+    An odd last row or column is dropped.
     """
     frames, height, width, channels = noise.shape
     even = noise[:, : height // 2 * 2, : width // 2 * 2]
@@ -45,17 +46,18 @@ def halved(noise: Floats) -> Floats:
 
 
 def select_flat(truth: Floats, noise: Floats, mask: Mask) -> Mask:
-    """The pixels of ``mask`` around which the truth hardly changes.
+    """Return the pixels of ``mask`` around which the ground truth is nearly constant.
 
-    At edges, shifts of pixels, demosaicing and JPEG make differences that are not noise. A pixel is
-    flat where the truth, averaged over 5x5 pixels, spans no more in the 5x5 window around it than
-    the sigma of the noise, in every channel. The flattest quarter of the picture always counts; the
-    sigma is measured there, as 1.4826 times the median absolute deviation.
+    At edges, shifts of pixels, demosaicing and JPEG cause differences that are not noise. First,
+    the ground truth is averaged over 5x5 pixels. A pixel is flat if the range of that average in
+    the 5x5 window around it is at most the sigma of the noise, in every channel. The flattest
+    quarter of the picture always counts. Sigma is measured there, as 1.4826 times the median
+    absolute deviation.
 
     Args:
-        truth: (height, width, channel).
+        truth: ground truth, (height, width, channel).
         noise: (frame, height, width, channel).
-        mask: (height, width), the pixels to select from; at least one.
+        mask: the pixels to select from, (height, width); at least one is set.
     """
     smooth = _over_window(np.add, truth) / np.float32(WINDOW**2)
     span = (_over_window(np.maximum, smooth) - _over_window(np.minimum, smooth)).max(-1)
@@ -66,7 +68,7 @@ def select_flat(truth: Floats, noise: Floats, mask: Mask) -> Mask:
 
 
 def _over_window(function: np.ufunc, image: Floats) -> Floats:
-    """A commutative function over the 5x5 window around each pixel; edge pixels are repeated."""
+    """Reduce the 5x5 window around each pixel with a commutative function; edges are repeated."""
     for axis in (0, 1):
         size = image.shape[axis]
         places = np.arange(WINDOW)[:, None] + np.arange(size) - WINDOW // 2

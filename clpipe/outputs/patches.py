@@ -1,4 +1,4 @@
-"""Where in a picture patches are cut, and how they are turned; what is said of them. Pure."""
+"""Patches: their places in a picture, their orientations, and their metadata."""
 
 import math
 import re
@@ -28,9 +28,9 @@ class Patch:
 
     Args:
         left, top: its first column and row in the picture.
-        size: of its sides, in px.
-        orientation: how it is turned when it has been cut out, one of EXIF's eight: each is a flip,
-            a turn by a multiple of 90 degrees, or both; 1 is none.
+        size: the length of its sides in px.
+        orientation: how it is flipped and rotated after the crop: one of EXIF's eight values, of
+            which 1 changes nothing.
     """
 
     left: int
@@ -44,31 +44,33 @@ class Patch:
         return Box(self.left, self.top, self.left + self.size, self.top + self.size)
 
     def cut_out(self, image: Array) -> Array:
-        """The patch, turned, of a whole image, (height, width[, channel])."""
+        """Return the patch of an image, (height, width[, channel]), in its orientation."""
         box = self.box
         return self.turned(image[box.top : box.bottom, box.left : box.right])
 
     def turned(self, part: Array) -> Array:
-        """A part of an image, turned; C-contiguous."""
+        """Return a part of an image in the patch's orientation, as a C-contiguous array."""
         return upright(part, self.orientation)
 
 
 @lru_cache(maxsize=64)
 def first_place(pattern: str, orientation: int, size: int) -> tuple[int, int] | None:
-    """The first column and row of a patch that has the pattern when it is turned.
+    """Return the first column and row of a patch that has the pattern after it is reoriented.
 
-    None where there is none. ``pattern`` is a Bayer pattern, such as "RGGB", or rows of letters.
+    Return None if there is no such place. ``pattern`` is a Bayer pattern, such as "RGGB", or rows
+    of letters.
 
-    So a mosaic keeps its pattern, and no pixel is interpolated or thrown away: the CFA-preserving
-    augmentation of Liu et al., "Learning Raw Image Denoising with Bayer Pattern Unification and
-    Bayer Preserving Augmentation" (CVPR workshops 2019), who crop a pixel after the flip instead.
+    The mosaic keeps its pattern, and no pixel is interpolated or discarded. This is the
+    CFA-preserving augmentation of Liu et al., "Learning Raw Image Denoising with Bayer Pattern
+    Unification and Bayer Preserving Augmentation" (CVPR workshops 2019). They crop a pixel after
+    the flip instead.
 
     >>> first_place("RGGB", 2, 128), first_place("GRBG", 5, 128)  # left to right; transposed
     ((1, 0), (1, 1))
     """
     cell = parse_array(pattern).letters
     rows, columns = cell.shape
-    around = math.lcm(rows, columns)  # both ways, since a turn may swap them
+    around = math.lcm(rows, columns)  # on both axes, because a rotation may swap them
     side = around + size % around
     field = np.tile(cell, (4 * around // rows, 4 * around // columns))
     for y in range(rows):
@@ -106,39 +108,45 @@ class Patches:
         for name, number in least.items():
             if not isinstance(number, int) or number < 1:
                 or_grid = ", or 'grid'" if name == "per_image" else ""
-                raise RequestError(f"found {name} {number!r}; expected 1 or more{or_grid}")
+                raise RequestError(
+                    f"{name}: found {number!r}; expected a whole number of 1 or more{or_grid}"
+                )
 
     @property
     def least(self) -> int:
-        """How many there are of any picture."""
+        """The number of patches that every picture has at least."""
         return 1 if self.per_image == "grid" else self.per_image
 
     def cutting(self, chain: Chain, width: int, height: int) -> "Cutting":
-        """Return how they are cut from the picture that a chain makes of an image of a size.
+        """Return how patches are cut from the picture of an image.
+
+        Args:
+            chain: the chain that makes the picture.
+            width, height: size of the image in px.
 
         Raises:
-            ImageError: it is smaller than a patch.
+            ImageError: the picture is smaller than a patch.
         """
         width, height = chain.size(width, height)
         if self.size > min(width, height):
             raise ImageError(
-                f"its picture has {width}x{height} pixels, and patches are to have "
-                f"{self.size}x{self.size}; make them smaller, or leave the image out"
+                f"its picture has {width}x{height} pixels, but patches need "
+                f"{self.size}x{self.size}; choose smaller patches, or exclude this image"
             )
         return Cutting(self, width, height, chain.filters.pattern, chain.seed)
 
 
 @dataclass(frozen=True)
 class Cutting:
-    """How patches are cut from the pictures of one size and CFA pattern.
+    """How patches are cut from pictures of one size and CFA pattern.
 
-    Each begins so that, turned, it has the pattern of the camera.
+    After it is reoriented, each patch has the camera's pattern.
 
     Args:
-        patches: which.
-        width, height: of the picture, at least as large as a patch.
-        pattern: of its mosaic, such as "RGGB", or rows of letters.
-        seed: of the draws.
+        patches: the number and size of patches.
+        width, height: size of the picture in px, at least that of a patch.
+        pattern: the pattern of its mosaic, such as "RGGB", or rows of letters.
+        seed: the seed of random draws.
     """
 
     patches: Patches
@@ -149,20 +157,20 @@ class Cutting:
 
     @property
     def count(self) -> int:
-        """How many there are. A grid covers the picture, except for a last odd column and row."""
+        """The number of patches. A grid covers the picture, except for a last odd row or column."""
         size, count = self.patches.size, self.patches.per_image
         return -(-self.width // size) * -(-self.height // size) if count == "grid" else count
 
     def cut(self, numbers: Sequence[int], key: str, epoch: int = 0) -> list[Patch]:
-        """Return patches by their numbers: at random places, or side by side, row by row.
+        """Return patches by their numbers: at random places, or in a grid, row by row.
 
-        The last patches of a row or column end where the picture does. The pattern may move any
-        patch of a grid by less than its period.
+        The last patches of a grid's row or column end where the picture does. To fit the pattern, a
+        patch of a grid may move by less than the pattern's period.
 
         Args:
-            numbers: of the patches.
-            key: of the image.
-            epoch: of a training.
+            numbers: the numbers of the patches.
+            key: the key of the image.
+            epoch: the epoch of a training.
         """
         size, is_grid = self.patches.size, self.patches.per_image == "grid"
         names = ("turn",) if is_grid else ("turn", "left", "top")
@@ -176,7 +184,7 @@ class Cutting:
         for number in numbers:
             orientation = self._orientation(drawn[f"{number}.turn"])
             place = first_place(self.pattern, orientation, size)
-            assert place  # or the orientation would not be taken
+            assert place  # _orientation returns only orientations that have one
             x, y = place
             if is_grid:
                 row, column = divmod(number, -(-self.width // size))
@@ -189,7 +197,7 @@ class Cutting:
         return patches
 
     def _orientation(self, number: float) -> int:
-        """Return the orientation of a number from 0 to 1, of those for which there is a place."""
+        """Return the orientation that a number from 0 to 1 selects among the possible ones."""
         size = self.patches.size
         if not self.patches.augment:
             return 1
@@ -202,9 +210,9 @@ class Cutting:
 
 
 def patch_name(number: int | None) -> str:
-    """What is put behind the image's name for a patch, by its number; None is none.
+    """Return what follows the image's name in that of a patch, by its number; "" for None.
 
-    It has no dot, so that each is a sample of WebDataset.
+    It contains no dot, so that WebDataset reads each patch as a sample.
 
     >>> patch_name(7), patch_name(None)
     ('_0007', '')
@@ -213,7 +221,7 @@ def patch_name(number: int | None) -> str:
 
 
 def without_patch(name: str) -> str:
-    """A name without what :func:`patch_name` put behind it.
+    """Return a name without the part that :func:`patch_name` adds.
 
     >>> without_patch("frame_12_0007"), without_patch("frame_12")
     ('frame_12', 'frame_12')
@@ -222,42 +230,48 @@ def without_patch(name: str) -> str:
 
 
 def every_patch(patches: Patches, chain: Chain, width: int, height: int, key: str) -> list[Patch]:
-    """Return all patches of the picture that a chain makes of an image of a size.
+    """Return all patches of the picture of an image.
+
+    Args:
+        patches: the number and size of patches.
+        chain: the chain that makes the picture.
+        width, height: size of the image in px.
+        key: the key of the image.
 
     Raises:
-        ImageError: it is smaller than a patch.
+        ImageError: the picture is smaller than a patch.
     """
     cutting = patches.cutting(chain, width, height)
     return cutting.cut(range(cutting.count), key)
 
 
 def variance_steps(chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
-    """See :func:`signal_and_noise`; the steps are of single pixels, so that patches have it, too.
+    """Return :func:`signal_and_noise`, if its steps work on single pixels, which patches need.
 
     Raises:
-        RequestError: as there, or a step reads the pixels around each.
+        RequestError: as for :func:`signal_and_noise`, or a step reads neighbouring pixels.
     """
     signal, noise = signal_and_noise(chain)
     for step in noise:
         if any(isinstance(pass_.access, Stencil) for pass_ in step.passes):
             raise RequestError(
-                f"variance: {step.name} mixes the noise of neighbours; move it before the noise or "
-                "behind the raw"
+                f"variance: {step.name} mixes the noise of neighbouring pixels, so patches have no "
+                "variance map; move it before the noise or after the raw"
             )
     return signal, noise
 
 
 def variance_at(noise: Sequence[Step], signal: Array, patch: Patch | None) -> Array:
-    """See :func:`variance_of`, of a patch of an image.
+    """Return :func:`variance_of` for an image, or for a patch of it.
 
     Args:
-        noise: the steps.
-        signal: what enters them, of the patch or of the whole image.
-        patch: where it is.
+        noise: the steps that add noise.
+        signal: the image that enters them, or the patch of it.
+        patch: the patch; None for the whole image.
     """
     if patch is None:
         return variance_of(noise, signal)
-    # Rows and columns more, so that the first pixel has the colour of an image's first one.
+    # Padding aligns the patch with the pattern, so that its first pixel has the right colour.
     down, across = noise[0].context.filters.period
     x, y = patch.left % across, patch.top % down
     padded = np.pad(signal, ((y, 0), (x, 0), (0, 0))[: signal.ndim], mode="edge")
@@ -265,7 +279,7 @@ def variance_at(noise: Sequence[Step], signal: Array, patch: Patch | None) -> Ar
 
 
 def facts_of(chain: Chain) -> dict[str, Any]:
-    """What a patch or a sample says of its camera and its raw."""
+    """Return the metadata of a patch or sample: its camera, seed, pattern, levels and colours."""
     facts: dict[str, Any] = {"camera": chain.camera.name, "seed": chain.seed}
     try:
         raw = negative_of(chain)

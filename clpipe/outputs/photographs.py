@@ -1,4 +1,4 @@
-"""The pictures of an output folder with their cameras, as its sidecars say them."""
+"""Reads the pictures of an output directory, with their cameras, from its sidecars."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -14,12 +14,12 @@ from clpipe.outputs.carried import carried_files
 from clpipe.outputs.sidecar import SIDECAR, SidecarError, outputs_in, sidecar_files, values_at
 from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
 
-# What is trained on is of one kind: noisy pictures lie in the folder itself, others below.
+# A training set has one kind of picture: noisy ones are in the folder, others in models/.
 OTHERS = (*PICTURES, *BASELINES)
 
 MODELS = {NOISY: "", **{role: f"models/{Rendition(role).label[1:]}/" for role in OTHERS}}
 
-CHANGED = "a sidecar that was changed since clpipe wrote it"
+CHANGED = "with a sidecar that was changed after clpipe wrote it"
 
 CAMERA = TypeAdapter(Intrinsics)
 
@@ -29,17 +29,17 @@ TABLE: TypeAdapter[dict[str, Any] | None] = TypeAdapter(dict[str, Any] | None)
 
 @dataclass(frozen=True)
 class Photograph:
-    """A picture of an output folder.
+    """A picture of an output directory.
 
     Args:
-        file: its path there.
-        role: what it is.
+        file: its path in the directory.
+        role: the role of its rendition.
         camera: its intrinsics.
-        pose: R and t, where known.
+        pose: R and t; None if they are not known.
         photometry: see :func:`clpipe.chain.photometry.photometry_of`.
         motion: see :func:`clpipe.outputs.motion.motion_records`.
-        name: of what it is a picture of, as its sidecar has it.
-        depth: the PNG of its depth in millimetres, in the folder; "" where there is none.
+        name: the name of its image in the sidecar.
+        depth: the path of the PNG of its depth in millimetres; "" if there is none.
     """
 
     file: str
@@ -53,14 +53,13 @@ class Photograph:
 
 
 def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Photograph]:
-    """The pictures that sidecars of a folder list, in the first format that is no raw.
+    """Yield the pictures that the sidecars of a folder list, in the first format except DNG.
 
-    Frames of bursts and exposures of brackets are among them; mosaics are not.
+    They include frames of bursts and exposures of brackets, but no mosaics.
 
     Args:
-        folder: the output folder.
-        left_out: gets the names of those whose camera is not known, by the reason.
-
+        folder: the output directory.
+        left_out: receives the names of pictures that are skipped, by reason.
     """
     for path in sidecar_files(folder):
         shown = path.relative_to(folder).as_posix()
@@ -72,7 +71,7 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
                 continue
             shown = file.relative_to(folder).as_posix()
             if values["intrinsics"] is None:
-                left_out["no known intrinsics, so in none of the files"].append(shown)
+                left_out["without known intrinsics, so in none of the files"].append(shown)
                 continue
             camera = CAMERA.validate_python(values["intrinsics"])
             pose = values["pose"]
@@ -83,15 +82,15 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
             told = *_light_and_motion(values), str(values["name"]), depth
             yield Photograph(shown, role, simplest(camera), r_and_t, *told)
         except SidecarError:
-            left_out[f"{CHANGED}, so not used; the same clpipe run makes it again"].append(shown)
+            left_out[f"{CHANGED}, so not used; repeat the same clpipe run"].append(shown)
         except (KeyError, TypeError, ValueError):
-            left_out["a sidecar that is damaged or of another version"].append(shown)
+            left_out["with a sidecar that is damaged or of another version"].append(shown)
 
 
 def _light_and_motion(
     values: Mapping[str, Any],
 ) -> tuple[Mapping[str, Any] | None, Mapping[str, Any] | None]:
-    """The photometry of a sidecar's picture, and the motion while it was exposed.
+    """Return the photometry of a sidecar's picture, and the motion during its exposure.
 
     Raises:
         KeyError, TypeError, ValueError: the values are damaged.
@@ -108,7 +107,7 @@ def _light_and_motion(
 
 
 def picture_of(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
-    """The picture of a sidecar; None where there is none.
+    """Return the picture file of a sidecar, or None if there is none.
 
     Raises:
         KeyError, TypeError, ValueError: the values are damaged.
@@ -121,7 +120,7 @@ def picture_of(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
 
 
 def simplest(camera: Intrinsics) -> Intrinsics:
-    """The same camera by the simplest of COLMAP's models that holds it.
+    """Return the same camera in the simplest of COLMAP's models that can describe it.
 
     Raises:
         KeyError: there is no such model.
@@ -138,5 +137,5 @@ def simplest(camera: Intrinsics) -> Intrinsics:
 
 
 def lens_record(camera: Intrinsics) -> dict[str, Any]:
-    """How cameras.json says a picture's lens: COLMAP's model, and its coefficients by name."""
+    """Return a lens as in cameras.json: COLMAP's model, and its coefficients by name."""
     return {"model": camera.model, "distortion": dict(camera.distortion)}

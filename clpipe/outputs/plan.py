@@ -1,4 +1,4 @@
-"""Which files a run makes of an image: their renditions, formats and names."""
+"""Plans the files that a run writes for an image: their renditions, formats and names."""
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -35,7 +35,8 @@ class RenditionFiles(NamedTuple):
     Args:
         sidecar: its sidecar.
         pictures: the files that every such rendition has.
-        others: files that it may have. An image of a step before ``start_at`` is never written.
+        others: files that it may have. For example, images of steps before ``start_at`` are never
+            written.
     """
 
     sidecar: Path
@@ -54,11 +55,11 @@ def ending_behind(ending: str, rendition: Rendition, patch: int | None = None) -
 
 @dataclass(frozen=True)
 class OutputPlan:
-    """The files that a request makes in a folder.
+    """The files that a request writes to an output directory.
 
     Args:
-        folder: where they go.
-        request: what is asked for.
+        folder: the output directory.
+        request: the request.
     """
 
     folder: Path
@@ -81,7 +82,7 @@ class OutputPlan:
         return every if job.renditions is None else tuple(e for e in every if e in job.renditions)
 
     def needed(self, job: Job, missing: Iterable[Rendition]) -> tuple[Rendition, ...]:
-        """Return the renditions to make, in order: missing ones, and what they are measured on."""
+        """Return the renditions to make, in order: missing ones, and those they are measured on."""
         needed = set(missing)
         for each in tuple(needed):
             if each.role in BASELINES:
@@ -101,7 +102,7 @@ class OutputPlan:
 
     @property
     def patches(self) -> Patches | None:
-        """Which patches are written in place of pictures."""
+        """The patches that are written instead of pictures; None writes pictures."""
         request = self.request
         if request.patch is None:
             return None
@@ -121,12 +122,12 @@ class OutputPlan:
         return record if self.carries(rendition) else record | {"carry": []}
 
     def carries(self, rendition: Rendition) -> bool:
-        """Return whether layers are carried with a rendition, which is the first of its image."""
+        """Return whether carried layers are written with a rendition: only with the first."""
         is_first = rendition.is_first and rendition.ev in (None, *self.request.bracket[:1])
         return bool(self.request.carry) and is_first
 
     def carried_endings(self, rendition: Rendition) -> dict[str, str]:
-        """Return the endings of the EXR of all carried layers, "", and of the PNGs by layer."""
+        """Return the endings of the PNGs by layer, and that of the EXR of all layers for ""."""
         if not self.carries(rendition):
             return {}
         depths = [each.name for each in self.request.aov_specs() if each.png]
@@ -136,13 +137,14 @@ class OutputPlan:
         """Check that the formats can hold the results, and that no file is written twice.
 
         Raises:
-            RequestError: they cannot, or a result would overwrite an input or another result.
+            RequestError: a format cannot hold a result, or a result would overwrite an input or
+                another result.
         """
         too_small = [f for f in self.formats if f not in (DNG, NPY) and FORMATS[f].bits < 32]
         if too_small and chain.result is Kind.RAW:
             raise RequestError(
                 f"the chain ends in DN, which {too_small[0]} cannot hold; "
-                "end it with normalize or a later stage, or use --format dng, npy or exr"
+                "end the chain with normalize or a later stage, or use --format dng, npy or exr"
             )
         if DNG in self.formats:
             dng_of(chain)  # rejects a chain without a raw
@@ -156,7 +158,7 @@ class OutputPlan:
             if other != format_:
                 raise RequestError(
                     f"--format {other} and {format_} would both write NAME.{ending_of(format_)}; "
-                    "run them into different folders"
+                    "use one run for each, with different output directories"
                 )
         self._check_paths(jobs)
 
@@ -169,13 +171,13 @@ class OutputPlan:
         for format_ in self.formats:
             if format_ == DNG or FORMATS[format_].ending == "exr":
                 raise RequestError(
-                    f"--patch: {format_} holds whole images; write patches with --format npy, png, "
-                    "tif or jpg"
+                    f"--patch: patches cannot be written as {format_}; use --format npy, png, tif "
+                    "or jpg"
                 )
         if self.request.baselines:
             raise RequestError(
-                "--patch: the noise of a baseline is measured on whole pictures; leave one of "
-                "--patch and --truth out"
+                "--patch: the noise of a baseline is measured on whole pictures; remove --patch, "
+                "or the baseline from --truth"
             )
         if VARIANCE in self.request.truths:
             variance_steps(chain)  # rejects steps that mix the noise of neighbours
@@ -197,20 +199,20 @@ class OutputPlan:
                     path = self.name(job, ending)
                     if inside and os.path.realpath(path) in inside:
                         raise RequestError(
-                            f"{path} is an input and would be overwritten; "
-                            "choose another output folder"
+                            f"{path}: this input would be overwritten; choose another output "
+                            "directory"
                         )
                     if path in makers:
                         raise RequestError(
-                            f"{makers[path].label} and {job.label} would both write {path}; "
-                            f"run them into different folders, or name them in a manifest"
+                            f"{makers[path].label} and {job.label} would both write {path}; use "
+                            "different output directories, or give them names in a manifest"
                         )
                     makers[path] = job
 
     def path(
         self, job: Job, ending: str, rendition: Rendition = FIRST, patch: int | None = None
     ) -> Path:
-        """Return a file of a job by its ending. ``patch`` is the number of a patch."""
+        """Return a file of a job by the end of its name. ``patch`` is the number of a patch."""
         return Path(self.name(job, ending_behind(ending, rendition, patch)))
 
     def name(self, job: Job, ending: str) -> str:
@@ -218,7 +220,7 @@ class OutputPlan:
         return f"{self.folder}/{job.stem}{ending}"
 
     def files(self, job: Job, rendition: Rendition) -> RenditionFiles:
-        """Return the files of a rendition. Of a grid of patches, only the first patch is known."""
+        """Return the files of a rendition. For a grid of patches, this is only the first patch."""
         sidecar, pictures, others = self._endings(rendition)
         return RenditionFiles(
             Path(self.name(job, sidecar)),

@@ -1,7 +1,7 @@
-"""What a picture's pixels depend on besides the request: the program, its libraries, the device.
+"""Identifies what pixels depend on besides the request: the program, its libraries, the device.
 
-The version alone does not identify a program, because people install from a checkout. So sidecars
-contain a digest of it, by which a run recognizes pictures that another program made.
+The version alone does not identify a program, because people install from a checkout. Sidecars
+therefore contain a digest of it, by which a run recognizes pictures that another program made.
 """
 
 import hashlib
@@ -25,17 +25,17 @@ from clpipe.engine.store import Store
 from clpipe.images.write import versions
 from clpipe.outputs.sidecar import Constant
 
-# The rooms in which nothing decides a pixel: they ask for pictures, or look at finished ones.
+# Packages that never affect a pixel: they request pictures, or read finished ones.
 WITHOUT_PIXELS = ("analysis", "commands", "dataset", "explorer", "reports", "scenes")
 IGNORED = (".pyc", ".typed")
 
 
 @cache
 def program_digest() -> str:
-    """The digest of this program: its modules, kernels and data, and what decodes and encodes.
+    """Return the digest of this program: its modules, kernels, data and image libraries.
 
-    64 hexadecimal digits. What the files hold is read once for each state of them, as their sizes
-    and times tell, and remembered in the cache folder.
+    The digest has 64 hexadecimal digits. The cache folder stores it, so files are read again only
+    if a size or modification time changes.
     """
     libraries = {**versions(), "numpy": np.__version__}
     parts = [_content(_folders()), json.dumps(libraries, sort_keys=True)]
@@ -47,7 +47,7 @@ def _folders() -> list[Path]:
 
 
 def _content(folders: list[Path]) -> str:
-    """The digest of what files hold, by their names in their folders."""
+    """Return the digest of the names and contents of all files in folders."""
     files = [(folder, path) for folder in folders for path in sorted(_files(folder))]
     stamps = []
     for _, path in files:
@@ -67,7 +67,7 @@ def _content(folders: list[Path]) -> str:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """The files below a folder that may decide pixels."""
+    """Yield the files below a folder that may affect pixels."""
     for place, folders, names in os.walk(folder):
         at_top = Path(place) == folder
         folders[:] = [
@@ -79,7 +79,7 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def device_record(device: Device | None) -> dict[str, Any]:
-    """Return what a sidecar says of a device, as JSON values; None is NumPy."""
+    """Return a sidecar's entry for a device, as JSON values; None is NumPy."""
     return {
         "name": device.info.name if device else "numpy",
         "platform": device.info.platform if device else "numpy",
@@ -92,7 +92,7 @@ def device_record(device: Device | None) -> dict[str, Any]:
 
 @cache
 def all_versions() -> dict[str, str]:
-    """Return the versions of all that a picture's bytes may depend on, by name."""
+    """Return the versions of all software that a picture's bytes may depend on, by name."""
     return Constant(
         clpipe=full_version(),
         python=platform.python_version(),

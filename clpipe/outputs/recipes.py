@@ -1,4 +1,4 @@
-"""Which pictures are made of an image, and how: with which chain and which noise."""
+"""The pictures of an image, with the chain and the noise of each."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -61,10 +61,10 @@ class Recipe:
         rendition: which picture of the image.
         chain: what makes it.
         noise: for a variance map, the steps whose noise has this variance in the chain's last
-            image, see :func:`clpipe.chain.truth.variance_of`; else ().
+            image, see :func:`clpipe.chain.truth.variance_of`; otherwise ().
         key: the key of the image.
-        spread: measures the noise of a baseline. The chain has that noise when it is known.
-        estimates: what was found about the noise of a baseline.
+        spread: measures the noise of a baseline, which is put into the chain afterwards.
+        estimates: measured values of the noise of a baseline.
     """
 
     rendition: Rendition
@@ -76,7 +76,7 @@ class Recipe:
 
     @property
     def noise_key(self) -> str:
-        """The key of its noise."""
+        """The key that seeds its noise."""
         return noise_key(self.chain.settings, self.key, self.rendition.frame)
 
     @property
@@ -97,11 +97,12 @@ def renditions(
     """Return the renditions that are made of an image, exposure by exposure.
 
     Args:
-        frames: how many frames; None is one picture. A burst also has the truth of its development.
-        truths: which of :data:`clpipe.chain.rendition.TRUTHS`.
-        bracket: what is added to the exposure's EV, for each exposure; () is one exposure.
-        baselines: which of :data:`clpipe.chain.rendition.BASELINES`. With any of them, the truths
-            that are pictures are made too.
+        frames: the number of frames; None is one picture. A burst also has the ground truth of its
+            development.
+        truths: members of :data:`clpipe.chain.rendition.TRUTHS`.
+        bracket: the EV to add to each exposure; () is one exposure.
+        baselines: members of :data:`clpipe.chain.rendition.BASELINES`. Any of them adds the ground
+            truths that are pictures.
 
     >>> [each.suffix for each in renditions(2)]
     ['.frame0', '.frame1', '.truth']
@@ -127,11 +128,11 @@ def recipes(asked: Iterable[Rendition], chain: Chain, key: str) -> list[Recipe]:
 
     Args:
         asked: the renditions. A baseline comes after the pictures that it is measured on.
-        chain: of the noisy picture.
-        key: of the image.
+        chain: the chain of the noisy picture.
+        key: the key of the image.
 
     Raises:
-        RequestError: the chain has no such truth, or no such exposure.
+        RequestError: the chain has no such ground truth, or no such exposure.
     """
     found: list[Recipe] = []
     spreads: dict[float | None, Spread] = {}  # baselines of one exposure share theirs
@@ -147,16 +148,16 @@ def recipes(asked: Iterable[Rendition], chain: Chain, key: str) -> list[Recipe]:
 
 
 def measured_on(baseline: Rendition) -> tuple[Rendition, Rendition, Rendition]:
-    """Return what a baseline is measured on: the noisy picture and the truths that are pictures."""
+    """Return the pictures on which a baseline is measured: the noisy one and two ground truths."""
     return baseline.beside(NOISY), baseline.beside(DEVELOPMENT), baseline.beside(CLEAN)
 
 
-@lru_cache(maxsize=64)  # as chain_and_noise
+@lru_cache(maxsize=64)  # for the same reason as chain_and_noise
 def exposed(chain: Chain, ev: float) -> Chain:
-    """Return a chain that is exposed by so many EV more, with noise of its own.
+    """Return a chain whose exposure is increased by ``ev``, with noise of its own.
 
     Raises:
-        RequestError: it has no such step, or the sum is not allowed.
+        RequestError: the chain has no exposure step, or the sum is not allowed.
     """
     step = chain.step_in(StageRole.EXPOSURE)
     before = getattr(step and step.method, "ev", None)
@@ -164,7 +165,8 @@ def exposed(chain: Chain, ev: float) -> Chain:
         names = ", ".join(each.name for each in chain.steps)
         name = stage_in(StageRole.EXPOSURE).name
         raise RequestError(
-            f"--bracket: it adds to {name}.ev, but this chain has no stage {name}: {names}"
+            f"--bracket: this option changes {name}.ev, but this chain has no stage {name}: "
+            f"{names}. Add that stage"
         )
     if not ev:
         return chain
@@ -172,7 +174,7 @@ def exposed(chain: Chain, ev: float) -> Chain:
         settings = overlay(chain.settings, {step.name: {"ev": before + ev}})
     except KeyedError as error:
         raise RequestError(
-            f"--bracket: {ev:+g} EV on {step.name}.ev={before:g} is too far; {error}"
+            f"--bracket: {ev:+g} EV added to {step.name}.ev={before:g} is not allowed; {error}"
         ) from None
     if settings.noise_key:
         settings = replace(settings, noise_key=of_bracket(settings.noise_key, ev))
@@ -186,11 +188,11 @@ def chain_and_noise(role: Role, chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
     """Return the chain of a rendition, and the noise of a variance map, see :class:`Recipe`.
 
     Args:
-        role: of the rendition.
-        chain: of the noisy picture.
+        role: the role of the rendition.
+        chain: the chain of the noisy picture.
 
     Raises:
-        RequestError: the chain has no such truth or baseline.
+        RequestError: the chain has no such ground truth or baseline.
     """
     if role == VARIANCE:
         return signal_and_noise(chain)

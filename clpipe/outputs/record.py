@@ -1,4 +1,4 @@
-"""What a sidecar says of a picture: all that is needed to make it again."""
+"""Makes the contents of a sidecar: all that is needed to recompute its picture."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -27,17 +27,18 @@ from clpipe.reference.intrinsics import Intrinsics
 
 FACTS, PATCHES = "facts", "patches"  # keys of a sidecar of patches
 
-SAID = ("image_key", "noise_key", "iso", "noise")  # keys of a sidecar that its patches have, too
+SAID = ("image_key", "noise_key", "iso", "noise")  # keys that sidecars of patches repeat
 
 
 def intrinsics_of(chain: Chain, source: SourceImage) -> Intrinsics | None:
     """Return the intrinsics of the picture of a render or a photograph; None if not known.
 
-    The picture of a photograph is turned upright. The lens of a raw is not known. An image that
-    enters after the first step may have passed a lens already.
+    The picture of a photograph is rotated upright. The intrinsics of a raw are not known. Those of
+    an image that enters after the first step are not known either, because a lens may have been
+    applied before.
 
     Raises:
-        RequestError: the render's own values contradict a lens of the chain.
+        RequestError: the render's camera contradicts a lens of the chain.
     """
     if isinstance(source, RawImage) or chain.steps[0].name != chain.names[0]:
         return None
@@ -71,20 +72,20 @@ def picture_record(
     carried: Aovs | None = None,
     patches: Sequence[Patch] = (),
 ) -> dict[str, Any]:
-    """Return all that is needed to make the files of a rendition again, as JSON values.
+    """Return all that is needed to recompute the files of a rendition, as JSON values.
 
     Args:
         job: the image.
         request: the record of the request for the image.
-        stamps: the size and the time of change of each file of the input, before it was read.
-        recipe: of the picture.
-        device: where it was made; None is NumPy.
+        stamps: the size and modification time of each input file, from before it was read.
+        recipe: the recipe of the picture.
+        device: the device that made it; None is NumPy.
         source: the image, as it was loaded.
-        result: what was made of it.
-        outputs: the files.
-        clipped: the share of clipped pixels, 0 to 1; None if the image has no upper end.
-        carried: layers that were written next to it.
-        patches: that were written in place of the picture.
+        result: the result of the chain.
+        outputs: the files that were written.
+        clipped: the share of clipped pixels, 0 to 1; None if the image has no upper limit.
+        carried: layers that were written next to the picture.
+        patches: patches that were written instead of the picture.
     """
     chain, rendition = recipe.whole, recipe.rendition
     facts = source.facts if isinstance(source, RawImage) else None
@@ -145,7 +146,7 @@ def picture_record(
 
 
 def patch_records(chain: Chain, patches: Sequence[Patch]) -> dict[str, Any]:
-    """Return what a sidecar says of patches, as JSON values: of their raw, and where each is."""
+    """Return a sidecar's entries for patches, as JSON values: their metadata, and their places."""
     facts = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in facts_of(chain).items()}
     places = [{"place": [patch.left, patch.top], "turn": patch.orientation} for patch in patches]
     return {FACTS: facts, PATCHES: places}
@@ -163,7 +164,7 @@ def patch_text(values: Mapping[str, Any], number: int) -> bytes:
 
 @lru_cache(maxsize=8)
 def stage_records(chain: Chain) -> list[dict[str, Any]]:
-    """Return what a sidecar says of the steps of a chain, as JSON values, which images share."""
+    """Return a sidecar's entry for the steps of a chain, as JSON values, which images share."""
     return [
         Constant(
             name=step.name,

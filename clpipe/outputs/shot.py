@@ -1,4 +1,4 @@
-"""The shot that a picture's EXIF tells of: what is stated of its camera, and how it was exposed."""
+"""The EXIF of a picture: its camera, and how it was exposed."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,16 +14,16 @@ from clpipe.stage import StageRole
 
 
 def tags_of(chain: Chain, source: SourceImage, tags: Tags, estimates: Estimates) -> Tags:
-    """The tags of a picture: what is stated of its camera, then what its image carries or says.
+    """Return the tags of a picture: those of the request's camera first, then those of its image.
 
-    An exposure by some EV more is one of a shutter that is open for longer.
+    A positive EV is recorded as a longer exposure time.
     """
     optics, own = chain.optics, {**source.shot, **tags.shot}
     time, bias = optics.exposure_time or own.get("exposure_time"), tags.bias
     if exposed := exposure_of(chain, estimates):
         bias = exposed.ev
         time = exposed.time or (time and time * 2.0**bias)
-    elif bias is not None:  # it was exposed before it was kept
+    elif bias is not None:  # the image was kept after the exposure step
         time = tags.exposure
     calibration = optics.calibration
     return replace(
@@ -40,15 +40,14 @@ def tags_of(chain: Chain, source: SourceImage, tags: Tags, estimates: Estimates)
 
 
 def sensor_of(chain: Chain, source: SourceImage, own: Mapping[str, float]) -> float | None:
-    """The width of a picture's sensor in mm, along the longer side; None where it is not known.
+    """Return the width of a picture's sensor in mm, along the longer side; None if not known.
 
-    It is stated, or follows from the focal length in mm and in px, or is that of the camera which
-    a lens by name stands on.
+    It is stated, or computed from the focal length in mm and in px.
 
     Args:
-        chain: of the picture.
+        chain: the chain of the picture.
         source: the image, as it was loaded.
-        own: what that says of its shot.
+        own: values that the image states about its shot.
     """
     optics = chain.optics
     stated = None if optics.is_sensor_of_lens else optics.sensor_width
@@ -63,12 +62,12 @@ def sensor_of(chain: Chain, source: SourceImage, own: Mapping[str, float]) -> fl
 
 
 def shown_tags(chain: Chain, source: SourceImage, tags: Tags) -> Tags:
-    """The tags of the image that a chain makes; binning cuts a part of the sensor off.
+    """Return the tags of the image that a chain makes. Binning may drop the edge of the sensor.
 
     Args:
-        chain: of the image.
+        chain: the chain of the image.
         source: the image that entered.
-        tags: with the width of the whole sensor.
+        tags: the tags, with the width of the whole sensor.
     """
     if not tags.sensor_width or not chain.geometry:
         return tags
@@ -82,15 +81,16 @@ def shown_tags(chain: Chain, source: SourceImage, tags: Tags) -> Tags:
 
 
 def kept_tags(chain: Chain, step: Step, source: SourceImage, tags: Tags) -> dict[str, str]:
-    """The attributes by which the image of a step carries the tags that its source carries.
+    """Return the attributes of a step's image that contain the tags of its source.
 
-    Behind the exposure it carries that, too, so that the picture made of it says the same.
+    After the exposure step they contain the exposure as well, so that a picture made from the image
+    has the same EXIF.
 
     Args:
-        chain: of the picture.
+        chain: the chain of the picture.
         step: one of its steps.
         source: the image that entered.
-        tags: of the picture.
+        tags: the tags of the picture.
     """
     own = {name: source.attributes[name] for name in TAG_ATTRIBUTES if name in source.attributes}
     exposure = chain.step_in(StageRole.EXPOSURE)

@@ -1,7 +1,7 @@
 """Sidecar files: JSON that contains its own digest, so that edits are noticed.
 
 All sidecars are written by :func:`sealed` and read by :func:`values_in`. The digest protects
-against accidents and edits, not against forgery. :mod:`clpipe.outputs.record` says what is in them.
+against accidents and edits, not against forgery. :mod:`clpipe.outputs.record` makes the contents.
 """
 
 import hashlib
@@ -19,7 +19,7 @@ from clpipe.base.errors import ImageError
 from clpipe.base.files import keep_names, write_whole
 from clpipe.base.reading import parse_json, read_bytes
 
-SIDECAR = "json"  # the ending of its name
+SIDECAR = "json"  # its extension
 
 OWN = "clpipe"  # the first key of every sidecar
 
@@ -27,12 +27,12 @@ SEAL = "sidecar_sha256"  # the last one: the SHA-256 of all lines before its own
 
 BEGINNING = b'{\n  "%b": ' % OWN.encode()
 
-# Either end of a sidecar, by which one that was cut off or edited is still recognized.
+# The beginning and end of a sidecar identify it even if it was cut off or edited.
 _BEGINNING = re.compile(rb'\s*\{\s*"%b"\s*:' % OWN.encode())
 _END = re.compile(rb'"%b"\s*:' % SEAL.encode())
 
 
-to_json = json.JSONEncoder().encode  # which json.dumps calls, after a look at its options
+to_json = json.JSONEncoder().encode  # json.dumps without its checks of options
 
 
 class SidecarError(ImageError):
@@ -40,9 +40,9 @@ class SidecarError(ImageError):
 
     def __init__(self, name: Path | str) -> None:
         super().__init__(
-            f"{name}: was changed since clpipe wrote it (its {SEAL} does not fit), so it is not "
-            "used; the same clpipe run makes it again, and takes other settings as options or in a "
-            "configuration"
+            f"{name}: this sidecar was changed after clpipe wrote it (its {SEAL} does not match), "
+            "so it is not used. To restore it, repeat the same clpipe run. To change settings, use "
+            "options or a configuration"
         )
 
 
@@ -59,14 +59,14 @@ def sealed(record: Mapping[str, Any]) -> bytes:
 
 
 def values_in(data: bytes, name: Path | str) -> dict[str, Any] | None:
-    """Return the values of a sidecar that is as clpipe wrote it. Only the key :data:`OWN` is sure.
+    """Return the values of an unchanged sidecar. Only its key :data:`OWN` is guaranteed.
 
     Args:
         data: the bytes of a file.
-        name: of the file, for the message.
+        name: the name of the file, for the message.
 
     Returns:
-        None if the file is empty, or is not a sidecar of clpipe's.
+        The values; None if the file is empty, or is not a sidecar of clpipe's.
 
     Raises:
         SidecarError: it was edited, cut off or damaged.
@@ -105,14 +105,14 @@ def read_sidecar(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise
     except OSError as error:
-        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ImageError(f"{path}: this file cannot be read: {error.strerror}") from None
     if not data.strip(b"\0"):
         raise FileNotFoundError(path)
     values = values_in(data, path)
     if values is None:
         raise ImageError(
-            f"{path}: clpipe did not write this file, and would overwrite it with its sidecar; "
-            "move it, choose another output folder, or say --redo all"
+            f"{path}: clpipe did not write this file, and would overwrite it with a sidecar; "
+            "move it, choose another output directory, or use --redo all"
         )
     return values
 
@@ -127,7 +127,7 @@ def sidecar_files(folder: Path) -> Iterator[Path]:
 
 
 def values_at(path: Path) -> dict[str, Any] | None:
-    """Return the values of a file that may be a sidecar; None if it is not, or cannot be read.
+    """Return the values of a file if it is a sidecar; None if it is not, or cannot be read.
 
     Raises:
         SidecarError: it was edited, cut off or damaged.
@@ -160,13 +160,13 @@ def remove_sidecar(path: Path) -> None:
     except FileNotFoundError:
         pass
     except OSError as error:
-        raise ImageError(f"{path}: cannot be removed: {error.strerror}") from None
+        raise ImageError(f"{path}: this sidecar cannot be removed: {error.strerror}") from None
 
 
 def outputs_in(values: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """Return the files that a sidecar's values list: the size and SHA-256 of each, by its name.
+    """Return the entries of the files that a sidecar lists, by name, with their size and SHA-256.
 
-    An entry is ignored if it lacks one of these, or its name is not one of the sidecar's folder.
+    An entry without these values, or with a name outside the sidecar's folder, is ignored.
     """
     listed = values.get("outputs")
     return {
@@ -181,16 +181,16 @@ def outputs_in(values: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
 def inputs_in(
     values: Mapping[str, Any], paths: Sequence[Path]
 ) -> list[tuple[Path, Mapping[str, Any]]]:
-    """Return the files that a picture was made of: those of its image and of its layers.
+    """Return the files from which a picture was made: those of its image and of its layers.
 
-    Each comes with what the sidecar says of it: its size, time of change and SHA-256.
+    Each has its entry in the sidecar: size, modification time and SHA-256.
 
     Args:
-        values: of the sidecar.
+        values: the values of the sidecar.
         paths: the files of the image.
 
     Raises:
-        KeyError, TypeError, ValueError: the values are damaged, or of more or fewer files.
+        KeyError, TypeError, ValueError: the values are damaged, or list another number of files.
     """
     one = {"size": values["input_size"], "modified": values["input_modified"]}
     layers = (*values.get("carried", ()), *values.get("depth", ()))
@@ -201,7 +201,7 @@ def inputs_in(
 
 
 class Constant(dict[str, Any]):
-    """A part of many records that never changes. Its JSON is made once.
+    """A constant part of many records, which is encoded as JSON only once.
 
     >>> Constant(a=1).text
     '{"a": 1}'
@@ -218,7 +218,7 @@ def _text_of(value: Any) -> str:
 
 
 def json_text(record: Mapping[str, Any]) -> str:
-    """Return JSON with a line for each key, and for each object of a list.
+    """Return JSON with a line for each key, and for each object in a list.
 
     >>> print(json_text({"a": 1, "b": [{"c": 2}, {"d": [3, 4]}]}), end="")
     {
@@ -241,5 +241,5 @@ def json_text(record: Mapping[str, Any]) -> str:
 
 
 def _seal_of(head: bytes) -> bytes:
-    """Return the last two lines of a sidecar, from those before."""
+    """Return the last two lines of a sidecar, from the bytes before them."""
     return f'  "{SEAL}": "{hashlib.sha256(head).hexdigest()}"\n}}\n'.encode()

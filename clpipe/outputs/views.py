@@ -1,4 +1,4 @@
-"""Views as files hold them: cameras.json, COLMAP's text model, nerfstudio's transforms.json."""
+"""Formats cameras as cameras.json, COLMAP's text model and nerfstudio's transforms.json."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ OPENGL_NOTE = (
     f"clpipe {__version__}: camera to world, OpenGL's axes; the first pixel's centre at (0.5, 0.5)"
 )
 
-# Its k4 of OPENCV is of r^8, which is none of OpenCV's coefficients.
+# nerfstudio's k4 for OPENCV is the coefficient of r^8, which OpenCV's polynomial does not have.
 NERFSTUDIO = {
     OPENCV: ("k1", "k2", "k3", "k4", "p1", "p2"),
     OPENCV_FISHEYE: ("k1", "k2", "k3", "k4"),
@@ -31,13 +31,13 @@ NERFSTUDIO = {
 
 
 class Responses:
-    """The curves from light to codes of a file's pictures, each once."""
+    """The response curves (light to code values) of a file's pictures, without duplicates."""
 
     def __init__(self) -> None:
         self._curves: list[Any] = []
 
     def of(self, picture: Photograph) -> dict[str, Any]:
-        """What a file says of a picture's light; its response is the number of one of the list."""
+        """Return a picture's photometry; its response is an index into the list of curves."""
         if picture.photometry is None:
             return {}
         curve = picture.photometry["response"]
@@ -47,12 +47,17 @@ class Responses:
 
     @property
     def record(self) -> dict[str, Any]:
-        """The list, as JSON values; nothing where there is none."""
+        """The list of curves, as JSON values; {} if it is empty."""
         return {"responses": self._curves} if self._curves else {}
 
 
 def cameras_json(pictures: Sequence[Photograph], up: str = "") -> str:
-    """A cameras.json, which ``--poses`` reads, too; ``up`` leads to the pictures' folder."""
+    """Return the text of a cameras.json, which ``--poses`` also reads.
+
+    Args:
+        pictures: the pictures.
+        up: the relative path from the file's folder to the pictures' folder.
+    """
     views, responses = [], Responses()
     for each in pictures:
         camera = each.camera
@@ -70,14 +75,14 @@ def colmap(
     posed: Sequence[Photograph],
     left_out: Mapping[str, list[str]],
 ) -> dict[str, str]:
-    """COLMAP's text model by the paths of its files; only the cameras where no pose is known.
+    """Return the texts of COLMAP's text model, by path; only the cameras if no pose is known.
 
     https://colmap.github.io/format.html. Pictures with the same camera share it.
 
     Args:
-        pictures: all.
-        posed: those whose pose is known.
-        left_out: gets the names that the format cannot hold, by the reason.
+        pictures: all pictures.
+        posed: the pictures whose pose is known.
+        left_out: receives the names of pictures that the format cannot hold, by reason.
     """
     numbers: dict[str, int] = defaultdict(count(1).__next__)
     of_file = {}
@@ -93,7 +98,7 @@ def colmap(
         images = []
         for number, each in enumerate(posed, 1):
             if any(letter.isspace() for letter in each.file):
-                why = "a blank in the name, which images.txt cannot hold"
+                why = "with a space in the name, which images.txt cannot hold"
                 left_out[why].append(each.file)
                 continue
             assert each.pose
@@ -113,7 +118,7 @@ def _text(values: Sequence[float]) -> str:
 
 
 def _rows_of(picture: Photograph) -> dict[str, Any]:
-    """A moving camera's poses at the first and last row, camera to world, and the times."""
+    """Return a moving camera's poses at the first and last row, camera to world, and the times."""
     motion = picture.motion
     if not motion:
         return {}
@@ -131,17 +136,17 @@ def nerfstudio(
     left_out: Mapping[str, list[str]],
     splits: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """A transforms.json of nerfstudio's; "" where no picture can be in it.
+    """Return the text of a nerfstudio transforms.json; "" if it cannot contain any picture.
 
-    https://docs.nerf.studio/quickstart/data_conventions.html. It counts pixels as COLMAP does. Its
-    k4 is none of OpenCV's, and all pictures are of one model: of more than one, fisheye pictures
-    are left out. A camera that all share stands above the frames, where other readers look for it.
+    https://docs.nerf.studio/quickstart/data_conventions.html. Its pixel coordinates are COLMAP's.
+    All pictures must have one camera model, so fisheye pictures are omitted if there are others. A
+    camera that all pictures share is written at the top level, where other readers expect it.
 
     Args:
-        pictures: those whose pose is known.
-        up: the way from the file's folder to the pictures'.
-        left_out: gets the names that the format cannot hold, by the reason.
-        splits: what pictures are for, by their names; "train", "val" or "test".
+        pictures: the pictures whose pose is known.
+        up: the relative path from the file's folder to the pictures' folder.
+        left_out: receives the names of pictures that the format cannot hold, by reason.
+        splits: "train", "val" or "test" for each picture, by its name in sidecars.
     """
     fisheyes = [each for each in pictures if each.camera.model == OPENCV_FISHEYE]
     is_fisheye = len(fisheyes) == len(pictures)
@@ -149,7 +154,8 @@ def nerfstudio(
     cameras, frames, responses = [], [], Responses()
     for each in pictures:
         if (each.camera.model == OPENCV_FISHEYE) != is_fisheye:
-            left_out[f"a lens that {TRANSFORMS} cannot hold beside others"].append(each.file)
+            why = f"with a fisheye lens, which {TRANSFORMS} cannot hold together with others"
+            left_out[why].append(each.file)
             continue
         assert each.pose
         camera = each.camera if is_fisheye else each.camera.polynomial()
@@ -170,7 +176,7 @@ def nerfstudio(
         split: [up + each.file for each in pictures if splits.get(each.name) == split]
         for split in dict.fromkeys(splits.values())
     }
-    if "val" in of_split:  # nerfstudio wants all three where it finds one
+    if "val" in of_split:  # nerfstudio needs all three if there is one
         of_split.setdefault("test", of_split["val"])
     lists = {f"{split}_filenames": files for split, files in of_split.items()}
     said = {"note": OPENGL_NOTE, "camera_model": model, **shared, **responses.record, **lists}

@@ -39,24 +39,27 @@ class OutputWriter(OutputPlan):
     """Writes the pictures of a request to a folder."""
 
     def runner(self, recipe: Recipe, device: Device | None) -> Runner:
-        """Return a runner that makes all of a rendition that is written, and nothing else."""
+        """Return a runner that computes the files of a rendition, and nothing else."""
         formats, keep = self.formats_of(recipe.rendition), self.keep_of(recipe.rendition)
         steps, encode, final = results_of(recipe.chain, formats, keep)
         final |= bool(self.request.baselines)  # to measure its noise
         return Runner(recipe.chain, device, steps, encode, final)
 
     def check_size(self, source: SourceImage, chain: Chain) -> None:
-        """Check that what a chain makes of an image fits into the formats.
+        """Check that the picture of an image fits into the formats.
 
         Raises:
-            ImageError: it is too large for one.
+            ImageError: it is too large for a format.
         """
         size = chain.size(*source.pixels.shape[1::-1])
         if "jpg" in self.formats and max(size) > JPEG_MAX_SIDE:
-            raise ImageError(f"JPEG holds at most {JPEG_MAX_SIDE} pixels a side; use --format png")
+            raise ImageError(
+                f"its picture would have {size[0]}x{size[1]} pixels, but JPEG allows at most "
+                f"{JPEG_MAX_SIDE} per side; use --format png"
+            )
 
     def check_folder(self) -> None:
-        """Check that the output folder can still be written to.
+        """Check that the output directory can still be written to.
 
         Raises:
             OutputError: it cannot.
@@ -66,9 +69,9 @@ class OutputWriter(OutputPlan):
 
     @staticmethod
     def picture_orientation(source: SourceImage, chain: Chain) -> int:
-        """Return EXIF's orientation by which a picture is turned upright.
+        """Return EXIF's orientation by which a picture is rotated upright.
 
-        A mosaic is not turned, because its pattern would change.
+        A mosaic is not rotated, because its pattern would change.
 
         Raises:
             ImageError: the attributes of the source are damaged.
@@ -89,18 +92,18 @@ class OutputWriter(OutputPlan):
 
         Args:
             job: the image.
-            recipe: of the picture.
+            recipe: the recipe of the picture.
             source: the image, as it was loaded.
-            result: what its :meth:`runner` made of it.
-            carried: layers that are written next to it.
-            patches: of which the result is; () is all of the picture.
+            result: the result of :meth:`runner`.
+            carried: layers to write next to the picture.
+            patches: the patches that the result contains; () for the whole picture.
 
         Returns:
-            The files.
+            The files, with their size and digest.
 
         Raises:
             ImageError: a file cannot be written.
-            OutputError: the output folder has gone.
+            OutputError: the output directory was removed.
         """
         self._make_folder_of(job)
         # A new picture next to an old sidecar would look like one that somebody has changed.
@@ -120,16 +123,16 @@ class OutputWriter(OutputPlan):
     def _write(
         self, job: Job, recipe: Recipe, source: SourceImage, result: Result, patch: int | None
     ) -> dict[Path, Stored]:
-        """Write the images of one rendition, or of a patch of it, by its number; see :meth:`write`.
+        """Write the images of one rendition, or of its patch with a number; see :meth:`write`.
 
-        The last image of a variance map is the variance.
+        For a variance map, the result's last image is the variance.
         """
         chain, rendition, camera = recipe.chain, recipe.rendition, recipe.chain.camera
         tags, source_orientation = from_attributes(
             source.attributes, Tags(camera.make, camera.model, chain.iso)
         )
         tags = tags_of(chain, source, tags, result.estimates)
-        if patch is not None:  # which does not have the width of the sensor
+        if patch is not None:  # a patch is not as wide as the sensor
             tags = replace(tags, sensor_width=None)
         orientation = self.picture_orientation(source, chain) if patch is None else 1
 
@@ -173,14 +176,14 @@ class OutputWriter(OutputPlan):
         return outputs
 
     def _make_folder_of(self, job: Job) -> None:
-        """Make the folders between the output folder, which must be there, and a job's files.
+        """Create the folders between the output directory, which must exist, and a job's files.
 
         Raises:
-            OutputError: the output folder has gone.
-            ImageError: they cannot be made.
+            OutputError: the output directory was removed.
+            ImageError: a folder cannot be created.
         """
         if not self.folder.is_dir():
-            raise OutputError(f"{self.folder}: the folder has gone; {RESUMABLE}")
+            raise OutputError(f"{self.folder}: this directory was removed; {RESUMABLE}")
         folder = self.path(job, "").parent
         try:
             if folder.is_dir():
@@ -189,30 +192,30 @@ class OutputWriter(OutputPlan):
             for place in folder.relative_to(self.folder).parents:
                 keep_names(self.folder / place)
         except OSError as error:
-            raise ImageError(f"{folder}: cannot be made: {error.strerror}") from None
+            raise ImageError(f"{folder}: this folder cannot be created: {error.strerror}") from None
 
 
 def _white(step: Step) -> float | None:
-    """The white level of a step's image in DN; of DN that a curve has made fewer, their own."""
+    """Return the white level of a step's image in DN, after companding if there is any."""
     context = step.method.next_context(step.context)
     return context.knots[-1][1] if context.knots else context.white_level
 
 
 def variance_attributes(recipe: Recipe) -> dict[str, str]:
-    """The attributes of a variance map; by their kind it can enter no chain."""
+    """Return the attributes of a variance map. Their kind prevents it from entering a chain."""
     own = attributes_of(recipe.noise[-1], recipe.whole, recipe.key, recipe.rendition.frame)
     return {**own, "stage": "variance", "kind": "variance"}
 
 
 def numbered(patches: Sequence[Patch]) -> list[tuple[int, Patch]] | list[tuple[None, None]]:
-    """Return the patches that are written with their numbers; all of a picture is one without."""
+    """Return patches with their numbers; without patches, one pair of None for the picture."""
     return [*enumerate(patches)] or [(None, None)]
 
 
 def part_of(result: Result, recipe: Recipe, number: int | None, patch: Patch | None) -> Result:
-    """Return what is written of a result: all of it, or a patch, turned, by its number.
+    """Return a result, or the part of it that is a patch, in the patch's orientation.
 
-    The last image of a variance map becomes the variance.
+    For a variance map, the last image becomes the variance.
     """
     if number is not None:
         result = mapped(result, itemgetter(number))
@@ -223,7 +226,7 @@ def part_of(result: Result, recipe: Recipe, number: int | None, patch: Patch | N
 
 
 def mapped(result: Result, change: Callable[[Array], Array]) -> Result:
-    """Return a result whose images are changed."""
+    """Return a result with a function applied to each image."""
     return Result(
         None if result.final is None else change(result.final),
         None if result.encoded is None else change(result.encoded),
@@ -233,7 +236,7 @@ def mapped(result: Result, change: Callable[[Array], Array]) -> Result:
 
 
 def samples(result: Result, format_: Format) -> Array:
-    """Return the last image in the type of a format for display: uint8, uint16 or float32."""
+    """Return the last image in the type of a display format: uint8, uint16 or float32."""
     if format_.bits == 8:
         assert result.encoded is not None
         return result.encoded
@@ -242,9 +245,10 @@ def samples(result: Result, format_: Format) -> Array:
 
 
 def typed(image: Floats, kind: Kind, white_level: float | None = None) -> Array:
-    """Return an image in the type of ``.npy``: uint16 DN, float16 display values, else float32.
+    """Return an image in its type for ``.npy``.
 
-    DN with a white level of more than 16 bits are uint32.
+    DN are uint16, or uint32 if the white level is above 65535. Display values are float16, and all
+    others float32.
 
     >>> typed(np.array([[511.0, 7e4]]), Kind.RAW)
     array([[  511, 65535]], dtype=uint16)

@@ -1,4 +1,4 @@
-"""Renders scenes in a Blender of its own process: bpy of this Python, or an installed program."""
+"""Renders scenes with Blender in a separate process: an installed program, or the package bpy."""
 
 import importlib.util
 import json
@@ -15,13 +15,13 @@ from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.base.files import write_new
 
 SCRIPT = Path(__file__).with_name("blender_script.py")
-ASKED = ".rendering.json"  # what is asked, in the folder of the renders
-MARK = "@clpipe "  # before each line that the script says to us
-LAST_LINES = 12  # of Blender's own, which are shown when it ends unexpectedly
+ASKED = ".rendering.json"  # the request, in the folder of the renders
+MARK = "@clpipe "  # prefix of the script's messages on standard output
+LAST_LINES = 12  # of Blender's output that are shown if it ends unexpectedly
 
 
 class RenderError(ClpipeError):
-    """Blender ended before everything was rendered."""
+    """Blender ended before all views were rendered."""
 
 
 @dataclass(frozen=True)
@@ -30,17 +30,16 @@ class Rendering:
 
     Args:
         scene: the .blend file.
-        folder: where NAME.exr of each view is written; those that are there stay.
-        views: which: ``{"frames": [numbers]}``, ``{"cameras": [records]}``, or ``{"path": "orbit",
+        folder: the folder for NAME.exr of each view. Existing files are skipped.
+        views: ``{"frames": [numbers]}``, ``{"cameras": [records]}``, or ``{"path": "orbit",
             "count": N, "seed": S, "box": None}``, where a box is six numbers.
-        resolution: width and height in px; None is the scene's.
-        samples: of light paths for each pixel.
-        time_limit: seconds for each view; None has none.
-        denoise: whether the renderer takes its own noise away.
-        seed: of the light paths.
-        faces: of a cube, which are rendered in place of each view: their "side" in px, and
-            "turns", the rotation from each one's axes to the camera's, by its name; None renders
-            views.
+        resolution: width and height in px; None uses the scene's.
+        samples: the number of light paths for each pixel.
+        time_limit: the limit in seconds for each view; None is no limit.
+        denoise: whether the renderer removes its own noise.
+        seed: the seed of the light paths.
+        faces: faces of a cube to render instead of each view: "side" in px, and "turns", the
+            rotation from each face's axes to the camera's, by name; None renders views.
     """
 
     scene: Path
@@ -54,21 +53,21 @@ class Rendering:
     faces: Mapping[str, Any] | None = None
 
     def record(self) -> dict[str, Any]:
-        """The rendering as JSON values."""
+        """Return the request as JSON values."""
         return {**asdict(self), "scene": str(self.scene), "folder": str(self.folder)}
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What Blender says of a scene before it renders.
+    """Blender's description of a scene, sent before it renders.
 
     Args:
-        blender: its version.
-        views: a record for each view: file, width, height, K, R and t, as in a ``cameras.json``.
-        objects: the names of objects by their index.
-        layers: the names of depth, normals and object numbers in its EXRs.
-        unit_metres: how long a unit is; None where the scene does not say.
-        notes: of views that see too little, and what was done about it.
+        blender: Blender's version.
+        views: a record for each view, like in a ``cameras.json``: file, width, height, K, R, t.
+        objects: the names of objects, by index.
+        layers: the names of the layers of depth, normals and object indices in the EXRs.
+        unit_metres: the length of a unit in metres; None if the scene does not state it.
+        notes: sentences about views that see too little, and which views replaced them.
     """
 
     blender: str
@@ -80,19 +79,19 @@ class Scene:
 
 
 def blender_command(program: str | None, asked: Path) -> list[str]:
-    """What runs our script in Blender.
+    """Return the command that runs clpipe's script in Blender.
 
     Args:
-        program: an installed Blender, or a Python that has the package bpy; None is this Python.
-        asked: the file that says what is asked.
+        program: an installed Blender, or a Python with the package bpy; None is this Python.
+        asked: the file with the request.
 
     Raises:
         RequestError: this Python has no bpy.
     """
     if program is None and importlib.util.find_spec("bpy") is None:
         raise RequestError(
-            "a .blend is rendered by Blender, and none is here: name an installed one with "
-            "--blender PATH, or a Python that has the package bpy"
+            "this Python lacks the package bpy, which renders a .blend; install it, or pass an "
+            "installed Blender, or a Python that has bpy, with --blender PATH"
         )
     if program is None or Path(program).name.startswith("python"):
         return [program or sys.executable, str(SCRIPT), str(asked)]
@@ -101,10 +100,10 @@ def blender_command(program: str | None, asked: Path) -> list[str]:
 
 
 class Renderer(AbstractContextManager["Renderer"]):
-    """A Blender that renders views in the background; it ends with the context.
+    """A Blender process that renders views in the background. It ends with the context.
 
     Args:
-        rendering: what is asked.
+        rendering: the request.
         program: see :func:`blender_command`.
 
     Raises:
@@ -127,23 +126,26 @@ class Renderer(AbstractContextManager["Renderer"]):
                 errors="replace",
             )
         except OSError as error:
-            raise RequestError(f"--blender: {program}: {error.strerror}") from None
+            raise RequestError(
+                f"--blender: {program} cannot be started: {error.strerror}; give the path of a "
+                "Blender"
+            ) from None
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
         self.stop()
-        with self._process:  # closes what it says, and waits
+        with self._process:  # closes its output, and waits
             pass
         self._asked.unlink(missing_ok=True)
 
     def stop(self) -> None:
-        """End it; what it had begun is lost, and done again by the next one."""
+        """End Blender. Unfinished views are lost, and rendered again by the next process."""
         self._process.terminate()
 
     def scene(self) -> Scene:
-        """What is to be rendered, once Blender has read the file.
+        """Wait until Blender has read the file, and return the description of the scene.
 
         Raises:
             RequestError: the scene cannot be rendered.
@@ -153,10 +155,10 @@ class Renderer(AbstractContextManager["Renderer"]):
         return Scene(**{each.name: values[each.name] for each in fields(Scene)})
 
     def rendered(self, count: int) -> Iterator[tuple[str, float]]:
-        """The name of each view as soon as it is there, and the seconds that it took, or 0.
+        """Yield the name of each finished view, with its render time in s; 0 if it existed.
 
         Raises:
-            RenderError: one cannot be rendered, or Blender ended.
+            RenderError: a view cannot be rendered, or Blender ended.
         """
         for _ in range(count):
             values = self._event("rendered")
@@ -177,4 +179,6 @@ class Renderer(AbstractContextManager["Renderer"]):
                 return values
         status = self._process.wait()
         said = "\n  ".join(self._latest)
-        raise RenderError(f"{self._path}: Blender ended with status {status}; it said:\n  {said}")
+        raise RenderError(
+            f"{self._path}: Blender ended with status {status}. Its last output:\n  {said}"
+        )

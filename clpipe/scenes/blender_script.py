@@ -1,7 +1,7 @@
 """Renders views of a Blender scene as linear EXRs. Blender's own Python runs it, without clpipe.
 
-What is asked is a JSON file, the last argument; see :class:`clpipe.scenes.blender.Rendering`. What
-happens goes to standard output, a line of JSON behind :data:`MARK` for each event.
+The last argument is a JSON file with the request; see :class:`clpipe.scenes.blender.Rendering`.
+Each event is a line on standard output: :data:`MARK`, then JSON.
 """
 
 import json
@@ -28,29 +28,31 @@ from blender_views import (
 
 MARK = "@clpipe "
 OLDEST = (4, 2)
-OWNER = attrgetter("library")  # of what comes from another .blend
+OWNER = attrgetter("library")  # the other .blend that data was linked from
 UNFINISHED = ".unfinished.exr"
 TIMES = re.compile(rb"(cycles\.[^\0]*_time\0string\0.{4})([0-9:.]+)", re.DOTALL)
 
 
 def tell(event: str, **values: Any) -> None:
-    """Say what happened."""
+    """Print an event."""
     print(MARK + json.dumps({"event": event, **values}), flush=True)
 
 
 def open_scene(path: str) -> Any:
-    """The scene of a .blend file, with all that it needs.
+    """Open a .blend file, and return its scene.
 
     Raises:
-        RefusedError: Blender is too old, or the file cannot be read or lacks a file.
+        RefusedError: Blender is too old, the file cannot be read, or a file that it uses is
+            missing.
     """
     if bpy.app.version < OLDEST:
         found = ".".join(map(str, bpy.app.version))
-        raise RefusedError(f"found Blender {found}; expected {'.'.join(map(str, OLDEST))} or newer")
+        oldest = ".".join(map(str, OLDEST))
+        raise RefusedError(f"this is Blender {found}, but {oldest} or newer is needed")
     try:
         bpy.ops.wm.open_mainfile(filepath=path, load_ui=False)
     except RuntimeError as error:
-        raise RefusedError(f"Blender cannot read it: {str(error).strip()}") from None
+        raise RefusedError(f"Blender cannot read this file: {str(error).strip()}") from None
     missing = [
         f"{kind} {each.name}: {file_of(each)}"
         for kind, files in (("texture", bpy.data.images), ("library", bpy.data.libraries))
@@ -58,24 +60,26 @@ def open_scene(path: str) -> Any:
         if is_missing(each)
     ]
     if missing:
-        raise RefusedError(f"a file is missing: {'; '.join(missing)}; pack it into the .blend")
+        raise RefusedError(
+            f"a file that the scene uses is missing: {'; '.join(missing)}; pack it into the .blend"
+        )
     return bpy.context.scene
 
 
 def is_missing(data: Any) -> bool:
-    """Whether an image or a library is used, and its file is not there."""
+    """Return whether an image or library is used, but its file is missing."""
     if not data.filepath or data.packed_file or getattr(data, "source", "FILE") != "FILE":
         return False
     return data.users > 0 and not os.path.exists(file_of(data))
 
 
 def file_of(data: Any) -> str:
-    """The path of an image or a library; a relative one counts from the .blend that says it."""
+    """Return the path of an image or library, resolved against the .blend that contains it."""
     return bpy.path.abspath(data.filepath, library=OWNER(data))
 
 
 def prepare(scene: Any, asked: Mapping[str, Any]) -> None:
-    """Set up rendering: Cycles, its passes, linear EXR, the same bytes each time.
+    """Set up rendering: Cycles, its passes, and linear EXR with the same bytes each time.
 
     Raises:
         RefusedError: this Blender was built without Cycles or its denoiser.
@@ -84,7 +88,9 @@ def prepare(scene: Any, asked: Mapping[str, Any]) -> None:
     try:
         render.engine = "CYCLES"
     except TypeError:
-        raise RefusedError("this Blender has no Cycles; use one from blender.org, or bpy") from None
+        raise RefusedError(
+            "this Blender has no Cycles; use one from blender.org, or the package bpy"
+        ) from None
     if asked["resolution"]:
         render.resolution_x, render.resolution_y = asked["resolution"]
         render.resolution_percentage = 100
@@ -99,7 +105,7 @@ def prepare(scene: Any, asked: Mapping[str, Any]) -> None:
         try:
             cycles.denoiser = "OPENIMAGEDENOISE"
         except TypeError:
-            raise RefusedError("this Blender has no denoiser; say --no-denoise") from None
+            raise RefusedError("this Blender has no denoiser; add --no-denoise") from None
     cycles.seed, cycles.use_animated_seed = asked["seed"], False
     for each in scene.view_layers:
         each.use = each == layer
@@ -116,7 +122,7 @@ def prepare(scene: Any, asked: Mapping[str, Any]) -> None:
 
 
 def number_objects(scene: Any) -> dict[int, list[str]]:
-    """The names of objects by their numbers, which are given where the scene gives none."""
+    """Return the names of objects by index. If the scene has no indices, assign them by name."""
     objects = sorted((o for o in scene.objects if o.type in GEOMETRY), key=lambda o: o.name)
     if not any(each.pass_index for each in objects):
         for number, each in enumerate(objects, 1):
@@ -128,7 +134,7 @@ def number_objects(scene: Any) -> dict[int, list[str]]:
 
 
 def render_view(scene: Any, folder: str, name: str, number: int, seed: int) -> None:
-    """Render a view into NAME.exr, which is there whole or not at all.
+    """Render a view to NAME.exr, which is written as a whole or not at all.
 
     Raises:
         RefusedError: it cannot be rendered or written.
@@ -136,7 +142,7 @@ def render_view(scene: Any, folder: str, name: str, number: int, seed: int) -> N
     unfinished = os.path.join(folder, f".{name}.{os.getpid()}{UNFINISHED}")
     settings = scene.render.image_settings
     if hasattr(settings, "use_exr_interleave"):
-        # Blender 5.0 cannot write parts of pixels that are not square.
+        # Blender 5.0 cannot write separate parts if pixels are not square.
         is_square = scene.render.pixel_aspect_x == scene.render.pixel_aspect_y
         settings.use_exr_interleave = not is_square
     scene.cycles.seed = (seed + number) % 2**31
@@ -150,7 +156,7 @@ def render_view(scene: Any, folder: str, name: str, number: int, seed: int) -> N
 
 
 def forget_times(path: str) -> None:
-    """Take the seconds that rendering took out of an EXR's header, for the same bytes each time."""
+    """Replace the render times in an EXR's header with zeros, for the same bytes each time."""
     with open(path, "r+b") as file:
         head = file.read(2**17)
         file.seek(0)
@@ -158,10 +164,10 @@ def forget_times(path: str) -> None:
 
 
 def main(asked: Mapping[str, Any]) -> None:
-    """Render all views that are not there yet."""
+    """Render all views that do not exist yet."""
     scene = open_scene(asked["scene"])
     if scene.camera is None:
-        raise RefusedError("it has no camera; add one, or name cameras with --poses")
+        raise RefusedError("this scene has no camera; add one, or pass cameras with --poses")
     prepare(scene, asked)
     objects = number_objects(scene)
     views, notes = views_of(scene, asked)
@@ -173,7 +179,9 @@ def main(asked: Mapping[str, Any]) -> None:
         if fault := fault_in(scene, cameras[-1]):
             blind.append(f"{name} ({fault})")
     if len(blind) == len(views):
-        raise RefusedError(f"no view sees enough: {', '.join(blind[:5])}")
+        raise RefusedError(
+            f"no view sees enough: {', '.join(blind[:5])}; move the camera, or use --poses"
+        )
     if blind:
         more = f" and {len(blind) - 5} others" if len(blind) > 5 else ""
         notes.append(f"these views see too little: {', '.join(blind[:5])}{more}")
@@ -191,7 +199,7 @@ def main(asked: Mapping[str, Any]) -> None:
         notes=notes,
     )
     for name in os.listdir(asked["folder"]):
-        if name.endswith(UNFINISHED):  # of a Blender that was killed
+        if name.endswith(UNFINISHED):  # left by a Blender that was killed
             os.remove(os.path.join(asked["folder"], name))
     own, face = scene.camera, face_camera(scene) if faces else None
     for name, number, set_up in views:

@@ -1,4 +1,4 @@
-"""Which views of a scene are rendered, and whether they see something.
+"""Chooses the views of a scene, and checks that they see enough of it.
 
 Blender's own Python runs it, without clpipe, for :mod:`clpipe.scenes.blender_script`.
 """
@@ -14,36 +14,38 @@ from mathutils import Matrix, Vector
 
 FLIP = Matrix(((1, 0, 0), (0, -1, 0), (0, 0, -1)))  # from Blender's camera axes to OpenCV's
 GEOMETRY = {"MESH", "CURVE", "CURVES", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD"}
-SPAN = math.radians(60)  # of an arc
-RAYS = 9  # across a picture, and down, by which it is known what a view sees
-FILLED, FLAT = 0.85, 0.98  # share of a picture, cosine between normals: a wall fills a view
-NEARER = 0.8  # of the way to what a camera looks at
-FINER = 16  # places on a path for each view
-DRAWS = 50  # of places in a box for each view
+SPAN = math.radians(60)  # the angle of an arc
+RAYS = 9  # per row and per column of a picture, to test what a view sees
+FILLED, FLAT = 0.85, 0.98  # share of a picture and cosine between normals at which a wall fills it
+NEARER = 0.8  # an object in the way is nearer than this share of the distance to the target
+FINER = 16  # candidates on a path for each view
+DRAWS = 50  # candidates in a box for each view, at most
 
-View = tuple[str, int, Callable[[], object]]  # name, number, and what sets the scene up for it
+View = tuple[str, int, Callable[[], object]]  # name, number, and a function that sets up the scene
 
 
 class RefusedError(Exception):
-    """Something that the user can mend."""
+    """An error that the user can correct."""
 
 
 def size_of(scene: Any) -> tuple[int, int]:
-    """The width and height of a picture in px."""
+    """Return the width and height of a picture in px."""
     percentage = scene.render.resolution_percentage
     render = scene.render
     return render.resolution_x * percentage // 100, render.resolution_y * percentage // 100
 
 
 def camera_of(scene: Any, name: str) -> dict[str, Any]:
-    """A view's camera as a record: K, R and t by OpenCV's axes, pixel centres at +0.5.
+    """Return a view's camera as a record: K, R and t in OpenCV's axes, pixel centres at +0.5.
 
     Raises:
-        RefusedError: it is no perspective camera.
+        RefusedError: the camera is not a perspective camera.
     """
     camera = scene.camera
     if camera.data.type != "PERSP":
-        raise RefusedError(f"camera {camera.name}: {camera.data.type}; expected a perspective one")
+        raise RefusedError(
+            f"camera {camera.name} has the type {camera.data.type}; make it a perspective camera"
+        )
     width, height = size_of(scene)
     aspect = {"scale_x": scene.render.pixel_aspect_x, "scale_y": scene.render.pixel_aspect_y}
     depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -63,7 +65,7 @@ def camera_of(scene: Any, name: str) -> dict[str, Any]:
 
 
 def set_camera(scene: Any, record: Mapping[str, Any]) -> None:
-    """Make the scene's camera that of a record, see :func:`camera_of`."""
+    """Set the scene's camera from a record, see :func:`camera_of`."""
     camera, rotation = scene.camera, Matrix(record["R"])
     turned = (FLIP @ rotation).transposed()
     place = -(rotation.transposed() @ Vector(record["t"]))
@@ -84,7 +86,7 @@ def set_camera(scene: Any, record: Mapping[str, Any]) -> None:
 
 
 def face_camera(scene: Any) -> Any:
-    """A camera for faces of a cube, which goes where the scene's camera goes."""
+    """Return a new camera for faces of a cube, which follows the scene's camera."""
     data = scene.camera.data.copy()
     data.animation_data_clear()
     data.type, data.sensor_fit, data.angle = "PERSP", "AUTO", math.radians(90)
@@ -100,10 +102,10 @@ def set_face(scene: Any, face: Any, turn: list[list[float]], side: int) -> None:
     """Make a face of a cube the scene's view.
 
     Args:
-        scene: with the camera in its place.
+        scene: the scene, with its camera in place.
         face: see :func:`face_camera`.
-        turn: from the face's axes to the camera's, by OpenCV's axes.
-        side: of the face, in px.
+        turn: the rotation from the face's axes to the camera's, in OpenCV's axes.
+        side: width and height of the face in px.
     """
     face.matrix_basis = (FLIP @ Matrix(turn) @ FLIP).to_4x4()
     render = scene.render
@@ -114,7 +116,7 @@ def set_face(scene: Any, face: Any, turn: list[list[float]], side: int) -> None:
 
 
 def target_of(scene: Any) -> Any:
-    """What the scene's camera looks at: what it sees in its middle, else the middle of all."""
+    """Return the point in the centre of the camera's view, or else the centre of all objects."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     place = scene.camera.evaluated_get(depsgraph).matrix_world
     forward = -place.col[2].to_3d().normalized()
@@ -128,24 +130,25 @@ def target_of(scene: Any) -> Any:
         for corner in each.bound_box
     ]
     if not corners:
-        raise RefusedError("it has no objects")
+        raise RefusedError("this scene has no objects to render; add one")
     return sum(corners, Vector()) / len(corners)
 
 
 def place_on(path: str, share: float, start: Any, target: Any) -> Any:
-    """The camera on an orbit or an arc, as ``matrix_world``; ``share`` is of the way, 0 to 1."""
+    """Return the ``matrix_world`` of a camera on an orbit or arc, at a share of it, 0 to 1."""
     angle = 2 * math.pi * share if path == "orbit" else SPAN * (share - 0.5)
     about = Matrix.Translation(target) @ Matrix.Rotation(angle, 4, "Z")
     return about @ Matrix.Translation(-target) @ start
 
 
 def on_path(scene: Any, asked: Mapping[str, Any], start: Any, target: Any) -> tuple[list[Any], str]:
-    """The cameras of an orbit or an arc, and a note where some of its places see too little.
+    """Return the cameras of an orbit or arc, and a note if some places on it see too little.
 
-    Evenly spaced places; where one of these sees too little, evenly of those that do not.
+    Places are evenly spaced. If one of them sees too little, they are chosen evenly among finer
+    places that see enough.
 
     Raises:
-        RefusedError: nearly none sees enough.
+        RefusedError: too few places see enough.
     """
     count, path = asked["count"], asked["path"]
     whole = count if path == "orbit" else max(count - 1, 1)
@@ -158,21 +161,21 @@ def on_path(scene: Any, asked: Mapping[str, Any], start: Any, target: Any) -> tu
     good = [place for place in finer if not fault_of(scene, place, target)]
     if len(good) < count:
         raise RefusedError(
-            f"of {steps} places on the {path} {len(good)} see enough: {most_of(reasons)}; move the "
-            "scene's camera, or say --path random --box, or --poses"
+            f"only {len(good)} of {steps} places on the {path} see enough ({most_of(reasons)}); "
+            "move the scene's camera, or use --path random --box, or --poses"
         )
     note = (
-        f"{len(reasons)} of {count} places on the {path} see too little ({most_of(reasons)}); the "
-        f"views are of the {100 * len(good) // steps} % of it that see enough"
+        f"{len(reasons)} of {count} places on the {path} see too little ({most_of(reasons)}), so "
+        f"the views come from the {100 * len(good) // steps} % of it that see enough"
     )
     return [good[number * len(good) // count] for number in range(count)], note
 
 
 def in_box(scene: Any, asked: Mapping[str, Any], start: Any, target: Any) -> tuple[list[Any], str]:
-    """Cameras in a box that look at the target, and a note where some were drawn again.
+    """Return cameras in a box that look at the target, and a note if some were drawn again.
 
     Raises:
-        RefusedError: nearly no place sees enough.
+        RefusedError: too few places see enough.
     """
     draw = random.Random(asked["seed"])  # noqa: S311 - places, no secrets
     reach = (start.translation - target).length / 4
@@ -190,20 +193,20 @@ def in_box(scene: Any, asked: Mapping[str, Any], start: Any, target: Any) -> tup
             found.append(matrix)
         if len(reasons) > DRAWS * asked["count"]:
             raise RefusedError(
-                f"of {len(reasons) + len(found)} places in the box {len(found)} see enough: "
-                f"{most_of(reasons)}; say another --box"
+                f"only {len(found)} of {len(reasons) + len(found)} places in the box see enough "
+                f"({most_of(reasons)}); choose another --box"
             )
     views = "view was" if len(reasons) == 1 else "views were"
     return found, f"{len(reasons)} {views} drawn again: {most_of(reasons)}" if reasons else ""
 
 
 def most_of(reasons: list[str]) -> str:
-    """The most frequent of some texts."""
+    """Return the most frequent of some texts."""
     return max(dict.fromkeys(reasons), key=reasons.count)
 
 
 def views_of(scene: Any, asked: Mapping[str, Any]) -> tuple[list[View], list[str]]:
-    """The views to render, and notes: the name and number of each, what sets the scene up for it.
+    """Return the views to render, and notes.
 
     Raises:
         RefusedError: too few places see enough.
@@ -233,19 +236,19 @@ def views_of(scene: Any, asked: Mapping[str, Any]) -> tuple[list[View], list[str
 
 
 def fault_of(scene: Any, matrix: Any, target: Any) -> str:
-    """Why a camera there would see too little; "" where it sees enough."""
+    """Return why a camera at this place would see too little; "" if it sees enough."""
     scene.camera.matrix_world = matrix
     bpy.context.view_layer.update()
     return fault_in(scene, camera_of(scene, ""), target)
 
 
 def fault_in(scene: Any, record: Mapping[str, Any], target: Any = None) -> str:
-    """Why the scene's camera sees too little, by rays through its picture; "" where it does not.
+    """Return why the scene's camera sees too little, by casting rays; "" if it sees enough.
 
     Args:
-        scene: with the camera in its place.
-        record: of the camera, see :func:`camera_of`.
-        target: what it should look at; None is nothing in particular.
+        scene: the scene, with its camera in place.
+        record: the record of the camera, see :func:`camera_of`.
+        target: the point that it should see; None for no particular point.
     """
     depsgraph = bpy.context.evaluated_depsgraph_get()
     place = scene.camera.evaluated_get(depsgraph).matrix_world
@@ -263,7 +266,7 @@ def fault_in(scene: Any, record: Mapping[str, Any], target: Any = None) -> str:
                 seen.append((met.name, normal))
                 behind += normal.dot(ray) > 0
     if not seen:
-        return "nothing is there"
+        return "it sees no objects"
     if behind > len(seen) / 2:
         return "most surfaces are seen from behind"
     names = [name for name, _ in seen]
@@ -277,5 +280,5 @@ def fault_in(scene: Any, record: Mapping[str, Any], target: Any = None) -> str:
         hit, where, _, _, met, _ = scene.ray_cast(depsgraph, eye, way.normalized())
         nearer = hit and (where - eye).length < NEARER * way.length
         if nearer and names.count(met.name) > len(seen) / 2:
-            return f"{met.name} stands before what the camera looks at"
+            return f"{met.name} hides the target"
     return ""

@@ -1,4 +1,4 @@
-"""The card of a dataset: README, contact sheet, manifest, and what each view is for."""
+"""The card of a dataset: README, contact sheet, manifest, and the split of each view."""
 
 import csv
 import io
@@ -21,28 +21,29 @@ MOST_ROWS = 12  # of the contact sheet
 TRUTH = Rendition("clean").suffix.removeprefix(".")
 SPLITS = ("train", "val", "test")
 
-# What carried layers hold, in which axes and units.
+# The contents of carried layers, with axes and units.
 TRUTHS = {
-    "depth": "along the axis of view, in the renders' unit ({unit}); as PNG in thousandths of it",
+    "depth": "along the viewing axis, in the renders' unit ({unit}); PNGs have thousandths of it",
     "normal": "of unit length, in the renders' axes",
-    "flow": "in px of the picture, to the right and down, to where a surface is in another frame; "
-    "of Blender's Vector X and Y are to the frame before, Y up, and Z and W from the next one",
-    "label": "whole numbers, the objects' own",
+    "flow": "in px of the picture, right and down, to the place of a surface in another frame. "
+    "In Blender's Vector, X and Y lead to the previous frame, with Y up. Z and W come from the "
+    "next frame",
+    "label": "whole numbers, the indices of objects",
     "colour": "linear",
 }
-AWAY = "the distance from the camera, in the renders' unit ({unit})"  # of a wide lens's depth
+AWAY = "the distance from the camera, in the renders' unit ({unit})"  # depth of a wide lens
 
 
 @dataclass(frozen=True)
 class About:
-    """What a dataset's card says that no sidecar knows.
+    """The contents of a dataset's card that are not in sidecars.
 
     Args:
-        renders: texts by their titles.
+        renders: texts about the renders, by title.
         licence: an SPDX identifier or a sentence; "" is not stated.
-        author: whose it is; "" is not stated.
-        unit: of depths and poses.
-        words: the command.
+        author: the author; "" is not stated.
+        unit: the unit of depth and poses.
+        words: the words of the command.
     """
 
     renders: Mapping[str, str]
@@ -53,15 +54,15 @@ class About:
 
 
 def write_card(folder: Path, renders: str, about: About) -> list[Path]:
-    """Write the card of a dataset, and what its views are for, from all that is there.
+    """Write the card of a dataset, and the splits of its views, from its contents.
 
     Args:
-        folder: of the dataset.
-        renders: the name of the folder of the renders in it.
-        about: what else is said.
+        folder: the folder of the dataset.
+        renders: the name of the folder of renders in it.
+        about: contents that are not in sidecars.
 
     Returns:
-        The files.
+        The files that were written.
 
     Raises:
         ImageError: a file cannot be read or written.
@@ -88,7 +89,7 @@ def write_card(folder: Path, renders: str, about: About) -> list[Path]:
 
 
 def _manifest(members: Sequence[Member], splits: Mapping[str, str]) -> str:
-    """A table of all pictures, with their files and what they were made with."""
+    """Return a CSV of all pictures, with their files and settings."""
     kinds = dict.fromkeys(kind for member in members for kind in member.files)
     names = ("ev", "gain", "exposure_time", "f_number")
     text = io.StringIO()
@@ -104,7 +105,7 @@ def _manifest(members: Sequence[Member], splits: Mapping[str, str]) -> str:
 
 
 def _sheet(folder: Path, members: Sequence[Member]) -> bytes | None:
-    """The contact sheet; None where the pictures are of no kind that is shown."""
+    """Return the contact sheet; None if the pictures have another format than JPEG, PNG, TIFF."""
     by_view: dict[str, dict[str, Member]] = {}
     for member in members:
         by_view.setdefault(member.view, {})[member.folder] = member
@@ -124,7 +125,7 @@ def _sheet(folder: Path, members: Sequence[Member]) -> bytes | None:
 
 
 def _truths(member: Member, names: bool = False) -> list[str]:
-    """A view's picture without noise, where there is one; its path or its name."""
+    """Return the path or name of a view's picture without noise, in a list that may be empty."""
     found = [(name, path) for name, path in member.files.items() if name == TRUTH]
     return [name if names else path for name, path in found]
 
@@ -136,7 +137,7 @@ def _readme(
     about: About,
     has_sheet: bool,
 ) -> str:
-    """The README of a dataset, in Markdown."""
+    """Return the README of a dataset, in Markdown."""
     shown = list(splits.values())
     of_series: dict[str, list[Member]] = {}
     for member in members:
@@ -151,8 +152,8 @@ def _readme(
     kinds = dict.fromkeys(kind for member in members for kind in member.files)
     there = [n for n in FILES if any((folder / series / n).exists() for series in of_series)]
     cameras = ", ".join(f"`{name}`" for name in there)
-    views = f"- {cameras} in each folder: intrinsics and poses for COLMAP and nerfstudio; in "
-    views += "`cameras.json` x_cam = R X + t, by OpenCV's axes, and places in px from the corner.\n"
+    views = f"- {cameras} in each folder: intrinsics and poses for COLMAP and nerfstudio. In "
+    views += "`cameras.json`, x_cam = R X + t in OpenCV's axes, and px count from the corner.\n"
     layers = {each["layer"]: each for member in members for each in member.layers}
     truths = "".join(
         f"- `{name}` ({each['kind']}): {_held(name, each['kind']).format(unit=about.unit)}.\n"
@@ -160,8 +161,8 @@ def _readme(
         if each["kind"] in TRUTHS
     )
     carried = (
-        f"\n## Truths that go along\n\nIn `NAME.carried.exr`, through the picture's own geometry; "
-        f"`valid` is 1 where all are known.\n\n{truths}"
+        f"\n## Carried layers\n\n`NAME.carried.exr` has these layers, warped like the picture. "
+        f"`valid` is 1 where all of them are known.\n\n{truths}"
         if layers
         else ""
     )
@@ -170,27 +171,27 @@ def _readme(
     counts = ", ".join(f"{shown.count(split)} in `{split}.txt`" for split in SPLITS)
     return f"""# {folder.resolve().name}
 
-Made by clpipe {__version__}: renders as a camera takes them, with its noise.
+Made by clpipe {__version__}: renders as pictures of a camera, with its noise.
 
 {sheet}- **Licence:** {about.licence or "not stated (`--licence`)"}
 - **Author:** {about.author or "not stated (`--author`)"}
 {facts}
-- **Views:** {len(shown)}: {counts}; of every eight, one for validation and one for tests.
+- **Views:** {len(shown)}: {counts}. One in eight is for validation, and one for tests.
 
 | folder | camera | ISO | pictures | size | EV | time, s | f-number | lens | variance of the raw |
 |---|---|---|---|---|---|---|---|---|---|
 {chr(10).join(rows)}
 
-y is the raw's signal, 1 at the white level. EVs are over the render as it is; `photometry` in each
-sidecar has gains, vignetting and the response.
+y is the raw's signal, 1 at the white level. EVs are relative to the render. `photometry` in each
+sidecar contains gains, vignetting and the response.
 
 ## Files
 
 - `{MANIFEST}`: a row for each picture, with its files ({", ".join(kinds)}), camera, ISO, exposure \
-and split. Paths are below this folder; that of a render is from here.
-- `NAME.json` beside each picture: everything that it was made with. \
-`clpipe replay NAME.json` makes it again, byte for byte.
-{views if there else ""}- `{RECORD}`: what the renders were made of. `run.jsonl`: the log.
+and split. Paths are relative to this folder.
+- `NAME.json` next to each picture: all settings that made it. \
+`clpipe replay NAME.json` recomputes it, byte for byte.
+{views if there else ""}- `{RECORD}`: what the renders were made from. `run.jsonl`: the log.
 {carried}
 ## Made by
 
@@ -198,19 +199,19 @@ and split. Paths are below this folder; that of a render is from here.
 {shlex.join(["clpipe", *words])}
 ```
 
-The same command makes the same pictures again on the same kind of device, and goes on where it \
-was interrupted; other ISOs, cameras and frames go beside.
+The same command makes the same pictures on the same kind of device, and resumes after an \
+interruption. With other ISOs, cameras or frames, it adds pictures.
 """
 
 
 def _all(members: Sequence[Member], fact: str) -> str:
-    """What is said of some pictures, where it differs with how much else there is."""
+    """Return the value of some pictures; if it differs, the first and the number of others."""
     first, *others = dict.fromkeys(getattr(member.facts, fact) for member in members)
     return f"{first} and {len(others)} others" if others else str(first)
 
 
 def _range(members: Sequence[Member], fact: str) -> str:
-    """The least and the largest number of some pictures."""
+    """Return the smallest and largest number of some pictures as text."""
     texts = [text for member in members if (text := getattr(member.facts, fact))]
     if not texts:
         return "not known"
@@ -219,5 +220,5 @@ def _range(members: Sequence[Member], fact: str) -> str:
 
 
 def _held(layer: str, kind: str) -> str:
-    """What a carried layer holds."""
+    """Return the description of a carried layer."""
     return AWAY if layer.endswith(f".{DISTANCE}") else TRUTHS[kind]

@@ -1,4 +1,4 @@
-"""What a dataset's folder has, by its sidecars: of each view, camera and ISO files and facts."""
+"""Reads the contents of a dataset's folder from its sidecars: files and metadata by view."""
 
 import logging
 import os
@@ -17,14 +17,14 @@ PICTURE = "picture"
 SERIES = re.compile(r"(?:[^/]+/)?iso[0-9.e+]+(?=/)|")  # the folder of a camera and an ISO
 SPLITS = {3: "val", 7: "test"}  # of eight views
 
-# What is raised for values of a forged sidecar.
+# The exceptions that values of a forged sidecar may raise.
 DAMAGED = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
 
 log = logging.getLogger(__name__)
 
 
 class Facts(NamedTuple):
-    """What is said of a picture, as texts: its size in px, the variance of the raw's noise."""
+    """The metadata of a picture as texts; ``law`` is the variance of the raw's noise."""
 
     camera: str
     iso: str
@@ -39,16 +39,16 @@ class Facts(NamedTuple):
 
 @dataclass(frozen=True)
 class Member:
-    """What was made of one view with one camera and ISO.
+    """The files of one view with one camera and ISO.
 
     Args:
-        view: the name of its render, without its ending.
-        folder: below the dataset's, by camera and ISO; "" is the dataset's own.
-        files: paths below the dataset's folder: "picture", "truth_clean" and so on, "carried", and
-            the PNG of a layer by its name.
-        facts: of the picture.
-        render: what it was made of, from the dataset's folder.
-        layers: that go along, as their records in the sidecar.
+        view: the name of its render, without extension.
+        folder: the folder for its camera and ISO; "" is the dataset's own.
+        files: paths in the dataset's folder: "picture", ground truth such as "truth_clean",
+            "carried", and the PNG of each layer by its name.
+        facts: the metadata of the picture.
+        render: the path of its render, relative to the dataset's folder.
+        layers: the records of carried layers in the sidecar.
     """
 
     view: str
@@ -60,12 +60,12 @@ class Member:
 
     @property
     def name(self) -> str:
-        """Its name in the sidecars."""
+        """The name in its sidecars."""
         return f"{self.folder}/{self.view}".lstrip("/")
 
 
 def split_of(number: int) -> str:
-    """What a view is for: of every eight one for validation and one for tests, else training.
+    """Return the split of a view: of every eight, one is for validation and one for tests.
 
     >>> [split_of(number) for number in range(9)].count("train"), split_of(3), split_of(15)
     (7, 'val', 'test')
@@ -74,17 +74,17 @@ def split_of(number: int) -> str:
 
 
 def splits_of(members: list[Member]) -> dict[str, str]:
-    """What each view is for, by its name, in their order; all pictures of a view for the same."""
+    """Return the split of each view, by name, sorted. All pictures of a view have one split."""
     views = dict.fromkeys(member.view for member in members)
     return {view: split_of(number) for number, view in enumerate(sorted(views))}
 
 
 def members_of(folder: Path, renders: str) -> list[Member]:
-    """What is there in a dataset's folder, sorted by views, then by cameras and ISOs.
+    """Return the members of a dataset, sorted by view, then by camera and ISO.
 
     Args:
-        folder: of the dataset.
-        renders: the name of its folder that has no pictures.
+        folder: the folder of the dataset.
+        renders: the name of the folder in it that contains renders.
     """
     found: dict[str, dict[str, tuple[Path, Mapping[str, Any]]]] = defaultdict(dict)
     for path in sidecar_files(folder):
@@ -94,7 +94,7 @@ def members_of(folder: Path, renders: str) -> list[Member]:
             if values := values_at(path):
                 found[str(values["name"])][str(values["picture"])] = path, values
         except (SidecarError, *DAMAGED):
-            log.warning("%s; the card goes without it", SidecarError(path))
+            log.warning("%s; the card omits this file", SidecarError(path))
     members = []
     for name, renditions in found.items():
         try:
@@ -102,7 +102,7 @@ def members_of(folder: Path, renders: str) -> list[Member]:
                 members.append(member)
         except DAMAGED:
             path = next(path for path, _ in renditions.values())
-            log.warning("%s; the card goes without it", SidecarError(path))
+            log.warning("%s; the card omits this file", SidecarError(path))
     return sorted(members, key=lambda each: (each.view, each.folder))
 
 
@@ -112,7 +112,7 @@ def _member(
     name: str,
     renditions: Mapping[str, tuple[Path, Mapping[str, Any]]],
 ) -> Member | None:
-    """What was made of a view; None where its picture is not there; see :func:`members_of`.
+    """Return the member of a view, or None if its picture is missing; see :func:`members_of`.
 
     Raises:
         KeyError, TypeError, ValueError, AttributeError, OverflowError: the values are damaged.
@@ -135,13 +135,13 @@ def _member(
     view = name.removeprefix(series).lstrip("/")
     said = Path(str(noisy["input"]))
     render = os.path.relpath(said.absolute(), folder.absolute())
-    if (folder / renders / said.name).exists():  # wherever the dataset was when it was made
+    if (folder / renders / said.name).exists():  # even if the dataset was moved
         render = f"{renders}/{said.name}"
     return Member(view, series, files, _facts(noisy), render, tuple(noisy.get("carried", ())))
 
 
 def _facts(values: Mapping[str, Any]) -> Facts:
-    """What the card says of a picture, by its sidecar.
+    """Return the metadata of a picture for the card, from the values of its sidecar.
 
     Raises:
         KeyError, TypeError, ValueError, AttributeError, OverflowError: the values are damaged.
@@ -157,7 +157,7 @@ def _facts(values: Mapping[str, Any]) -> Facts:
 
 
 def _lens(values: Mapping[str, Any]) -> str:
-    """Focal lengths and distortion of a picture in words."""
+    """Return the focal lengths and distortion of a picture as text."""
     camera = values["intrinsics"]
     if not camera:
         return "not known"

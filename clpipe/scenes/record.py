@@ -1,4 +1,4 @@
-"""What a dataset was made of, so that a folder holds one dataset only."""
+"""The record of what a dataset was made from, which prevents two datasets in one folder."""
 
 import json
 from collections.abc import Mapping
@@ -13,14 +13,14 @@ RECORD = "dataset.json"
 
 
 def read_record(folder: Path, made_of: Mapping[str, Any]) -> dict[str, Any]:
-    """What is known of a folder's dataset, which must have been made of the same; {} of a new one.
+    """Return the record of a folder's dataset; {} if there is none yet.
 
     Args:
-        folder: of the dataset.
-        made_of: what its renders depend on, as JSON values.
+        folder: the folder of the dataset.
+        made_of: the values on which its renders depend, as JSON values.
 
     Raises:
-        RequestError: it holds another one, or a file that clpipe did not write.
+        RequestError: the folder contains another dataset, or a record that clpipe did not write.
     """
     path = folder / RECORD
     try:
@@ -31,22 +31,25 @@ def read_record(folder: Path, made_of: Mapping[str, Any]) -> dict[str, Any]:
         known = None
     before = known.get("made_of") if isinstance(known, dict) else None
     if not isinstance(before, dict):
-        raise RequestError(f"{path}: clpipe did not write it; choose another output folder")
+        raise RequestError(
+            f"{path}: clpipe did not write this file; choose another output directory"
+        )
     for key in dict.fromkeys((*before, *made_of)):
         if before.get(key) != made_of.get(key):
             raise RequestError(
-                f"{folder}: holds a dataset with {key} {json.dumps(before.get(key))}, and "
-                f"{json.dumps(made_of.get(key))} is asked for; choose another output folder"
+                f"{folder}: this folder has a dataset with {key} {json.dumps(before.get(key))}, "
+                f"but the request has {json.dumps(made_of.get(key))}; choose another output "
+                "directory"
             )
     return known or {}
 
 
 def keep_said(folder: Path, said: Mapping[str, str | None]) -> dict[str, str]:
-    """What was said of a folder's dataset now, else before: kept for the next time.
+    """Store texts about a dataset in its record, and return them with those stored before.
 
     Args:
-        folder: of the dataset, which has a record.
-        said: texts by their names; None is nothing new.
+        folder: the folder of the dataset, which has a record.
+        said: texts by name; None keeps the earlier text.
 
     Raises:
         ImageError: the record cannot be written.
@@ -61,10 +64,10 @@ def keep_said(folder: Path, said: Mapping[str, str | None]) -> dict[str, str]:
 
 
 def write_record(folder: Path, made_of: Mapping[str, Any], found: Mapping[str, Any]) -> None:
-    """Write what a dataset is made of, and what was found in it.
+    """Write the record of a dataset: the values that its renders depend on, and its contents.
 
     Raises:
-        ImageError: it cannot be written.
+        ImageError: the record cannot be written.
     """
     record = {"made_of": made_of, **found}
     before = read_record(folder, made_of).get("said")

@@ -1,4 +1,4 @@
-"""Where a dataset's renders come from: Blender, while they are developed, or a folder."""
+"""The source of a dataset's renders: a running Blender, or a folder of renders."""
 
 import json
 import os
@@ -20,7 +20,7 @@ from clpipe.scenes.view_request import made_by
 
 RENDERS, UNIT, NOTE = "renders", "Unit of depth and poses", "Which views"
 CAMERAS = "cameras.json"
-FLOW = "Vector"  # the layer that has it, of frames
+FLOW = "Vector"  # Blender's layer of flow, for frames
 
 
 @dataclass
@@ -28,14 +28,14 @@ class Source:
     """The renders of a dataset.
 
     Args:
-        inputs: what they are found by, as clpipe run takes them.
-        poses: the file of their cameras; None where they are not known.
-        layers: that go along with the pictures.
-        about: what the dataset's card says of them, by its titles.
-        renderer: what makes them; None where all of them are there.
-        names: of the views, in their order, where they are made.
-        faces: of a cube, whose files each view has; none where it is one file.
-        failure: why rendering ended early.
+        inputs: the inputs of clpipe run that contain them.
+        poses: the file of their cameras; None if they are not known.
+        layers: the layers to carry.
+        about: texts for the dataset's card, by title.
+        renderer: the Blender that renders them; None if all exist.
+        names: the names of the views in order, if Blender renders them.
+        faces: the names of a cube's faces, each a file of its own; empty if a view is one file.
+        failure: the reason why rendering ended early.
     """
 
     inputs: list[str]
@@ -49,7 +49,7 @@ class Source:
     _is_stopped: bool = False
 
     def jobs(self) -> list[Job] | None:
-        """The renders that are made; None where they are to be found."""
+        """Return the jobs of views that Blender renders; None if renders exist in a folder."""
         (folder,) = self.inputs
         jobs = []
         for name in self.names:
@@ -60,16 +60,18 @@ class Source:
         return jobs or None
 
     def stop(self) -> None:
-        """Render no more."""
+        """Stop rendering."""
         self._is_stopped = True
         if self.renderer:
             self.renderer.stop()
 
     def as_rendered(self, jobs: Sequence[Job], tell: Callable[[str], None]) -> Iterator[Job]:
-        """The jobs, each as soon as its render is there; ``failure`` says why the rest is missing.
+        """Yield the jobs, each as soon as its render is finished.
+
+        If rendering fails, the rest is missing, and ``failure`` contains the reason.
 
         Args:
-            jobs: those of a render one after the other.
+            jobs: the jobs; those of one render are consecutive.
             tell: prints a line.
         """
         if not self.renderer:
@@ -88,14 +90,14 @@ class Source:
 
 
 def from_folder(folder: Path, output: Path, poses: Path | None) -> Source:
-    """Renders that exist, with the cameras that are asked for or lie among them, and the layers.
+    """Return existing renders with their layers, and the given cameras or those in the folder.
 
     Raises:
-        RequestError: there is no such folder, or the output folder has another dataset.
+        RequestError: there is no such folder, or the output directory has another dataset.
     """
     check_exists(folder)
     if not folder.is_dir():
-        raise RequestError(f"{folder}: expected a .blend, or a folder of renders")
+        raise RequestError(f"{folder}: this is neither a .blend nor a folder of renders; give one")
     made_of = {"renders": folder.resolve().name}
     read_record(output, made_of)
     own = [path for name in (CAMERAS, "transforms.json") if (path := folder / name).is_file()]
@@ -105,12 +107,12 @@ def from_folder(folder: Path, output: Path, poses: Path | None) -> Source:
 
 
 def layers_in(folder: Path) -> tuple[str, ...]:
-    """The depth, labels, normals and flow that every EXR of a folder has, as --carry takes them."""
+    """Return values of --carry for the depth, labels, normals and flow in every EXR of a folder."""
     common: dict[str, str] | None = None
     for path in sorted(folder.rglob("*.exr")):
         try:
             found = find_layers(path)
-        except ImageError:  # which the run tells
+        except ImageError:  # the run reports it
             continue
         own: dict[str, str] = {
             each.without_rank.rpartition(".")[2]: kind
@@ -122,30 +124,30 @@ def layers_in(folder: Path) -> tuple[str, ...]:
 
 
 def _carried(name: str, kind: str) -> str:
-    """A layer as --carry takes it: depth and object numbers as PNGs, too."""
+    """Return the value of --carry for a layer, with PNGs of depth and object indices."""
     is_plain = kind == "depth" or (kind == "label" and name.lower().startswith(("index", "object")))
     return f"{name}:png" if is_plain else name
 
 
 def from_scene(stack: ExitStack, rendering: Rendering, output: Path, program: str | None) -> Source:
-    """Renders of a scene, which a Blender begins to make; none where all of them are there.
+    """Return the renders of a scene. Blender is started unless all of them exist.
 
     Args:
-        stack: ends Blender.
-        rendering: what is asked, of the folder ``renders`` in the output folder.
+        stack: ends Blender when it is closed.
+        rendering: the request, for the folder ``renders`` in the output directory.
         output: the folder of the dataset.
         program: an installed Blender; None is the package bpy.
 
     Raises:
-        RequestError: the scene cannot be rendered, there is no Blender, or the output folder has
-            another dataset.
+        RequestError: the scene cannot be rendered, there is no Blender, or the output directory
+            has another dataset.
     """
     asked = rendering.record()
     path, views = rendering.scene, asked.pop("views")
     sha256 = digests([str(path)]).get(str(path))
     if sha256 is None:
         check_exists(path)
-        raise RequestError(f"{path}: cannot be read")
+        raise RequestError(f"{path}: this scene cannot be read; check its permissions")
     del asked["folder"]
     made_of = {**asked, "scene": path.name, "sha256": sha256, "views": made_by(views)}
     made_of = json.loads(json.dumps(made_of))
@@ -176,16 +178,16 @@ def _are_there(folder: Path, scene: Mapping[str, Any], faces: Sequence[str]) -> 
 
 
 def _about(rendering: Rendering, scene: Scene) -> dict[str, str]:
-    """What the card says of the renders."""
-    limit = f", at most {rendering.time_limit:g} s a view" if rendering.time_limit else ""
-    unit = f"{scene.unit_metres:g} m" if scene.unit_metres else "not said by the scene"
+    """Return the card's texts about the renders, by title."""
+    limit = f", at most {rendering.time_limit:g} s per view" if rendering.time_limit else ""
+    unit = f"{scene.unit_metres:g} m" if scene.unit_metres else "not stated by the scene"
     objects = ", ".join(f"{number} {' + '.join(n)}" for number, n in scene.objects.items())
     denoised = "denoised by Open Image Denoise" if rendering.denoise else "not denoised"
-    limits = "; a time limit makes other pictures on other machines" if rendering.time_limit else ""
+    limits = "; with a time limit, pictures depend on the machine" if rendering.time_limit else ""
     return {
         "Scene": f"`{rendering.scene.name}`, rendered by Blender {scene.blender}",
         "Renders": f"`{RENDERS}/`, Cycles, {rendering.samples} samples{limit}, {denoised}; "
-        "linear Rec. 709, half floats; depth, normals and object numbers beside",
+        "linear Rec. 709, half floats, with depth, normals and object indices",
         UNIT: unit,
         "Objects": objects or "none",
         **({NOTE: "; ".join(scene.notes)} if scene.notes else {}),

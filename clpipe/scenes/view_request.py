@@ -1,4 +1,4 @@
-"""Which views of a scene are rendered, as the command line says it and as Blender is asked."""
+"""Converts the command line's choice of views to the request for Blender."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -23,25 +23,28 @@ def asked_views(
     poses: Path | None,
     seed: int,
 ) -> dict[str, Any]:
-    """What Blender is asked for, see :class:`clpipe.scenes.blender.Rendering`.
+    """Return the request for views, see :class:`clpipe.scenes.blender.Rendering`.
 
     Args:
-        views: how many are generated; None is :data:`USUAL_VIEWS` where nothing else is asked for.
-        path: of :data:`PATHS`; None is the first.
-        box: two corners, of a path in a box.
-        frames: of the scene.
+        views: the number of generated views; None is :data:`USUAL_VIEWS`, unless there are frames
+            or poses.
+        path: one of :data:`PATHS`; None is the first.
+        box: two corners of a box, for random places.
+        frames: numbers of frames of the scene.
         poses: a file with cameras.
-        seed: of places in a box.
+        seed: the seed of random places.
 
     Raises:
-        RequestError: two of them are asked for, or a file of cameras is wrong.
+        RequestError: more than one source of views is given, or a file of cameras is wrong.
     """
     generated = views is not None or path is not None or box is not None
     kinds = {"--views, --path and --box": generated, "--frames": frames, "--poses": poses}
     if len(asked := [name for name, is_asked in kinds.items() if is_asked]) > 1:
-        raise RequestError(f"found {' and '.join(asked)}; each says which views there are: use one")
+        raise RequestError(
+            f"found {' and '.join(asked)}; each of them sets the views, so use only one"
+        )
     if box is not None and path != "random":
-        raise RequestError("--box: it is for --path random")
+        raise RequestError("--box: this option needs --path random; add it, or remove --box")
     if frames:
         return {"frames": list(frames)}
     if poses:
@@ -51,10 +54,10 @@ def asked_views(
 
 
 def cameras_of(poses: Path) -> list[dict[str, Any]]:
-    """A record for each view of a file: name, width, height, K, R and t.
+    """Return a record for each view of a file: name, width, height, K, R and t.
 
     Raises:
-        RequestError: it cannot be read, or a view is not known fully, or two have one name.
+        RequestError: the file cannot be read, a view is incomplete, or two views have one name.
     """
     records: dict[str, dict[str, Any]] = {}
     for view in read_views(poses):
@@ -63,11 +66,11 @@ def cameras_of(poses: Path) -> list[dict[str, Any]]:
             raise RequestError(f"--poses {poses}: view {view.name}: {view.problem}")
         if view.size is None or not {"fx", "rotation"} <= values.keys():
             raise RequestError(
-                f"--poses {poses}: view {view.name}: to be rendered, it must have width, height, "
-                "focal length and pose"
+                f"--poses {poses}: view {view.name}: width, height, focal length or pose is "
+                "missing; add it"
             )
         if name in records:
-            raise RequestError(f"--poses {poses}: two views are called {name}")
+            raise RequestError(f"--poses {poses}: two views are called {name}; rename one")
         width, height = view.size
         fx = values["fx"]
         fy, cx = values.get("fy", fx), values.get("cx", width / 2)
@@ -78,18 +81,18 @@ def cameras_of(poses: Path) -> list[dict[str, Any]]:
 
 
 def made_by(views: Mapping[str, Any]) -> Any:
-    """What the renders of views depend on; those of a frame do not depend on the other frames."""
+    """Return the values on which renders of views depend. A frame does not depend on others."""
     return "frames" if "frames" in views else views
 
 
 def parse_frames(text: str) -> list[int]:
-    """Numbers of frames.
+    """Return the numbers of frames in a text.
 
     >>> parse_frames("1-4, 9")
     [1, 2, 3, 4, 9]
 
     Raises:
-        RequestError: it says none.
+        RequestError: the text contains no frames.
     """
     frames: dict[int, None] = {}
     for part in text.split(","):
@@ -102,18 +105,20 @@ def parse_frames(text: str) -> list[int]:
             )
         frames |= dict.fromkeys(range(first, last + 1))
     if not frames:
-        raise RequestError(f"--frames: found {text!r}, which is no frame; expected such as 1-24")
+        raise RequestError(
+            f"--frames: found {text!r}, which contains no frame; expected a range such as 1-24"
+        )
     return list(frames)
 
 
 def parse_resolution(text: str) -> tuple[int, int]:
-    """A width and a height in px.
+    """Return the width and height in px in a text.
 
     >>> parse_resolution("960x640")
     (960, 640)
 
     Raises:
-        RequestError: it is none.
+        RequestError: the text has another form.
     """
     width, height = map(whole_number, text.lower().partition("x")[::2])
     if not (0 < width <= LARGEST and 0 < height <= LARGEST):
@@ -122,13 +127,13 @@ def parse_resolution(text: str) -> tuple[int, int]:
 
 
 def parse_box(text: str) -> list[float]:
-    """Two corners of a box: the lowest x, y and z, and the highest.
+    """Return two corners of a box: the lowest x, y and z, then the highest.
 
     >>> parse_box("-1,-1,0, 1,1,2")
     [-1.0, -1.0, 0.0, 1.0, 1.0, 2.0]
 
     Raises:
-        RequestError: it is none.
+        RequestError: the text has another form.
     """
     try:
         values = [float(part) for part in text.split(",")]

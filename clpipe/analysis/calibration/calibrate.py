@@ -1,8 +1,8 @@
-"""Noise parameters of a sensor from its frames, one ISO at a time.
+"""Estimates the noise parameters of a sensor from its frames, one ISO at a time.
 
-After Bielova et al. (CVPR Workshops 2019): repeated frames of a static scene give each pixel a mean
-and a variance, and a line through them gives a and b of Var[y] = a*y + b. Everything here is in DN,
-with light counted from the black level.
+The method is that of Bielova et al. (CVPR Workshops 2019). Repeated frames of a static scene give
+each pixel a mean and a variance. A line through them gives a and b of Var[y] = a*y + b. Values are
+in DN, and light is counted from the black level.
 """
 
 from dataclasses import replace
@@ -39,14 +39,14 @@ def calibrate(
 
     Args:
         iso: the ISO, for messages.
-        scene: (frames, height, width) in DN, of one static scene; or a single frame.
+        scene: frames of one static scene, or a single frame, in DN: (frames, height, width).
         dark: frames without light, in the same form, or None.
         sensor: pattern and levels.
-        whole: the frames hold whole DN; the variance of rounding is then subtracted.
+        whole: whether the frames have whole DN, so that the variance of rounding is subtracted.
 
     Raises:
         ImageError: the frames are identical, move, clip or flicker too much, or no line with a
-            positive slope goes through them.
+            positive slope fits them.
     """
     try:
         if len(scene) == 1:
@@ -59,7 +59,7 @@ def calibrate(
 def figures_of(
     dark: Floats | None, sensor: Sensor, darkness: DarkFrames | None
 ) -> DarkFigures | None:
-    """What dark frames show beside read noise; None without any that say something of it."""
+    """Return figures of dark frames other than read noise; None if the frames do not allow it."""
     if dark is None or darkness is None or (len(dark) > 1 and darkness.stack is None):
         return None
     return dark_figures(dark, sensor, darkness.hot)
@@ -68,7 +68,7 @@ def figures_of(
 def _from_single_frame(
     iso: float, frame: Floats, dark: Floats | None, sensor: Sensor, whole: bool
 ) -> Calibration:
-    """The noise from a single frame of a scene; arguments as :func:`calibrate`."""
+    """Estimate the noise from a single frame of a scene; see :func:`calibrate`."""
     notes = [
         "a single frame: texture that looks like noise counts as noise; errors do not cover it"
     ]
@@ -112,7 +112,7 @@ def _from_single_frame(
 def _from_repeats(
     iso: float, scene: Floats, dark: Floats | None, sensor: Sensor, whole: bool
 ) -> Calibration:
-    """The noise from two or more frames of a scene; arguments as :func:`calibrate`."""
+    """Estimate the noise from two or more frames of a scene; see :func:`calibrate`."""
     notes: list[str] = []
     rounding = ROUNDING if whole else 0.0
     check_enough(float(((scene > 0) & (scene < sensor.white_level)).mean()))
@@ -134,9 +134,7 @@ def _from_repeats(
     line = fit_line(list(stack.tables(stack.variance()).values()))
     hot = darkness.hot if darkness else fixed_pattern.hot_in_scene(stack, line)
     if not darkness and len(hot.rows):
-        notes.append(
-            "hot pixels are judged on the scene, where a glint of one pixel looks the same"
-        )
+        notes.append("hot pixels are found in the scene, where a glint of one pixel looks the same")
     dead = fixed_pattern.dead_in_scene(stack, line)
     for bad in (hot, dead):
         stack.used[bad.rows, bad.columns] = False

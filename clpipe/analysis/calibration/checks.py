@@ -1,6 +1,6 @@
-"""Checks of a calibration: what refuses frames, and what only notes a doubt.
+"""Checks of a calibration, which reject frames or add notes.
 
-The limits are choices; ``tests/test_calibrate.py`` has a case on each side of them.
+The limits are choices. ``tests/test_calibrate.py`` has a case on each side of them.
 """
 
 from collections.abc import Sequence
@@ -10,27 +10,27 @@ from clpipe.analysis.calibration.line_fit import Bin, Line, Table, fit_line
 from clpipe.analysis.calibration.repeats import Stack
 from clpipe.base.errors import ImageError
 
-LEAST_USED = 0.25  # share of the pixels that must count
+LEAST_USED = 0.25  # share of the pixels that must be valid
 UNALIKE = 0.2  # deviation of a frame's variance from the median frame's, relative
 ROUGH = 0.4  # DN of noise below which rounding depends on the noise
 BENT = 0.1  # deviation of a bin's variance from the line, relative
 
 
 def check_enough(share: float) -> None:
-    """See that enough of the pixels count.
+    """Check that enough of the pixels are valid.
 
     Raises:
-        ImageError: fewer than a quarter do.
+        ImageError: fewer than a quarter are.
     """
     if share < LEAST_USED:
         raise ImageError(
-            f"{1 - share:.0%} of the pixels are clipped, or so near to it that their noise is; "
+            f"{1 - share:.0%} of the pixels, or their noise, are clipped; "
             "expose less, or check the levels"
         )
 
 
 def check_static(stack: Stack, line: Line) -> None:
-    """See that all frames show the same scene.
+    """Check that all frames show the same scene.
 
     Raises:
         ImageError: neighbouring pixels vary together.
@@ -39,33 +39,33 @@ def check_static(stack: Stack, line: Line) -> None:
     if moving.value > max(repeats.MOVING, 5 * moving.error):
         share = repeats.share_beyond_noise(stack, line)
         raise ImageError(
-            f"the frames do not show the same: neighbouring pixels share {moving.value:.0%} of "
-            f"their variance, and {share:.1%} of the pixels vary more than noise does; the scene "
-            "or the camera moved, the light changed, or the raws were denoised"
+            f"the frames do not show the same scene: neighbouring pixels share {moving.value:.0%} "
+            f"of their variance, and {share:.1%} of the pixels vary more than noise does. The "
+            "scene or the camera moved, the light changed, or the raws were denoised"
         )
 
 
 def check_alike(stack: Stack, line: Line, what: str) -> None:
-    """See that all frames are equally noisy; ``what`` they are called in messages.
+    """Check that all frames are equally noisy; ``what`` is their name in messages.
 
     Raises:
-        ImageError: one is not.
+        ImageError: a frame is not.
     """
     noise = repeats.noise_by_frame(stack, line)
     for k, share in enumerate(noise, 1):
         if abs(share - 1) > UNALIKE:
             raise ImageError(
                 f"{what} {k} of {len(noise)} (in the order given, folders by name) has {share:.2f} "
-                "times the others' variance about the mean; is it a picture without noise, a mean "
-                "of frames, or from another setting?"
+                "times the others' variance about the mean. Remove it if it has no noise, is a "
+                "mean of frames, or has another setting"
             )
 
 
 def fit_channel(tables: Sequence[dict[str, Table]], channel: str) -> Line:
-    """The line of one channel.
+    """Return the line of one channel.
 
     Raises:
-        ImageError: its pixels define no line that rises.
+        ImageError: its pixels do not define a rising line.
     """
     try:
         line = fit_line([table[channel] for table in tables])
@@ -75,40 +75,40 @@ def fit_channel(tables: Sequence[dict[str, Table]], channel: str) -> Line:
 
 
 def check_rising(line: Line, channel: str) -> Line:
-    """The line, if its variance rises with light.
+    """Return the line, if its variance rises with light.
 
     Raises:
         ImageError: it does not.
     """
     if line.gain.value <= 0:
         raise ImageError(
-            f"channel {channel}: variance does not rise with light (a = "
-            f"{line.gain.value:.3g} +- {line.gain.error:.2g} DN); is it raw, and is the scene both "
-            "dark and bright?"
+            f"channel {channel}: variance does not rise with light (a = {line.gain.value:.3g} +- "
+            f"{line.gain.error:.2g} DN). Give raws of a scene that is both dark and bright"
         )
     return line
 
 
 def check_significant(line: Line) -> Line:
-    """The line of all channels, if its slope is above two standard errors.
+    """Return the line of all channels, if its slope is above two standard errors.
 
     Raises:
         ImageError: it is not.
     """
     if not check_rising(line, "of all").gain.significant:
         raise ImageError(
-            f"the scene has too little light or range to tell a: found {line.gain.value:.3g} +- "
-            f"{line.gain.error:.2g} DN; it should be dark in some places and bright in others"
+            f"the scene has too little light or range to measure a: found {line.gain.value:.3g} +- "
+            f"{line.gain.error:.2g} DN; use a scene that is dark in some places and bright in "
+            "others"
         )
     return line
 
 
 def line_notes(pooled: Line, rounding: float, lines: dict[str, Line] | None = None) -> list[str]:
-    """Doubts about a line: its errors, noise below rounding, b below zero, channels that differ."""
+    """Return notes on a line: large errors, noise below rounding, negative b, unequal channels."""
     notes = []
     gain, floor = pooled.gain, pooled.floor
     if gain.error > 0.1 * gain.value:
-        notes.append(f"a is only known to {gain.error / gain.value:.0%}; give more frames or light")
+        notes.append(f"a is known only to {gain.error / gain.value:.0%}; add frames or light")
     if rounding and abs(floor.value) < ROUGH**2:
         notes.append(
             f"b is {floor.value:.2f} DN^2; below {ROUGH} DN of noise, rounding depends on the "
@@ -116,11 +116,11 @@ def line_notes(pooled: Line, rounding: float, lines: dict[str, Line] | None = No
         )
     elif floor.value < -2 * floor.error:
         notes.append(
-            "b is below zero: there is less noise in the dark than a line can have, so the black "
+            "b is below zero: dark noise is lower than any line allows, so the black "
             "level is too low, or the raws were processed"
         )
     elif not floor.significant:
-        notes.append("b is not above zero by two standard errors; dark frames (--dark) would help")
+        notes.append("b is not above zero by two standard errors; add dark frames (--dark)")
     for name, line in (lines or {}).items():
         difference = line.gain.value - gain.value
         if abs(difference) > max(5 * line.gain.error, 0.03 * gain.value):
@@ -129,7 +129,7 @@ def line_notes(pooled: Line, rounding: float, lines: dict[str, Line] | None = No
 
 
 def linearity_notes(pooled: Line, rounding: float, bins: Sequence[Bin]) -> list[str]:
-    """A doubt where the variance of a bin is far from the line."""
+    """Return a note if the variance of a bin is far from the line."""
     worst, light = 0.0, 0.0
     for one in bins:
         expected = pooled.gain.value * one.light + pooled.floor.value + rounding

@@ -11,11 +11,11 @@ from clpipe.analysis.calibration.line_fit import Estimate, Line
 from clpipe.analysis.calibration.repeats import Sensor, Stack
 from clpipe.base.types import Floats
 
-CLIPPED = 1e-3  # share of samples at 0 DN from which the frames say nothing of noise
+CLIPPED = 1e-3  # share of samples at 0 DN above which noise cannot be measured
 
 
 class DarkPattern(NamedTuple):
-    """What stays the same in all dark frames."""
+    """The noise that all dark frames share."""
 
     column_noise: Estimate  # DN
     dsnu: Estimate  # DN
@@ -24,11 +24,11 @@ class DarkPattern(NamedTuple):
 
 @dataclass(frozen=True)
 class DarkFrames:
-    """The mean of dark frames and its level in DN, hot pixels, and what varies between frames.
+    """The mean of dark frames and its level in DN, hot pixels, and the variation between frames.
 
-    ``stack`` is None for a single frame, or where too many samples are at 0 DN. ``temporal`` is the
-    variance of a pixel of one frame, without row noise but with rounding, DN^2; it is 0 where there
-    is no stack.
+    The stack is None for a single frame, or if too many samples are 0 DN. The temporal variance is
+    that of a pixel of one frame in DN^2, without row noise but with rounding. It is 0 if there is
+    no stack.
     """
 
     mean: Floats
@@ -41,10 +41,10 @@ class DarkFrames:
 
     @staticmethod
     def analyse(dark: Floats | None, sensor: Sensor, notes: list[str]) -> "DarkFrames | None":
-        """Analyse dark frames, (frames, height, width) in DN, and add doubts to ``notes``.
+        """Analyse dark frames, (frames, height, width) in DN, and add remarks to ``notes``.
 
         Raises:
-            ImageError: two frames are equal sample by sample.
+            ImageError: two frames have equal samples.
         """
         if dark is None:
             return None
@@ -55,14 +55,14 @@ class DarkFrames:
         level = float(mean[good].mean())
         if abs(level - sensor.black_level) > max(1.0, 0.1 * float(dark[0].std())):
             notes.append(
-                f"dark frames lie at {level:.2f} DN, not at the black level of "
-                f"{sensor.black_level:g}; light is counted from there"
+                f"the mean of dark frames is {level:.2f} DN, not the black level of "
+                f"{sensor.black_level:g}; light is counted from that mean"
             )
         zeros = float((dark <= 0).mean())
         stack, temporal = None, Estimate(0.0, 0.0)
         if zeros > CLIPPED:
             notes.append(
-                f"{zeros:.1%} of the dark samples are 0 DN, so the dark frames say nothing of noise"
+                f"{zeros:.1%} of the dark samples are 0 DN, so noise cannot be measured in them"
             )
         elif len(dark) > 1:
             stack = repeats.stacked(dark.copy(), sensor, "dark frames")
@@ -75,24 +75,24 @@ class DarkFrames:
         return DarkFrames(mean, level, len(dark), hot, stack, temporal, sensor)
 
     def columns(self) -> Floats:
-        """The offset of each column, (width,), DN."""
+        """Return the offset of each column in DN, (width,)."""
         good = np.ones(self.mean.shape, bool)
         good[self.hot.rows, self.hot.columns] = False
         return np.mean(self.mean - self.level, axis=0, where=good).astype(np.float32)
 
     def row_noise(self) -> Estimate | None:
-        """Row noise in DN; None without a stack."""
+        """Return row noise in DN; None without a stack."""
         if self.stack is None:
             return None
         flat = Line(Estimate(0.0, 0.0), self.temporal, self.mean.size)
         return repeats.row_variance([repeats.row_offsets(self.stack, flat)[2]]).root()
 
     def pattern(self, pooled: Line, rounding: float) -> DarkPattern:
-        """Column noise, DSNU and hot pixels.
+        """Return column noise, DSNU and hot pixels.
 
         Args:
-            pooled: the noise of all channels, for the temporal noise where there is no stack.
-            rounding: the variance of rounding to whole DN, DN^2, which is not part of ``pooled``.
+            pooled: the noise of all channels, for the temporal noise if there is no stack.
+            rounding: the variance of rounding to whole DN, DN^2, which ``pooled`` excludes.
         """
         temporal = self.temporal if self.stack else pooled.lowered(-rounding).floor
         left = temporal.scaled(1 / self.frames)

@@ -1,7 +1,7 @@
 """Dark current from dark frames of several exposure times.
 
-Cameras take the mean dark charge off with their black level, so its shot noise and its pattern
-tell it, and not the mean (EMVA 1288, release 4.0, 2021, has both ways).
+Cameras subtract the mean dark charge with their black level. Dark current is therefore estimated
+from its shot noise and its pattern (EMVA 1288, release 4.0, 2021, describes both methods).
 """
 
 from collections.abc import Mapping
@@ -19,14 +19,14 @@ FEWEST_TIMES = 2
 
 @dataclass(frozen=True)
 class DarkCurrent:
-    """The dark current of the frames' temperature, and how pixels differ in it."""
+    """The dark current at the frames' temperature, and its spread over pixels."""
 
     current: Estimate  # e-/s
-    spread: Estimate | None  # standard deviation over mean; None where no current is seen
+    spread: Estimate | None  # standard deviation over mean; None if no current is measured
     times: tuple[float, ...]  # s
 
     def record(self) -> dict[str, object]:
-        """The figures as JSON values."""
+        """Return the figures as JSON values."""
         spread = self.spread and {"value": self.spread.value, "error": self.spread.error}
         current = {"value": self.current.value, "error": self.current.error}
         return {"current_e_per_s": current, "spread": spread, "times_s": list(self.times)}
@@ -35,15 +35,15 @@ class DarkCurrent:
 def dark_current(
     stacks: Mapping[float, Floats], gain: Estimate, sensor: Sensor
 ) -> DarkCurrent | None:
-    """The dark current of frames of one ISO and temperature; None for fewer than two times.
+    """Return the dark current of frames of one ISO and temperature; None for fewer than two times.
 
-    Variance in time rises by gain^2 * current for each second, that of the pattern by the square of
-    gain * current * spread for each second squared.
+    Temporal variance rises by gain^2 * current per second. The variance of the pattern rises by the
+    square of gain * current * spread per squared second.
 
     Args:
-        stacks: dark frames by exposure time, s; (two or more frames, height, width) in DN.
-        gain: the system gain, DN/e-.
-        sensor: for the pattern of its colours.
+        stacks: dark frames in DN by exposure time in s: (two or more frames, height, width).
+        gain: the system gain in DN/e-.
+        sensor: the sensor, for its filter array.
     """
     stacks = {time: frames for time, frames in sorted(stacks.items()) if len(frames) > 1}
     if len(stacks) < FEWEST_TIMES:
@@ -69,9 +69,9 @@ def dark_current(
 
 
 def variances(frames: Floats, sensor: Sensor) -> tuple[Estimate, Estimate]:
-    """The variances of a pixel in time, and of the pattern of pixels, DN^2.
+    """Return the temporal variance of a pixel and the variance of the pixels' pattern, in DN^2.
 
-    What rows and columns share is neither.
+    Both exclude the noise of rows and columns.
     """
     count = len(frames)
     mean = frames.mean(axis=0, dtype=np.float64)
@@ -95,7 +95,7 @@ def variances(frames: Floats, sensor: Sensor) -> tuple[Estimate, Estimate]:
 
 
 def slope_of(x: Doubles, estimates: tuple[Estimate, ...]) -> Estimate:
-    """The slope of a line through estimates, each weighted by its error."""
+    """Return the slope of a line through estimates, each weighted by its error."""
     y = np.array([e.value for e in estimates])
     weight = 1 / np.array([max(e.error, 1e-12) for e in estimates]) ** 2
     middle = float((weight * x).sum() / weight.sum())

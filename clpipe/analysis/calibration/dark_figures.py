@@ -1,4 +1,4 @@
-"""What dark frames show beside read noise: errors of the black level, tails, waves, smooth maps.
+"""Figures of dark frames other than read noise: black level errors, tails, waves, smooth maps.
 
 Frames are (frame, height, width) in DN, of one ISO, exposure time and temperature.
 """
@@ -14,16 +14,16 @@ from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.base.types import Array, Doubles, Floats, Mask
 
-FEW_FOR_LEVELS = 4  # frames from which the scatter of their levels is told
-FEW_FOR_JUMPS = 8  # and pixels that jump
+FEW_FOR_LEVELS = 4  # frames needed to measure the scatter of their levels
+FEW_FOR_JUMPS = 8  # frames needed to find pixels that jump
 SAMPLES = 400_000  # of residuals, for the shape of read noise
 SHAPES = np.linspace(-0.4, 0.4, 17)  # of Tukey lambda distributions that are compared
 GROUPS = 16  # of samples, for the error of their shape
-FALSE_ALARM = 1e-4  # chance of a wave where there is none
-FINER = 8  # times as many frequencies as rows, where a wave is looked for
+FALSE_ALARM = 1e-4  # probability of finding a wave if there is none
+FINER = 8  # the number of frequencies to search, relative to the number of rows
 BLOCK = 32  # px, over which maps are averaged
-FEWEST_BLOCKS = 6  # each way
-JUMPS = 10.0  # variance over that of the other pixels, from which a pixel jumps
+FEWEST_BLOCKS = 6  # along each axis
+JUMPS = 10.0  # variance relative to other pixels, above which a pixel counts as jumping
 TINY = 1e-9  # DN^2
 WIDTH_OF_KNOTS = 0.96  # half width of the correlation of a cubic B-spline, in its knots' distance
 
@@ -43,8 +43,9 @@ class Wave:
 class Shading:
     """The mean dark frame without the errors of its colours, averaged over blocks of 32x32.
 
-    ``variance`` is that of what is smooth, DN^2; ``length`` the distance of knots, in px, of a
-    cubic B-spline that is as smooth.
+    Args:
+        variance: the variance of the smooth part in DN^2.
+        length: the distance in px between the knots of a cubic B-spline of the same smoothness.
     """
 
     blocks: Floats
@@ -54,7 +55,7 @@ class Shading:
 
 @dataclass(frozen=True)
 class DarkFigures:
-    """Figures of dark frames in DN; None where so few frames cannot tell."""
+    """Figures of dark frames in DN; None if there are too few frames."""
 
     color_bias: FourEstimates  # R, G in R's rows, G in B's, B
     black_level_error: Estimate | None
@@ -65,7 +66,7 @@ class DarkFigures:
     rts_amplitude: Estimate | None
 
     def record(self) -> dict[str, Any]:
-        """The figures as JSON values."""
+        """Return the figures as JSON values."""
         shading = self.shading and asdict(self.shading.variance.root())
         return {
             "color_bias_dn": [asdict(each) for each in self.color_bias],
@@ -80,7 +81,7 @@ class DarkFigures:
 
 
 def dark_figures(dark: Floats, sensor: Sensor, hot: Pixels) -> DarkFigures:
-    """The figures of dark frames, (frame, height, width); hot pixels are left out."""
+    """Return the figures of dark frames, (frame, height, width), without hot pixels."""
     good = np.ones(dark.shape[1:], bool)
     good[hot.rows, hot.columns] = False
     frames = len(dark)
@@ -103,7 +104,7 @@ def dark_figures(dark: Floats, sensor: Sensor, hot: Pixels) -> DarkFigures:
 
 
 def sites_of(pattern: str) -> list[tuple[slice, slice]]:
-    """The sites of R, G in the rows of R, G in the rows of B and B in a frame.
+    """Return the sites of R, of G in R's rows, of G in B's rows, and of B.
 
     >>> sites_of("GRBG")[0]
     (slice(0, None, 2), slice(1, None, 2))
@@ -116,7 +117,7 @@ def sites_of(pattern: str) -> list[tuple[slice, slice]]:
 
 
 def without_rows(rest: Floats) -> Floats:
-    """Deviations from the mean frame, without those of each row's even and odd columns."""
+    """Return deviations from the mean frame, without those of each row's even and odd columns."""
     own = rest.copy()
     for start in (0, 1):
         part = own[:, :, start::2]
@@ -125,7 +126,7 @@ def without_rows(rest: Floats) -> Floats:
 
 
 def bias_of(levels: Doubles, own: Floats, black: float) -> FourEstimates:
-    """The mean errors of the four levels, DN, from (frame, 4) levels."""
+    """Return the mean errors of the four levels in DN, from (frame, 4) levels."""
     frames = len(levels)
     pixels = float(own.var() or 1.0) / own[0].size * 4
     errors = levels.std(axis=0, ddof=1) / frames**0.5 if frames > 1 else [pixels**0.5] * 4
@@ -135,12 +136,12 @@ def bias_of(levels: Doubles, own: Floats, black: float) -> FourEstimates:
 
 
 def scatter(levels: Doubles, rest: Floats, sites: Sequence[tuple[slice, slice]]) -> Estimate:
-    """By how much the four levels differ from frame to frame, beyond what rows and pixels explain.
+    """Return the variation of the four levels between frames, without that of rows and pixels.
 
     Args:
-        levels: (frame, 4), DN.
+        levels: (frame, 4), in DN.
         rest: deviations from the mean frame.
-        sites: of the four.
+        sites: the sites of the four channels.
     """
     total = float(levels.var(axis=0, ddof=1).mean())
     of_rows = [rest[(slice(None), *site)].mean(axis=2, dtype=np.float64) for site in sites]
@@ -150,11 +151,10 @@ def scatter(levels: Doubles, rest: Floats, sites: Sequence[tuple[slice, slice]])
 
 
 def shape_of(own: Floats, good: Mask) -> Estimate | None:
-    """The shape of the Tukey lambda distribution of which read noise has the L-kurtosis.
+    """Return the shape of the Tukey lambda distribution with the L-kurtosis of read noise.
 
-    L-moments (Hosking, J. R. Stat. Soc. B 1990) exist where tails are so heavy that the fourth
-    moment does not. What the mean of so few frames and whole DN do to them is seen in samples of
-    the distribution.
+    L-moments (Hosking, J. R. Stat. Soc. B 1990) exist even if tails are too heavy for a fourth
+    moment. Samples of the distribution show the effect of a mean of few frames and of whole DN.
     """
     frames = len(own)
     values = own[:, good].ravel()
@@ -174,7 +174,10 @@ def shape_of(own: Floats, good: Mask) -> Estimate | None:
 
 
 def of_shape(u: Doubles, shape: float, sigma: float) -> Doubles:
-    """Deviations from the mean of frames of whole DN with Tukey lambda noise, (frame, sample)."""
+    """Return deviations from the mean of frames in whole DN, with Tukey lambda noise.
+
+    The result is (frame, sample).
+    """
     x = np.log(u / (1 - u)) if abs(shape) < 1e-9 else (u**shape - (1 - u) ** shape) / shape
     noise = x * (sigma / x.std())
     dn = np.rint(noise + np.linspace(-0.5, 0.5, u.shape[1]))
@@ -182,7 +185,7 @@ def of_shape(u: Doubles, shape: float, sigma: float) -> Doubles:
 
 
 def l_kurtosis(values: Array) -> float:
-    """The fourth L-moment over the second; 0.1226 for Gaussian noise.
+    """Return the fourth L-moment over the second; 0.1226 for Gaussian noise.
 
     >>> round(l_kurtosis(np.random.default_rng(0).normal(size=100_000)), 2)
     0.12
@@ -195,12 +198,12 @@ def l_kurtosis(values: Array) -> float:
 
 
 def wave_in(rows: Doubles) -> Wave | None:
-    """A wave in the means of rows, (frame, row), of which each frame has another phase."""
+    """Return a wave in the means of rows, (frame, row), which has another phase in each frame."""
     from scipy import stats
 
     frames, height = rows.shape
     power = (np.abs(np.fft.rfft(rows, FINER * height)) ** 2).mean(axis=0)
-    power[: 2 * FINER] = 0  # what is slower is shading that changes
+    power[: 2 * FINER] = 0  # slower waves are changes of shading
     background = float(np.median(power[2 * FINER :]) / stats.gamma.median(frames) * frames)
     peak = int(power.argmax())
     limit = stats.gamma.isf(FALSE_ALARM / height, frames) / frames
@@ -213,7 +216,7 @@ def wave_in(rows: Doubles) -> Wave | None:
 
 
 def shading_of(mean: Doubles, good: Mask, sites: Sequence[tuple[slice, slice]]) -> Shading | None:
-    """What is smooth in a mean dark frame; None for a frame of too few blocks."""
+    """Return the smooth part of a mean dark frame; None if it has too few blocks."""
     flat = np.where(good, mean, np.nan)
     for site in sites:
         flat[site] -= np.nanmean(flat[site])
@@ -231,24 +234,24 @@ def shading_of(mean: Doubles, good: Mask, sites: Sequence[tuple[slice, slice]]) 
 
 
 def diagonal(blocks: Array, lag: int) -> float:
-    """The covariance of blocks along the diagonals, which share neither rows nor columns."""
+    """Return the covariance of blocks along the diagonals, which share neither rows nor columns."""
     own = blocks - blocks.mean()
     down, up = own[lag:, lag:] * own[:-lag, :-lag], own[lag:, :-lag] * own[:-lag, lag:]
     return float((down.mean() + up.mean()) / 2)
 
 
 def smooth_variance(blocks: Array) -> float:
-    """The variance of what is smooth: the covariance of blocks, from two lags, at none.
+    """Return the variance of the smooth part: the covariance of blocks, extrapolated to lag 0.
 
-    Covariance falls with the square of a small lag, so it is (4 c(1) - c(2)) / 3.
+    Covariance falls with the square of a small lag, so the result is (4 c(1) - c(2)) / 3.
     """
     return (4 * diagonal(blocks, 1) - diagonal(blocks, 2)) / 3
 
 
 def jumps(own: Floats, good: Mask) -> tuple[Estimate | None, Estimate | None]:
-    """The share of pixels that jump between two levels, and the mean distance of these, DN.
+    """Return the share of pixels that jump between two levels, and the levels' mean distance in DN.
 
-    Distances have an exponential distribution; those that do not stand out are added by it.
+    Distances have an exponential distribution, which accounts for jumps too small to be found.
     """
     variance = own.var(axis=0, dtype=np.float64, ddof=1)[good]
     usual = float(np.median(variance))
@@ -266,12 +269,12 @@ def jumps(own: Floats, good: Mask) -> tuple[Estimate | None, Estimate | None]:
 
 
 def slope_and_offset(shadings: Mapping[float, Shading]) -> tuple[Estimate, Estimate]:
-    """Standard deviations of the maps k and b of shading = k ISO + b, in DN for an ISO and in DN.
+    """Return the standard deviations of the maps k (in DN per ISO) and b (in DN) of k ISO + b.
 
-    Feng et al., TPAMI 2023: at each place a line over the ISO.
+    A line over the ISO is fitted at each place (Feng et al., TPAMI 2023).
 
     Args:
-        shadings: by ISO, two or more.
+        shadings: the shading at two or more ISOs.
     """
     isos = np.array(list(shadings))
     maps = np.stack([each.blocks for each in shadings.values()]).astype(np.float64)

@@ -1,4 +1,4 @@
-"""What a profile says of dark frames, from calibrations: values, None where unknown, and why."""
+"""A profile's values for dark frames, from calibrations, with their sources; None is unknown."""
 
 from collections.abc import Sequence
 
@@ -13,11 +13,11 @@ UNKNOWN = "not known: "
 
 
 def plus_minus(estimate: Estimate, unit: str = "") -> str:
-    """A value with its error, or an upper limit where it is not significant.
+    """Return a value with its error as text, or an upper limit if it is not significant.
 
     >>> plus_minus(Estimate(1.41, 0.012), "DN"), plus_minus(Estimate(0.0, 0.1), "DN")
     ('1.41 +- 0.012 DN', 'not seen, below 0.2 DN')
-    >>> plus_minus(Estimate(-5.0, 0.1))  # nothing is below zero but by chance or drift
+    >>> plus_minus(Estimate(-5.0, 0.1))  # below zero only by chance or drift
     'not seen, below 0.2'
     """
     unit = unit and f" {unit}"
@@ -27,14 +27,14 @@ def plus_minus(estimate: Estimate, unit: str = "") -> str:
 
 
 def weighted(estimates: Sequence[Estimate]) -> Estimate:
-    """The mean of estimates, weighted by their inverse squared errors."""
+    """Return the mean of estimates, weighted by their inverse squared errors."""
     weight = np.array([1 / max(e.error, 1e-12) ** 2 for e in estimates])
     value = float(weight @ [e.value for e in estimates] / weight.sum())
     return Estimate(value, float(weight.sum() ** -0.5))
 
 
 def dark_values(calibrations: Sequence[Calibration]) -> Sourced:
-    """The keys of a profile that hold at every ISO, and the sources of those by ISO."""
+    """Return the keys of a profile that apply at all ISOs, and the sources of keys by ISO."""
     found = {**_telegraph(calibrations), **_wave(calibrations), **_shading(calibrations)}
     for key, unit in (("tukey_lambda", ""), ("black_level_error", "DN")):
         own = {c.iso: e for c in calibrations if c.dark and (e := getattr(c.dark, key))}

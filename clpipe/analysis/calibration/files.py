@@ -1,4 +1,4 @@
-"""Calibration of a camera from files: frames in, a profile and a picture of the fit out."""
+"""Calibrates a camera from files, and writes a profile and a picture of the fit."""
 
 import os
 from collections.abc import Sequence
@@ -25,13 +25,12 @@ def calibrate_files(
     """Estimate the noise at each ISO of the frames.
 
     Args:
-        inputs: files, folders and globs of frames of a scene; what is also in ``dark`` is left out.
+        inputs: files, folders and globs of frames of a scene; files in ``dark`` are skipped.
         dark: files, folders and globs of frames without light.
-        overrides: replace what the files say.
+        overrides: values that replace those in the files.
 
     Returns:
-        The first frame, for what it says of the camera, and the calibrations in ascending order of
-        ISO.
+        The first frame, for its metadata, and the calibrations in ascending order of ISO.
 
     Raises:
         RequestError: the frames do not belong together, needed metadata is missing, or SciPy or
@@ -44,25 +43,25 @@ def calibrate_files(
     without_light = {os.path.realpath(path) for path in dark_paths}
     scene_paths = [p for p in find_frames(inputs) if os.path.realpath(p) not in without_light]
     if not scene_paths:
-        raise RequestError("all frames are dark frames; give frames of a scene too")
+        raise RequestError("all frames are dark frames; add frames of a scene")
     scene = [read_frame(path, overrides) for path in scene_paths]
     groups = group_frames(scene, [read_frame(path, overrides) for path in dark_paths])
     return scene[0], [calibrate_group(group) for group in groups]
 
 
 def write_profile(path: Path, frame: CalibrationFrame, calibrations: Sequence[Calibration]) -> Path:
-    """Write the profile, and the picture of the fit beside it.
+    """Write the profile, and the picture of the fit next to it.
 
     Args:
-        path: of the profile.
-        frame: one of the frames, for what it says of the camera.
+        path: the path of the profile.
+        frame: one of the frames, for its metadata.
         calibrations: one for each ISO.
 
     Returns:
         The path of the picture.
 
     Raises:
-        ImageError: a file cannot be written, or the estimates make no valid profile.
+        ImageError: a file cannot be written, or the estimates do not form a valid profile.
     """
     from clpipe.analysis.calibration.plot import calibration_png  # imports Matplotlib
 
@@ -75,10 +74,10 @@ def write_profile(path: Path, frame: CalibrationFrame, calibrations: Sequence[Ca
 
 
 def write_with_picture(path: Path, text: str, png: bytes) -> Path:
-    """Write a profile's text, and the picture of the measurement beside it; returns its path.
+    """Write a profile, and the picture of the measurement next to it; return the picture's path.
 
     Raises:
-        ImageError: a file cannot be written, or the text is no valid profile.
+        ImageError: a file cannot be written, or the text is not a valid profile.
     """
     picture = path.with_suffix(".png")
     write_new(picture, png)
@@ -86,7 +85,7 @@ def write_with_picture(path: Path, text: str, png: bytes) -> Path:
         with whole_file(path) as file:
             file.write(text.encode())
             file.flush()
-            load_camera(file.name)  # raises RequestError for a profile that no run could use
+            load_camera(file.name)  # raises RequestError for an invalid profile
     except RequestError as error:
-        raise ImageError(f"the estimates make no valid profile: {error}") from None
+        raise ImageError(f"the estimates do not form a valid profile: {error}") from None
     return picture

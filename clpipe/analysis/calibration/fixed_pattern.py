@@ -9,13 +9,13 @@ from clpipe.analysis.calibration.repeats import Sensor, Stack
 from clpipe.base.types import Array, Floats
 from clpipe.reference.cfa import sites
 
-SURE = 7.0  # standard deviations; by chance not one of 1e8 pixels is further out
-# Choices; tests/test_calibrate.py shows what they find and refuse.
+SURE = 7.0  # standard deviations, which not one of 1e8 pixels exceeds by chance
+# Choices; tests/test_calibrate.py shows what they find and reject.
 BLOCK = 16  # px of one colour, the side of a block
 LEAST_BLOCKS = 30  # flat blocks that PRNU needs
 DARKEST = 0.05  # signal units, the least light of a block that shows PRNU
 UNEVEN = 0.03  # relative standard deviation of the scene in a flat block, at most
-LEAST_DEVIATION = 0.05  # DN, the least deviation that a mean dark frame is taken to have
+LEAST_DEVIATION = 0.05  # DN, the smallest assumed deviation of a mean dark frame
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,13 @@ class Pixels:
 
 
 def _pixels(mask: Array, excess: Array, seen_on: float) -> Pixels:
-    """The pixels where a mask is True."""
+    """Return the pixels where a mask is True."""
     rows, columns = np.nonzero(mask)
     return Pixels(rows, columns, excess[mask].astype(np.float64), seen_on)
 
 
 def hot_in_dark(dark: Floats, sensor: Sensor) -> Pixels:
-    """Hot pixels of a mean dark frame, (height, width) in DN.
+    """Return hot pixels of a mean dark frame, (height, width) in DN.
 
     They are 7 standard deviations above the median of the 3x3 pixels of the same colour. The
     standard deviation is a quarter of the range from -2 to 2 sigma (95 %) of all pixels.
@@ -61,10 +61,10 @@ def hot_in_dark(dark: Floats, sensor: Sensor) -> Pixels:
 
 
 def hot_in_scene(stack: Stack, line: Line) -> Pixels:
-    """Hot pixels of a scene: those that exceed all 8 neighbours of the same colour by far.
+    """Return hot pixels of a scene, which exceed all 8 neighbours of the same colour by far.
 
-    The excess must be above 7 standard deviations of the mean plus the range of these neighbours,
-    and above three times the excess of any adjacent pixel over its own neighbours.
+    The excess must be above 7 standard deviations of the mean plus the range of the neighbours. It
+    must also be above three times the excess of any adjacent pixel over its own neighbours.
     """
     from scipy.ndimage import maximum_filter
 
@@ -80,11 +80,11 @@ def hot_in_scene(stack: Stack, line: Line) -> Pixels:
 
 
 def dead_in_scene(stack: Stack, line: Line) -> Pixels:
-    """Dead pixels of a scene: without light where all 8 neighbours of the same colour have light.
+    """Return dead pixels of a scene: dark although all 8 neighbours of the same colour have light.
 
-    Without light is less than 7 standard deviations of the dark, or than a tenth of the darkest
-    neighbour: the line may put the dark's variance at 0. The neighbours must have four times those
-    deviations, and more than their range.
+    A dark pixel has less than 7 standard deviations of dark noise, or less than a tenth of the
+    darkest neighbour. The second limit is needed if the line gives dark noise a variance of 0. The
+    neighbours must have four times those deviations, and more than their range.
     """
     low, high = _extremes(stack)
     dark = SURE * float(np.sqrt(line.at(np.zeros(1))[0] / len(stack.rest)))
@@ -94,7 +94,7 @@ def dead_in_scene(stack: Stack, line: Line) -> Pixels:
 
 
 def _extremes(stack: Stack) -> tuple[Floats, Floats]:
-    """The smallest and the largest light of each pixel's 8 neighbours of the same colour, DN."""
+    """Return the smallest and largest light in DN of each pixel's 8 neighbours of one colour."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     around = np.ones((3, 3), bool)
@@ -109,18 +109,18 @@ def _extremes(stack: Stack) -> tuple[Floats, Floats]:
 def dark_pattern(
     dark: Floats, temporal: Estimate, bad: Pixels, sensor: Sensor
 ) -> tuple[Estimate, Estimate]:
-    """The variances of column offsets and of pixels (DSNU) in a mean dark frame, in DN^2.
+    """Return the variances of column offsets and of pixels (DSNU) in a mean dark frame, in DN^2.
 
     Args:
         dark: the mean of the dark frames, DN.
         temporal: the variance that the frames' noise leaves in a pixel of it, without row noise,
             DN^2.
-        bad: hot pixels, which are left out.
-        sensor: its pattern; each channel's mean is subtracted, as channels may differ in black.
+        bad: hot pixels, which are excluded.
+        sensor: the sensor; each channel's mean is subtracted, because black levels may differ.
 
     Returns:
-        The variance of columns, without what the scatter of pixels leaves in a column's mean; and
-        that of DSNU, with columns and rows subtracted, without the temporal noise.
+        The variance of columns, without the part from the scatter of pixels, and the variance of
+        DSNU, without columns, rows and temporal noise.
     """
     values = dark.astype(np.float64)
     good = np.ones(dark.shape, bool)
@@ -146,17 +146,17 @@ def dark_pattern(
 
 
 def response_pattern(stack: Stack, line: Line, dsnu: float) -> Estimate | None:
-    """PRNU squared, from places where the scene is flat; None where there are too few.
+    """Return PRNU squared, from flat places of the scene; None if there are too few.
 
     From blocks of 16x16 pixels of one colour, a smooth surface and the means of rows and columns
     are subtracted. The variance that remains, without temporal noise and DSNU, is (PRNU * light)^2.
-    A block is flat where that surface is nearly level and diagonal neighbours are uncorrelated. All
-    flat blocks must agree on the PRNU, else it is taken for texture of the scene.
+    A block is flat if that surface is nearly level and diagonal neighbours are uncorrelated. If
+    flat blocks do not agree on the PRNU, it counts as texture of the scene.
 
     Args:
         stack: the frames of a scene.
         line: their noise, rounding included.
-        dsnu: the variance of DSNU in DN^2, 0 where it is unknown.
+        dsnu: the variance of DSNU in DN^2; 0 if it is unknown.
     """
     surface = _surface()
     freedom = BLOCK**2 - surface.shape[1]
@@ -189,9 +189,10 @@ def response_pattern(stack: Stack, line: Line, dsnu: float) -> Estimate | None:
 
 
 def _surface() -> Array:
-    """What is subtracted from a block, as orthonormal columns, (BLOCK^2, functions).
+    """Return the functions that are subtracted from a block, as orthonormal columns.
 
-    These are the mean of each row and column, and a polynomial surface of the fourth degree.
+    These are the mean of each row and column, and a polynomial surface of the fourth degree:
+    (BLOCK^2, functions).
     """
     one = np.linspace(-1, 1, BLOCK)
     row, column = np.repeat(np.eye(BLOCK), BLOCK, axis=0), np.tile(np.eye(BLOCK), (BLOCK, 1))
@@ -201,7 +202,7 @@ def _surface() -> Array:
 
 
 def _blocks(plane: Array) -> Array:
-    """A plane cut into whole blocks, (blocks, BLOCK, BLOCK)."""
+    """Return a plane cut into whole blocks, (blocks, BLOCK, BLOCK)."""
     rows, columns = (n // BLOCK for n in plane.shape)
     cut = plane[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK)
     return cut.swapaxes(1, 2).reshape(-1, BLOCK, BLOCK)

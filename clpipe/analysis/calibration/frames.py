@@ -1,4 +1,4 @@
-"""Frames for a calibration: the files, and what each says of its camera and levels."""
+"""Frames for a calibration: finds the files, and reads their camera and levels."""
 
 import glob
 from collections.abc import Iterable, Sequence
@@ -24,12 +24,12 @@ from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.reference.filter_array import MONO, NAMED
 from clpipe.stage import Kind
 
-MOSAICS = (*RENDER_SUFFIXES, ".png")  # endings of files with a mosaic that are not camera raws
+MOSAICS = (*RENDER_SUFFIXES, ".png")  # extensions of mosaics that are not camera raws
 
 
 @dataclass(frozen=True)
 class FrameOverrides:
-    """What the user states about all frames, instead of what their files say; None is not stated.
+    """The user's values for all frames, which replace those in files; None is not set.
 
     Levels are in DN. ``dump`` is the format of headerless dumps.
     """
@@ -41,7 +41,7 @@ class FrameOverrides:
     dump: Dump | None = None
 
     def check(self) -> None:
-        """See that the numbers are possible.
+        """Check that the numbers are possible.
 
         Raises:
             RequestError: one is not.
@@ -53,12 +53,14 @@ class FrameOverrides:
         ):
             high = 1e7 if name == "--iso" else 65535.0
             if value is not None and not low <= value <= high:
-                raise RequestError(f"{name}: found {value:g}; allowed: {low:g} to {high:g}")
+                raise RequestError(
+                    f"{name}: found {value:g}, but expected a value from {low:g} to {high:g}"
+                )
 
 
 @dataclass(frozen=True)
 class CalibrationFrame:
-    """A file with one mosaic, and its metadata; the pixels are read later."""
+    """A file with one mosaic, and its metadata. The pixels are read later."""
 
     path: Path
     make: str
@@ -66,18 +68,18 @@ class CalibrationFrame:
     iso: float
     exposure: str  # as text, "" if unknown
     sensor: Sensor
-    signal: bool = False  # the file holds signal, not DN
+    signal: bool = False  # whether the file has signal instead of DN
     facts: RawFacts | Dump | None = None  # of a camera raw, or of a dump
     gains: tuple[float, float] | None = None  # white balance, red and blue (green = 1)
     xyz_to_camera: Matrix | None = None
 
     @property
     def seconds(self) -> float | None:
-        """The exposure time in s, where the file says it as a camera does."""
+        """The exposure time in s; None if the file does not state it."""
         return self.facts.exposure if isinstance(self.facts, RawFacts) else None
 
     def read(self) -> Floats:
-        """The mosaic in DN, (height, width).
+        """Return the mosaic in DN, (height, width).
 
         Raises:
             ImageError: the file cannot be read, or is smaller than 16x16.
@@ -92,25 +94,30 @@ class CalibrationFrame:
             with np.errstate(over="ignore"):
                 mosaic = mosaic * np.float32(self.sensor.unit) + np.float32(self.sensor.black_level)
             if not np.isfinite(mosaic).all():
-                raise ImageError(f"{self.path}: damaged: its signal is beyond the range of floats")
+                raise ImageError(
+                    f"{self.path}: it is damaged: its signal exceeds the range of floats"
+                )
             nearest = np.rint(mosaic)
-            # Signal that normalize made from whole DN comes back to within float's last bits.
+            # Signal from whole DN is restored only up to float precision, so it is rounded.
             if np.abs(mosaic - nearest).max() < 0.01:
                 mosaic = nearest
         if min(mosaic.shape) < 16:
             height, width = mosaic.shape
-            raise ImageError(f"{self.path}: {width}x{height} pixels; at least 16x16 are needed")
+            raise ImageError(
+                f"{self.path}: this frame has {width}x{height} pixels, but at least 16x16 are "
+                "needed"
+            )
         return mosaic
 
 
 def find_frames(inputs: Sequence[str]) -> list[Path]:
-    """The files that inputs name, each once. An input is a file, a folder or a glob.
+    """Return the files of inputs, without duplicates. An input is a file, a folder or a glob.
 
-    Of a folder's own files, and of those that match a glob, mosaics and raws by their endings are
-    taken.
+    In a folder (not below it) and for a glob, only files with the extension of a mosaic or raw are
+    used.
 
     Raises:
-        RequestError: an input matches nothing.
+        RequestError: an input has no such file.
     """
     paths: list[Path] = []
     for text in inputs:
@@ -123,13 +130,16 @@ def find_frames(inputs: Sequence[str]) -> list[Path]:
             check_input(path)
             files = [path]
         if not files:
-            raise RequestError(f"{text}: no mosaic or raw file there")
+            raise RequestError(
+                f"{text}: there is no mosaic or raw file; give camera raws, or mosaics kept by "
+                "clpipe"
+            )
         paths += files
     return list(dict.fromkeys(paths))
 
 
 def _frames_among(paths: Iterable[Path]) -> list[Path]:
-    """The files with the ending of a mosaic or a raw, sorted by name; hidden ones are left out."""
+    """Return the files with the extension of a mosaic or raw, sorted, without hidden ones."""
     endings = (*MOSAICS, *RAW_SUFFIXES)
     matches = (p for p in paths if p.suffix.lower() in endings and not p.name.startswith("."))
     return sorted(p for p in matches if p.is_file())
@@ -138,11 +148,11 @@ def _frames_among(paths: Iterable[Path]) -> list[Path]:
 def read_frame(path: Path, overrides: FrameOverrides) -> CalibrationFrame:
     """Read the metadata of a frame: a camera raw, a mosaic that clpipe kept, or another mosaic.
 
-    A headerless dump is another mosaic, where the user states its format.
+    A headerless dump counts as another mosaic if the user states its format.
 
     Raises:
-        ImageError: the file cannot be read, or holds no mosaic.
-        RequestError: neither the file nor the user states what is needed.
+        ImageError: the file cannot be read, or is not a mosaic.
+        RequestError: a value is missing that neither the file nor the user states.
     """
     has_header = path.suffix.lower() in MOSAICS
     dump = overrides.dump if may_be_dump(path) and not has_header else None
@@ -157,7 +167,9 @@ def read_frame(path: Path, overrides: FrameOverrides) -> CalibrationFrame:
         if getattr(overrides, name) is None
     ]
     if missing:
-        raise RequestError(f"{path}: does not say how it was taken; give {', '.join(missing)}")
+        raise RequestError(
+            f"{path}: this file does not state how it was taken; add {', '.join(missing)}"
+        )
     assert overrides.pattern and overrides.iso is not None
     assert overrides.black_level is not None and overrides.white_level is not None
     sensor = Sensor(overrides.pattern, overrides.black_level, overrides.white_level)
@@ -165,11 +177,11 @@ def read_frame(path: Path, overrides: FrameOverrides) -> CalibrationFrame:
 
 
 def _from_raw(path: Path, overrides: FrameOverrides) -> CalibrationFrame:
-    """The frame in a camera raw."""
+    """Return the frame of a camera raw."""
     facts = read_facts(path)
     iso = overrides.iso or facts.iso
     if iso is None:
-        raise RequestError(f"{path}: does not say its ISO; give --iso")
+        raise RequestError(f"{path}: this file does not state its ISO; add --iso")
     exposure = ""
     if facts.exposure:
         short = facts.exposure < 0.3
@@ -190,12 +202,12 @@ def _from_raw(path: Path, overrides: FrameOverrides) -> CalibrationFrame:
 def _from_kept(
     path: Path, attributes: dict[str, str], overrides: FrameOverrides
 ) -> CalibrationFrame:
-    """The frame in a mosaic that clpipe kept."""
+    """Return the frame of a mosaic that clpipe kept."""
     kind = attributes.get("kind", "")
     if kind not in (Kind.RAW.label, Kind.MOSAIC.label):
         found = one_line(f"{kind}, kept after {attributes.get('stage')}")
         raise ImageError(
-            f"{path}: holds {found}; a mosaic is needed, such as clpipe run --until quantize writes"
+            f"{path}: this file contains {found}; give a mosaic (clpipe run --until quantize)"
         )
     try:
         settings = embedded_settings(attributes)
@@ -222,11 +234,11 @@ def _from_kept(
 
 
 def _sensor(overrides: FrameOverrides, pattern: str, black: float, white: float) -> Sensor:
-    """Pattern and levels: the user's, else those of the file."""
+    """Return pattern and levels: the user's, or else those of the file."""
     stated = overrides.pattern or pattern
     name = "" if stated in PATTERNS else next((n for n, r in NAMED.items() if r == stated), stated)
     return Sensor(
-        PATTERNS[0] if stated == MONO else stated,  # its sites are alike, whatever they are called
+        PATTERNS[0] if stated == MONO else stated,  # all sites are equal, so any pattern fits
         black if overrides.black_level is None else overrides.black_level,
         white if overrides.white_level is None else overrides.white_level,
         name,

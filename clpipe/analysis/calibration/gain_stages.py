@@ -1,4 +1,4 @@
-"""Gain stages: ISOs that share a conversion gain, told apart by their read noise."""
+"""Gain stages: groups of ISOs that share a conversion gain, found from their read noise."""
 
 from collections.abc import Sequence
 
@@ -12,11 +12,11 @@ LEAST_OF_PREDICTED = 0.7
 
 
 def gain_stages(calibrations: Sequence[Calibration]) -> list[list[Calibration]]:
-    """Calibrations in ascending order of ISO, cut where another conversion gain begins.
+    """Return calibrations in ascending order of ISO, split where the conversion gain changes.
 
-    Within a gain stage, the read noise in DN is sqrt((before * K)^2 + after^2), with K the system
-    gain, so it rises with the ISO. A new stage begins where it falls, or, after two ISOs of a
-    stage, where it is less than 0.7 of what that formula predicts from them.
+    Within a gain stage, the read noise in DN is sqrt((before * K)^2 + after^2), where K is the
+    system gain, so it rises with the ISO. A new stage begins if read noise falls. After two ISOs of
+    a stage, it also begins if read noise is less than 0.7 of the prediction from them.
     """
     stages: list[list[Calibration]] = []
     for one in sorted(calibrations, key=lambda c: c.iso):
@@ -28,7 +28,7 @@ def gain_stages(calibrations: Sequence[Calibration]) -> list[list[Calibration]]:
 
 
 def _least_read_noise(stage: Sequence[Calibration], one: Calibration) -> float:
-    """The read noise in DN below which an ISO does not belong to a gain stage."""
+    """Return the read noise in DN below which an ISO does not belong to a gain stage."""
     last = stage[-1]
     doubt = 2 * float(np.hypot(last.read_noise.error, one.read_noise.error))
     least = last.read_noise.value - doubt

@@ -1,4 +1,4 @@
-"""Frames of one ISO together, and their calibration."""
+"""Groups frames by ISO, and calibrates each group."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from clpipe.base.types import Floats
 
 @dataclass(frozen=True)
 class Group:
-    """The frames of a scene and the dark frames of one ISO; ``longer`` are of other times."""
+    """The frames of a scene and the dark frames of one ISO; ``longer`` have other times."""
 
     iso: float
     scene: tuple[CalibrationFrame, ...]
@@ -27,11 +27,11 @@ class Group:
 def group_frames(
     scene: Sequence[CalibrationFrame], dark: Sequence[CalibrationFrame]
 ) -> list[Group]:
-    """Frames by ISO, in ascending order.
+    """Return groups of frames by ISO, in ascending order.
 
     Raises:
-        RequestError: frames differ in camera, pattern or levels, or those of one ISO in exposure;
-            or an ISO has dark frames only; or the levels are impossible.
+        RequestError: frames differ in camera, pattern or levels; frames of one ISO differ in
+            exposure; an ISO has only dark frames; or the levels are impossible.
     """
     frames = [*scene, *dark]
     first = frames[0]
@@ -47,13 +47,15 @@ def group_frames(
                     "calibrate one camera at a time"
                 )
     if first.sensor.unit <= 0:
-        raise RequestError(f"the white level must be above black; found {_levels(first.sensor)}")
+        raise RequestError(
+            f"found {_levels(first.sensor)}, but the white level must be above black"
+        )
     groups = []
     for iso in sorted({frame.iso for frame in frames}):
         scene_at_iso = tuple(f for f in scene if f.iso == iso)
         if not scene_at_iso:
             raise RequestError(
-                f"ISO {iso:g} has dark frames only; give frames of a scene at that ISO too"
+                f"ISO {iso:g} has only dark frames; add frames of a scene at that ISO"
             )
         first = scene_at_iso[0]
         for frame in scene_at_iso[1:]:
@@ -71,11 +73,13 @@ def group_frames(
 def by_time(
     dark: Sequence[CalibrationFrame], seconds: float | None
 ) -> list[tuple[CalibrationFrame, ...]]:
-    """Dark frames of one ISO by exposure time: first those of the scene's, else of the shortest.
+    """Return lists of dark frames of one ISO by exposure time.
+
+    The first list has the exposure time of the scene, or else the shortest time.
 
     Args:
-        dark: the frames; none is one empty list of them.
-        seconds: of the scene, s.
+        dark: the frames; without any, there is one empty list.
+        seconds: the exposure time of the scene in s.
     """
     times = sorted({frame.seconds or 0.0 for frame in dark})
     if seconds in times:
@@ -85,7 +89,7 @@ def by_time(
 
 
 def _levels(sensor: Sensor) -> str:
-    """The levels in words."""
+    """Return the levels as text."""
     return f"black {sensor.black_level:g}, white {sensor.white_level:g}"
 
 
@@ -104,7 +108,7 @@ def calibrate_group(group: Group) -> Calibration:
     if brightest <= black:
         raise ImageError(
             f"{group.scene[0].path}: its largest sample is {brightest:g}, not above the black "
-            f"level of {black:g} DN; dark frames are given with --dark"
+            f"level of {black:g} DN; pass dark frames with --dark"
         )
     whole = bool((scene[0] == np.rint(scene[0])).all())
     found = calibrate(group.iso, scene, dark, group.scene[0].sensor, whole)
@@ -112,14 +116,14 @@ def calibrate_group(group: Group) -> Calibration:
 
 
 def current_of(group: Group, found: Calibration) -> DarkCurrent | None:
-    """The dark current of a group with dark frames of several exposure times."""
+    """Return the dark current of a group with dark frames of several exposure times."""
     every = (group.dark, *group.longer)
     stacks = {frames[0].seconds or 0.0: read_frames(frames) for frames in every if len(frames) > 1}
     return dark_current(stacks, found.pooled.gain, found.sensor)
 
 
 def read_frames(frames: Sequence[CalibrationFrame]) -> Floats:
-    """The frames in DN, (frames, height, width).
+    """Return the frames in DN, (frames, height, width).
 
     Raises:
         ImageError: a file cannot be read.
@@ -139,7 +143,7 @@ def read_frames(frames: Sequence[CalibrationFrame]) -> Floats:
 def _different_sizes(
     frame: CalibrationFrame, mosaic: Floats, other: CalibrationFrame, other_mosaic: Floats
 ) -> RequestError:
-    """The error that two frames differ in size."""
+    """Return the error that two frames differ in size."""
     (height, width), (other_height, other_width) = mosaic.shape, other_mosaic.shape
     return RequestError(
         f"{frame.path}: {width}x{height} pixels, but {other.path} has "

@@ -1,10 +1,10 @@
 """The line variance = gain*light + floor through the pixels of repeated frames.
 
-A pixel's mean over the frames is itself noisy, and a plain least-squares line through noisy
-abscissas is too flat. So the line is fitted with an instrumental variable (Fuller, Measurement
-Error Models, 1987, sec. 1.4): the mean of neighbours of the same colour, which follows the light
-but shares no noise with the pixel. Only sums by classes of the instrument are stored, so that a fit
-costs little.
+A pixel's mean over the frames is itself noisy, and an ordinary least-squares line through noisy
+abscissas is too flat. The line is therefore fitted with an instrumental variable (Fuller,
+Measurement Error Models, 1987, sec. 1.4). This is the mean of neighbours of the same colour, which
+follows the light but shares no noise with the pixel. A fit is fast, because only sums by classes of
+the instrument are stored.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ CLASSES = 2048  # of the instrument
 GROUPS = 64  # of rows, for the standard errors
 BINS = 32  # for pictures
 LEAST_IN_BIN = 50  # pixels
-DARKEST = 0.01  # share of the pixels through which the first weights go
+DARKEST = 0.01  # share of the pixels that determine the first weights
 ROUNDS = 12  # of weights from the line of the round before
 
 
@@ -37,13 +37,14 @@ class Estimate:
         return self.value > 2 * self.error
 
     def scaled(self, factor: float) -> "Estimate":
-        """Value and error times a factor, such as that of another unit."""
+        """Return value and error times a factor, for example to convert the unit."""
         return Estimate(self.value * factor, self.error * abs(factor))
 
     def root(self) -> "Estimate":
-        """The standard deviation, where this is a variance.
+        """Return the standard deviation, if this is a variance.
 
-        For a variance that is not above zero it is 0, with the root of the standard error as error.
+        If the variance is not above zero, the value is 0, and the error is the root of the standard
+        error.
 
         >>> Estimate(4.0, 0.4).root(), Estimate(-1.0, 0.25).root()
         (Estimate(value=2.0, error=0.1), Estimate(value=0.0, error=0.5))
@@ -56,9 +57,9 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Line:
-    """variance = gain*light + floor, the gain in DN (which is DN/e-), the floor in DN^2.
+    """The line variance = gain*light + floor, with the gain in DN/e- and the floor in DN^2.
 
-    ``pixels`` is the number of pixels behind it.
+    ``pixels`` is the number of pixels that it was fitted to.
     """
 
     gain: Estimate
@@ -66,20 +67,20 @@ class Line:
     pixels: int
 
     def at(self, light: Array) -> Array:
-        """The variance at each light above black in DN; it is safe to divide by.
+        """Return the variance at each light above black in DN.
 
-        It is at least a ten-thousandth of the largest variance that comes out.
+        Each is at least a ten-thousandth of the largest, so that dividing by it is safe.
         """
         variance = self.gain.value * light + self.floor.value
         return np.maximum(variance, 1e-4 * max(np.max(variance), 1e-9))
 
     def lowered(self, variance: float) -> "Line":
-        """The line with ``variance``, DN^2, subtracted from its floor."""
+        """Return the line with ``variance``, DN^2, subtracted from its floor."""
         floor = Estimate(self.floor.value - variance, self.floor.error)
         return Line(self.gain, floor, self.pixels)
 
     def record(self, signal_range: float) -> dict[str, Any]:
-        """a and b in signal units, gain and read noise in DN, each with its standard error."""
+        """Return a and b in signal units, gain and read noise in DN, each with its error."""
         return {
             "a": asdict(self.gain.scaled(1 / signal_range)),
             "b": asdict(self.floor.scaled(1 / signal_range**2)),
@@ -93,8 +94,8 @@ class Line:
 class Table:
     """Sums over pixels by classes of the instrument, in groups of rows.
 
-    ``sums`` is (GROUPS, 4, CLASSES): count, instrument, light and variance. ``squares`` is
-    (CLASSES,), the squared variances. ``degrees`` are the degrees of freedom of a pixel's variance.
+    ``sums`` is (GROUPS, 4, CLASSES): count, instrument, light and variance. ``squares`` contains
+    squared variances, (CLASSES,). ``degrees`` are the degrees of freedom of a pixel's variance.
     """
 
     sums: NDArray[np.float64] = field(repr=False)
@@ -105,13 +106,13 @@ class Table:
     def of(
         variance: Array, light: Array, instrument: Array, rows: Array, unit: float, degrees: int
     ) -> "Table":
-        """The table of some pixels; all arrays have one value for each pixel.
+        """Return the table of some pixels; all arrays have one value for each pixel.
 
         Args:
-            variance: over the frames, DN^2, unbiased.
+            variance: the unbiased variance over the frames, DN^2.
             light: the mean over the frames above black, DN.
             instrument: a value that follows the light but shares no noise with the pixel, DN.
-            rows: the number of the row; pixels of one row may share noise.
+            rows: the number of the row, because pixels of one row may share noise.
             unit: the white level minus the black level, DN.
             degrees: the number of frames minus one.
         """
@@ -127,7 +128,7 @@ class Table:
 
 
 def class_of(instrument: Array, unit: float) -> NDArray[np.intp]:
-    """The class of each value; classes are of equal width in the root of the signal.
+    """Return the class of each value. Classes have equal width in the root of the signal.
 
     >>> class_of(np.array([-3.0, 0.0, 250.0, 9e9]), 1000).tolist()
     [0, 0, 975, 2045]
@@ -141,8 +142,8 @@ def fit_line(tables: Sequence[Table]) -> Line:
 
     A pixel's weight is the inverse variance of its sample variance, degrees / (2 variance^2), with
     the variance from the line itself. The errors come from the sandwich formula over groups of rows
-    (Liang and Zeger, Biometrika 1986), so they also hold for noise that is not Gaussian and for
-    noise that a row shares.
+    (Liang and Zeger, Biometrika 1986). They are therefore valid for row noise, and for noise that
+    is not Gaussian.
 
     >>> light, rows = np.linspace(0, 900, 1001), np.arange(1001)
     >>> line = fit_line([Table.of(0.5 * light + 4, light, light, rows, 1000, 7)])
@@ -160,10 +161,10 @@ def fit_line(tables: Sequence[Table]) -> Line:
     z = z / count
     total = count.sum()
     if total < 3 or np.ptp(z) == 0:
-        raise ValueError("too few pixels count, or all have the same light")
+        raise ValueError("too few pixels can be used, or all have the same brightness")
     # The first weights are those of a rising line through the darkest pixels and the mean of all.
-    # No variance is taken for less than half of the darkest pixels', or the weights of a few pixels
-    # could grow without limit.
+    # Variances are at least half of the darkest pixels' variance, so that no weight grows without
+    # limit.
     order = np.argsort(z)
     darkest = order[np.cumsum(count[order]) <= max(DARKEST * total, count[order[0]], LEAST_IN_BIN)]
     dark = s[darkest].sum() / count[darkest].sum()
@@ -199,7 +200,7 @@ class Bin:
 
 
 def binned(table: Table) -> tuple[Bin, ...]:
-    """A table in 32 bins of equal width in the root of the light, without those of few pixels."""
+    """Return a table in 32 bins of equal width in the root of the light, without sparse bins."""
     sums = np.vstack([table.sums.sum(axis=0), table.squares]).reshape(5, BINS, -1).sum(axis=-1)
     bins = []
     for count, _, light, variance, square in sums.T:

@@ -1,4 +1,4 @@
-"""The picture of a calibration."""
+"""Draws a calibration."""
 
 import math
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ COLUMNS = 3  # of panels, one for each ISO
 
 
 def calibration_png(calibrations: Sequence[Calibration], title: str) -> bytes:
-    """A calibration as a PNG, 1600 px wide.
+    """Return a calibration as a PNG, 1600 px wide.
 
-    For each ISO it shows variance over mean with the fitted lines, and below the photon-transfer
-    curves of all ISOs (log noise over log light), all in DN.
+    For each ISO, it shows variance over mean with the fitted lines. Below are the photon-transfer
+    curves of all ISOs (log noise over log light). Values are in DN.
 
     Args:
         calibrations: one calibration for each ISO.

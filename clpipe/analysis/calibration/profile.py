@@ -1,4 +1,4 @@
-"""A camera profile from calibrations: TOML text, with the source of every figure."""
+"""Makes a camera profile from calibrations: TOML text, with the source of each value."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -24,12 +24,12 @@ def calibrated_profile(
     gains: Gains | None = None,
     xyz_to_camera: Matrix | None = None,
 ) -> str:
-    """The profile as :func:`clpipe.camera.profile.load_camera` reads it.
+    """Return the text of a profile, which :func:`clpipe.camera.profile.load_camera` reads.
 
     Args:
-        name: of the profile.
-        make: of the camera.
-        model: of the camera.
+        name: the name of the profile.
+        make: the make of the camera.
+        model: the model of the camera.
         calibrations: one calibration for each ISO, at least one, all of one sensor.
         gains: white balance gains of red and blue (green = 1), if the frames state them.
         xyz_to_camera: the camera's matrix, if the frames state it.
@@ -70,7 +70,7 @@ def calibrated_profile(
 
 
 def _stage_tables(stage: Sequence[Calibration]) -> dict[str, list[Any]]:
-    """The tables of a gain stage in the profile; those that lack an ISO are left out."""
+    """Return the tables of a gain stage in the profile, without those that lack an ISO."""
     darks = [c.dark for c in stage]
     shapes = [d.tukey_lambda if d else None for d in darks]
     errors = [d.black_level_error if d else None for d in darks]
@@ -89,18 +89,18 @@ def _stage_tables(stage: Sequence[Calibration]) -> dict[str, list[Any]]:
 
 
 def read_noise(one: Calibration) -> float:
-    """The read noise in DN; where b is not above zero, the root of b's standard error."""
+    """Return the read noise in DN; if b is not above zero, the root of b's standard error."""
     own = one.read_noise
     return own.value or own.error
 
 
 def _significant(estimate: Estimate | None) -> float | None:
-    """The value, or 0 where it is not above zero by two standard errors; None where unknown."""
+    """Return the value, or 0 if it is not above zero by two standard errors; None if unknown."""
     return None if estimate is None else estimate.value if estimate.significant else 0.0
 
 
 def _gain_source(calibrations: Sequence[Calibration]) -> str:
-    """The source of system gain and read noise: method, frames and values at each ISO."""
+    """Return the source of system gain and read noise: method, frames and values at each ISO."""
     parts = []
     for c in calibrations:
         frames = f"{c.scene_frames} frame{'s' if c.scene_frames > 1 else ''}"
@@ -113,7 +113,7 @@ def _gain_source(calibrations: Sequence[Calibration]) -> str:
 
 
 def _line_source(calibrations: Sequence[Calibration], key: str) -> str:
-    """The source of row or column noise."""
+    """Return the source of row or column noise."""
     estimates = [(c.iso, e) for c in calibrations if (e := getattr(c, key)) is not None]
     if not estimates:
         needs = "two frames" if key == "row_noise" else "dark frames"
@@ -124,13 +124,13 @@ def _line_source(calibrations: Sequence[Calibration], key: str) -> str:
 
 
 def _white_in_electrons(lowest: Calibration) -> str:
-    """The charge at the white level of the lowest ISO, in words."""
+    """Return the charge at the white level of the lowest ISO, as text."""
     electrons = lowest.sensor.unit / lowest.pooled.gain.value
     return f"at ISO {lowest.iso:g} the white level is {electrons:.0f} e-, and the ADC clips there"
 
 
 def _fixed_pattern(calibrations: Sequence[Calibration]) -> dict[str, tuple[float | None, str]]:
-    """PRNU, DSNU, hot and dead pixels by key: the value, None where unknown, and its source."""
+    """Return PRNU, DSNU, hot and dead pixels by key: the value (None if unknown) and its source."""
     result: dict[str, tuple[float | None, str]] = {}
     prnu = [c.prnu for c in calibrations if c.prnu]
     result["prnu"] = (None, "not known: no scene was flat enough, or it was not significant")
@@ -157,7 +157,7 @@ def _fixed_pattern(calibrations: Sequence[Calibration]) -> dict[str, tuple[float
 
 
 def _hot(calibrations: Sequence[Calibration]) -> dict[str, tuple[float | None, str]]:
-    """Hot pixels, from the dark frames of the ISO that shows most of them; as _fixed_pattern."""
+    """Return hot pixels like _fixed_pattern, from the dark frames of the ISO with most of them."""
     judged = [c for c in calibrations if c.hot and c.dark_frames]
     if not judged:
         candidates = max((len(c.hot.rows) for c in calibrations if c.hot), default=0)
@@ -172,7 +172,7 @@ def _hot(calibrations: Sequence[Calibration]) -> dict[str, tuple[float | None, s
     share = (count / best.size, source)
     if not count:
         return {"hot_pixel_share": share}
-    # The median of level * (1 + Exp(1)) is level * (1 + ln 2), also where the hottest pixels clip.
+    # The median of level * (1 + Exp(1)) is level * (1 + ln 2), even if the hottest pixels clip.
     median = float(np.median(best.hot.excess))
     level = median / best.pooled.gain.value / (1 + math.log(2))
     source = f"median charge of {count} hot pixels over 1 + ln 2, the median of 1 + Exp(1)"

@@ -1,4 +1,4 @@
-"""Stacks of frames of one static scene: what varies from frame to frame is noise."""
+"""Stacks of frames of one static scene, in which the variation between frames is noise."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,20 +14,20 @@ from clpipe.reference.filter_array import MIRRORED
 
 # The limits are choices; tests/test_calibrate.py has a case on each side of the last two.
 FAR_FROM_CLIPPING = 4.0  # standard deviations of a frame
-LARGEST_FLICKER = 0.05  # of the mean brightness; more is taken for another exposure
-MOVING = 0.02  # share of the variance that neighbours share; more is taken for motion
+LARGEST_FLICKER = 0.05  # of the mean brightness; more counts as another exposure
+MOVING = 0.02  # share of the variance that neighbours share; more counts as motion
 
 Site = tuple[slice, slice]  # the rows and columns of a filter's place in the period
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """The pattern and levels of a sensor, which give its frames a meaning."""
+    """The pattern and levels of a sensor, which are needed to interpret its frames."""
 
-    pattern: str  # Bayer's, or the rows of another filter array
+    pattern: str  # a Bayer pattern, or the rows of another filter array
     black_level: float  # DN
     white_level: float  # DN
-    filter_array: str = ""  # its name as a profile has it, where it is not Bayer's
+    filter_array: str = ""  # its name in a profile; "" for a Bayer pattern
 
     @property
     def unit(self) -> float:
@@ -36,12 +36,12 @@ class Sensor:
 
     @property
     def bayer(self) -> Pattern:
-        """Its Bayer pattern; of another array one that stands in where there is no light."""
+        """Its Bayer pattern; for another array, a substitute that is used for dark frames."""
         return next((pattern for pattern in PATTERNS if pattern == self.pattern), PATTERNS[0])
 
     @property
     def channels(self) -> dict[str, list[Site]]:
-        """The places of each channel: R, G1, G2 and B of a Bayer pattern, else of each filter."""
+        """The sites of each channel: R, G1, G2 and B of a Bayer pattern, or of each filter."""
         found: dict[str, list[Site]] = {}
         for name, site in sites(self.pattern).items():
             channel = name if self.pattern in PATTERNS else name.rstrip("0123456789")
@@ -50,14 +50,14 @@ class Sensor:
 
     @property
     def period(self) -> tuple[int, int]:
-        """After how many rows and columns the filters repeat."""
+        """The numbers of rows and columns after which the filters repeat."""
         rows, columns = next(iter(sites(self.pattern).values()))
         return rows.step, columns.step
 
 
 @dataclass(frozen=True)
 class Rows:
-    """The offsets of rows: their mean square over the frames, and the part that is pixel noise."""
+    """The mean square of each row's offset over the frames, and the part due to pixel noise."""
 
     square: Array  # (rows,), DN^2
     explained: Array  # by pixel noise; (rows,), DN^2
@@ -68,9 +68,12 @@ class Rows:
 class Stack:
     """Frames of one exposure as their mean and the deviations from it, in DN.
 
-    ``light``, (height, width), is the mean above black; ``around`` is the mean of each pixel's
-    neighbours of the same filter in other rows, see :func:`neighbours`; ``rest``, (frames, height,
-    width), is the frames minus their mean. ``used`` is True for the pixels that count.
+    Args:
+        light: the mean above black, (height, width).
+        around: the mean of each pixel's neighbours of the same filter, see :func:`neighbours`.
+        rest: the frames minus their mean, (frames, height, width).
+        sensor: pattern and levels.
+        used: True for valid pixels.
     """
 
     light: Floats
@@ -85,16 +88,16 @@ class Stack:
         return len(self.rest) - 1
 
     def variance(self) -> Array:
-        """The sample variance of each pixel over the frames, DN^2."""
+        """Return the sample variance of each pixel over the frames, DN^2."""
         return np.einsum("kij,kij->ij", self.rest, self.rest) / self.degrees
 
     def without_columns(self, offsets: Floats) -> "Stack":
-        """The stack with the offsets of columns, (width,), subtracted from its light."""
+        """Return the stack with the offsets of columns, (width,), subtracted from its light."""
         light = self.light - offsets
         return replace(self, light=light, around=neighbours(light, self.sensor.period))
 
     def tables(self, variance: Array) -> dict[str, Table]:
-        """The table of each channel, from the variances of pixels, (height, width), DN^2."""
+        """Return the table of each channel, from the variances of pixels, (height, width), DN^2."""
         tables = {}
         for name, places in self.sensor.channels.items():
             used = [self.used[site] for site in places]
@@ -113,20 +116,20 @@ class Stack:
 
 
 def stacked(frames: Floats, sensor: Sensor, what: str = "frames") -> Stack:
-    """Frames, (frames, height, width) in DN, as a stack in which all pixels count.
+    """Return frames, (frames, height, width) in DN, as a stack in which all pixels are valid.
 
-    The frames are overwritten. ``what`` they are called in messages.
+    The frames are overwritten. ``what`` is their name in messages.
 
     Raises:
-        ImageError: two frames are equal sample by sample.
+        ImageError: two frames have equal samples.
     """
     seen: dict[bytes, int] = {}
     for k, frame in enumerate(frames, 1):
         first = seen.setdefault(blake2b(np.ascontiguousarray(frame).data).digest(), k)
         if first != k:
             raise ImageError(
-                f"{what} {first} and {k} are identical in every sample; one frame was given "
-                "twice, or both were made with one seed and image key"
+                f"{what} {first} and {k} are identical in every sample. One frame was given "
+                "twice, or both were made with the same seed and image key; remove one"
             )
     mean = frames.mean(axis=0, dtype=np.float64).astype(np.float32)
     rest = np.subtract(frames, mean, out=frames)
@@ -135,7 +138,7 @@ def stacked(frames: Floats, sensor: Sensor, what: str = "frames") -> Stack:
 
 
 def neighbours(image: Floats, period: tuple[int, int]) -> Floats:
-    """The mean of six pixels of the same filter, in the rows of a period above and below.
+    """Return the mean of six pixels of the same filter, in the rows of a period above and below.
 
     They share no noise with the pixel, row noise included.
     """
@@ -146,8 +149,10 @@ def neighbours(image: Floats, period: tuple[int, int]) -> Floats:
 
 
 def beside(size: int, period: int) -> tuple[Array, Array]:
-    """For each row, the ones a period before and behind; at an end, where a mirror (reflect-101)
-    would have other filters, twice the one that is there.
+    """Return, for each row, the rows one period before and after it.
+
+    At an end, the row on the other side is returned twice, because a mirrored row (reflect-101)
+    would have other filters.
 
     >>> [each.tolist() for each in beside(9, 4)]
     [[4, 5, 6, 7, 0, 1, 2, 3, 4], [4, 5, 6, 7, 8, 1, 2, 3, 4]]
@@ -163,10 +168,10 @@ def beside(size: int, period: int) -> tuple[Array, Array]:
 
 
 def ceiling(frames: Floats, sensor: Sensor) -> float:
-    """The DN at which samples clip: the largest sample if it repeats, else the white level.
+    """Return the DN at which samples clip: the largest sample if it repeats, or the white level.
 
     Many cameras clip below the white level that their files state. The largest sample repeats if at
-    least ten pixels have it in every frame, a number that was chosen.
+    least ten pixels have it in every frame; this number is a choice.
     """
     top = float(frames.max())
     constant = int((frames == top).all(axis=0).sum())
@@ -174,10 +179,10 @@ def ceiling(frames: Floats, sensor: Sensor) -> float:
 
 
 def unclipped(stack: Stack, line: Line | None, top: float) -> Stack:
-    """The stack without pixels that clip, or so near to clipping that their noise may.
+    """Return the stack without pixels that are clipped, or whose noise may be.
 
     With a line, the light of a pixel and of its neighbours must be more than 4 standard deviations
-    from 0 DN and from ``top``, DN; without one, no sample may be at either.
+    from 0 DN and from ``top`` (in DN). Without one, no sample may be at either limit.
     """
     black = stack.sensor.black_level
     if line is None:
@@ -192,15 +197,15 @@ def unclipped(stack: Stack, line: Line | None, top: float) -> Stack:
 
 
 def without_flicker(stack: Stack) -> tuple[Stack, Array]:
-    """The stack with all frames scaled to the same mean, if their means differ significantly.
+    """Return the stack with all frames scaled to one mean, if their means differ significantly.
 
-    That is by more than four standard errors, taken over rows, since a row may share noise.
+    A significant difference is above four standard errors, computed over rows because of row noise.
 
     Returns:
         The stack, and each frame's brightness relative to the mean minus 1; zeros if unchanged.
 
     Raises:
-        ImageError: a frame differs by more than a lamp's flicker.
+        ImageError: a frame differs by more than the flicker of a lamp.
     """
     weight = stack.used.astype(np.float32)
     light = np.einsum("ij,ij->i", weight, stack.light, dtype=np.float64)
@@ -228,9 +233,9 @@ def without_flicker(stack: Stack) -> tuple[Stack, Array]:
 
 
 def row_offsets(stack: Stack, line: Line) -> tuple[Array, Array, Rows]:
-    """The offset of each row in each frame: its mean, weighted by the pixels' inverse variance.
+    """Return the offset of each row in each frame: a mean weighted by inverse pixel variance.
 
-    The weights keep the shot noise of bright pixels out of it.
+    The weights reduce the effect of the shot noise of bright pixels.
 
     Returns:
         The weights, (height, width), the offsets, (frames, height) in DN, and their mean squares.
@@ -246,15 +251,15 @@ def without_rows(stack: Stack, line: Line) -> tuple[Array, Rows]:
     """Subtract the offsets of rows from the stack, in place.
 
     Subtracting a row's weighted mean lowers each pixel's variance by 1 / sum(1 / variance), which
-    is added again.
+    is corrected.
 
     Args:
         stack: the frames.
         line: their noise without row noise.
 
     Returns:
-        The unbiased variance of each pixel, (height, width) in DN^2, and the rows, their pixel
-        noise now computed from the pixels' own variances.
+        The unbiased variance of each pixel, (height, width) in DN^2, and the rows, with pixel noise
+        computed from the pixels' variances.
     """
     weight, offsets, rows = row_offsets(stack, line)
     stack.rest[...] -= offsets[:, :, None].astype(np.float32)
@@ -264,7 +269,7 @@ def without_rows(stack: Stack, line: Line) -> tuple[Array, Rows]:
 
 
 def row_variance(parts: Sequence[Rows]) -> Estimate:
-    """The variance of row offsets in DN^2: their mean square minus the part that is pixel noise.
+    """Return the variance of row offsets in DN^2: their mean square minus that of pixel noise.
 
     Rows are weighted by the inverse variance of that difference.
     """
@@ -282,9 +287,9 @@ def row_variance(parts: Sequence[Rows]) -> Estimate:
 
 
 def common_motion(stack: Stack, line: Line) -> Estimate:
-    """The share of its variance that a pixel shares with the pixel two rows below.
+    """Return the share of its variance that a pixel shares with the pixel two rows below.
 
-    It is 0 for noise, and above for a scene that moves, changing light and denoised raws.
+    It is 0 for noise, and larger for a moving scene, changing light or denoised raws.
     """
     weight = np.where(stack.used, 1 / np.sqrt(line.at(stack.around)), 0).astype(np.float32)
     products = squares = 0.0
@@ -300,9 +305,9 @@ def common_motion(stack: Stack, line: Line) -> Estimate:
 
 
 def noise_by_frame(stack: Stack, line: Line) -> Array:
-    """The variance of each frame's noise relative to that of the median frame, (frames,).
+    """Return the variance of each frame's noise relative to that of the median frame, (frames,).
 
-    Frames of one setting agree closely; a mean of frames, or a clean picture, has less.
+    Frames of one setting agree closely. A mean of frames, or a clean picture, has less noise.
     """
     weight = np.where(stack.used, 1 / line.at(stack.around), 0)
     squares = np.einsum("ij,kij,kij->k", weight, stack.rest, stack.rest, dtype=np.float64)
@@ -310,9 +315,9 @@ def noise_by_frame(stack: Stack, line: Line) -> Array:
 
 
 def share_beyond_noise(stack: Stack, line: Line) -> float:
-    """The share of pixels with more variance than noise has in one of a million pixels.
+    """Return the share of pixels with more variance than noise has in one of a million pixels.
 
-    The line is first scaled so that it holds for the median pixel.
+    The line is first scaled to fit the median pixel.
     """
     from scipy.stats import chi2
 

@@ -12,10 +12,10 @@ from clpipe.analysis.calibration.repeats import Sensor
 
 @dataclass(frozen=True)
 class Calibration:
-    """The noise at one ISO, in DN unless a comment says otherwise; None where frames cannot tell.
+    """The noise at one ISO, in DN unless a comment says otherwise; None if not measurable.
 
-    ``lines`` are those of the channels and ``pooled`` that of all channels together; the variance
-    of rounding to whole DN is subtracted from them, but not from ``bins``.
+    ``lines`` has a line for each channel, and ``pooled`` is that of all channels together. The
+    variance of rounding to whole DN is subtracted from them, but not from ``bins``.
     """
 
     iso: float
@@ -26,7 +26,7 @@ class Calibration:
     pooled: Line
     bins: dict[str, tuple[Bin, ...]]
     size: int  # pixels of a frame
-    used: float  # the share of them that counts
+    used: float  # the share of valid pixels
     rounding: float  # the variance of rounding to whole DN, DN^2
     row_noise: Estimate | None = None
     column_noise: Estimate | None = None
@@ -40,18 +40,18 @@ class Calibration:
 
     @property
     def method(self) -> str:
-        """How a and b were estimated, in words."""
+        """The method by which a and b were estimated, as text."""
         if self.scene_frames > 1:
             return "variance over repeated frames"
         return "single image (Foi et al. 2008)"
 
     @property
     def read_noise(self) -> Estimate:
-        """The read noise in DN: 0 where b is not above zero."""
+        """The read noise in DN; 0 if b is not above zero."""
         return self.pooled.floor.root()
 
     def record(self) -> dict[str, Any]:
-        """The calibration as JSON values."""
+        """Return the calibration as JSON values."""
         unit, gain = self.sensor.unit, self.pooled.gain.value
         electrons = self.dsnu and asdict(self.dsnu.scaled(1 / gain))
         return {

@@ -1,16 +1,17 @@
 """Noise of a single raw image: Foi, Trimeche, Katkovnik, Egiazarian, "Practical
 Poissonian-Gaussian noise modeling and fitting for single-image raw-data", IEEE TIP 17(10), 2008.
 
-Wavelet details of smooth places hold only noise. Places of similar smoothed value form a level set,
-which has a mean and a standard deviation; the line variance = a*y + b is the most likely one for
-all these pairs. Clipped samples are modelled, not left out (sec. III).
+Wavelet details of smooth places contain only noise. Places of similar smoothed value form a level
+set, which has a mean and a standard deviation. The line variance = a*y + b is the most likely one
+for all these pairs. Clipped samples are modelled, not excluded (sec. III).
 
-It differs from the paper in three ways. The deviation of a level set comes from those of its places
-whose local variance the line of the round before explains, not from the median of all details,
-which is far too large where half of a picture is textured. The integral of the likelihood over the
-unknown y of a level set is computed to first order, since the mean of a set is known far better
-than its deviation. The optimum is searched over the variances at both ends of the light, so b may
-come out below zero.
+The method differs from the paper in three ways:
+
+- The deviation of a level set comes from places whose local variance the previous line explains.
+  The median of all details would be far too large if half of a picture is textured.
+- The integral of the likelihood over the unknown y of a level set is computed to first order. The
+  mean of a set is known far better than its deviation.
+- The optimum is searched over the variances at both ends of the light, so b may be negative.
 """
 
 import contextlib
@@ -49,7 +50,7 @@ class Places:
     variance: Values
 
     def sets(self) -> list[NDArray[np.intp]]:
-        """The level sets as indices: places by their smoothed signal, in sets of equal size."""
+        """Return the level sets as indices: places by smoothed signal, in sets of equal size."""
         order = np.argsort(self.smooth, kind="stable")
         return np.array_split(order, min(LEVELS, len(order) // LEAST) or 1)
 
@@ -64,16 +65,16 @@ class LevelSets:
 
 
 def joined(parts: Sequence[LevelSets]) -> LevelSets:
-    """The sets of several collections in one."""
+    """Return several collections of level sets as one."""
     columns = ([getattr(p, name) for p in parts] for name in ("mean", "deviation", "count"))
     return LevelSets(*(np.concatenate(column) for column in columns))
 
 
 def smooth_places(plane: Floats) -> Places:
-    """The smooth places in the plane of one colour, (height, width) signal (sec. II-A and II-B).
+    """Return the smooth places in the plane of one colour, (height, width) (sec. II-A, II-B).
 
-    A place is smooth where the Laplacian of the smoothed image plus the magnitude of the
-    Laplacian's gradient is less than the local standard deviation of the details.
+    A place is smooth if the Laplacian of the smoothed image plus the magnitude of the Laplacian's
+    gradient is less than the local standard deviation of the details. Values are signal.
     """
     from scipy.ndimage import convolve1d, laplace, sobel, uniform_filter
 
@@ -87,7 +88,7 @@ def smooth_places(plane: Floats) -> Places:
     bend = laplace(smooth, mode="mirror")
     slope = np.hypot(sobel(bend, 0, mode="mirror"), sobel(bend, 1, mode="mirror")) / 8
     flat = slope + np.abs(bend) < EDGE * local
-    # The filter's running sum may come out below zero.
+    # The filter's running sum may be negative.
     variance = np.maximum(uniform_filter(detail * detail, WINDOW, mode="mirror"), 0)
     return Places(smooth[flat], approximation[flat], variance[flat])
 
@@ -95,11 +96,11 @@ def smooth_places(plane: Floats) -> Places:
 def explained_line(
     parts: Sequence[Places], low: float, dark: Sequence[LevelSets] = ()
 ) -> tuple[float, float, LevelSets, Values]:
-    """The line behind the places that it explains, and their level sets.
+    """Return the line of the places that it explains, and their level sets.
 
     The first line goes through each set's 5 % quantile of local variances, scaled to the variance
-    that a chi-square distribution has there. In each further round the places below 1.4 times the
-    line count; their mean is divided by that of a chi-square distribution cut at 1.4.
+    of a chi-square distribution with that quantile. In each further round, only places below 1.4
+    times the line are used. Their mean is divided by that of a chi-square distribution cut at 1.4.
 
     Args:
         parts: the smooth places of each colour.
@@ -107,7 +108,7 @@ def explained_line(
         dark: further level sets, from dark frames.
 
     Returns:
-        a and b in signal units; the level sets; the standard errors of a and b.
+        a and b in signal units, the level sets, and the standard errors of a and b.
 
     Raises:
         ValueError: there are too few sets, or all have the same light.
@@ -137,11 +138,11 @@ def explained_line(
 
 
 def clipped_moments(y: Values, deviation: Values, low: float) -> tuple[Values, Values]:
-    """Mean and standard deviation of y plus Gaussian noise, clipped to low..1 (sec. III-B).
+    """Return mean and deviation of y plus Gaussian noise, clipped to low..1 (sec. III-B).
 
-    A normal of mean u and deviation 1, clipped to values above 0, has the mean
-    E_m(u) = Phi(u) u + phi(u) and the variance S_m(u)^2 = Phi(u) + phi(u) u - phi(u)^2
-    + Phi(u) u (u - Phi(u) u - 2 phi(u)). The two ends are combined as if they were far apart.
+    Let a normal of mean u and deviation 1 be clipped to values above 0. Its mean is
+    `E_m(u) = Phi(u) u + phi(u)`. Its variance is `S_m(u)^2 = Phi(u) + phi(u) u - phi(u)^2 +
+    Phi(u) u (u - Phi(u) u - 2 phi(u))`. The two ends are combined as if they were far apart.
 
     >>> mean, deviation = clipped_moments(np.array([0.0, 0.5]), np.array([0.1, 0.1]), 0.0)
     >>> mean.round(4).tolist(), deviation.round(4).tolist()
@@ -162,14 +163,14 @@ def clipped_moments(y: Values, deviation: Values, low: float) -> tuple[Values, V
 
 
 def most_likely_line(sets: LevelSets, low: float) -> tuple[float, float, Values]:
-    """The most likely line behind level sets (sec. II-C and III-C), in signal units.
+    """Return the most likely line of level sets (sec. II-C and III-C), in signal units.
 
     Each set's deviation is compared with that of the clipped model at the set's mean. Its relative
     variance is 1.35 / (n + 1.5) for n places. Its distribution is half a Gaussian and half a
     Cauchy, which tolerates sets with texture.
 
     Args:
-        sets: of signal, 1 = white level.
+        sets: level sets of signal, where 1 is the white level.
         low: the signal at 0 DN, where it clips.
 
     Returns:
@@ -221,7 +222,7 @@ def most_likely_line(sets: LevelSets, low: float) -> tuple[float, float, Values]
 def _errors(
     cost: Callable[[Values], float], at: Values, line: Callable[[Values], Values]
 ) -> Values:
-    """Standard errors of a and b from the curvature of the likelihood at its optimum."""
+    """Return the standard errors of a and b, from the curvature of the likelihood's optimum."""
     step = 0.01
     unit = np.eye(2) * step
     curvature = np.empty((2, 2))
@@ -238,10 +239,10 @@ def _errors(
 def single_image(
     light: Floats, sensor: Sensor, dark: LevelSets | None = None
 ) -> tuple[dict[str, Line], Line, LevelSets]:
-    """The lines of a mosaic's channels, the line of all channels, and the level sets behind it.
+    """Return the lines of a mosaic's channels, the line of all channels, and its level sets.
 
-    The wavelet details are diagonal ones, which row and column noise does not reach. A channel with
-    too few smooth places has no line.
+    Diagonal wavelet details are used, which exclude row and column noise. A channel with too few
+    smooth places has no line.
 
     Args:
         light: (height, width) above black, DN.

@@ -12,19 +12,19 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Doubles, Mask
 
 ROUNDING = 1 / 12  # the variance of rounding to whole DN, DN^2
-LEAST_DARK = 0.24  # DN^2: a variance below it is one of rounding alone
+LEAST_DARK = 0.24  # DN^2: a smaller variance is due to rounding only
 FITTED = 0.7  # of the saturation, up to which K and R are fitted
-LINEAR = 0.05, 0.95  # of the saturation, between which linearity is judged
+LINEAR = 0.05, 0.95  # of the saturation, between which linearity is measured
 MOST_AT_ZERO = 0.005  # of the samples without light
-ENOUGH = 3  # exposures that are fitted, at least
+ENOUGH = 3  # the smallest number of exposures for a fit
 
 
 @dataclass(frozen=True)
 class Linearity:
-    """The line through the light, and how far the light is off it, in % of the line.
+    """The line of mean DN over photons, and the deviations from it in % of the line.
 
-    ``slope`` and ``offset`` are in DN per photon and DN, ``deviation`` is for each exposure, and
-    ``least`` and ``most`` are those between 5 and 95 % of the saturation (LE_min and LE_max).
+    The slope is in DN per photon, and the offset in DN. There is a deviation for each exposure. The
+    least and most are those between 5 and 95 % of the saturation (LE_min and LE_max).
     """
 
     slope: float
@@ -37,9 +37,9 @@ class Linearity:
 
 @dataclass(frozen=True)
 class NonUniformity:
-    """DSNU or PRNU: of all pixels, and its parts of rows, columns and single pixels.
+    """DSNU or PRNU of all pixels, and its parts due to rows, columns and single pixels.
 
-    A part that is not above zero is 0, with the error that it has then.
+    A part that is not above zero is set to 0, and keeps its error.
     """
 
     total: Estimate
@@ -50,9 +50,9 @@ class NonUniformity:
 
 @dataclass(frozen=True)
 class Figures:
-    """A sensor's figures. ``saturated`` is the number of the exposure at the saturation.
+    """A sensor's figures. ``saturated`` is the number of the exposure at saturation.
 
-    Dark currents are None where fewer than three exposure times tell of none.
+    Dark currents are None if there are fewer than three exposure times.
     """
 
     system_gain: Estimate  # K, DN/e-
@@ -74,7 +74,7 @@ class Figures:
     fitted: Mask  # exposures
 
     def record(self) -> dict[str, Any]:
-        """The figures as JSON values, each with its error."""
+        """Return the figures as JSON values, each with its error."""
         plain = ("linearity", "saturated", "fitted")
         values = {name: value for name, value in vars(self).items() if name not in plain}
         own = {name: value and asdict(value) for name, value in values.items()}
@@ -83,16 +83,16 @@ class Figures:
 
 
 def figures(moments: Moments) -> Figures:
-    """The figures of a series.
+    """Return the figures of a series.
 
     Raises:
-        RequestError: noise without light is cut off, the series has no saturation, or noise and
-            light do not rise together.
+        RequestError: noise without light is clipped, the series has no saturation, or noise does
+            not rise with light.
     """
     if moments.dark_stack.at_zero > MOST_AT_ZERO:
         raise RequestError(
-            f"{moments.dark_stack.at_zero:.1%} of the samples without light are 0 DN, where their "
-            f"noise is cut off; EMVA 1288 allows {MOST_AT_ZERO:.1%}: raise the camera's black level"
+            f"{moments.dark_stack.at_zero:.1%} of the samples without light are 0 DN, where "
+            f"noise is clipped; EMVA 1288 allows {MOST_AT_ZERO:.1%}. Raise the camera's black level"
         )
     bright, light, noise = moments.bright, moments.light, moments.noise
     saturated = saturation_index(moments)
@@ -106,7 +106,9 @@ def figures(moments: Moments) -> Figures:
     responsivity = _slope(bright.photons[fitted], light[fitted])
     for name, each in (("variance", gain), ("light", responsivity)):
         if not each.significant:
-            raise RequestError(f"the {name} does not rise with the exposure; is it one series?")
+            raise RequestError(
+                f"the {name} does not rise with the exposure; give the frames of one series"
+            )
     efficiency = _quotient(responsivity, gain)
     dark2, noise_slope = _dark_variance(moments.dark, moments.dark_stack.mean_frame.size)
     dark_dn = dark2.root()
@@ -114,7 +116,7 @@ def figures(moments: Moments) -> Figures:
     # (sigma / K + 1/2) / QE, in which most of K cancels.
     least = Estimate(dark_dn.value + gain.value / 2, float(np.hypot(dark_dn.error, gain.error / 2)))
     threshold = _quotient(least, responsivity)
-    # The saturation lies anywhere within half a step of the exposures.
+    # The saturation is within half a step of the exposures.
     photons = bright.photons
     step = float(np.ptp(photons[max(saturated - 1, 0) : saturated + 2])) / 2
     saturation = Estimate(float(photons[saturated]), step / 12**0.5)
@@ -142,14 +144,14 @@ def figures(moments: Moments) -> Figures:
 
 
 def saturation_index(moments: Moments) -> int:
-    """The number of the exposure at which the noise is greatest.
+    """Return the number of the exposure at which the noise is greatest.
 
-    From the brightest exposure on it is the first with more noise than the two next darker ones:
-    noise may rise slowly up to there, and scatter. What is less than half of the most noise is a
-    scatter of clipped frames.
+    Starting with the brightest exposure, it is the first with more noise than the two next darker
+    ones, because noise may rise slowly and scatter. Noise below half of the maximum is scatter of
+    clipped frames.
 
     Raises:
-        RequestError: it is the brightest one.
+        RequestError: it is the brightest exposure.
     """
     variance = moments.bright.variance
     darker = np.maximum(variance[1:-1], variance[:-2])
@@ -157,14 +159,14 @@ def saturation_index(moments: Moments) -> int:
     saturated = int(peaks[-1]) if len(peaks) else int(np.argmax(variance))
     if saturated == len(variance) - 1:
         raise RequestError(
-            "the series ends before the saturation: its brightest exposure has the most noise; "
-            "expose longer"
+            "the series ends before saturation, because its brightest exposure has the most noise; "
+            "add longer exposures"
         )
     return saturated
 
 
 def _slope(x: Doubles, y: Doubles) -> Estimate:
-    """The slope of the line y = slope * x by least squares, its error from the residuals."""
+    """Fit y = slope * x by least squares, and return the slope with an error from residuals."""
     squares = float(x @ x)
     slope = float(x @ y) / squares
     residuals = y - slope * x
@@ -172,7 +174,7 @@ def _slope(x: Doubles, y: Doubles) -> Estimate:
 
 
 def _line(x: Doubles, y: Doubles) -> tuple[Estimate, Estimate]:
-    """Slope and offset of a line by least squares, their errors from the residuals."""
+    """Fit a line by least squares, and return slope and offset with errors from residuals."""
     terms = np.stack([x, np.ones_like(x)], axis=1)
     inverse = np.linalg.inv(terms.T @ terms)
     found = inverse @ terms.T @ y
@@ -183,22 +185,22 @@ def _line(x: Doubles, y: Doubles) -> tuple[Estimate, Estimate]:
 
 
 def _quotient(above: Estimate, below: Estimate) -> Estimate:
-    """The quotient of two estimates whose errors are independent."""
+    """Return the quotient of two estimates whose errors are independent."""
     value = above.value / below.value
     error = np.hypot(above.error, value * below.error) / below.value
     return Estimate(value, float(error))
 
 
 def _dark_variance(dark: Temporal, pixels: int) -> tuple[Estimate, Estimate | None]:
-    """The variance without light at no exposure, DN^2, and its slope, DN^2/ns.
+    """Return the variance without light at no exposure, DN^2, and its slope, DN^2/ns.
 
-    With fewer than three exposure times it is that of the shortest one.
+    With fewer than three exposure times, it is the variance at the shortest.
     """
     if len(np.unique(dark.time)) < ENOUGH:
         variance = float(dark.variance[np.argmin(dark.time)])
         found, slope = Estimate(variance, variance * (2 / pixels) ** 0.5), None
     else:
-        # In ms, lest a sum of squares drowns the rest.
+        # In ms, so that squares do not lose precision.
         per_ms, found = _line(dark.time / 1e6, dark.variance)
         slope = per_ms.scaled(1e-6)
     return (found if found.value > LEAST_DARK else Estimate(LEAST_DARK, 0.0)), slope
@@ -207,7 +209,7 @@ def _dark_variance(dark: Temporal, pixels: int) -> tuple[Estimate, Estimate | No
 def _dark_current(
     dark: Temporal, gain: Estimate, noise_slope: Estimate | None
 ) -> tuple[Estimate | None, Estimate | None]:
-    """The dark current in e-/s, from means and from variances."""
+    """Return the dark current in e-/s, from means and from variances."""
     if noise_slope is None:
         return None, None
     of_mean = _line(dark.time / 1e6, dark.mean)[0].scaled(1e-6)
@@ -218,7 +220,7 @@ def _dark_current(
 
 
 def _linearity(moments: Moments, saturated: int) -> Linearity:
-    """The line of least squares of relative deviations, and these."""
+    """Return the line of least squares of relative deviations, and the deviations."""
     light, photons = moments.light, moments.bright.photons
     low, high = (share * light[saturated] for share in LINEAR)
     used = (light >= low) & (light <= high) & (photons <= photons[saturated])
@@ -238,13 +240,13 @@ def _linearity(moments: Moments, saturated: int) -> Linearity:
 
 
 def _dsnu(dark: Spatial, gain: Estimate) -> NonUniformity:
-    """The deviation of pixels without light, e-."""
+    """Return the deviation of pixels without light, e-."""
     parts = (dark.variance, *dark.parts)
     return NonUniformity(*(_quotient(part.root(), gain) for part in parts))
 
 
 def _prnu(bright: Spatial, dark: Spatial) -> NonUniformity:
-    """The relative deviation of pixels at half the saturation, less that without light."""
+    """Return the relative deviation of pixels at half the saturation, minus that without light."""
     light = bright.mean - dark.mean
     lit, unlit = (bright.variance, *bright.parts), (dark.variance, *dark.parts)
     of_light = (

@@ -1,4 +1,4 @@
-"""A sensor measured after EMVA 1288, from files: a series in, a profile and its picture out."""
+"""Measures a sensor according to EMVA 1288 from a series, and writes a profile and a picture."""
 
 from pathlib import Path
 
@@ -10,18 +10,18 @@ from clpipe.analysis.emva.series import read_series
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
 
-USUAL_ISO = 100.0  # of a profile, where the user states none
+USUAL_ISO = 100.0  # of a profile if the user does not state one
 
 
 def measure_series(path: Path) -> tuple[Moments, Figures]:
-    """The moments and the figures of a series.
+    """Return the moments and the figures of a series.
 
     Args:
-        path: of its text.
+        path: the text of the series.
 
     Raises:
-        RequestError: the text or a frame cannot be read or does not fit, or the series does not
-            allow an estimate; SciPy or matplotlib is not installed.
+        RequestError: the text or a frame cannot be read or does not fit, the series does not allow
+            an estimate, or SciPy or matplotlib is not installed.
     """
     require("clpipe calibrate", "scipy", "matplotlib")
     moments = read_moments(read_series(path))
@@ -34,17 +34,17 @@ def measure_series(path: Path) -> tuple[Moments, Figures]:
 def write_emva_profile(
     path: Path, series: Path, iso: float | None, moments: Moments, found: Figures
 ) -> Path:
-    """Write the profile of a series, and its picture beside it; returns the picture's path.
+    """Write the profile of a series, and its picture next to it; return the picture's path.
 
     Args:
-        path: of the profile.
+        path: the path of the profile.
         series: the path of the text of the series.
-        iso: what the profile calls the setting of the series; None is 100.
-        moments: of the series.
+        iso: the ISO in the profile for the setting of the series; None is 100.
+        moments: the moments of the series.
         found: its figures.
 
     Raises:
-        ImageError: a file cannot be written, or the figures make no valid profile.
+        ImageError: a file cannot be written, or the figures do not form a valid profile.
     """
     from clpipe.analysis.emva.plot import emva_png  # imports Matplotlib
 

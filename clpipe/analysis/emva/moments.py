@@ -1,4 +1,4 @@
-"""Means and variances of a series' frames, in DN: all that the figures are made of."""
+"""Means and variances of a series' frames in DN, from which all figures are computed."""
 
 from dataclasses import dataclass
 
@@ -11,22 +11,22 @@ from clpipe.base.types import Array, Doubles
 
 @dataclass(frozen=True)
 class Temporal:
-    """Pairs of frames: arrays with a value for each exposure, in DN and DN^2."""
+    """Statistics of pairs of frames: arrays with a value for each exposure, in DN and DN^2."""
 
     time: Doubles  # ns
     photons: Doubles
     mean: Doubles
     variance: Doubles  # temporal, of a frame
-    flicker: Doubles  # by which the means of the two frames differ
+    flicker: Doubles  # the difference between the means of the two frames
 
 
 @dataclass(frozen=True)
 class Spatial:
-    """A stack of frames.
+    """Statistics of a stack of frames.
 
-    ``variance`` is the spatial one of the sensor (s^2) without what temporal noise leaves of itself
-    in a mean of so many frames; ``row``, ``column`` and ``pixel`` are its parts. ``temporal`` is
-    the variance of a frame. All in DN^2.
+    ``variance`` is the spatial variance of the sensor (s^2), without the part that temporal noise
+    leaves in a mean of frames. Its parts are those of rows, columns and pixels. ``temporal`` is the
+    variance of a frame. Variances are in DN^2.
     """
 
     frames: int
@@ -36,7 +36,7 @@ class Spatial:
 
     @property
     def mean(self) -> float:
-        """The mean of all pixels, DN."""
+        """The mean of all pixels in DN."""
         return float(self.mean_frame.mean())
 
     @property
@@ -54,8 +54,8 @@ class Spatial:
     def parts(self) -> tuple[Estimate, Estimate, Estimate]:
         """The parts of rows, columns and pixels, which add up to the variance.
 
-        Means of rows have the variance row + pixel / N, those of columns column + pixel / M, for N
-        columns and M rows (as release 4.0 has it). One below zero was not seen.
+        For N columns and M rows, means of rows have the variance row + pixel / N, and those of
+        columns have column + pixel / M (release 4.0). Negative values are set to zero.
         """
         rows, columns = self.mean_frame.shape
         total = self.variance
@@ -71,10 +71,10 @@ class Spatial:
 
     @property
     def stripes(self) -> Estimate:
-        """The variance of columns' offsets that differ from neighbour to neighbour, DN^2.
+        """The variance in DN^2 of column offsets that differ between neighbours.
 
-        Half that of the differences of neighbouring columns, to which slopes over many columns add
-        nothing, less what single pixels leave in means of columns.
+        It is half the variance of differences of neighbouring columns, minus the part that single
+        pixels leave in means of columns. Slopes over many columns do not affect it.
         """
         steps = np.diff(self.mean_frame, axis=1)
         rows, count = steps.shape
@@ -84,9 +84,9 @@ class Spatial:
 
 
 def _less(measured: float, noise: float, count: float) -> Estimate:
-    """A variance of ``count`` values, less that of noise in them.
+    """Return a variance of ``count`` values, minus that of noise in them.
 
-    The standard error is that of the noise alone, so of a measurement of the same sensor again.
+    The standard error is that of the noise only: of repeated measurements of the same sensor.
     """
     variance = float(measured) - noise
     scatter = 4 * max(variance, 0.0) * noise + 2 * noise * noise
@@ -95,9 +95,9 @@ def _less(measured: float, noise: float, count: float) -> Estimate:
 
 @dataclass(frozen=True)
 class Moments:
-    """What is left of a series: pairs with and without light, and the two stacks.
+    """The statistics of a series: pairs with and without light, and the two stacks.
 
-    ``dark_of`` has, for each pair with light, the number of the dark one that was exposed as long.
+    ``dark_of`` lists, for each pair with light, the number of the dark pair of the same time.
     """
 
     full_scale: int
@@ -111,12 +111,12 @@ class Moments:
 
     @property
     def light(self) -> Doubles:
-        """The means of pairs with light above dark, DN."""
+        """The means of pairs with light minus dark, in DN."""
         return self.bright.mean - self.dark.mean[self.dark_of]
 
     @property
     def noise(self) -> Doubles:
-        """The variances of pairs with light above dark, DN^2."""
+        """The variances of pairs with light minus dark, in DN^2."""
         return self.bright.variance - self.dark.variance[self.dark_of]
 
 
@@ -124,7 +124,7 @@ def read_moments(series: Series) -> Moments:
     """Read all frames of a series, one or two of them at a time.
 
     Raises:
-        RequestError: a frame cannot be read, or does not fit the series.
+        RequestError: a frame cannot be read, or does not match the series.
     """
     white = 0
 
@@ -155,7 +155,7 @@ def read_moments(series: Series) -> Moments:
 
 
 def _stack(series: Series, exposure: Exposure) -> Spatial:
-    """The mean frame and the temporal variance of a stack."""
+    """Return the mean frame and the temporal variance of a stack."""
     total = np.zeros((series.height, series.width), np.int64)
     squares = np.zeros_like(total)
     at_zero = 0.0

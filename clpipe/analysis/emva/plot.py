@@ -1,4 +1,4 @@
-"""The picture of a series: the standard's curves, spectrograms and histograms."""
+"""Draws a series: the standard's curves, spectrograms and histograms."""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,7 +18,7 @@ BINS = 256
 
 
 def emva_png(moments: Moments, figures: Figures, title: str) -> bytes:
-    """The standard's plots as a PNG, 1600 px wide.
+    """Return the standard's plots as a PNG, 1600 px wide.
 
     They are sensitivity, photon transfer, signal-to-noise ratio, linearity,
     spectrograms of rows and of columns, and histograms of DSNU and PRNU.
@@ -41,7 +41,7 @@ def emva_png(moments: Moments, figures: Figures, title: str) -> bytes:
 
 
 def _fitted(panel: Axes, x: Doubles, y: Doubles, figures: Figures, at: float) -> None:
-    """Draw points, those that were not fitted hollow, and the saturation."""
+    """Draw points (hollow if they were not fitted) and the saturation."""
     used = figures.fitted
     panel.plot(x[used], y[used], "o", ms=4, color=MEASURED, label="fitted")
     panel.plot(x[~used], y[~used], "o", ms=4, mfc="none", color=MEASURED, label="not fitted")
@@ -77,7 +77,7 @@ def _photon_transfer(panel: Axes, moments: Moments, figures: Figures) -> None:
 
 
 def _signal_to_noise(panel: Axes, moments: Moments, figures: Figures) -> None:
-    """SNR over photons with its model, and that with DSNU and PRNU."""
+    """Draw SNR over photons with its model, and with DSNU and PRNU."""
     bright = moments.bright
     seen = (bright.variance > 0) & (moments.light > 0)
     seen &= bright.photons <= figures.saturation.value
@@ -156,7 +156,9 @@ def _spectra(panel: Axes, moments: Moments, figures: Figures, across: bool) -> N
 
 
 def spectrum(frame: Doubles) -> Doubles:
-    """The root of the mean power spectrum of a frame's rows; that of white noise is its deviation.
+    """Return the root of the mean power spectrum of a frame's rows.
+
+    For white noise, it is the standard deviation at all frequencies.
 
     >>> noise = np.random.default_rng(0).normal(0, 3, (500, 64))
     >>> bool(abs(spectrum(noise)[1:] - 3).max() < 0.3)
@@ -187,7 +189,7 @@ def _prnu(panel: Axes, moments: Moments, figures: Figures) -> None:
 
 
 def _histogram(panel: Axes, values: Doubles) -> None:
-    """Draw how many pixels have a value, and how many of a Gaussian of that deviation."""
+    """Draw a histogram of pixels, and a Gaussian of the same deviation."""
     counts, edges = np.histogram(values, BINS)
     centres, step = (edges[1:] + edges[:-1]) / 2, edges[1] - edges[0]
     sigma = float(values.std())

@@ -1,4 +1,4 @@
-"""A camera profile from the figures of a series: TOML text, with the source of every figure."""
+"""Makes a camera profile from the figures of a series: TOML text, with sources."""
 
 from typing import Any
 
@@ -10,23 +10,23 @@ from clpipe.camera.text import profile_text
 
 
 def emva_profile(name: str, iso: float, source: str, moments: Moments, figures: Figures) -> str:
-    """The profile as :func:`clpipe.camera.profile.load_camera` reads it.
+    """Return the text of a profile, which :func:`clpipe.camera.profile.load_camera` reads.
 
-    What differs from row to row or over wide areas counts as differences of single pixels, so that
-    DSNU and PRNU of all pixels are the sensor's.
+    Differences between rows, or over wide areas, count as differences of single pixels, so that
+    DSNU and PRNU of all pixels match the sensor.
 
     Args:
-        name: of the profile.
-        iso: what the profile calls the setting of the series; the standard knows none.
+        name: the name of the profile.
+        iso: the ISO for the setting of the series; the standard does not define one.
         source: the series, for the sources.
-        moments: of the series.
-        figures: of the series.
+        moments: the moments of the series.
+        figures: the figures of the series.
     """
     dark = moments.dark_stack
     dark2 = figures.dark_noise_dn.value**2
     temporal = dark.temporal if dark2 <= LEAST_DARK else dark2
     black, read_noise, pattern = before_rounding(dark.mean, temporal, dark.variance.value)
-    # Less noise in the dark than before rounding tilts the line of K, which goes through zero.
+    # If rounding reduces dark noise, it tilts the line of K, which goes through zero.
     used = moments.light[figures.fitted]
     hidden = read_noise**2 + ROUNDING - temporal
     gain = figures.system_gain.value - hidden * float(used.sum() / (used @ used))
@@ -99,7 +99,7 @@ def emva_profile(name: str, iso: float, source: str, moments: Moments, figures: 
 
 
 def _parts(figure: NonUniformity, unit: str) -> str:
-    """A non-uniformity with its parts, for the sources."""
+    """Return a non-uniformity with its parts, for the sources."""
     parts = {"rows": figure.row, "columns": figure.column, "single pixels": figure.pixel}
     each = ", ".join(f"{name} {plus_minus(part, unit)}" for name, part in parts.items())
     return f"{plus_minus(figure.total, unit)} ({each})"

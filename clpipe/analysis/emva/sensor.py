@@ -1,29 +1,29 @@
-"""Gaussian models of a sensor: what rounding hides in the dark, and where noise is greatest."""
+"""Gaussian models of a sensor: the effect of rounding on dark noise, and the noise maximum."""
 
 import numpy as np
 
 from clpipe.base.types import Doubles
 
-COARSE = 1.0  # DN: with more noise than that, rounding adds 1/12 DN^2 and nothing else
+COARSE = 1.0  # DN: with more noise, the only effect of rounding is to add 1/12 DN^2
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(21)
 NODE_WEIGHTS = WEIGHTS / WEIGHTS.sum()
-FINE = np.linspace(-4, 4, 161)  # standard deviations, of pixels among which rounding is not smooth
+FINE = np.linspace(-4, 4, 161)  # standard deviations, at which rounding is sampled
 FINE_WEIGHTS = np.exp(-FINE * FINE / 2) / np.exp(-FINE * FINE / 2).sum()
 SEARCHED = np.linspace(0.6, 1.1, 2001)  # of the light that fills the sensor
 ROUNDS = 20  # of the search for a full well
 
 
 def before_rounding(mean: float, temporal: float, spatial: float) -> tuple[float, float, float]:
-    """The mean and the deviations over time and over pixels, DN, before frames were rounded.
+    """Return mean, temporal deviation and spatial deviation in DN, before frames were rounded.
+
+    Above a temporal deviation of 1 DN, rounding adds 1/12 DN^2 to its variance. Below that, it
+    shifts means, and reduces or increases both variances. In this case, the function finds the
+    Gaussian sensor whose rounded frames have the three values.
 
     Args:
-        mean: of the rounded frames, DN.
+        mean: the mean of the rounded frames, DN.
         temporal: the variance of a rounded pixel over time, DN^2.
         spatial: the variance of the means of rounded pixels, DN^2.
-
-    Above a deviation of 1 DN over time, rounding adds 1/12 DN^2 to it. Below, it shifts means and
-    hides or enlarges both variances; the Gaussian sensor is then found whose rounded frames have
-    the three figures.
 
     >>> [round(each, 3) for each in before_rounding(100.2, 4 + 1 / 12, 0.04)]
     [100.2, 2.0, 0.2]
@@ -49,12 +49,12 @@ def before_rounding(mean: float, temporal: float, spatial: float) -> tuple[float
 
 
 def rounded(mean: float, over_time: float, over_pixels: float) -> tuple[float, float, float]:
-    """The mean, DN, and the variances over time and pixels, DN^2, of a Gaussian sensor's frames.
+    """Return the mean (DN) and the temporal and spatial variance (DN^2) of rounded frames.
 
     Args:
-        mean: before rounding, DN.
-        over_time: the deviation of a pixel, DN.
-        over_pixels: the deviation of pixels, DN.
+        mean: the mean before rounding, DN.
+        over_time: the deviation of a pixel over time, DN.
+        over_pixels: the deviation between pixels, DN.
     """
     from scipy.special import ndtr
 
@@ -71,13 +71,13 @@ def rounded(mean: float, over_time: float, over_pixels: float) -> tuple[float, f
 
 
 def noisiest_light(gain: float, read_noise: float, prnu: float, full: float) -> float:
-    """The light, in e-, at which noise over time is greatest, before it is cut off at the top.
+    """Return the light in e- at which temporal noise is largest, before clipping reduces it.
 
     Args:
-        gain: DN/e-.
-        read_noise: DN.
+        gain: in DN/e-.
+        read_noise: in DN.
         prnu: relative.
-        full: the light above black at which a pixel, or the converter, is full, DN.
+        full: the light above black at which a pixel or the converter saturates, in DN.
 
     >>> 0.9 < noisiest_light(0.1, 2.0, 0.005, 4000) / 40000 < 1
     True
@@ -88,14 +88,14 @@ def noisiest_light(gain: float, read_noise: float, prnu: float, full: float) -> 
     sigma = np.sqrt(gain * light + read_noise**2)
     u = (full - light) / sigma
     density, below = np.exp(-u * u / 2) / np.sqrt(2 * np.pi), ndtr(u)
-    # The variance of a standard normal that is cut off at u.
+    # The variance of a standard normal that is clipped at u.
     cut = -density + u * (1 - below)
     variance = sigma * sigma * (below - u * density + u * u * (1 - below) - cut * cut)
     return float(SEARCHED[np.argmax(variance @ NODE_WEIGHTS)] * full / gain)
 
 
 def full_well(gain: float, read_noise: float, prnu: float, saturation: float) -> float:
-    """The full well, in e-, with which noise is greatest at a saturation, in e-; as above."""
+    """Return the full well in e- for which noise is largest at ``saturation`` in e-."""
     well = saturation
     for _ in range(ROUNDS):
         well *= saturation / noisiest_light(gain, read_noise, prnu, gain * well)

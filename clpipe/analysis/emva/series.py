@@ -29,7 +29,7 @@ PAIR = 2  # frames of one exposure, for temporal figures
 MOST_BITS = 16
 SIDES = 16, 16_384  # px, least and most
 LEAST_EXPOSURES = 9  # with light; the standard asks for 50
-NS = 1e9  # in a second
+NS = 1e9  # nanoseconds in a second
 FORMS = {
     "v": "v RELEASE",
     "n": "n BITS WIDTH HEIGHT",
@@ -46,12 +46,12 @@ class Exposure:
     time: float
     photons: float  # 0: dark
     frames: tuple[Path, ...]
-    line: int = field(default=0, compare=False)  # of the text; 0: of none
+    line: int = field(default=0, compare=False)  # in the text; 0 if there is none
 
 
 @dataclass(frozen=True)
 class Series:
-    """A series. ``bright`` and ``dark`` are pairs, in ascending order of light and time."""
+    """A series. ``bright`` and ``dark`` contain pairs, in ascending order of light and time."""
 
     path: Path
     bits: int
@@ -64,20 +64,20 @@ class Series:
 
     @property
     def full_scale(self) -> int:
-        """The largest DN that the bits hold."""
+        """The largest possible DN."""
         return int(2**self.bits - 1)
 
     def dark_of(self, exposure: Exposure) -> int:
-        """The number, in ``dark``, of the pair that was exposed as long; see :meth:`check`."""
+        """Return the number in ``dark`` of the pair with the same exposure time."""
         if len(self.dark) == 1:
             return 0
         return [each.time for each in self.dark].index(exposure.time)
 
     def read(self, frame: Path) -> Array:
-        """A frame in DN, (height, width), whole numbers.
+        """Return a frame in DN, (height, width), whole numbers.
 
         Raises:
-            RequestError: it cannot be read, or has another size or more bits than the series.
+            RequestError: the frame cannot be read, or has another size or more bits.
         """
         try:
             pixels = read_whole_numbers(frame)
@@ -86,19 +86,19 @@ class Series:
         height, width = pixels.shape
         if (width, height) != (self.width, self.height):
             raise RequestError(
-                f"{frame}: found {width}x{height} pixels; {self.path} says {self.width}x"
+                f"{frame}: found {width}x{height} pixels, but {self.path} states {self.width}x"
                 f"{self.height}"
             )
         if (most := int(pixels.max())) > self.full_scale:
             raise RequestError(
-                f"{frame}: found {most} DN; {self.path} says {self.bits} bits, which end at "
+                f"{frame}: found {most} DN, but {self.path} states {self.bits} bits, so at most "
                 f"{self.full_scale}"
             )
         return pixels
 
 
 class _Lines:
-    """The lines of a text with their numbers, one after the other."""
+    """Reads the lines of a text one by one, with their numbers."""
 
     def __init__(self, path: Path, text: str) -> None:
         self._path = path
@@ -107,7 +107,7 @@ class _Lines:
         self._at = 0
 
     def next(self, only: str = "") -> tuple[int, list[str]] | None:
-        """The number and the words of the next line; None at the end, or at another letter."""
+        """Return number and words of the next line; None at the end, or at another letter."""
         if self._at == len(self._lines):
             return None
         number, line = self._lines[self._at]
@@ -130,7 +130,7 @@ class _Lines:
     def number(
         self, number: int, word: str, name: str, low: float, high: float, whole: bool = False
     ) -> float:
-        """A number of a line, in which a comma may stand for the point, or a whole number."""
+        """Return a number in a line, whose decimal separator may be a comma, or a whole number."""
         try:
             value = whole_number(word) if whole else float(word.replace(",", "."))
         except ValueError:
@@ -145,14 +145,14 @@ def read_series(path: Path) -> Series:
     """Read the text of a series.
 
     Raises:
-        RequestError: it cannot be read, a line is wrong, or it lacks what the standard asks for.
+        RequestError: the text cannot be read, a line is wrong, or required frames are missing.
     """
     try:
         text = read_text(path)
     except OSError as error:
         raise RequestError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise RequestError(f"{path}: it is not a text in UTF-8") from None
+        raise RequestError(f"{path}: this file is not text in UTF-8") from None
     lines = _Lines(path, text)
     size: list[int] = []
     exposures: dict[tuple[float, float, bool], Exposure] = {}
@@ -175,18 +175,18 @@ def read_series(path: Path) -> Series:
                 raise lines.error(number, f"the exposure of line {exposures[key].line} again")
             exposures[key] = own
     if not size:
-        raise RequestError(f"{path}: found no line {FORMS['n']}")
+        raise RequestError(f"{path}: the line {FORMS['n']} is missing")
     return _checked(path, size, list(exposures.values()))
 
 
 def _exposure(lines: _Lines, number: int, words: Sequence[str], folder: Path) -> Exposure:
-    """The exposure of a line b or d, and of the frames that follow it.
+    """Return the exposure of a line b or d, and of the frames that follow it.
 
     Args:
-        lines: of the text.
-        number: of the line.
-        words: of the line: a time and, with light, photons.
-        folder: of the text.
+        lines: the lines of the text.
+        number: the number of the line.
+        words: the words of the line: a time and, with light, photons.
+        folder: the folder of the text.
     """
     time = lines.number(number, words[0], "time", 0, 1e15)
     photons = [lines.number(number, word, "photons", 0, 1e12) for word in words[1:]]
@@ -203,10 +203,10 @@ def _exposure(lines: _Lines, number: int, words: Sequence[str], folder: Path) ->
 
 
 def _checked(path: Path, size: Sequence[int], exposures: Sequence[Exposure]) -> Series:
-    """The series of a text's exposures.
+    """Return the series of a text's exposures.
 
     Raises:
-        RequestError: it lacks exposures, or a dark pair or stack.
+        RequestError: exposures, a dark pair or a stack are missing.
     """
 
     def of(lit: bool, pair: bool) -> tuple[Exposure, ...]:
@@ -220,13 +220,13 @@ def _checked(path: Path, size: Sequence[int], exposures: Sequence[Exposure]) -> 
             f"{LEAST_EXPOSURES} are needed, and EMVA 1288 asks for 50"
         )
     if not dark:
-        raise RequestError(f"{path}: found no exposure of two frames without light (d)")
+        raise RequestError(f"{path}: an exposure of two frames without light (d) is missing")
     times = {each.time for each in dark}
     for each in bright:
         if len(dark) > 1 and each.time not in times:
             raise RequestError(
-                f"{path}, line {each.line}: no two frames without light were exposed for "
-                f"{each.time:g} ns, too"
+                f"{path}, line {each.line}: two frames without light are missing that were exposed "
+                f"for {each.time:g} ns as well"
             )
     stacks: list[Exposure] = []
     for is_lit, letter in ((True, "b"), (False, "d")):
@@ -249,7 +249,7 @@ def _checked(path: Path, size: Sequence[int], exposures: Sequence[Exposure]) -> 
 
 
 def series_text(series: Series, comment: str) -> str:
-    """The text of a series, as :func:`read_series` reads it; a comment stands at its top."""
+    """Return the text of a series for :func:`read_series`, which begins with a comment."""
     lines = [
         *(f"# {line}" for line in comment.splitlines()),
         f"v {RELEASE}",

@@ -1,4 +1,4 @@
-"""A series of a camera of clpipe's: uniform light through the raw stages of a chain."""
+"""Simulates a series of a camera: uniform light through the raw stages of a chain."""
 
 import math
 from collections.abc import Callable
@@ -19,15 +19,15 @@ from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
 from clpipe.images.write import write_grey_png
 
-FIRST, LAST = "crosstalk", "quantize"  # what a chain does between the clean mosaic and the raw
-BEYOND = 0.1  # of the exposures up to the saturation; so many follow
-SATURATED = 0.01  # s: the time after which the light saturates the sensor
-SHARE = 0.5  # of the saturation, at which the stack for PRNU is taken
+FIRST, LAST = "crosstalk", "quantize"  # the stages between the clean mosaic and the raw
+BEYOND = 0.1  # exposures beyond saturation, relative to the number below it
+SATURATED = 0.01  # s: the exposure time at which the light saturates the sensor
+SHARE = 0.5  # of the saturation, for the stack for PRNU
 
 
 @dataclass(frozen=True)
 class SeriesSize:
-    """How large a series is: px of a frame, exposures up to the saturation, frames of a stack."""
+    """The size of a series: px of a frame, exposures up to saturation, frames of a stack."""
 
     width: int = 640
     height: int = 480
@@ -36,7 +36,7 @@ class SeriesSize:
 
 
 def saturation_of(camera: Camera, iso: float) -> float:
-    """The electrons at which a camera's noise is greatest; raises as :meth:`Camera.noise`."""
+    """Return the electrons at which a camera's noise is largest. Errors: :meth:`Camera.noise`."""
     noise, unit = camera.noise(iso), camera.signal_range
     gain = noise.a * unit
     full = min(unit, gain * camera.full_well) if camera.full_well else unit
@@ -52,19 +52,19 @@ def simulate(
     device: Device | None,
     watch: Callable[[int, int], None] = lambda done, of: None,
 ) -> Series:
-    """Make a series of a camera: frames as PNG, and the text that describes them, last.
+    """Make a series of a camera: frames as PNG, and finally the text that describes them.
 
-    The light falls on the mosaic behind the colour filters, alike for all pixels, and goes through
-    the stages from ``crosstalk`` to ``quantize``.
+    All pixels of the mosaic receive the same light, after the colour filters. The stages from
+    ``crosstalk`` to ``quantize`` process it.
 
     Args:
-        camera: a name or a profile's file.
+        camera: a name, or the file of a profile.
         iso: its ISO; None is the lowest.
-        seed: of the noise.
-        folder: where the series is written.
-        size: of the series.
-        device: where it is computed; None is NumPy.
-        watch: is told after each frame how many are done, and of how many.
+        seed: the seed of the noise.
+        folder: the folder for the series.
+        size: the size of the series.
+        device: the device that computes it; None is NumPy.
+        watch: called after each frame with the number of finished frames, and of all frames.
 
     Raises:
         RequestError: there is no such camera or ISO, or the folder has a series.
@@ -74,7 +74,7 @@ def simulate(
     check_folder(folder)
     text = folder / NAME
     if text.exists():
-        raise RequestError(f"{text}: there is a series already; name another folder")
+        raise RequestError(f"{text}: this folder already contains a series; choose another folder")
     values = {"camera": camera, "iso": sensor.iso_range[0] if iso is None else iso, "seed": seed}
     settings = overlay(Settings(), values)
     efficiency = sensor.quantum_efficiency or 1.0
@@ -104,18 +104,18 @@ def simulate(
 
 
 def _exposed(settings: Settings, exposure: Exposure) -> Settings:
-    """The settings with an exposure's time, in which dark current gathers."""
+    """Return the settings with an exposure's time, which determines the dark charge."""
     return overlay(settings, {"dark_current": {"exposure_time": exposure.time / NS}})
 
 
 def _planned(path: Path, camera: Camera, saturation: float, size: SeriesSize) -> Series:
-    """The exposures of a series, and where its frames will lie.
+    """Return the exposures of a series, with the paths of its frames.
 
     Args:
-        path: of the text.
-        camera: whose series it is.
-        saturation: photons.
-        size: of the series.
+        path: the path of the text.
+        camera: the camera.
+        saturation: the photons at saturation.
+        size: the size of the series.
     """
     last = size.exposures + math.ceil(size.exposures * BEYOND)
     steps = np.arange(1, last + 1) / size.exposures

@@ -1,6 +1,9 @@
-"""Matching: from pictures of a camera to the development whose noise has the same signature.
+"""Matching: finds the development whose noise has the signature of a camera's pictures.
 
-``match`` is the whole way: ``scenes`` reads and checks pictures, ``columns`` has the figures that
-are compared, ``space`` what may change, ``simulation`` develops a scene, ``search`` looks for the
-best, ``result`` measures and writes it, and ``plot`` draws it.
+- ``match`` is the complete process, which uses the other modules.
+- ``scenes`` reads and checks pictures.
+- ``columns`` computes the statistics that are compared.
+- ``space`` defines what may change.
+- ``simulation`` develops a scene.
+- ``search`` finds the best development, ``result`` measures and writes it, ``plot`` draws it.
 """

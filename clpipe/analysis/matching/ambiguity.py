@@ -1,8 +1,8 @@
-"""What a match leaves open: numbers that the columns do not tell, alone or one from another.
+"""Finds parameters of a match that are poorly constrained, singly or in pairs.
 
-Around the best, residuals change about linearly with the logarithms of its numbers. Their Jacobian
-J gives the covariance of the numbers, the inverse of J'J, as residuals are in units of their error
-and floor (Gauss and Newton's approximation; Seber and Wild, Nonlinear Regression, 1989, ch. 5).
+Near the best match, residuals are about linear in the logarithms of its numbers. Residuals are in
+units of their error and floor. The covariance of the numbers is the inverse of J'J, where J is
+the Jacobian (Gauss and Newton; Seber and Wild, Nonlinear Regression, 1989, ch. 5).
 """
 
 import itertools
@@ -17,17 +17,17 @@ from clpipe.analysis.matching.search import Candidate, Search, with_numbers
 from clpipe.analysis.matching.space import Dimension
 from clpipe.base.types import Doubles
 
-NEAR = 0.1  # of a logarithm: how far from the best residuals are looked at, on either side
+NEAR = 0.1  # the step in a logarithm, on either side, for differences of residuals
 TWICE = math.log(2)
-CORRELATED = 0.95  # beyond it, two numbers are not told apart
-RIDGE = 1e-6  # so that numbers that do exactly the same have an inverse, too
+CORRELATED = 0.95  # above this, two numbers cannot be distinguished
+RIDGE = 1e-6  # makes the matrix invertible if two numbers have the same effect
 
 
 @dataclass(frozen=True)
 class Ambiguity:
-    """One number that no residual tells, or two that make up for each other.
+    """A number that no residual constrains, or two that compensate each other.
 
-    ``correlation`` is that of the errors of the two; None for one.
+    ``correlation`` is that of the errors of two numbers; None for one number.
     """
 
     names: tuple[str, ...]
@@ -35,22 +35,25 @@ class Ambiguity:
 
     def __str__(self) -> str:
         if self.correlation is None:
-            return f"{self.names[0]} is not told: a factor of 2 alters no residual beyond its noise"
+            return (
+                f"{self.names[0]} is poorly constrained: a factor of 2 changes no residual "
+                "significantly"
+            )
         return (
-            f"{' and '.join(self.names)} cannot be told apart: their errors have a correlation of "
-            f"{self.correlation:+.2f}, so other values of both fit about as well"
+            f"{' and '.join(self.names)} cannot be distinguished: the correlation of their errors "
+            f"is {self.correlation:+.2f}, so other values of both fit about as well"
         )
 
     def record(self) -> dict[str, Any]:
-        """The ambiguity as JSON values."""
+        """Return the ambiguity as JSON values."""
         return {"names": list(self.names), "correlation": self.correlation}
 
 
 def ambiguities(search: Search, found: Candidate) -> tuple[Ambiguity, ...]:
-    """What the search's pictures do not tell of the numbers that were found.
+    """Return the numbers that the search's pictures constrain poorly.
 
     Raises:
-        StoppedError: the search's watch asked for it.
+        StoppedError: the search's watch stopped it.
     """
     slopes = {
         dimension.name: slope(search, found, dimension)
@@ -60,7 +63,7 @@ def ambiguities(search: Search, found: Candidate) -> tuple[Ambiguity, ...]:
 
 
 def slope(search: Search, found: Candidate, dimension: Dimension) -> Doubles:
-    """The change of residuals per logarithm of a number, by a difference around the best."""
+    """Return the change of residuals per logarithm of a number, from differences near the best."""
     best = found.numbers[dimension.name]
     values = [dimension.value(dimension.share(best * math.exp(step))) for step in (-NEAR, NEAR)]
     before, after = (
@@ -71,11 +74,11 @@ def slope(search: Search, found: Candidate, dimension: Dimension) -> Doubles:
 
 
 def ambiguous(slopes: Mapping[str, Doubles], scenes: int = 1) -> tuple[Ambiguity, ...]:
-    """What a Jacobian of residuals leaves open.
+    """Return the numbers that a Jacobian of residuals constrains poorly.
 
     Args:
-        slopes: of the residuals per logarithm of each number; a residual of 1 is its noise.
-        scenes: by the root of whose count residuals are divided.
+        slopes: changes of residuals per logarithm of each number. A residual of 1 is its noise.
+        scenes: the number of scenes; residuals are divided by its root.
 
     >>> a, b, c = np.array([[3.0, 0, 0], [0, 2.0, 0], [3.0, 0, 0.3]])
     >>> [each.names for each in ambiguous({"a": a, "b": b, "c": c, "d": a / 9})]

@@ -1,8 +1,8 @@
 """The signature of a finished picture's noise: the columns by which developments are compared.
 
-They hold the size and the tails of luma noise, autocorrelations of luma and chroma, correlations of
-channels and the power spectrum of luma in four bands. The size and the skew of luma noise by
-intensity go further into the shadows than the other columns.
+They are the size and tails of luma noise, autocorrelations of luma and chroma, correlations of
+channels, and the power spectrum of luma in four bands. Size and skew of luma noise by intensity
+include darker shadows than the other columns.
 """
 
 import itertools
@@ -28,19 +28,19 @@ from clpipe.base.types import Array, Doubles, Floats, Mask
 
 REACH = 6  # px, the longest lag
 BANDS = (0.0, 0.125, 0.25, 0.375, 0.75)  # edges in cycles per pixel; a corner is at 0.71
-LEVELS = (12, 24, 40, 64, 96, 128, 160, 192, 226)  # of luma; noise is compared between two of them
-SHADOWS, MIDTONES = (24, 48), (64, 160)  # of luma, where the skew of its noise is compared
+LEVELS = (12, 24, 40, 64, 96, 128, 160, 192, 226)  # of luma: edges of the bins of intensity
+SHADOWS, MIDTONES = (24, 48), (64, 160)  # ranges of luma in which the skew of noise is compared
 BLOCK = 32  # px
-GROUPS = 8  # of blocks, of which a jackknife leaves out one at a time
-FEWEST_FRAMES = 4  # for tails: what is left of a frame beside the mean of few is their mixture
+GROUPS = 8  # of blocks; the jackknife omits one at a time
+FEWEST_FRAMES = 4  # for tails, because the difference from a mean of few frames mixes their noise
 
 
 @dataclass(frozen=True)
 class Column:
-    """One figure of a signature: how it is named, and when two of them count as equal.
+    """A column of a signature: its name, and the scale of its residuals.
 
-    A ``relative`` residual is a share of theirs. ``floor`` is the residual that the search regards
-    as small; it is added to the standard error. It is least for what a signature has.
+    A ``relative`` residual is a share of the camera's value. ``floor`` is a residual that the
+    search regards as small, and is added to the standard error.
     """
 
     text: str
@@ -48,7 +48,7 @@ class Column:
     relative: bool = False
 
     def residual(self, ours: float, theirs: float) -> float:
-        """By how much ours is larger; a share of theirs where the column is ``relative``."""
+        """Return ours minus theirs; as a share of theirs if the column is ``relative``."""
         if not self.relative:
             return ours - theirs
         return ours / theirs - 1 if theirs else np.nan
@@ -95,10 +95,10 @@ COLUMNS: Mapping[str, Column] = {
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """The pixels of a scene that count, and its luma, (height, width) each.
+    """The valid pixels of a scene, and its luma, (height, width) each.
 
-    ``mask`` goes down to the shadows, where noise is told by its intensity; ``bright``, without
-    them, is where everything else is compared; ``slopes`` is where flat places and edges are.
+    ``mask`` includes shadows, which are compared only by intensity. ``bright`` excludes them, and
+    is used for all other columns. ``slopes`` are the masks of flat areas and edges.
     """
 
     mask: Mask
@@ -107,29 +107,30 @@ class Places:
 
     @cached_property
     def bright(self) -> Mask:
-        """The pixels that count and are not dark."""
+        """The valid pixels that are not dark."""
         return np.asarray(self.mask & (self.level >= DARKEST))
 
     def without(self, left_out: Mask) -> "Places":
-        """The places but for some pixels, (height, width)."""
+        """Return the places without some pixels, (height, width)."""
         slopes = self.slopes and self.slopes.within(~left_out)
         return Places(self.mask & ~left_out, self.level, slopes)
 
     @cached_property
     def pairs(self) -> Doubles:
-        """How many bright pairs there are at each lag, (13, 13); NaN where there is none."""
+        """The number of bright pairs at each lag, (13, 13); NaN if there is none."""
         count = products(self.bright[None].astype(np.float64)).round()
         return np.where(count > 0, count, np.nan)
 
 
-Figures = dict[str, float]  # by the names of COLUMNS; what cannot be computed is NaN
+Figures = dict[str, float]  # by the names of COLUMNS; NaN if not computable
 
 
 @dataclass(frozen=True)
 class Noise:
     """The noise of the frames of one scene, and the luma of their mean.
 
-    ``rgb`` is (frame, height, width, 3) without drift, ``level`` (height, width), 0 to 255.
+    ``rgb`` is noise without drift, (frame, height, width, 3). ``level`` is luma from 0 to 255,
+    (height, width).
     """
 
     rgb: Doubles
@@ -145,14 +146,14 @@ class Noise:
 def noise_of_frames(
     frames: Sequence[Floats], mean: Doubles | Floats | None, level: Doubles | None = None
 ) -> Noise:
-    """The noise of frames of one scene.
+    """Return the noise of frames of one scene.
 
-    Without a mean, it is their difference from their own mean, times sqrt(n / (n - 1)).
+    Without ``mean``, noise is the difference from the mean of the frames times sqrt(n / (n - 1)).
 
     Args:
-        frames: (height, width, 3) each, 0 to 255.
+        frames: frames from 0 to 255, (height, width, 3) each.
         mean: the scene without noise.
-        level: the luma by which noise is compared; None is that of the mean.
+        level: the luma by which noise is binned; None is that of the mean.
     """
     clean = np.mean(frames, axis=0) if mean is None else mean
     count = len(frames)
@@ -162,7 +163,7 @@ def noise_of_frames(
 
 
 def figures_of(noise: Noise, places: Places) -> Figures:
-    """The columns of noise, over all frames, at the pixels that count."""
+    """Return the columns of noise over all frames, in the valid pixels."""
     found, mask = dict.fromkeys(COLUMNS, np.nan), places.bright
     if not mask.any():
         return found
@@ -194,12 +195,12 @@ def figures_of(noise: Noise, places: Places) -> Figures:
 
 
 def signature(picture: Array, mean: Array, mask: Mask | None = None) -> Figures:
-    """The columns of the noise of one picture.
+    """Return the columns of the noise of one picture.
 
     Args:
         picture: (height, width, 3), 0 to 255.
         mean: the same scene without noise, or the mean of many pictures of it.
-        mask: the pixels that count; None: :func:`clpipe.analysis.signature.flat_places`.
+        mask: the valid pixels; None uses :func:`clpipe.analysis.signature.flat_places`.
 
     >>> generator = np.random.default_rng(0)
     >>> grey = np.full((200, 200, 3), 128.0)
@@ -218,19 +219,19 @@ PLACES |= FURTHER_RIGHT
 
 
 def lags(table: Doubles, prefix: str, names: Sequence[str]) -> Figures:
-    """Named lags of a map of autocorrelation."""
+    """Return named lags of a map of autocorrelation."""
     places = {name: (REACH + PLACES[name][0], REACH + PLACES[name][1]) for name in names}
     return {f"{prefix}{name}": float(table[place]) for name, place in places.items()}
 
 
 def products(planes: Doubles) -> Doubles:
-    """The sums of products at all lags up to 6 px, (13, 13) with lag 0 in the middle.
+    """Return the sums of products at all lags up to 6 px, (13, 13) with lag 0 in the middle.
 
-    They come by way of the power spectrum (Wiener and Khinchin). Products of matrices would need no
-    second transform, but BLAS takes longer to wake its threads for them.
+    They are computed from the power spectrum (Wiener and Khinchin). Matrix products would need no
+    second transform, but BLAS takes longer to start its threads.
 
     Args:
-        planes: (frame, height, width), 0 beyond their borders.
+        planes: (frame, height, width), which are 0 beyond their borders.
     """
     from scipy import fft
 
@@ -243,13 +244,13 @@ def products(planes: Doubles) -> Doubles:
 
 
 def autocorrelation(plane: Doubles, places: Places) -> Doubles:
-    """The autocorrelation of noise at all lags up to 6 px, (13, 13) with lag 0 in the middle.
+    """Return the autocorrelation of noise at lags up to 6 px, (13, 13) with lag 0 in the centre.
 
-    It is over all frames, and of opposite lags it is the mean.
+    It is computed over all frames. Opposite lags are averaged.
 
     Args:
         plane: (frame, height, width).
-        places: the pixels that count.
+        places: the valid pixels.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         covariance = products(plane * places.bright) / (places.pairs * len(plane))
@@ -257,10 +258,11 @@ def autocorrelation(plane: Doubles, places: Places) -> Doubles:
 
 
 def spectrum_of(table: Doubles) -> tuple[Doubles, Doubles]:
-    """The power spectrum of an autocorrelation, and the frequency in cycles per pixel, (64, 64).
+    """Return the power spectrum of an autocorrelation, and the frequencies, (64, 64) each.
 
-    It is the transform of the autocorrelation under a triangular window (Blackman and Tukey, 1958;
-    the window is Bartlett's). Independent noise has 1 everywhere.
+    It is the transform of the autocorrelation with a triangular window (Blackman and Tukey, 1958;
+    the window is Bartlett's). Independent noise has 1 everywhere. Frequencies are in cycles per
+    pixel.
     """
     steps, frequency = np.arange(-REACH, REACH + 1), np.fft.fftfreq(64)
     fall = 1 - np.abs(steps) / (REACH + 1)
@@ -270,7 +272,7 @@ def spectrum_of(table: Doubles) -> tuple[Doubles, Doubles]:
 
 
 def bands(table: Doubles) -> Figures:
-    """The shares of luma's power in four bands of frequency."""
+    """Return the shares of luma's power in four bands of frequency."""
     spectrum, radius = spectrum_of(table)
     edges = itertools.pairwise(BANDS)
     inside = [spectrum[(radius >= low) & (radius < high)].sum() for low, high in edges]
@@ -278,10 +280,10 @@ def bands(table: Doubles) -> Figures:
 
 
 def by_intensity(noise: Doubles, level: Doubles) -> Figures:
-    """Luma rms and skew at several intensities; tails, over the sigma of the intensity's bin.
+    """Return rms and skew of luma by intensity, and tails relative to the sigma of each bin.
 
     Args:
-        noise: of luma, (frame, sample).
+        noise: the noise of luma, (frame, sample).
         level: luma of the mean, (sample,).
     """
     found: Figures = {}
@@ -301,14 +303,14 @@ def by_intensity(noise: Doubles, level: Doubles) -> Figures:
         kept = (count >= FEWEST) & (variance > 0)
         z = (noise / np.sqrt(variance)[bins])[:, kept[bins]].ravel()
     if z.size:
-        squares = z * z  # of which a product is much faster than a fourth power
+        squares = z * z  # multiplying squares is much faster than a fourth power
         found["kurtosis"] = float((squares * squares).mean() / squares.mean() ** 2)
         found["beyond_4_sigma"] = float(1e4 * (np.abs(z) > 4).mean())
     return found
 
 
 def skewness(noise: Doubles) -> float:
-    """The third moment over the cubed sigma; NaN for too few samples.
+    """Return the third moment over the cubed sigma; NaN for too few samples.
 
     >>> round(skewness(np.array([[0.0, 0.0, 0.0, 4.0]] * 100)), 3), skewness(np.zeros((1, 4)))
     (1.155, nan)
@@ -320,15 +322,15 @@ def skewness(noise: Doubles) -> float:
 
 
 def block_numbers(shape: tuple[int, ...]) -> Array:
-    """A number for each pixel, (height, width): the same in a block of 32x32, and no two alike."""
+    """Return the number of each pixel's block of 32x32 px, (height, width)."""
     rows, columns = (np.arange(size) // BLOCK for size in shape[:2])
     return np.asarray(rows[:, None] * (columns[-1] + 1) + columns[None])
 
 
 def errors_of(noise: Noise, places: Places) -> Figures:
-    """The standard errors of the columns, by the jackknife over blocks (Quenouille, 1956).
+    """Return the standard errors of the columns, by the jackknife over blocks (Quenouille, 1956).
 
-    The blocks are dealt into eight groups, each left out in turn.
+    The blocks form eight groups, each of which is omitted once.
     """
     mask = places.mask
     numbers = block_numbers(mask.shape)

@@ -1,4 +1,4 @@
-"""The whole way of ``clpipe match``: pictures in, a development out."""
+"""The process of ``clpipe match``, from pictures to a development."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,10 +14,10 @@ from clpipe.engine.device import open_device
 
 
 def check_names(output: Path, plot: Path | None) -> None:
-    """See that files to write have names that say what they are.
+    """Check the extensions of the files to write.
 
     Raises:
-        RequestError: one has not.
+        RequestError: one is wrong.
     """
     if output.suffix != ".toml":
         raise RequestError(f"-o: found {output}; expected a name that ends in .toml")
@@ -33,20 +33,20 @@ def match_files(
     device: str | None = None,
     watch: Watch | None = None,
 ) -> Match:
-    """Find the development whose noise is that of pictures.
+    """Find the development whose noise matches that of pictures.
 
     Args:
-        frames: files or globs of pictures, as :func:`clpipe.analysis.matching.scenes.load_scenes`.
+        frames: files or globs, see :func:`clpipe.analysis.matching.scenes.load_scenes`.
         means: files or globs of their means; none for a burst.
-        camera: whose raw noise is developed; None is the default camera.
-        iso: at which; None finds the ISO, too.
-        device: where, as ``clpipe devices`` lists them, or "numpy"; None chooses.
-        watch: is told how it goes, and may stop it.
+        camera: the camera whose raw noise is developed; None is the default camera.
+        iso: the ISO; None finds it.
+        device: a device that ``clpipe devices`` lists, or "numpy"; None chooses.
+        watch: receives the progress, and may stop the search.
 
     Raises:
-        StoppedError: the watch asked for it.
+        StoppedError: the watch stopped the search.
         RequestError: the pictures do not belong together, or there is no such camera or ISO.
-        ImageError: a file cannot be read, or does not tell of noise.
+        ImageError: a file cannot be read, or noise cannot be measured in it.
         DeviceError: there is no such device.
     """
     values = {"camera": camera, "iso": iso}

@@ -1,4 +1,4 @@
-"""The picture of a match: theirs and ours, side by side."""
+"""Draws a match: the noise of the camera and that of the development."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ from clpipe.base.types import Doubles
 
 INKS = {"theirs": "#222222", "ours": "#c8102e"}
 STEP = 16  # levels between two points of noise by intensity
-FEWEST = 500  # samples of such a point
+FEWEST = 500  # samples for such a point
 
 
 def draw(match: Match, path: Path) -> None:
@@ -42,7 +42,7 @@ def draw(match: Match, path: Path) -> None:
 
 
 def mean_table(match: Match, who: str, planes: Sequence[int]) -> Doubles:
-    """The autocorrelation of planes (0 luma, 1 Cb, 2 Cr) of "theirs" or "ours", over scenes."""
+    """Return the mean autocorrelation of planes (0 luma, 1 Cb, 2 Cr) of "theirs" or "ours"."""
     tables = [
         autocorrelation(getattr(scene, who).planes[plane], Places(scene.mask, scene.theirs.level))
         for scene in match.noises

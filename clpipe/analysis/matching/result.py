@@ -1,4 +1,4 @@
-"""What a search found: the columns of both, on what it saw and on what it did not, and a file."""
+"""The result of a search: columns inside and outside the searched areas, and a configuration."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,15 +18,15 @@ from clpipe.base.types import Mask
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import value_text
 
-AT_END = 0.01  # of an ISO: what is as near to an end of the range is at it
-CHECKED = 4  # frames of each pair that are developed when the result is measured
+AT_END = 0.01  # an ISO within this share of an end of the range counts as at the end
+CHECKED = 4  # frames of each pair that are developed to measure the result
 
 
 @dataclass(frozen=True)
 class Row:
-    """One column: theirs and ours, the mean of all scenes; ours less theirs; and their errors.
+    """A column: theirs and ours as means over scenes, the residual (ours minus theirs), and errors.
 
-    A relative column's residual is a share of theirs. NaN where nothing can be compared.
+    A relative column's residual is a share of theirs. NaN means that nothing can be compared.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Row:
 
 
 class Compared(NamedTuple):
-    """The noise of a scene, theirs and ours, and the pixels that count, searched or not."""
+    """The noise of a scene, theirs and ours, and its valid pixels, searched or not."""
 
     theirs: Noise
     ours: Noise
@@ -51,9 +51,10 @@ class Compared(NamedTuple):
 
 @dataclass(frozen=True)
 class Match:
-    """A development, and how like the camera's its noise is.
+    """A development, and the similarity of its noise to that of the camera.
 
-    ``seen`` are the columns of the places that the search saw, ``unseen`` of those that it did not.
+    ``seen`` has the columns in areas that were used in the search, ``unseen`` those in held-out
+    areas.
     """
 
     settings: Settings
@@ -67,33 +68,33 @@ class Match:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a reader of the configuration must know: the verdict and the warnings."""
+        """Sentences for a reader of the configuration: the verdict and the warnings."""
         return (self.verdict, *self.warnings)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is ambiguous, and where the camera's ISOs ended the search."""
+        """Sentences about poorly constrained numbers, and about an ISO at the end of the range."""
         ended = ended_by(self.settings, self.numbers)
         return (*map(str, self.ambiguities), *([ended] if ended else []))
 
     @property
     def verdict(self) -> str:
-        """The correlation with the largest residual in places that the search did not see."""
+        """A sentence with the correlation of the largest residual in held-out areas."""
         rows = [
             row
             for row in self.unseen
             if abs(row.theirs) <= 1 and not (row.relative or row.name in (*TAILS, *SKEWS))
         ]
         if not rows:
-            return "the places that were not searched are too few to tell"
+            return "the held-out areas are too small for a verdict"
         worst = max(rows, key=lambda row: abs(row.residual))
         return (
-            "largest residual of a correlation in places not searched: "
+            "largest residual of a correlation in held-out areas: "
             f"{worst.residual:+.3f} ({COLUMNS[worst.name].text})"
         )
 
     def record(self) -> dict[str, Any]:
-        """The match as JSON values; what could not be compared is null."""
+        """Return the match as JSON values, with null for columns that cannot be compared."""
         return {
             "settings": self.settings.record(),
             "searched": dict(self.numbers),
@@ -114,7 +115,7 @@ class Match:
 
 
 def ended_by(settings: Settings, numbers: Mapping[str, float]) -> str:
-    """What is to be said of an ISO that was searched up to an end of the camera's range, else "".
+    """Return a sentence about an ISO at an end of the camera's range; "" if it is not there.
 
     >>> ended_by(Settings(camera="nikon-d800"), {"iso": 6400})  # doctest: +ELLIPSIS
     'iso stopped at 6400, where those of nikon-d800 end: the pictures may have more noise than...'
@@ -130,15 +131,15 @@ def ended_by(settings: Settings, numbers: Mapping[str, float]) -> str:
 
 
 def row_record(row: Row) -> dict[str, float | None]:
-    """The figures of a row as JSON values."""
+    """Return the figures of a row as JSON values."""
     return {key: json_number(getattr(row, key)) for key in ("theirs", "ours", "residual", "error")}
 
 
 def measured(search: Search, found: Candidate) -> Match:
-    """What was found, developed with new noise, and measured on all crops.
+    """Return the match of a candidate, developed with new noise and measured on all crops.
 
     Raises:
-        StoppedError: the search's watch asked for it.
+        StoppedError: the search's watch stopped it.
     """
     scenes = search.scenes
     settings = with_output(found.settings, scenes)
@@ -165,10 +166,10 @@ def measured(search: Search, found: Candidate) -> Match:
 
 
 def rows_of(pairs: Sequence[tuple[Target, Target]]) -> tuple[Row, ...]:
-    """A row for each column, over scenes.
+    """Return a row for each column, over scenes.
 
-    The error of a residual is the larger of that which the jackknives give, and that of the mean of
-    the scenes' residuals.
+    The error of a residual is the larger of two: that of the jackknife, and that of the mean of the
+    scenes' residuals.
     """
     rows = []
     for name, column in COLUMNS.items():
@@ -193,9 +194,9 @@ def rows_of(pairs: Sequence[tuple[Target, Target]]) -> tuple[Row, ...]:
 
 
 def with_output(settings: Settings, scenes: Scenes) -> Settings:
-    """The settings with the JPEG of the camera's pictures.
+    """Return the settings with the JPEG of the camera's pictures.
 
-    What was matched in another format is written without subsampling, which would change it.
+    If the pictures have another format, subsampling is turned off, because it would change noise.
     """
     if scenes.jpeg is None:
         return overlay(settings, {"output": {"jpeg_subsampling": "4:4:4"}})
@@ -207,10 +208,10 @@ def with_output(settings: Settings, scenes: Scenes) -> Settings:
 
 
 def configuration(settings: Settings, scenes: Scenes, remarks: Sequence[str]) -> str:
-    """A development as a configuration file, with remarks at its beginning.
+    """Return a development as a configuration file, with remarks at its beginning.
 
-    The stages and every parameter of those that were searched are written, so that it stays the
-    same where a default changes, and lies over another way to a raw with all of its steps.
+    It contains the stages, and every parameter of the searched ones. The result therefore does not
+    depend on defaults, and can be combined with another configuration up to the raw.
     """
     names = [scene.name for scene in scenes.each]
     more = f" and {len(names) - 1} more" if len(names) > 1 else ""
@@ -240,6 +241,6 @@ def write_configuration(
     """Write a development as a :func:`configuration`.
 
     Raises:
-        ImageError: it cannot be written.
+        ImageError: the file cannot be written.
     """
     write_new(path, configuration(settings, scenes, remarks).encode())

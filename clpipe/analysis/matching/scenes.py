@@ -1,4 +1,4 @@
-"""The pictures of a camera that a development is matched to: read, checked, cut, and masked."""
+"""Reads, checks, crops and masks the pictures of a camera to match."""
 
 import glob
 import os
@@ -25,32 +25,32 @@ from clpipe.base.types import Doubles, Floats, Mask
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding
 from clpipe.images.read import read_finished
 
-LARGEST = 640  # px; of a larger picture, the flattest crops of CROP x CROP are taken
-CROP = 512  # px; crops begin at multiples of 16, where the blocks of a JPEG do
+LARGEST = 640  # px; larger pictures are reduced to their flattest crops of CROP x CROP
+CROP = 512  # px; crops begin at multiples of 16, to align with the blocks of a JPEG
 CROPS = 4
 FEWEST_FLAT = 4000  # pixels of all scenes that are neither clipped nor near an edge
-FEWEST_OF_EACH = 1000  # and of each
-DARK = 12  # luma, from which on noise is compared by its intensity
-ALIKE = 1e-9  # squares of DN of 255, from rounding in a mean; noise has more
-HOLDOUT = 3  # one crop or block in so many is kept out of the search
-MANY = 6  # crops, of which whole ones are kept out; of fewer, a whole one would be one odd scene
+FEWEST_OF_EACH = 1000  # such pixels of each scene
+DARK = 12  # luma, above which noise is compared by intensity
+ALIKE = 1e-9  # squared levels of 255, due to rounding in a mean; noise has more
+HOLDOUT = 3  # one crop or block of this many is held out of the search
+MANY = 6  # crops from which whole ones are held out; with fewer, one might be unusual
 SMOOTH = 1.5  # px, over which the mean of a burst is smoothed before it is developed again
 
-SHIFT = 0.5  # px, by which a frame may lie beside its mean
-SURE = 15.0  # standard errors of white noise from which a shift is one; three of a camera's noise
-SCENE_SHARE, SCENE_BLOCK = 0.05, 64  # as in clpipe.analysis.measure
-MOVED, MOVED_BLOCK = 1.0, 16  # sigma, px: the mean of a block that noise does not reach
+SHIFT = 0.5  # px, by which a frame may be shifted against its mean
+SURE = 15.0  # standard errors of white noise for a significant shift; three of a camera's noise
+SCENE_SHARE, SCENE_BLOCK = 0.05, 64  # see clpipe.analysis.repeats
+MOVED, MOVED_BLOCK = 1.0, 16  # sigma, px: a mean of a block that noise does not reach
 MOST_MOVED = 0.1  # share of the blocks
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Frames of one scene, (height, width, 3), 0 to 255, and what they are compared with.
+    """Frames of one scene, (height, width, 3) from 0 to 255, and their mean.
 
-    ``mean`` is what was given, or their own mean where ``own_mean``. Masks are (height, width):
-    ``counted`` is what is neither clipped nor dark and does not move, ``flat`` the flat places of
-    it, ``kept_out`` the part of the picture that the search does not see. Columns in ``left_out``
-    cannot be compared.
+    The mean is that of many pictures, or of the frames themselves if ``own_mean`` is set. Masks are
+    (height, width). ``counted`` has the pixels that are not clipped, dark or moving. ``flat`` has
+    the flat ones among them. ``kept_out`` is held out of the search. Columns in ``left_out`` cannot
+    be compared.
     """
 
     name: str
@@ -64,11 +64,11 @@ class Scene:
 
     @property
     def mask(self) -> Mask:
-        """The flat places that the search sees."""
+        """The flat pixels that the search uses."""
         return np.asarray(self.flat & ~self.kept_out)
 
     def places(self, part: Mask | None = None) -> Places:
-        """Where noise is compared: everywhere, or in a part of the picture, (height, width)."""
+        """Return the pixels in which noise is compared, in a part of the picture or everywhere."""
         slopes = slopes_of(luma(self.mean), self.counted)
         places = Places(self.flat, self.noise.level, slopes)
         return places if part is None else places.without(~part)
@@ -80,14 +80,15 @@ class Scene:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """The columns that so few frames without a mean do not have."""
+        """The columns that cannot be computed from few frames without a mean."""
         return TAILS if self.own_mean and len(self.frames) < FEWEST_FRAMES else ()
 
     @property
     def clean(self) -> Doubles:
         """The scene without noise, to be developed again, (height, width, 3), 0 to 255.
 
-        The mean of a burst still has noise; it is smoothed, since flat places alone count.
+        The mean of a burst has noise, so it is smoothed. This is possible because only flat areas
+        are compared.
         """
         if not self.own_mean:
             return self.mean
@@ -98,7 +99,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Scenes:
-    """The scenes of one camera, and what a reader of the report must know of them."""
+    """The scenes of one camera, and notes about them for the report."""
 
     each: tuple[Scene, ...]
     jpeg: JpegEncoding | None
@@ -106,17 +107,17 @@ class Scenes:
 
 
 def expand(patterns: Sequence[str], what: str) -> list[Path]:
-    """The files of names and globs, in order; what exists is a name.
+    """Return the files of names and globs, in order. An existing file is never read as a glob.
 
     Raises:
-        RequestError: a glob matches nothing.
+        RequestError: a glob matches no file.
     """
     found: list[Path] = []
     for pattern in patterns:
         is_glob = glob.has_magic(pattern) and not os.path.exists(pattern)
         names = sorted(glob.glob(pattern)) if is_glob else [pattern]
         if not names:
-            raise RequestError(f"{what}: nothing matches {pattern}")
+            raise RequestError(f"{what}: no file matches {pattern}; correct the pattern")
         if not is_glob:
             check_input(Path(pattern))
         found += map(Path, names)
@@ -132,14 +133,14 @@ def load_scenes(frames: Sequence[str], means: Sequence[str]) -> Scenes:
             for all.
 
     Raises:
-        RequestError: too few frames, or pictures that do not belong together.
+        RequestError: there are too few frames, or the pictures do not belong together.
         ImageError: a file cannot be read, or has too few flat places.
     """
     paths, mean_paths = expand(frames, "FRAME"), expand(means, "--mean")
     pictures = [read_picture(path) for path in paths]
     if not mean_paths and len(paths) == 1:
         raise RequestError(
-            f"{paths[0]}: one frame, and nothing to tell its noise from its scene; give more "
+            f"{paths[0]}: one frame alone cannot separate noise from the scene; give more "
             "frames of the same scene, or their mean (--mean)"
         )
     if mean_paths and len(mean_paths) not in (1, len(paths)):
@@ -165,8 +166,8 @@ def load_scenes(frames: Sequence[str], means: Sequence[str]) -> Scenes:
     ]
     if whole[0].left_out:
         notes.append(
-            f"{len(paths)} frames without a mean: kurtosis and tails are left out; "
-            f"{FEWEST_FRAMES} frames tell them"
+            f"{len(paths)} frames without a mean: kurtosis and tails are not compared; "
+            f"they need {FEWEST_FRAMES} frames"
         )
     pieces = [
         crop
@@ -181,19 +182,21 @@ def load_scenes(frames: Sequence[str], means: Sequence[str]) -> Scenes:
 
 
 def read_picture(path: Path) -> Floats:
-    """A finished picture, (height, width, 3), 0 to 255.
+    """Return a finished picture, (height, width, 3), 0 to 255.
 
     Raises:
-        ImageError: the file cannot be read, or is no finished picture.
+        ImageError: the file cannot be read, or is not a finished picture.
     """
     source = read_finished(path)
     if source is None:
-        raise ImageError(f"{path}: not a finished picture; expected a JPEG, PNG or TIFF in colour")
+        raise ImageError(
+            f"{path}: this is not a finished picture; give a JPEG, PNG or TIFF in colour"
+        )
     return source.pixels * np.float32(255)
 
 
 def encoding_text(encoding: JpegEncoding | None) -> str:
-    """An encoding in words."""
+    """Return an encoding as text."""
     if encoding is None:
         return "no JPEG that clpipe can write"
     return f"a JPEG of quality {encoding.quality}, {encoding.subsampling}"
@@ -206,10 +209,10 @@ def checked_scene(
     jpeg: JpegEncoding | None,
     notes: list[str],
 ) -> Scene:
-    """Frames of one scene, seen to be that; what moves in a small part of them is masked.
+    """Return a scene, after checking its frames. Small moving parts are masked.
 
     Raises:
-        RequestError: sizes or scenes differ, or things move.
+        RequestError: sizes or scenes differ, or large parts move.
     """
     mean = read_picture(mean_path) if mean_path else None
     own = mean is None
@@ -224,7 +227,9 @@ def checked_scene(
                 "give pictures of one size"
             )
     if min(frames[0].shape[:2]) < 2 * SCENE_BLOCK:
-        raise ImageError(f"{paths[0]}: too small; expected {2 * SCENE_BLOCK} px or more each way")
+        raise ImageError(
+            f"{paths[0]}: this picture is too small; each side needs {2 * SCENE_BLOCK} px"
+        )
     clean = np.asarray(np.mean(frames, axis=0) if mean is None else mean, np.float64)
     against = str(mean_path) if mean_path else "the mean of the frames"
     mask = flat_places(clean, DARK)
@@ -234,7 +239,7 @@ def checked_scene(
     for path, frame in zip(paths, frames, strict=True):
         still &= still_places(path, frame, clean, against, mask)
     if not still.all():
-        notes.append(f"{paths[0]}: {(~still).mean():.1%} of the picture moves, and is left out")
+        notes.append(f"{paths[0]}: {(~still).mean():.1%} of the picture moves and is excluded")
     if mean is not None:
         refuse_noisy_mean(paths[0], frames[0], mean, against)
     level, kept_out = luma(clean), np.zeros_like(mask)
@@ -243,10 +248,11 @@ def checked_scene(
 
 
 def still_places(path: Path, frame: Floats, clean: Doubles, against: str, flat: Mask) -> Mask:
-    """Where a frame shows what its mean shows, (height, width).
+    """Return the pixels in which a frame shows the same as its mean, (height, width).
 
     Raises:
-        RequestError: it shows another scene, has moved as a whole or in wide parts, or is the same.
+        RequestError: the frame shows another scene, is shifted, moves in large parts, or equals the
+            mean.
     """
     from scipy import ndimage
 
@@ -255,8 +261,8 @@ def still_places(path: Path, frame: Floats, clean: Doubles, against: str, flat: 
     energy = float((difference**2).mean())
     if energy < ALIKE:
         raise RequestError(
-            f"{path} has the same pixels as {against}, and so no noise; give pictures that were "
-            "taken one by one"
+            f"{path} has the same pixels as {against}, so there is no noise; give pictures that "
+            "were taken separately"
         )
     sharp = difference - ndimage.gaussian_filter(difference, DRIFT)
     slopes = np.gradient(ndimage.gaussian_filter(luma(clean), 1.0))
@@ -266,15 +272,15 @@ def still_places(path: Path, frame: Floats, clean: Doubles, against: str, flat: 
     if (np.abs(shift) > np.maximum(SHIFT, SURE * errors)).any():
         down, right = shift
         raise RequestError(
-            f"{path} lies {right:+.1f} px to the right and {down:+.1f} px below {against}; "
-            "a scene that moves tells nothing of noise; use a tripod"
+            f"{path} is shifted against {against} by {right:+.1f} px to the right and {down:+.1f} "
+            "px down, so the difference is not only noise; use a tripod"
         )
     wide = block_means(difference, SCENE_BLOCK)
     if (share := float((wide**2).mean()) / energy) > SCENE_SHARE:
         raise RequestError(
             f"{path} does not show the same scene as {against}: averaged over "
-            f"{SCENE_BLOCK}x{SCENE_BLOCK} pixels, {share:.0%} of the difference remains, of noise "
-            f"less than {SCENE_SHARE:.0%} would"
+            f"{SCENE_BLOCK}x{SCENE_BLOCK} pixels, {share:.0%} of the difference remains, but of "
+            f"noise less than {SCENE_SHARE:.0%} would; give pictures of one scene"
         )
     sigma = float(sharp[flat].std())
     moved = np.abs(block_means(sharp, MOVED_BLOCK)) > MOVED * sigma
@@ -291,14 +297,14 @@ def still_places(path: Path, frame: Floats, clean: Doubles, against: str, flat: 
 
 
 def block_means(plane: Doubles, block: int) -> Doubles:
-    """The means of whole blocks, (rows, columns)."""
+    """Return the means of whole blocks, (rows, columns)."""
     rows, columns = (size // block for size in plane.shape)
     whole = plane[: rows * block, : columns * block]
     return np.asarray(whole.reshape(rows, block, columns, block).mean((1, 3)))
 
 
 def refuse_noisy_mean(path: Path, frame: Floats, mean: Floats, against: str) -> None:
-    """See that a mean has less noise than its frame.
+    """Check that a mean has less noise than its frame.
 
     Raises:
         RequestError: it has more.
@@ -306,12 +312,13 @@ def refuse_noisy_mean(path: Path, frame: Floats, mean: Floats, against: str) -> 
     rough = [float((np.diff(luma(p), 2) ** 2).mean()) for p in (frame, mean)]
     if rough[1] > rough[0]:
         raise RequestError(
-            f"--mean: {against} has more noise than {path}; are frame and mean exchanged?"
+            f"--mean: {against} has more noise than {path}; check that frame and mean are not "
+            "swapped"
         )
 
 
 def too_few(names: Sequence[str], cleans: Sequence[Doubles], flat: int, needed: int) -> str:
-    """Why so few pixels of scenes count, in one sentence."""
+    """Return why scenes have too few pixels to measure noise, as a sentence."""
     y = np.concatenate([luma(clean).ravel() for clean in cleans])
     out = float(((y < 30) | (y > 225)).mean())
     why = (
@@ -320,13 +327,13 @@ def too_few(names: Sequence[str], cleans: Sequence[Doubles], flat: int, needed: 
         else "too little of it is flat"
     )
     return (
-        f"{', '.join(names)}: {flat} pixels tell of noise, at least {needed} are needed: {why}; "
-        "give pictures of a scene with smooth, middle tones, or more of them"
+        f"{', '.join(names)}: noise can be measured in {flat} pixels, but {needed} are needed: "
+        f"{why}; give pictures of a scene with smooth areas of middle brightness, or more pictures"
     )
 
 
 def crops_of(scene: Scene, size: int = CROP, count: int = CROPS) -> list[Scene]:
-    """The flattest crops of a scene, at most ``count``, up to ``size`` wide and high."""
+    """Return the flattest crops of a scene, at most ``count``, up to ``size`` wide and high."""
     height, width = scene.mask.shape
     down, right = min(size, height), min(size, width)
     step = min(CROP, size // 2)
@@ -344,12 +351,12 @@ def crops_of(scene: Scene, size: int = CROP, count: int = CROPS) -> list[Scene]:
 
 
 def window(place: tuple[int, int], height: int, width: int) -> tuple[slice, slice]:
-    """The rows and columns of a crop whose upper left corner is at a place, (row, column)."""
+    """Return the rows and columns of a crop with this upper left corner, (row, column)."""
     return np.s_[place[0] : place[0] + height, place[1] : place[1] + width]
 
 
 def cut(scene: Scene, at: tuple[slice, slice], place: tuple[int, int]) -> Scene:
-    """A crop of a scene."""
+    """Return a crop of a scene."""
     return replace(
         scene,
         name=f"{scene.name} at {place[1]},{place[0]}",
@@ -362,7 +369,7 @@ def cut(scene: Scene, at: tuple[slice, slice], place: tuple[int, int]) -> Scene:
 
 
 def with_holdout(pieces: Sequence[Scene]) -> tuple[Scene, ...]:
-    """The crops, with one third kept out of the search: whole crops of six, or blocks of fewer."""
+    """Return the crops with one third held out: whole crops if there are six, otherwise blocks."""
     if len(pieces) >= MANY:
         return tuple(
             replace(piece, kept_out=np.full_like(piece.flat, number % HOLDOUT == HOLDOUT - 1))

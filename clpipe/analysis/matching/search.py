@@ -1,7 +1,7 @@
 """The search for a development whose noise has a camera's signature.
 
-Methods are tried part by part (coordinate descent), each with its numbers fitted by least squares
-(scipy's trust region, with bounds). All evaluations share their random numbers, so that the sum of
+Methods are tried part by part (coordinate descent). For each, numbers are fitted by least squares
+(SciPy's trust region, with bounds). All evaluations share their random numbers, so that the sum of
 squares is a smooth function of the numbers.
 """
 
@@ -32,23 +32,23 @@ from clpipe.engine.device import Device
 LOG = logging.getLogger(__name__)
 
 GLANCE, QUICK, FULL = 2, 3, 20  # steps of least squares: at first, while promising, at the end
-COARSE, FINE = 1e-3, 1e-4  # shares of cost and numbers at which least squares ends; the last fit's
+COARSE, FINE = 1e-3, 1e-4  # relative tolerances of least squares; the second for the last fit
 HOPELESS, PROMISING = 5.0, 1.5  # times the best cost, before and after a glance
-ENOUGH = 0.5  # residuals of a typical column below which no other method is tried
-CONVERGED = 0.95  # share of the cost above which another few steps gain too little to go on
+ENOUGH = 0.5  # residual of a typical column below which no other method is tried
+CONVERGED = 0.95  # if a few steps leave more than this share of the cost, the fit ends
 STEP = 0.03  # of a dimension's range, for differences
-KNEE = 3.0  # residuals beyond count less than their squares (soft L1)
-BETTER = 0.9  # share of the cost below which another method is taken; by chance, some reach it
+KNEE = 3.0  # larger residuals count less than their squares (soft L1)
+BETTER = 0.9  # share of the cost below which another method is chosen, because of random effects
 FEW, SMALL = 4, 384  # scenes by which methods are compared, and the size of their crops, px
 ROUNDS = 2  # of all parts
-LAST = 20  # ways in whose time the last fit is done, which is of all scenes in their full size
+LAST = 20  # the duration of the last fit (all scenes at full size), as a number of trials
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A development: its settings, the numbers that were fitted, and the cost that is left.
+    """A development: its settings, the fitted numbers, and the remaining cost.
 
-    ``residual`` is that of a typical column, in its error and floor together.
+    ``residual`` is that of a typical column, in units of its error and floor together.
     """
 
     choices: Mapping[str, Choice]
@@ -63,17 +63,17 @@ class StoppedError(Exception):
 
 
 class Watch:
-    """What a search tells as it goes. This one says nothing, and never stops a search."""
+    """Receives the progress of a search. This base class ignores it, and never stops a search."""
 
     is_stopping = False  # whether the search is to raise StoppedError
 
     def advanced(self, share: float, best: Candidate, scenes: Scenes) -> None:
-        """Take in how much of the search is done, 0 to 1, and the best development so far."""
+        """Receive the share of the search that is done, 0 to 1, and the best development so far."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A scene with the figures that are searched for, and their standard errors."""
+    """A scene with its target columns and their standard errors."""
 
     scene: Scene
     places: Places
@@ -81,7 +81,7 @@ class Target:
     errors: Figures
 
     def residuals(self, ours: Figures) -> Doubles:
-        """The residual of each column that can be compared, over its error and floor together."""
+        """Return the residuals of comparable columns, in units of error and floor together."""
         found = []
         for name, column in COLUMNS.items():
             theirs, error = self.figures[name], self.errors[name]
@@ -94,14 +94,14 @@ class Target:
 
 
 class Search:
-    """Looks for a development of some scenes' noise.
+    """Searches for the development that reproduces the noise of scenes.
 
     Args:
         scenes: the camera's pictures.
-        settings: to start from.
-        space: what may change.
-        device: where to develop; None is NumPy.
-        watch: is told how it goes, and may stop it.
+        settings: the settings to start from.
+        space: the choices to compare.
+        device: the device for development; None is NumPy.
+        watch: receives the progress, and may stop the search.
     """
 
     def __init__(
@@ -123,10 +123,10 @@ class Search:
         self._done, self._expected, self._share = 0, LAST, 0.0  # ways that are tried
 
     def run(self) -> Candidate:
-        """The best development that is found.
+        """Return the best development.
 
         Raises:
-            StoppedError: the watch asked for it.
+            StoppedError: the watch stopped the search.
         """
         flattest = sorted(self.targets, key=lambda t: -int(t.scene.mask.sum()))[:FEW]
         crops = [crops_of(target.scene, SMALL, 1)[0] for target in flattest]
@@ -156,13 +156,13 @@ class Search:
         return min(last, again, key=lambda candidate: candidate.cost)
 
     def ways(self, best: Candidate, part: str) -> int:
-        """How many ways of a part there are to try."""
+        """Return the number of choices of a part to try."""
         steps = steps_of(best, part)
         variants = sum(1 for step in steps for _ in variants_of(best.settings, step))
         return len(self.space.choices[part]) + variants
 
     def told(self, best: Candidate) -> Candidate:
-        """The best, after the watch was told of it, and of one more way that was tried."""
+        """Return the best candidate, after reporting it and one more trial to the watch."""
         self._done += 1
         self._share = max(self._share, min(self._done / self._expected, 1.0))
         self.watch.advanced(self._share, best, self.scenes)
@@ -177,10 +177,11 @@ class Search:
         tried: set[tuple[str, ...]],
         own: bool = False,
     ) -> Candidate:
-        """The better of the best and the same with another choice of a part.
+        """Return the better of the best candidate and a variant with another choice of a part.
 
-        Its numbers start from the best's; those of the part do so where the choice is the best's
-        ``own`` method, because to another method they mean other things, and none at another size.
+        The variant's numbers start from those of the best. Numbers of the part itself do so only if
+        the choice is the best's ``own`` method, because they differ in meaning between methods. At
+        another size, all numbers start anew.
         """
         choices = {**best.choices, part: choice}
         other = tuple(each.text for each in choices.values())
@@ -203,9 +204,9 @@ class Search:
     def converged(
         self, candidate: Candidate, targets: Sequence[Target], limit: float = np.inf
     ) -> Candidate:
-        """A candidate fitted until a few steps gain too little to go on, or not below a limit.
+        """Return a candidate, fitted until further steps gain little, or until it cannot win.
 
-        A best that is not would lose to any other that is.
+        The best candidate is also fitted this far, so that comparisons are fair.
         """
         before = np.inf
         while candidate.cost < min(limit, CONVERGED * before):
@@ -220,7 +221,7 @@ class Search:
         targets: Sequence[Target],
         steps: int,
     ) -> Candidate:
-        """The numbers of a set of choices, fitted from a start as far as it has them."""
+        """Return the numbers of a set of choices, fitted from a start that may lack some."""
         from scipy.optimize import least_squares
 
         settings = self.settings
@@ -262,14 +263,14 @@ class Search:
         return made(values, float(found.cost))
 
     def dimensions(self, settings: Settings) -> list[Dimension]:
-        """The numbers that are searched with some settings."""
+        """Return the numbers that are searched for some settings."""
         strength = [self.space.strength] if self.space.strength else []
         return [*strength, *dimensions_of(make_chain(settings))]
 
     def scaled(
         self, settings: Settings, numbers: Mapping[str, float], target: Target
     ) -> dict[str, float]:
-        """The numbers with a strength that gives about the luma rms of a scene.
+        """Return the numbers with a strength that approximates the luma rms of a scene.
 
         Variance is about proportional to the ISO.
         """
@@ -282,10 +283,10 @@ class Search:
         return scaled
 
     def residuals(self, settings: Settings, targets: Sequence[Target]) -> Doubles:
-        """The residuals of all columns of some scenes.
+        """Return the residuals of all columns of some scenes.
 
         Raises:
-            StoppedError: the watch asked for it.
+            StoppedError: the watch stopped the search.
         """
         if self.watch.is_stopping:
             raise StoppedError
@@ -295,7 +296,7 @@ class Search:
         return np.concatenate(found) / len(targets) ** 0.5
 
     def figures(self, settings: Settings, target: Target) -> Figures:
-        """The columns of a scene's development, which is done once."""
+        """Return the columns of a scene's development, which is cached."""
         key = repr(settings), target.scene
         if key not in self._known:
             self.evaluations += 1
@@ -305,41 +306,41 @@ class Search:
 
 
 def target_of(scene: Scene, part: Mask | None = None) -> Target:
-    """A scene, or a part of it, as what is searched for."""
+    """Return a scene, or a part of it, as a target."""
     return target_at(scene, scene.noise, scene.places(part))
 
 
 def target_at(scene: Scene, noise: Noise, places: Places) -> Target:
-    """The figures of noise in a scene; NaN where there are too few samples for an error."""
+    """Return a target from noise; columns are NaN if there are too few samples for an error."""
     figures, errors = figures_of(noise, places), errors_of(noise, places)
     kept = {name: np.nan if np.isnan(errors[name]) else figures[name] for name in figures}
     return Target(scene, places, kept, errors)
 
 
 def typical(cost: float, targets: Sequence[Target]) -> float:
-    """The residual of a typical column at a cost, in its error and floor together."""
+    """Return the residual of a typical column at a cost, in units of error and floor."""
     columns = sum(len(target.residuals(target.figures)) for target in targets) / len(targets)
     return float((2 * cost / columns) ** 0.5)
 
 
 def labels(candidate: Candidate) -> tuple[str, ...]:
-    """What a candidate's choices are called."""
+    """Return the names of a candidate's choices."""
     return tuple(choice.text for choice in candidate.choices.values())
 
 
 def steps_of(candidate: Candidate, part: str) -> list[str]:
-    """The steps of a part whose structure is searched: its own, and the denoising that it adds."""
+    """Return the steps of a part whose structure is searched, including added denoising."""
     own = candidate.choices[part].values
     return [part] if part in DEVELOPMENT else [step for step in own if step.startswith("denoise")]
 
 
 def merged(first: Choice, second: Choice) -> Choice:
-    """A choice and a variant of it, as one."""
+    """Return a choice merged with a variant of it."""
     return Choice(second.text, {**first.values, **second.values}, first.stages)
 
 
 def with_numbers(settings: Settings, numbers: Mapping[str, float]) -> Settings:
-    """The settings with numbers by their dotted names over them."""
+    """Return the settings with numbers set by their dotted names."""
     values: dict[str, object] = {}
     for name, number in numbers.items():
         step, _, parameter = name.rpartition(".")

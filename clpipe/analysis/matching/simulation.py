@@ -1,4 +1,4 @@
-"""A scene developed: the picture of the camera, back in linear light, through a chain."""
+"""Develops a scene: converts the camera's picture to linear light, and runs a chain on it."""
 
 import math
 import threading
@@ -21,17 +21,17 @@ from clpipe.engine.runner import Runner
 from clpipe.images.jpeg import through_jpeg
 from clpipe.stage import Kind, Method, ReferenceContext
 
-LINEAR = 16  # scenes in linear light that are kept: as many as there are, of one tone curve
+LINEAR = 16  # scenes in linear light that are cached, for one tone curve
 UNDONE = ("gamma", "tone_curve")  # by the stage of that name with "inverse_" before it
-# Stages that the light of a picture has gone through.
+# Stages that have already been applied to a picture.
 SEEN = ("shutter", "defocus", "motion_blur", "distortion", "vignetting", "optical_blur")
 
 
 class Simulator:
-    """Develops scenes with one setting after another, on one device.
+    """Develops scenes with varying settings on one device.
 
     Args:
-        device: where; None is NumPy.
+        device: the device; None is NumPy.
     """
 
     def __init__(self, device: Device | None) -> None:
@@ -42,16 +42,16 @@ class Simulator:
         self._linear = BoundedCache[Floats](LINEAR)
 
     def noise(self, settings: Settings, scene: Scene, key: str, count: int | None = None) -> Noise:
-        """The noise of a scene's development, at the intensities of the camera's pictures.
+        """Return the noise of a scene's development, at the intensities of the camera's pictures.
 
-        A burst is developed as often as it has frames, and compared with its own mean, as the
-        camera's is; other frames are compared with their development without noise.
+        A burst is developed once for each frame, and compared with its own mean, like that of the
+        camera. Other frames are compared with their development without noise.
 
         Args:
-            settings: of the development.
-            scene: whose mean is developed, and encoded as its frames were.
-            key: what the noise is made of.
-            count: how many frames; None is as many as the scene has.
+            settings: the settings of the development.
+            scene: the scene, whose mean is developed and encoded like its frames.
+            key: the key that seeds the noise.
+            count: the number of frames; None is that of the scene.
         """
         seen = [name for name in settings.step_names if base_name(name) in SEEN]
         chain = make_chain(replace(settings, skip=(*settings.skip, *seen)))
@@ -69,7 +69,7 @@ class Simulator:
         return noise_of_frames(frames, mean, scene.noise.level)
 
     def _linear_light(self, chain: Chain, scene: Scene) -> Floats:
-        """The scene in the light, and of the size, that the chain starts on."""
+        """Return the scene in linear light, with the size that the chain starts on."""
         methods, scale, gain = undoing(chain), scale_of(chain), gain_of(chain)
         key = scene, scale, gain, *((type(m), m.model_dump_json()) for m in methods)
 
@@ -83,25 +83,25 @@ class Simulator:
 
 
 def finished(pixels: Array | None, scene: Scene) -> Floats:
-    """A developed picture, (height, width, 3), 0 to 255, as the scene's frames were encoded."""
+    """Return a developed picture encoded like the scene's frames, (height, width, 3), 0 to 255."""
     assert pixels is not None
     return (through_jpeg(pixels, scene.jpeg) if scene.jpeg else pixels).astype(np.float32)
 
 
 def gain_of(chain: Chain) -> float:
-    """By how much a chain brightens linear light, curves aside: in exposure and in linear tone."""
+    """Return the factor by which a chain brightens linear light, without its curves."""
     in_light = (s.method for s in chain.steps if s.stage.reads is Kind.RGB)
     return math.prod(float(method.gain) for method in in_light if hasattr(method, "gain"))
 
 
 def scale_of(chain: Chain) -> float:
-    """How large the picture that a chain makes is, over what it starts on."""
+    """Return the size of a chain's picture relative to that of its input."""
     scales = (getattr(s.method, "scale", 1.0) for s in chain.steps if s.stage.name == RESIZE)
     return math.prod(scales)
 
 
 def enlarged(image: Floats, scale: float) -> Floats:
-    """A picture, (height, width, 3), so large that scaled it has its size again; linear between."""
+    """Return a picture, (height, width, 3), enlarged linearly by the inverse of a scale."""
     if scale == 1:
         return image
     from scipy import ndimage
@@ -112,7 +112,7 @@ def enlarged(image: Floats, scale: float) -> Floats:
 
 
 def undoing(chain: Chain) -> list[Method]:
-    """The methods that take a finished picture back to the light that the chain starts on."""
+    """Return the methods that convert a finished picture to the light that the chain starts on."""
     found = []
     for step in reversed(chain.steps):
         if step.stage.name in UNDONE:

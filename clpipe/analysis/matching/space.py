@@ -1,8 +1,8 @@
-"""What a search may change: the methods of the development's stages, and the numbers they declare.
+"""The space of a search: the methods of the development's stages, and their numbers.
 
-A new method or parameter in a stage of the development is searched, too. Only methods that need a
-file or a matrix of the user's are not. What cameras do and the default chain does not is named
-here: smaller pictures, colours of their own, and smoother chroma.
+New methods and parameters of these stages are included automatically, unless a method needs a file
+or matrix of the user. This module adds what cameras do but the default chain does not: smaller
+pictures, the sensor's own colours, and smoother chroma.
 """
 
 import math
@@ -23,19 +23,19 @@ from clpipe.stage import Method
 DEVELOPMENT = ("denoise", "demosaic", "sharpen")
 TONE = "tone_curve"
 RESIZE, SCALES = "resize", (0.5, 2 / 3, 0.75)  # of cameras' smaller pictures
-BEFORE = TONE  # where a stage of these goes that the chain lacks
+BEFORE = TONE  # a stage that the chain lacks is inserted before this one
 SHARPEN = "sharpen"
-# Chroma alone, once more and wider: cameras smooth it at a half or a quarter of the resolution.
+# Chroma is smoothed again and wider: cameras do so at a half or a quarter of the resolution.
 SMOOTHER = {"method": "bilateral", "luma_size": 1, "luma_strength": 0.0, "chroma_size": 7}
 COARSER = {"method": "biweight", "luma_strength": 0.0, "chroma_scale": 3}
-SEARCHED_UNITS = ("", "px")  # what is in units of the signal follows from the noise
-ALSO = ("sharpen.limit",)  # searched, though it follows from the noise: it says what edges get
+SEARCHED_UNITS = ("", "px")  # numbers in units of the signal follow from the noise
+ALSO = ("sharpen.limit",)  # searched nevertheless, because it sets the noise at edges
 SPAN = 8.0  # a number is searched within this factor of where it starts
 
 
 @dataclass(frozen=True)
 class Dimension:
-    """A number that is searched: its dotted name, its range, its first value, its scale."""
+    """A number to search: its dotted name, range, first value and scale."""
 
     name: str
     low: float
@@ -44,7 +44,7 @@ class Dimension:
     logarithmic: bool = False
 
     def value(self, share: float) -> float:
-        """The value at a share of the range, 0 to 1, to four digits.
+        """Return the value at a share of the range, 0 to 1, to four digits.
 
         >>> Dimension("a.b", 1, 100, 10, logarithmic=True).value(0.5)
         10.0
@@ -57,7 +57,7 @@ class Dimension:
         return min(max(float(f"{value:.4g}"), self.low), self.high)
 
     def share(self, value: float) -> float:
-        """The share of the range at which a value lies; the inverse of :meth:`value`."""
+        """Return the share of the range for a value; the inverse of :meth:`value`."""
         value = min(max(value, self.low), self.high)
         if self.logarithmic:
             return math.log(value / self.low) / math.log(self.high / self.low)
@@ -66,9 +66,9 @@ class Dimension:
 
 @dataclass(frozen=True)
 class Choice:
-    """A way to do a part of the development: values of a configuration, and stages to add.
+    """A choice for a part of the development: values of a configuration, and stages to add.
 
-    ``stages`` are added before the stage that they are mapped to, unless the chain has them.
+    Each of ``stages`` is inserted before the stage that it is mapped to, unless the chain has it.
     """
 
     text: str
@@ -76,10 +76,10 @@ class Choice:
     stages: Mapping[str, str] = field(default_factory=dict)
 
     def over(self, settings: Settings) -> Settings:
-        """The settings with this choice over them.
+        """Return the settings with this choice applied.
 
         Raises:
-            KeyedError: they do not allow it.
+            KeyedError: the settings do not allow it.
         """
         names = list(settings.stages)
         for name, before in self.stages.items():
@@ -89,7 +89,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Space:
-    """The choices to compare, by what they are about, and the strength that is searched, if any."""
+    """The choices to compare, by part, and the number that sets the strength of noise, if any."""
 
     choices: Mapping[str, tuple[Choice, ...]]
     strength: Dimension | None
@@ -101,7 +101,7 @@ class Space:
 
 
 def is_number(annotation: Any) -> bool:
-    """Whether a parameter is a float, not a choice, a list or a whole number.
+    """Return whether a parameter is a float, not a choice, a list or a whole number.
 
     >>> is_number(float | None), is_number(int)
     (True, False)
@@ -112,13 +112,12 @@ def is_number(annotation: Any) -> bool:
 
 
 def dimensions_of(chain: Chain) -> list[Dimension]:
-    """The numbers of a chain's development that kernels get as arguments, with their ranges.
+    """Return the numbers of a chain's development that are kernel arguments, with their ranges.
 
-    A share is searched from 0 to 1, anything else within a factor of 8 of its value in the chain,
-    as far as its limits allow.
-    What is 0 there is switched off, and stays so. Numbers in units of the signal are not searched,
-    because they follow from the noise, but for the limit of sharpening; nor those without an upper
-    limit.
+    A share is searched from 0 to 1. Other numbers are searched within a factor of 8 of their value
+    in the chain, as far as their limits allow. A number that is 0 is turned off, and stays 0.
+    Numbers without an upper limit are not searched. Nor are numbers in units of the signal, except
+    for the limit of sharpening, because they follow from the noise.
     """
     found = []
     for step in chain.steps:
@@ -144,7 +143,7 @@ def dimensions_of(chain: Chain) -> list[Dimension]:
 
 
 def limits_of(metadata: list[Any]) -> tuple[float, float]:
-    """The declared limits of a parameter; infinite where there is none."""
+    """Return the declared limits of a parameter; infinite if there are none."""
     low, high = -math.inf, math.inf
     for limit in metadata:
         for key in ("ge", "gt"):
@@ -155,9 +154,9 @@ def limits_of(metadata: list[Any]) -> tuple[float, float]:
 
 
 def space_for(settings: Settings, iso_is_given: bool) -> Space:
-    """The whole space: every part of the development, and the ISO where it is not given.
+    """Return the whole space: all parts of the development, and the ISO if it is not set.
 
-    What changes the most comes first, so that the rest is compared where it belongs.
+    Parts with the largest effect come first, so that others are compared near the final result.
     """
     choices: dict[str, tuple[Choice, ...]] = {}
     if RESIZE not in settings.stages:
@@ -179,7 +178,7 @@ def space_for(settings: Settings, iso_is_given: bool) -> Space:
 
 
 def smaller(settings: Settings) -> Iterator[Choice]:
-    """The ways to a smaller picture: each scale and method, before sharpening and after it."""
+    """Yield choices for a smaller picture: each scale and method, before or after sharpening."""
     for scale in SCALES:
         for method in all_stages()[RESIZE].methods:
             values = {RESIZE: {"method": method.method, "scale": scale}}
@@ -190,7 +189,7 @@ def smaller(settings: Settings) -> Iterator[Choice]:
 
 
 def chroma_ways(settings: Settings) -> Iterator[Choice]:
-    """What makes the noise of chroma: the colours of the sensor or the scene's; smoothed again."""
+    """Yield choices for the noise of chroma: colours of the sensor or scene, smoothed again."""
     before = SHARPEN if SHARPEN in settings.stages else BEFORE
     colours: dict[str, dict[str, Any]] = {"colours of the camera": {}}
     if "inverse_color_matrix" in settings.stages:
@@ -202,15 +201,15 @@ def chroma_ways(settings: Settings) -> Iterator[Choice]:
 
 
 def usable(method: type[Method]) -> bool:
-    """Whether a method works as it is, without a file of the user's."""
+    """Return whether a method works without a file of the user."""
     fields: list[Any] = [f.json_schema_extra for f in method.model_fields.values()]
     return not any(extra["file"] for extra in fields)
 
 
 def variants_of(settings: Settings, step: str) -> Iterator[Choice]:
-    """A step's method with one of its structural parameters a step up or down, or chosen anew.
+    """Yield a step's method with one structural parameter a step up or down, or another choice.
 
-    A window of one pixel is switched off, and stays so.
+    A window of one pixel is turned off, and stays so.
     """
     method = settings.method(step)
     table = settings.parameters.get(step, {})

@@ -1,6 +1,6 @@
-"""Noise models of others as camera profiles.
+"""Converts noise models of other programs to camera profiles.
 
-``read`` is the whole way, from a file to a profile's text: it tells by what a file holds which of
-``dng``, ``android`` and ``darktable`` reads it. Each of these makes a ``model.SensorModel``, of
+``read`` converts a file to the text of a profile. It finds from the contents whether ``dng``,
+``android`` or ``darktable`` reads the file. Each of these returns a ``model.SensorModel``, from
 which ``model`` writes the profile.
 """

@@ -1,7 +1,7 @@
-"""Android's DNG noise model, as CameraITS (tests/dng_noise_model) generates it for a device tree.
+"""Reads Android's DNG noise model, which CameraITS (tests/dng_noise_model) generates for devices.
 
-Its functions are compute_noise_model_entry_S and _O: a = A*ISO + B, and b = C*ISO^2 + D*gain^2 with
-gain the digital gain, max(1, ISO / the highest analogue ISO). Planes are in R, Gr, Gb, B order.
+Its functions are compute_noise_model_entry_S and _O: a = A*ISO + B, and b = C*ISO^2 + D*gain^2. The
+digital gain is max(1, ISO / the highest analogue ISO). Planes are in the order R, Gr, Gb, B.
 """
 
 import math
@@ -13,7 +13,7 @@ from clpipe.base.errors import RequestError
 
 MARK = "noise_model_A"
 
-# Lengths are bounded, so that time is in proportion to the text.
+# Lengths are bounded, so that the time is proportional to the length of the text.
 _SPACE = r"\s{0,9}"
 _COEFFICIENTS = rf'"?{_SPACE}(?:\[{_SPACE}\])?{_SPACE}[=:]{_SPACE}[\[{{]([^\]}}]{{1,999}})[\]}}]'
 _NUMBER = r"([0-9.]{1,30}(?:[eE][+-]?[0-9]{1,4})?)"
@@ -24,20 +24,22 @@ _RANGE = re.compile(
 
 
 def parse_android(text: str, path: Path) -> SensorModel:
-    """The noise of a phone from the text of its noise model, at the full stops of its ISOs.
+    """Return the noise of a phone from the text of its noise model, at full stops of ISO.
 
     Args:
-        text: C, or another language with the same names and numbers; it is not run.
-        path: of the text, for messages and for the name of the camera, which it does not state.
+        text: C, or another language with the same names and numbers. It is not executed.
+        path: the file, for messages and for the name of the camera, which the text lacks.
 
     Raises:
-        RequestError: coefficients are missing, or are no noise.
+        RequestError: coefficients are missing, or do not describe noise.
     """
     factors = {key: _green(text, key, path) for key in "ABCD"}
     found = _HIGHEST_ANALOGUE.search(text)
     highest = _number(found[1]) if found else math.inf
     if not highest > 0:
-        raise RequestError(f"{path}: its highest analogue ISO is {found and found[1]}; above 0?")
+        raise RequestError(
+            f"{path}: its highest analogue ISO is {found and found[1]}, but must be above 0"
+        )
     isos, range_source = _isos(text, highest)
     laws = []
     for iso in isos:
@@ -48,8 +50,8 @@ def parse_android(text: str, path: Path) -> SensorModel:
             laws.append(Law(iso, a, b))
     if not laws:
         raise RequestError(
-            f"{path}: a and b are above 0 at no ISO from {isos[0]:g} to {isos[-1]:g}; its "
-            "coefficients are no noise of a camera"
+            f"{path}: a and b are not both above 0 at any ISO from {isos[0]:g} to {isos[-1]:g}, so "
+            "its coefficients do not describe a camera's noise"
         )
     law = " ".join(f"{key} = {value:.6g}" for key, value in factors.items())
     digital = f"beyond ISO {highest:g} by digital gain" if found else "digital gain not stated"
@@ -61,28 +63,28 @@ def parse_android(text: str, path: Path) -> SensorModel:
 
 
 def _green(text: str, key: str, path: Path) -> float:
-    """The coefficient of green: the mean over Gr and Gb, or the only one.
+    """Return the coefficient of green: the mean over Gr and Gb, or the only one.
 
     Raises:
-        RequestError: it is missing, or not a number.
+        RequestError: the coefficient is missing, or not a number.
     """
     found = re.search(f"noise_model_{key}{_COEFFICIENTS}", text)
     if not found:
         raise RequestError(
-            f"{path}: has no noise_model_{key} = {{ ... }}; an Android noise model has "
+            f"{path}: noise_model_{key} = {{ ... }} is missing; an Android noise model has "
             "noise_model_A, _B, _C and _D"
         )
     planes = [_number(part) for part in found[1].split(",") if part.strip()]
     if len(planes) not in (1, 4) or not all(map(math.isfinite, planes)):
         raise RequestError(
-            f"{path}: noise_model_{key} has {found[1].strip()!r}; four numbers are needed, for "
+            f"{path}: noise_model_{key} is {found[1].strip()!r}, but must be four numbers, for "
             "R, Gr, Gb, B, or one for all"
         )
     return planes[0] if len(planes) == 1 else (planes[1] + planes[2]) / 2
 
 
 def _number(text: str) -> float:
-    """The number of a text, NaN where it is none."""
+    """Return the number in a text, or NaN."""
     try:
         return float(text)
     except ValueError:
@@ -90,7 +92,7 @@ def _number(text: str) -> float:
 
 
 def _isos(text: str, highest: float) -> tuple[list[float], str]:
-    """The ends of the ISOs and the full stops between, and what stands in for the ends."""
+    """Return the lowest and highest ISO with full stops between, and a note on assumed values."""
     if found := _RANGE.search(text):
         low, high = sorted((max(float(found[1]), 1.0), max(float(found[2]), 1.0)))
         source = ""

@@ -1,9 +1,9 @@
-"""darktable's noiseprofiles.json: noise after demosaicing, converted to that of the raw.
+"""Converts darktable's noiseprofiles.json, which describes noise after demosaicing, to raw noise.
 
-Its Var[y] = a*y + b is of pictures after demosaicing, and of an estimator that is 4 times too low
-by itself, so a of raw green is 12.8 times its a of green. For six cameras whose gain is known
-(Wei et al. 2020; Hanji et al. 2020) the factor is 9 to 16 at ISO 800 and above; below, the file's
-a is too high. Its b cannot be converted.
+Its Var[y] = a*y + b applies after demosaicing, and its estimator is 4 times too low. Therefore a of
+raw green is 12.8 times the file's a of green. For six cameras of known gain (Wei et al. 2020; Hanji
+et al. 2020) the factor is 9 to 16 at ISO 800 and above. Below that, the file's a is too high. Its b
+cannot be converted.
 """
 
 import re
@@ -24,19 +24,17 @@ from clpipe.camera.profile import built_in_name, comparable, load_camera
 MARK = "noiseprofiles"
 RAW_OVER_DEMOSAICED = 12.8
 TRUSTED_ISO = 800.0  # the lowest at which the factor holds
-LOWEST_ISO = 100.0  # what is below is often this one with another exposure
-UNCERTAINTY = (
-    0.3  # of the factor; where a/ISO is further from its median, raws are scaled or denoised
-)
+LOWEST_ISO = 100.0  # lower ISOs are often ISO 100 with another exposure
+UNCERTAINTY = 0.3  # of the factor; if a/ISO is further from its median, raws are scaled or denoised
 
-# Fujifilm's X-Trans cameras by model, after rawspeed's cameras.xml; X-T100 and X-T200 are Bayer.
+# Fujifilm's X-Trans cameras (source: rawspeed's cameras.xml); X-T100 and X-T200 are Bayer.
 X_TRANS = re.compile(r"X-(?:E|H|M|Pro)\d.*|X-S\d\d|X-T\d\d?(?: II)?|X100[STFV].*|X[237]0|XQ\d")
 
 Slope = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
 
 
 class Profile(BaseModel):
-    """The noise at an ISO; ``skip`` marks one that darktable does not use."""
+    """The noise at an ISO; ``skip`` marks a profile that darktable does not use."""
 
     iso: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
     a: tuple[Any, Slope, Any]  # red, green, blue; those of red and blue follow the light
@@ -44,19 +42,19 @@ class Profile(BaseModel):
 
 
 def parse_darktable(values: Any, path: Path, camera: str | None) -> SensorModel:
-    """The noise of a camera from the value of the file.
+    """Return the noise of a camera from the values of the file.
 
     Args:
-        values: what the JSON holds.
-        path: of the file, for messages.
-        camera: by make and model, or by any name that a built-in camera has; None is the only one.
+        values: the values of the JSON.
+        path: the file, for messages.
+        camera: make and model, or any name of a built-in camera; None is the only camera.
 
     Raises:
-        RequestError: there is no such camera, or the file is not of darktable's form.
+        RequestError: there is no such camera, or the file is not in darktable's format.
     """
     cameras = {comparable(f"{entry[0]} {entry[1]}"): entry for entry in _all(values)}
     if not cameras:
-        raise RequestError(f"{path}: its noiseprofiles hold no camera; darktable's file has many")
+        raise RequestError(f"{path}: its noiseprofiles list no camera; give darktable's own file")
     make, model, profiles = cameras[_chosen(cameras, path, camera)]
     try:
         checked = TypeAdapter(list[Profile]).validate_python(profiles)
@@ -65,8 +63,8 @@ def parse_darktable(values: Any, path: Path, camera: str | None) -> SensorModel:
         raise RequestError(f"{path}: {make} {model}: profiles{fault.key}: {fault.text}") from None
     if X_TRANS.fullmatch(model):
         raise RequestError(
-            f"{path}: {make} {model} has no Bayer pattern but X-Trans; its noise was measured "
-            "behind another demosaicing, for which this conversion is not; fujifilm-x-t3 is "
+            f"{path}: {make} {model} has an X-Trans pattern, whose noise darktable measured "
+            "after another demosaicing, so it cannot be converted; fujifilm-x-t3 is "
             "built in"
         )
     slopes: dict[float, float] = {}
@@ -75,7 +73,7 @@ def parse_darktable(values: Any, path: Path, camera: str | None) -> SensorModel:
             slopes.setdefault(profile.iso, profile.a[1] * RAW_OVER_DEMOSAICED)
     slopes = {iso: a for iso, a in slopes.items() if iso >= LOWEST_ISO} or slopes
     if not slopes:
-        raise RequestError(f"{path}: {make} {model}: has no profiles")
+        raise RequestError(f"{path}: {make} {model} has no profiles; choose another camera")
     slopes, how = _plausible(slopes)
     source = (
         f"darktable's noiseprofiles.json, {make} {model}, noise after demosaicing: a of raw green "
@@ -87,9 +85,10 @@ def parse_darktable(values: Any, path: Path, camera: str | None) -> SensorModel:
 
 
 def _plausible(slopes: dict[float, float]) -> tuple[dict[float, float], str]:
-    """a by ISO, below the trusted ISOs in proportion to the ISO, and in words what was done.
+    """Return a by ISO, corrected, and a description of the corrections.
 
-    Trusted ISOs whose a/ISO is far from the median are left out. Without trusted ones, a stays.
+    Below the trusted ISOs, a becomes proportional to the ISO. Trusted ISOs whose a/ISO is far from
+    the median are excluded. Without trusted ISOs, a does not change.
 
     >>> _plausible({100.0: 9.0, 800.0: 8.0, 1250.0: 4.0, 1600.0: 16.0})[0]
     {100.0: 1.0, 800.0: 8.0, 1600.0: 16.0}
@@ -101,7 +100,7 @@ def _plausible(slopes: dict[float, float]) -> tuple[dict[float, float], str]:
     far = [iso for iso, one in per_iso.items() if abs(one / middle - 1) > UNCERTAINTY]
     kept = {iso: a for iso, a in slopes.items() if iso not in far}
     lowest = next((iso for iso in kept if iso >= TRUSTED_ISO), None)
-    if lowest is None:  # two that contradict each other
+    if lowest is None:  # two values contradict each other
         return slopes, ""
     kept |= {iso: kept[lowest] * iso / lowest for iso in kept if iso < lowest}
     how = f"; below ISO {lowest:g}, where its a is too high, in proportion to the ISO"
@@ -112,7 +111,7 @@ def _plausible(slopes: dict[float, float]) -> tuple[dict[float, float], str]:
 
 
 def _all(values: Any) -> Iterator[tuple[str, str, Any]]:
-    """Maker, model and profiles of each camera; what is not of the form is left out."""
+    """Yield maker, model and profiles of each camera. Entries of another form are skipped."""
     for maker in _list(values, MARK):
         make = maker.get("maker") if isinstance(maker, dict) else None
         for each in _list(maker, "models"):
@@ -127,10 +126,10 @@ def _list(values: Any, key: str) -> list[Any]:
 
 
 def _chosen(cameras: dict[str, tuple[str, str, Any]], path: Path, camera: str | None) -> str:
-    """The key of the camera that was asked for.
+    """Return the key of the requested camera.
 
     Raises:
-        RequestError: none was, or the file does not have it.
+        RequestError: no camera was requested, or the file does not have it.
     """
     keys = list(cameras)
     example = " ".join(cameras[keys[0]][:2])
@@ -138,7 +137,7 @@ def _chosen(cameras: dict[str, tuple[str, str, Any]], path: Path, camera: str | 
         if len(keys) == 1:
             return keys[0]
         raise RequestError(
-            f"{path}: holds {len(keys)} cameras; say which, such as --camera {example!r}"
+            f"{path}: this file has {len(keys)} cameras; choose one, such as --camera {example!r}"
         )
     wanted = [comparable(camera)]
     if built_in := built_in_name(camera):
@@ -153,4 +152,4 @@ def _chosen(cameras: dict[str, tuple[str, str, Any]], path: Path, camera: str | 
     near = get_close_matches(wanted[0], keys, n=3, cutoff=0.6)
     names = ", ".join(" ".join(cameras[key][:2]) for key in near)
     hint = f"; similar are {names}" if near else f"; one is {example}"
-    raise RequestError(f"{path}: has no camera {camera!r} among {len(keys)}{hint}")
+    raise RequestError(f"{path}: camera {camera!r} is not among its {len(keys)} cameras{hint}")

@@ -1,4 +1,4 @@
-"""The NoiseProfile of a DNG: a and b of each colour at the file's ISO (DNG 1.4, tag 51041)."""
+"""Reads the NoiseProfile of a DNG: a and b of each colour at its ISO (DNG 1.4, tag 51041)."""
 
 import math
 from pathlib import Path
@@ -8,29 +8,29 @@ from clpipe.analysis.noise_models.model import Law, Levels, SensorModel
 from clpipe.base.errors import ImageError
 from clpipe.images.raw import read_exif, read_facts
 
-NOISE_PROFILE = "Tag 0xC761"  # as exifread has it
+NOISE_PROFILE = "Tag 0xC761"  # exifread's name
 
 
 def read_dng(path: Path) -> SensorModel:
-    """The noise of the camera of a DNG, from the pair for green, or the one for all colours.
+    """Return the noise of a DNG's camera, from the values for green, or those for all colours.
 
     Raises:
-        ImageError: it cannot be read, holds no Bayer mosaic, or does not state its noise, its ISO
-            or its levels.
+        ImageError: the DNG cannot be read, is not a Bayer mosaic, or does not state its noise, ISO
+            or levels.
     """
     facts, exif = read_facts(path), read_exif(path)
     tags = (tag for name, tag in exif.tags.items() if name.endswith(NOISE_PROFILE))
     tag = next(tags, None)
     if tag is None:
         raise ImageError(
-            f"{path}: has no NoiseProfile (tag 51041), in which a DNG states its noise; DNGs of "
+            f"{path}: this DNG has no NoiseProfile (tag 51041), which states noise; DNGs of "
             "Android phones, Adobe's converter and clpipe have one"
         )
     values = _numbers(tag)
     if len(values) not in (2, 6):
         raise ImageError(
-            f"{path}: its NoiseProfile has {len(values)} numbers; it needs a and b, for all "
-            "colours or for each of three"
+            f"{path}: its NoiseProfile has {len(values)} numbers, but needs a and b, once for all "
+            "colours, or for each of three"
         )
     a, b = values[2:4] if len(values) == 6 else values
     if not (math.isfinite(a) and math.isfinite(b) and a > 0 and b > 0):
@@ -38,10 +38,12 @@ def read_dng(path: Path) -> SensorModel:
             f"{path}: its NoiseProfile has a = {a:g} and b = {b:g} for green; both must be above 0"
         )
     if facts.iso is None:
-        raise ImageError(f"{path}: does not state its ISO, for which its NoiseProfile holds")
+        raise ImageError(
+            f"{path}: this DNG does not state the ISO to which its NoiseProfile applies"
+        )
     if not 0 <= facts.black_level < facts.white_level:
         raise ImageError(
-            f"{path}: its levels cannot be right: black {facts.black_level}, white "
+            f"{path}: its levels are impossible: black {facts.black_level}, white "
             f"{facts.white_level}"
         )
     own = exif.color_matrix()
@@ -60,7 +62,7 @@ def read_dng(path: Path) -> SensorModel:
 
 
 def _numbers(tag: Any) -> list[float]:
-    """The values of a tag of doubles; exifread has each as a tuple of one."""
+    """Return the values of a tag of doubles, which exifread stores as tuples of one."""
     try:
         return [float(v[0] if isinstance(v, tuple) else v) for v in tag.values]
     except (AttributeError, IndexError, TypeError, ValueError, ZeroDivisionError):

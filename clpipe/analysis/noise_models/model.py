@@ -1,4 +1,4 @@
-"""What a file says of a sensor's noise, and the camera profile that is made of it."""
+"""The noise of a sensor from a file of another program, and the camera profile made from it."""
 
 import math
 import re
@@ -12,20 +12,20 @@ from clpipe.base.text import printable
 from clpipe.camera.profile import SRGB_TO_XYZ, Camera, Matrix, built_in_name, load_camera
 from clpipe.camera.text import profile_text
 
-# The middle of the range that Brooks et al. (CVPR 2019) draw from: red 1.9 to 2.4, blue 1.5 to 1.9.
+# The middle of the ranges of Brooks et al. (CVPR 2019): red 1.9 to 2.4, blue 1.5 to 1.9.
 STAND_IN_GAINS = (2.15, 1.70)
 
-# ln(read noise in DN of 14 bits) over ln(system gain): means of the laws of the five cameras of
+# ln(read noise in 14-bit DN) over ln(system gain): means of the laws of the five cameras of
 # Wei et al., CVPR 2020 (github.com/Vandermode/ELD).
 READ_NOISE_SLOPE, READ_NOISE_OFFSET = 0.600, 1.521
-READ_NOISE_RANGE = 15871.0  # DN of signal 1 there: 14 bits and a black level of 512
+READ_NOISE_RANGE = 15871.0  # DN of signal 1 in that source: 14 bits, black level 512
 
 NOT_IN_FILE = "not in the file, and not known; zero stands in"
 
 
 @dataclass(frozen=True)
 class Levels:
-    """The black and the white level of a sensor in DN, and where they are from."""
+    """The black and white level of a sensor in DN, and their source."""
 
     black: float
     white: float
@@ -38,7 +38,7 @@ FOURTEEN_BITS = Levels(512, 16383, "not in the file; those of 14 bits with black
 
 @dataclass(frozen=True)
 class Law:
-    """Var[y] = a*y + b at an ISO; b is None where it is not known."""
+    """Var[y] = a*y + b at an ISO; b is None if not known."""
 
     iso: float
     a: float
@@ -47,18 +47,18 @@ class Law:
 
 @dataclass(frozen=True)
 class SensorModel:
-    """The noise of a camera as a file states it.
+    """The noise of a camera that a file states.
 
     Attributes:
-        make: of the camera, "unknown" where the file has none.
-        model: of the camera.
-        laws: one for each ISO, ascending, at least one; a and b are above 0.
-        source: what the laws are from.
-        levels: of the file, or what stands in.
-        in_file: whether the levels are the file's.
+        make: the make of the camera; "unknown" if the file does not state it.
+        model: the model of the camera.
+        laws: one law for each ISO, ascending, at least one; a and b are above 0.
+        source: the source of the laws.
+        levels: the levels of the file, or assumed levels.
+        in_file: whether the levels are from the file.
         gains: white balance gains of red and blue (green = 1), if the file states them.
-        xyz_to_camera: XYZ to camera RGB at D65, if it is known.
-        matrix_source: what the matrix is from.
+        xyz_to_camera: the matrix from XYZ to camera RGB at D65, if it is known.
+        matrix_source: the source of the matrix.
     """
 
     make: str
@@ -73,19 +73,19 @@ class SensorModel:
 
     @property
     def name(self) -> str:
-        """The name for a profile: maker and model in small letters, with hyphens."""
+        """The name for a profile: make and model in lower case, with hyphens."""
         words = re.findall(r"[^\W_]+", f"{self.make} {self.model}".casefold())
         return "-".join(word for word in dict.fromkeys(words) if word != "corporation")
 
     def profile(self, name: str) -> str:
-        """The text of a camera profile.
+        """Return the text of a camera profile.
 
         system_gain = a * range and read_noise = sqrt(b) * range (EMVA 1288), where the range is
-        the white level less the black level. What the file does not state of a camera that is
-        built in is the built-in profile's.
+        the white level minus the black level. If the camera is built in, values that the file does
+        not state are those of the built-in profile.
 
         Args:
-            name: of the profile.
+            name: the name of the profile.
         """
         built_in = built_in_name(f"{self.make} {self.model}")
         known = load_camera(built_in) if built_in else None
@@ -97,9 +97,9 @@ class SensorModel:
         gain_source, read_source = self.source, f"{self.source}; read_noise = sqrt(b) * range"
         if any(law.b is None for law in self.laws):
             read_source = (
-                f"not known; stands in: ln(sigma) = {READ_NOISE_SLOPE} ln(system_gain) + "
-                f"{READ_NOISE_OFFSET} in DN of 14 bits, the mean of the five cameras of Wei et al. "
-                "2020 (github.com/Vandermode/ELD), of which single ones are a factor of 2 away"
+                f"not known; assumed: ln(sigma) = {READ_NOISE_SLOPE} ln(system_gain) + "
+                f"{READ_NOISE_OFFSET} in 14-bit DN, the mean of five cameras in Wei et al. "
+                "2020 (github.com/Vandermode/ELD). Single cameras differ by a factor of 2"
             )
         colours, sources = self._colours(known)
         values = {
@@ -132,7 +132,7 @@ class SensorModel:
         )
 
     def _colours(self, known: Camera | None) -> tuple[dict[str, Any], dict[str, str]]:
-        """White balance gains and matrix of the profile, with their sources."""
+        """Return white balance gains and matrix of the profile, with their sources."""
         matrix: Matrix | None
         if self.xyz_to_camera:
             gains, matrix = gains_at_d65(self.xyz_to_camera), self.xyz_to_camera
@@ -154,7 +154,7 @@ class SensorModel:
 
 
 def read_noise(law: Law) -> float:
-    """The standard deviation without light in signal units; by the law above where unknown."""
+    """Return the standard deviation without light in signal units; estimated if it is unknown."""
     if law.b is not None:
         return math.sqrt(law.b)
     gain = law.a * READ_NOISE_RANGE
@@ -162,7 +162,7 @@ def read_noise(law: Law) -> float:
 
 
 def gains_at_d65(xyz_to_camera: Matrix) -> tuple[float, float]:
-    """The white balance gains of red and blue (green = 1) at D65.
+    """Return the white balance gains of red and blue (green = 1) at D65.
 
     >>> gains_at_d65(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
     (1.0521, 0.9182)

@@ -1,4 +1,4 @@
-"""A file of others with a noise model, told by what it holds, as the text of a camera profile."""
+"""Reads a noise model of another program, whose format is detected, as a camera profile."""
 
 from pathlib import Path
 
@@ -15,24 +15,24 @@ from clpipe.camera.text import check_profile_name
 
 TIFF = (b"II*\0", b"MM\0*")
 READ = (
-    "read are a DNG with a NoiseProfile, an Android noise model (the text with noise_model_A) and "
+    "give a DNG with a NoiseProfile, an Android noise model (the text with noise_model_A) or "
     "darktable's noiseprofiles.json"
 )
 
 
 def import_camera(path: Path, camera: str | None, output: Path | None) -> tuple[str, Camera]:
-    """Make a camera profile of a file with a noise model, and write it if ``output`` is given.
+    """Make a camera profile from a file with a noise model, and write it if ``output`` is set.
 
     Args:
         path: a DNG with a NoiseProfile, an Android noise model, or darktable's noiseprofiles.json.
-        camera: which camera of a file that holds several.
-        output: of the profile, which is replaced where it exists; its name ends in .toml.
+        camera: the camera to choose if the file has several.
+        output: the file for the profile, ending in .toml. An existing file is replaced.
 
     Returns:
-        The text of the profile, and the camera that it is.
+        The text of the profile, and its camera.
 
     Raises:
-        RequestError: the file is none of these, or makes no valid profile; or the name of the
+        RequestError: the file is none of these, the profile would be invalid, or the name of the
             output does not end in .toml.
         ImageError: the DNG cannot be used, or the profile cannot be written.
     """
@@ -47,11 +47,11 @@ def import_camera(path: Path, camera: str | None, output: Path | None) -> tuple[
 
 
 def read_model(path: Path, camera: str | None) -> SensorModel:
-    """The noise model of a file.
+    """Return the noise model of a file.
 
     Raises:
-        RequestError: as :func:`import_camera`.
-        ImageError: as :func:`import_camera`.
+        RequestError: as for :func:`import_camera`.
+        ImageError: as for :func:`import_camera`.
     """
     check_exists(path)
     try:
@@ -67,7 +67,8 @@ def read_model(path: Path, camera: str | None) -> SensorModel:
     is_darktable = text.lstrip().startswith("{") and darktable.MARK in text
     if camera is not None and not is_darktable:
         raise RequestError(
-            f"--camera: {path} holds one camera; it picks one of darktable's noiseprofiles.json"
+            f"--camera: {path} has only one camera; remove this option, which is for darktable's "
+            "file"
         )
     if is_tiff:
         return read_dng(path)
@@ -75,9 +76,11 @@ def read_model(path: Path, camera: str | None) -> SensorModel:
         try:
             values = parse_json(text)
         except ValueError as error:
-            raise RequestError(f"{path}: damaged, or not valid JSON: {error}") from None
+            raise RequestError(
+                f"{path}: this file is damaged, or not valid JSON: {error}"
+            ) from None
         return parse_darktable(values, path, camera)
     if android.MARK in text:
         return parse_android(text, path)
     found = "text without a noise model" if text.strip() else "neither text nor a DNG"
-    raise RequestError(f"{path}: holds {found if head else 'nothing'}; {READ}")
+    raise RequestError(f"{path}: this file contains {found if head else 'nothing'}; {READ}")
