@@ -68,7 +68,10 @@ def test_a_dump_of_another_size_is_told_what_would_fit(tmp_path):
     (tmp_path / "a.raw").write_bytes(bytes(64 * 48 * 2))
     options = ("--dump", "64x40:uint16le")
     output = clpipe("run", tmp_path / "a.raw", "-o", tmp_path, *options, status=1)
-    assert "a.raw: this file has 6144 bytes, but 64x40 uint16le has 5120; it would fit 64x48 uint16le" in output
+    assert (
+        "a.raw: this file has 6144 bytes, but 64x40 uint16le has 5120; it would fit 64x48 uint16le"
+        in output
+    )
     output = clpipe("run", tmp_path / "a.raw", "-o", tmp_path, status=1)
     assert "not a raw that LibRaw knows" in output or "--dump" in output
 
