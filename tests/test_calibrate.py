@@ -169,7 +169,7 @@ def test_dark_frames_give_columns_dsnu_and_the_black_level():
     found = calibrate(800, shots, dark, SENSOR)
     assert off(found.column_noise, columns.std())[0] < 0.03
     assert off(found.dsnu, 1.5)[0] < 0.02
-    assert any("dark frames lie at 51" in note for note in found.notes)
+    assert any("the mean of dark frames is 51" in note for note in found.notes)
     # Another rounding went over the frames: that of the pattern.
     assert off(found.pooled.floor, 2.5**2 + ROUNDING)[0] < 0.02
     assert off(found.pooled.gain, 2)[0] < 0.01

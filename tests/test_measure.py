@@ -468,9 +468,9 @@ def test_a_shift_by_a_pixel_is_refused_and_strong_noise_is_not(developed, tmp_pa
     frames = [load_picture(tmp_path / f"{name}.frame{k}.png") for k in range(3)]
     assert measure(frames) and frames[0].iso == 12800
     moved = replace(frames[1], path=Path("moved.png"), pixels=np.roll(frames[1].pixels, 1, 1))
-    with pytest.raises(RequestError, match=r"^moved\.png does not lie over the others: "):
+    with pytest.raises(RequestError, match=r"^moved\.png is not aligned with the others: "):
         measure([frames[0], moved, frames[2]])
-    with pytest.raises(RequestError, match=r"^moved\.png does not lie over \S+frame0\.png: "):
+    with pytest.raises(RequestError, match=r"^moved\.png is not aligned with \S+frame0\.png: "):
         measure([frames[0], moved])
 
 

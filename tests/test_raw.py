@@ -208,7 +208,7 @@ def test_raws_and_renders_of_a_folder_go_their_own_ways(tmp_path):
     (folder / "d.nef").write_bytes(b"\xff\xd8\xff\xe0 nothing")
     out = tmp_path / "out"
     output = clpipe("run", folder, "-o", out, "--keep", "all", "--iso", 800, status=1)
-    assert "d.nef: it is a JPEG, not a camera raw" in output
+    assert "d.nef: this is a JPEG, not a camera raw" in output
     assert "4 of 5 images done, 1 failed" in output
     alone = tmp_path / "alone"
     clpipe("run", folder / "b.dng", folder / "c.DNG", "-o", alone, "--iso", 800)

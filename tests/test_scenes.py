@@ -101,13 +101,13 @@ def test_it_goes_on_where_it_was_and_makes_the_same(clpipe, scene, blender, tmp_
     clpipe(*command, "-o", "whole")
     scene.write_text("die after 2")
     said = clpipe(*command, "-o", "set", status=2).stderr
-    assert "Blender ended with status 11; it said:" in said
+    assert "Blender ended with status 11. Its last output:" in said
     assert "Segmentation fault (not really)" in said
     assert "2 of 4 images done, 0 failed, 2 not begun" in said
     assert not (tmp_path / "set/README.md").exists()
     record = tmp_path / "set/dataset.json"
     record.write_text(record.read_text().replace(sha256_of(scene)[0], "0" * 64))
-    assert "holds a dataset with sha256" in clpipe(*command, "-o", "set", status=2).stderr
+    assert "has a dataset with sha256" in clpipe(*command, "-o", "set", status=2).stderr
     scene.write_text("a room")
     record.write_text(record.read_text().replace("0" * 64, sha256_of(scene)[0]))
     assert (

@@ -236,7 +236,7 @@ def test_six_files_a_cube_map_and_a_map_become_a_picture(write, clpipe):
     )
     write("in/room_up.exr", **colours(np.zeros((9, 9, 3))))
     told = clpipe("run", "in", "-o", "o", *RUN, *options_of("unified"), status=1).output
-    assert "room_up.exr: it is 9x9" in " ".join(told.split())
+    assert "room_up.exr: this view has 9x9" in " ".join(told.split())
 
 
 def test_overlapping_views_and_what_no_view_shows(write, clpipe):
