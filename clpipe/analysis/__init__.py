@@ -1,8 +1,7 @@
-"""Measurement of noise: statistics of images; cameras, calibrated or of others' noise models;
-and the development of a camera, matched. And of light: the exposures of a sequence. And pictures
-compared, as figures.
+"""Measurement of noise: statistics of images, camera calibration, imported noise models.
 
-This room works on arrays and on files that ``images`` reads; only ``matching`` develops pictures,
-``metering`` runs a chain as far as its exposure, and ``emva`` one as far as its raw. It imports
-``outputs`` and below, and is the only room that imports SciPy and Matplotlib.
+The package also matches a camera's development, meters the exposures of a sequence and compares
+images in figures. It works on arrays and on files that ``images`` reads. Only ``matching`` develops
+images; ``metering`` runs a chain up to its exposure, and ``emva`` runs one up to its raw. The
+package imports ``outputs`` and below. Only this package imports SciPy and Matplotlib.
 """

@@ -1,4 +1,4 @@
-"""The errors that a user sees, by their cause. Each class carries the program's exit status."""
+"""The errors that a user sees, by cause. Each class has the program's exit status."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -6,11 +6,11 @@ from typing import Any, Self
 
 from clpipe.base.text import one_line
 
-LONGEST = 4000  # characters of a message; what it repeats of a file can have any length
+LONGEST = 4000  # characters of a message, because text quoted from a file can have any length
 
 
 class ClpipeError(Exception):
-    """Base of all errors that are reported as one clear message, without a traceback."""
+    """Base class of all errors that clpipe reports as one message, without a traceback."""
 
     exit_status = 2
 
@@ -21,13 +21,13 @@ class ClpipeError(Exception):
 
 
 class RequestError(ClpipeError):
-    """The request was wrong: an unknown name, a bad value, a chain that does not fit."""
+    """The request is wrong: an unknown name, an invalid value, or stages that do not fit."""
 
     exit_status = 2
 
 
 class MissingError(RequestError):
-    """A file or folder that was named does not exist; ``name`` is what was written."""
+    """A named file or folder does not exist. ``name`` is the name as the user wrote it."""
 
     def __init__(self, name: str, message: str) -> None:
         super().__init__(message)
@@ -38,7 +38,7 @@ class MissingError(RequestError):
 
 
 class KeyedError(RequestError):
-    """A bad setting; ``key`` is its dotted name, such as ``sensor_noise.a``."""
+    """A setting is invalid. ``key`` is its dotted name, such as ``sensor_noise.a``."""
 
     def __init__(self, key: str, message: str) -> None:
         super().__init__(message)
@@ -49,11 +49,12 @@ class KeyedError(RequestError):
 
 
 class ImageError(ClpipeError):
-    """One image cannot be read, processed or written; the run continues with the others.
+    """One image cannot be read, processed or written. The run continues with the others.
 
     Args:
         message: what is wrong.
-        way: a sentence with options that help, which some commands lack; not in the text.
+        way: a sentence about options that help. Some commands lack these options, so the sentence
+            is not part of the message.
     """
 
     exit_status = 1
@@ -64,16 +65,16 @@ class ImageError(ClpipeError):
 
     @property
     def with_way(self) -> Self:
-        """The error with the options that help in its text."""
+        """The same error with the sentence ``way`` in its message."""
         return type(self)(f"{self}. {self.way}") if self.way else self
 
 
 class NoPictureError(ImageError):
-    """A file is a whole image, but has no channels of the kind that is read, such as only depth."""
+    """A file is a valid image, but lacks the channels to read. For example, it has only depth."""
 
 
 class KindError(ImageError):
-    """A kept image lacks the channels that are needed; ``attributes`` are those of the file."""
+    """A kept image lacks the required channels. ``attributes`` are those of the file."""
 
     def __init__(self, path: Path, attributes: Mapping[str, str]) -> None:
         stage = attributes.get("stage", "a stage that it does not name")
@@ -83,22 +84,22 @@ class KindError(ImageError):
 
 
 class DeviceFailedError(ImageError):
-    """A device failed at one image, though it was tried again; it may do for others."""
+    """A device failed for one image, also at the second try. Other images may succeed."""
 
 
 class DeviceError(ClpipeError):
-    """There is no usable device, or the requested one cannot be used."""
+    """No device is usable, or the requested device is not."""
 
     exit_status = 3
 
 
 class OutputError(ClpipeError):
-    """Nothing more can be written: the disk is full, or the folder has gone."""
+    """No more files can be written: the disk is full, or the output directory is missing."""
 
     exit_status = 1
 
 
 class ClusterError(ClpipeError):
-    """The cluster was lost during a run; the images finished until then are written."""
+    """The cluster was lost during a run. The images finished before are written."""
 
     exit_status = 1

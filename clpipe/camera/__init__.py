@@ -1,6 +1,5 @@
 """Cameras: profiles of sensors and the noise model, and lenses by their names.
 
-Nothing here reads images or knows the chain; a profile, one of the built-in TOML files or a user's,
-answers "what is a and b at this ISO".
-It imports ``base`` only.
+A profile is a TOML file, built-in or written by a user. It gives the noise parameters a and b at an
+ISO. No module here reads images or knows the chain. The package imports only ``base``.
 """

@@ -1,6 +1,6 @@
 """Training data: samples and patches of renders, developed when needed; noise for clean raws.
 
-Nothing is written. It imports ``pipeline`` and below, but not ``batch`` and ``analysis``.
+The package writes no files. It imports ``pipeline`` and below, but not ``batch`` or ``analysis``.
 """
 
 from clpipe.dataset.dataset import Dataset

@@ -61,7 +61,7 @@ def room_for(
     """
     shapes = {(box.height, box.width) for box in boxes}
     if len(shapes) > 1:
-        raise ValueError(f"patches of {sorted(shapes)}; expected one size")
+        raise ValueError(f"patches have the sizes {sorted(shapes)}, but all must have one size")
     sizes = plan.sizes(width, height)
 
     def shape(kind: Kind, level: int) -> tuple[int, ...]:
@@ -74,7 +74,10 @@ def room_for(
         own = shape(plan.encoded, len(sizes) - 1)
         encoded = aligned_empty(own, np.uint8) if into is None else into
         if encoded.shape != own or encoded.dtype != np.uint8:
-            raise ValueError(f"into is {encoded.shape} {encoded.dtype}; {own} uint8")
+            raise ValueError(
+                f"into has shape {encoded.shape} and type {encoded.dtype}, but the result has "
+                f"shape {own} and type uint8"
+            )
     return HostImages(
         images={i.number: np.empty(shape(i.kind, i.level), np.float32) for i in images},
         encoded=encoded,

@@ -118,19 +118,19 @@ class PoclBuilder:
             enough = has_room(self._folder.parent)
         except OSError as error:
             raise DeviceError(
-                f"{self._folder.parent}: PoCL's folder has been removed while this process used it "
-                f"({error.strerror}); start again, and exclude it from clean-ups of temporary files"
+                f"{self._folder.parent}: PoCL's folder was removed while this process used it "
+                f"({error.strerror}). Exclude it from clean-ups of temporary files and start again."
             ) from None
         if not enough:
             raise DeviceError(
-                f"{self._folder}: PoCL needs {ROOM >> 20} MiB of room there to compile in; free "
-                "some, or name another folder for temporary files with TMPDIR"
+                f"{self._folder}: PoCL needs {ROOM >> 20} MiB of free space there to compile. Free "
+                "some space, or set TMPDIR to another folder for temporary files."
             )
         left = None if self._has_compiled else memory_left()
         if left and left.bytes < COMPILER:
             raise DeviceError(
-                f"PoCL's compiler takes about {in_words(COMPILER)} of memory; "
-                f"{in_words(left.bytes)} are left by {left.by}; allow more for the first run"
+                f"PoCL's compiler needs about {in_words(COMPILER)} of memory, but "
+                f"{in_words(left.bytes)} are left by {left.by}. Allow more for the first run."
             )
         PoclBuilder._has_compiled = True
 

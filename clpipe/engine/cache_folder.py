@@ -73,8 +73,8 @@ def is_private(folder: Path) -> bool:
         return False
     if reason:
         log.warning(
-            "%s: %s, and what lies there is run; kernels are not kept "
-            "(chmod 700, or name another folder with %s)",
+            "%s: %s, and clpipe runs the programs in it. Kernels are therefore not cached. "
+            "Use chmod 700, or name another folder with %s.",
             *(folder, reason, VARIABLE),
         )
     return not reason
@@ -84,7 +84,8 @@ def later_runs() -> str:
     """Return in words where later runs find what is compiled now."""
     if folder := cache_folder():
         return f"later runs find them in {folder}"
-    return f"later runs do so again, because they cannot be kept in {wanted_folder() or 'a home'}"
+    place = wanted_folder() or "the home directory"
+    return f"later runs compile them again, because they cannot be cached in {place}"
 
 
 def pocl_folder() -> Path | None:
@@ -110,6 +111,6 @@ def pocl_problem() -> str:
     if process_folder():
         return ""
     return (
-        "PoCL needs a folder for temporary files that can be written to and run from (no "
-        f"'noexec'), with {ROOM >> 20} MiB of room; name one with TMPDIR"
+        f"PoCL needs a writable folder for temporary files with {ROOM >> 20} MiB of free space, "
+        "mounted without 'noexec'. Set TMPDIR to such a folder"
     )

@@ -86,7 +86,7 @@ def difference(one: Array | None, two: Array | None) -> Difference:
     """
     if one is None or two is None or one.shape != two.shape:
         shapes = [None if image is None else image.shape for image in (one, two)]
-        raise ValueError(f"found images of shapes {shapes}; expected two of one shape")
+        raise ValueError(f"the images have the shapes {shapes}, but both must have one shape")
     apart = np.nan_to_num(np.abs(one.astype(np.float64) - two), nan=np.inf)
     return Difference(apart.size, int(np.count_nonzero(apart)), float(apart.max()))
 

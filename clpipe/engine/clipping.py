@@ -52,7 +52,7 @@ def clipping_text(share: float) -> str:
     """The warning about a share of clipped pixels.
 
     >>> clipping_text(0.997)
-    '99.7 % of its pixels are clipped; are its values 0 to 255, or is exposure.ev too high?'
+    '99.7 % of its pixels are clipped. Check exposure.ev, and whether its values are 0 to 255.'
     """
     text = f"{100 * share:.3g} % of its pixels are clipped"
-    return f"{text}; are its values 0 to 255, or is exposure.ev too high?"
+    return f"{text}. Check exposure.ev, and whether its values are 0 to 255."

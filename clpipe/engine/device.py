@@ -165,7 +165,7 @@ class Device:
         Raises:
             DeviceError: the device cannot be opened again.
         """
-        log.warning("%s failed, and is opened again", self.info.label)
+        log.warning("%s failed. It is opened again.", self.info.label)
         forget_programs(self.info, self._programs)
         self._open()
 
@@ -229,7 +229,10 @@ def open_devices(
     """
     if any(selector.lower() == "numpy" for selector in selectors):
         if len(selectors) > 1:
-            raise DeviceError(f"found devices {', '.join(selectors)}; numpy is used alone")
+            named = ", ".join(selectors)
+            raise DeviceError(
+                f"devices {named}: numpy cannot be combined with other devices. Name it alone."
+            )
         return []
     chosen = choose_all(selectors, find_devices())
     processes = share[1]

@@ -88,15 +88,15 @@ def find_devices(again: bool = False) -> list[DeviceInfo]:
     global _process
     if _process not in (None, os.getpid()):
         raise DeviceError(
-            "this process was forked from one that had used OpenCL, which would hang here; let it "
-            'be spawned (multiprocessing\'s "spawn" or "forkserver"), or fork before'
+            "this process was forked from one that had used OpenCL, so OpenCL would hang here. "
+            'Use multiprocessing\'s "spawn" or "forkserver", or fork before the first use of OpenCL'
         )
     check_addresses(ADDRESSES + OF_THREAD * processors(), "an OpenCL runtime")
     _process = os.getpid()
     forced_target()
     known = verdicts(again)
     if known.listing:
-        raise DeviceError(f"OpenCL's drivers cannot be listed: {known.listing}; {remedies()}")
+        raise DeviceError(f"OpenCL's drivers cannot be listed: {known.listing}. {remedies()}")
     found: list[DeviceInfo] = []
     for platform in platforms(known.hidden):
         devices, reason = devices_of(platform, known)
@@ -120,7 +120,7 @@ def devices_of(platform: Any, known: Verdicts) -> tuple[list[Any], str]:
     import pyopencl as cl
 
     if reason := known.platforms.get(platform_id(platform)):
-        return [], f"asked for its devices, {reason}"
+        return [], f"when asked for its devices, {reason}"
     problem = pocl_problem() if is_pocl(platform.name) else ""
     try:
         return list(platform.get_devices()), problem or "it offers no device"
@@ -186,8 +186,11 @@ def remedies() -> str:
         *(["apt-get install pocl-opencl-icd (Debian, Ubuntu)"] if linux else []),
     ]
     if name := forced_target():
-        ways.insert(0, f"to unset {TARGET_VARIABLE} (it is {name})")
-    return f"what helps here: {', or '.join(ways)}; --device numpy needs none, and is slow"
+        ways.insert(0, f"unset {TARGET_VARIABLE} (it is {name})")
+    return (
+        f"On this machine, try: {', or '.join(ways)}. "
+        "To run without OpenCL, use --device numpy, which is slow."
+    )
 
 
 def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
@@ -202,7 +205,7 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
     if not devices:
         places = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES")  # where the loader looks for platforms
         limits = "".join(f" ({n} is {os.environ[n]!r})" for n in places if n in os.environ)
-        raise DeviceError(f"no OpenCL platform was found{limits}; {remedies()}")
+        raise DeviceError(f"no OpenCL platform was found{limits}. {remedies()}")
     if selector is not None:
         matching = [
             d
@@ -219,7 +222,7 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
     usable = [d for d in devices if d.type in ("GPU", "CPU") and not d.problem]
     if not usable:
         reasons = "; ".join(f"{d.label}: {d.problem or 'an emulator'}" for d in devices)
-        raise DeviceError(f"no usable OpenCL device ({reasons}); {remedies()}")
+        raise DeviceError(f"no usable OpenCL device ({reasons}). {remedies()}")
     return min(usable, key=rank)
 
 

@@ -56,6 +56,6 @@ def check_memory(sizes: Mapping[str, int], memory: int) -> None:
     """
     if sum(sizes.values()) > memory:
         raise ImageError(
-            f"a patch needs {in_words(sum(sizes.values()))} of device memory; "
-            f"allowed are {in_words(memory)}"
+            f"a patch needs {in_words(sum(sizes.values()))} of device memory, but the limit is "
+            f"{in_words(memory)}. Raise the memory limit, or use smaller patches."
         )

@@ -67,8 +67,8 @@ class Recovery:
                         raise
                     width, height = work.size
                     raise ImageError(
-                        f"{width}x{height} pixels: {device.info.label} is out of memory, in tiles "
-                        f"of any size; others may be using it ({full})"
+                        f"{width}x{height} pixels: {device.info.label} is out of memory, even with "
+                        f"the smallest tiles ({full}). Close other programs that use the device."
                     ) from None
             try:
                 if isinstance(flight, Exception):
@@ -133,8 +133,8 @@ class Recovery:
         self._failures += 1
         if self._failures >= FAILURES:
             raise DeviceError(
-                f"{self._device.info.label} failed at {self._failures} images in a row and is "
-                f"given up: {error}"
+                f"{self._device.info.label} failed for {self._failures} images in a row, so it is "
+                f"no longer used: {error}"
             ) from None
 
 

@@ -92,8 +92,8 @@ def check_sizes(plan: Plan, width: int, height: int) -> None:
         own = sizes[kept.level]
         if own != last:
             raise ImageError(
-                f"the image of {name} has {own[0]}x{own[1]} pixels, but the last one "
-                f"{last[0]}x{last[1]}; patches are cut of images of one size"
+                f"the image after {name} has {own[0]}x{own[1]} pixels, but the last image has "
+                f"{last[0]}x{last[1]}. Patches need images of one size. Do not keep {name}."
             )
 
 
@@ -292,7 +292,7 @@ class Runner:
         shape = image.shape[2] if image.ndim == 3 else 1
         if image.ndim not in (2, 3) or shape != channels or 0 in image.shape:
             raise ImageError(
-                f"found an image of shape {image.shape}, but the chain starts on "
+                f"the image has shape {image.shape}, but the chain starts on "
                 f"{self.chain.source.label} with {channels} channel(s)"
             )
 

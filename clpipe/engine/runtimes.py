@@ -40,13 +40,13 @@ def lanes_for(type_: str, platform: Any, device: Any, target: Target) -> int:
 def problem_with(type_: str, platform: Any, device: Any) -> str:
     """Why a device cannot be used, as far as can be told without trying it; "" where it can."""
     if type_ == "accelerator":
-        return "neither a GPU nor a CPU (an emulator or an FPGA)"
+        return "it is neither a GPU nor a CPU, but an emulator or an FPGA"
     if not device.available or not device.compiler_available:
         return "it is not available or has no compiler"
     if is_pocl(platform.name) and not shutil.which("ld"):
         return (
-            "PoCL needs a linker and there is no 'ld' on the PATH "
-            "(Debian, Ubuntu: apt-get install binutils; conda: binutils)"
+            "PoCL needs a linker, but there is no 'ld' on the PATH. "
+            "Install binutils (Debian, Ubuntu: apt-get install binutils)"
         )
     return pocl_problem() if is_pocl(platform.name) else ""
 

@@ -321,10 +321,10 @@ def tiling_of(
         least = cut.amid(across, 4)
         needs, wants = (buffer_sizes(plan, extents, ends) for extents in (least, whole))
         raise ImageError(
-            f"{width}x{height} pixels need {in_words(sum(wants.values()))} of "
-            f"device memory, or in the smallest tiles {in_words(sum(needs.values()))}, with "
-            f"{in_words(max(needs.values()))} in one piece; allowed are {in_words(memory)}, with "
-            f"{in_words(largest)} in one piece"
+            f"{width}x{height} pixels need {in_words(sum(wants.values()))} of device memory, or "
+            f"{in_words(sum(needs.values()))} in the smallest tiles, with a buffer of "
+            f"{in_words(max(needs.values()))}. The limit is {in_words(memory)}, with buffers of at "
+            f"most {in_words(largest)}. Raise the memory limit, or use another device."
         )
     _, columns, rows = best
     tiles = tuple(

@@ -65,7 +65,7 @@ def problem_of(device: Any, lanes: int) -> str:
     except cl.MemoryError:
         raise
     except cl.Error as error:
-        return f"it compiles nothing: {first_error(str(error))}"
+        return f"it cannot compile kernels: {first_error(str(error))}"
     source, results = samples(), np.zeros((2, COUNT), np.float32)
     flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
     src = cl.Buffer(context, flags, hostbuf=source)
@@ -76,7 +76,7 @@ def problem_of(device: Any, lanes: int) -> str:
     noisy, quotients = expected(source)
     wrong = int((results[0] != noisy).sum())
     wrong += int((np.abs(results[1] - quotients) > 4e-7 * np.abs(quotients)).sum())
-    return f"it computes {wrong} of {2 * COUNT} numbers wrongly" if wrong else ""
+    return f"{wrong} of {2 * COUNT} numbers that it computes are wrong" if wrong else ""
 
 
 def first_error(text: str) -> str:

@@ -159,7 +159,7 @@ def _run(known: Verdicts, only_listing: bool = False) -> tuple[list[dict[str, An
     if status is None:
         return lines, f"{SLOW} {LIMIT} s for a tiny kernel"
     if status >= WINDOWS_FAULT:
-        return lines, f"it ends the process ({status:#x})"
+        return lines, f"it crashes the process ({status:#x})"
     if status >= 0:
         return lines, None if status == 0 else ""
     if -status == getattr(signal, "SIGKILL", None):  # most likely for want of memory
@@ -170,7 +170,7 @@ def _run(known: Verdicts, only_listing: bool = False) -> tuple[list[dict[str, An
         name = signal.Signals(-status).name
     except ValueError:
         name = f"signal {-status}"
-    return lines, f"it ends the process ({name}){last}"
+    return lines, f"it crashes the process ({name}){last}"
 
 
 def _parsed(output: bytes) -> Iterator[dict[str, Any]]:

@@ -1,5 +1,5 @@
-"""A camera to try: one render developed on the device as its settings change, in a web page.
+"""The explorer: a web page that develops one render on the device whenever its settings change.
 
-It is above everything that develops and measures, and below the commands. Starlette and uvicorn are
-imported here alone.
+The package may import everything that develops and measures, but not the commands. Only this
+package imports Starlette and uvicorn.
 """

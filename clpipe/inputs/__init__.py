@@ -1,5 +1,5 @@
-"""Inputs: which files a run is about, and how each enters a chain.
+"""Inputs: which files a run processes, and at which stage each enters a chain.
 
-Folders, globs and manifests become jobs; renders, camera raws, dumps and kept images become pixels
-with a chain. Nothing is developed or written here. This room imports ``chain`` and below.
+Folders, globs and manifests become jobs. Renders, camera raws, dumps and kept images become pixels
+with a chain. No module here develops or writes images. The package imports ``chain`` and below.
 """

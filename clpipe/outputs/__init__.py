@@ -1,11 +1,11 @@
-"""What is written of an image: which pictures, in which formats, with which sidecar.
+"""Output files: which pictures of an image are written, in which formats, with which sidecar.
 
-:mod:`~clpipe.outputs.plan` names the files that a run writes, :mod:`~clpipe.outputs.recipes` says
-how each picture is made, :mod:`~clpipe.outputs.existing` finds what is there already, and
+:mod:`~clpipe.outputs.plan` names the files that a run writes. :mod:`~clpipe.outputs.recipes` lists
+the steps of each picture. :mod:`~clpipe.outputs.existing` finds the files of earlier runs, and
 :mod:`~clpipe.outputs.writer` writes the rest. :mod:`~clpipe.outputs.sidecar` reads and writes
-sidecars, :mod:`~clpipe.outputs.record` says what is in them. ``photographs`` and ``annotations``
-read an output folder by its sidecars.
+sidecars, and :mod:`~clpipe.outputs.record` defines their contents. ``photographs`` and
+``annotations`` read an output directory through its sidecars.
 
-The room decides names and contents, and leaves encoding to ``images``. It imports ``inputs`` and
+The package decides names and contents; ``images`` encodes the files. It imports ``inputs`` and
 below, and starts no threads.
 """

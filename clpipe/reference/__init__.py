@@ -1,5 +1,5 @@
-"""NumPy twins of ``kernels/lib``: the same definitions, file by file, for the references.
+"""NumPy versions of ``kernels/lib``: the same definitions, file by file, for the references.
 
-A function of a kernel header has the same name here and, for everything up to the raw, gives the
-same bits. Nothing here knows stages or devices. This room imports ``base`` only.
+Each function of a kernel header has the same name here. Up to the raw, both return the same bits.
+No module here knows stages or devices. The package imports only ``base``.
 """

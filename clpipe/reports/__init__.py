@@ -1,5 +1,5 @@
-"""Reports of runs: what an output folder has, looked at, as one HTML file.
+"""Reports of runs: the contents of an output directory as one HTML file.
 
-May import: base, stage, images, chain, outputs, batch, analysis and the rooms below them. Only this
-room imports Jinja2.
+The package may import base, stage, images, chain, outputs, batch, analysis and the packages below
+them. Only this package imports Jinja2.
 """

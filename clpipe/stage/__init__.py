@@ -4,8 +4,8 @@ A stage is declared once, in ``clpipe/stages/<name>.py``, as a :class:`Stage` wi
 :class:`Method` classes. The fields of a method are its parameters; their validation, help,
 ``--set``, kernel arguments and sidecar entries are all derived from that declaration.
 
-What a stage file may import is all in ``__all__`` here, and only from here. The room imports
-``camera``, ``reference`` and ``base``; it knows nothing of chains, devices and files.
+A stage file may import from this package only, and only the names in ``__all__``. The package
+imports ``camera``, ``reference`` and ``base``. It does not know chains, devices or files.
 """
 
 from clpipe.base.types import Array, Floats

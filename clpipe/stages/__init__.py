@@ -1,8 +1,8 @@
 """The stages, one in each file or folder, and the default chain.
 
 A file declares one stage: its methods, their parameters, kernels and NumPy references. Every module
-here must define ``STAGE``: :func:`own_stages` imports them all, so nothing else lists them. Code
-that several stages share belongs in ``reference`` or ``stage``. This room imports ``images``,
+here must define ``STAGE``: :func:`own_stages` imports them all, so no other list is needed. Code
+that several stages share belongs in ``reference`` or ``stage``. The package imports ``images``,
 ``stage``, ``reference``, ``camera`` and ``base``.
 """
 

@@ -1,6 +1,6 @@
-"""A camera's raw noise on PyTorch's tensors, inside a training loop, on a CPU or a GPU.
+"""Raw noise on PyTorch tensors, inside a training loop, on a CPU or a GPU.
 
-It is PyTorch alone: no OpenCL, no files, no processes of its own. It needs the package ``torch``.
+The package uses only PyTorch: no OpenCL, no files and no processes. It needs the package ``torch``.
 """
 
 from typing import TYPE_CHECKING, Any
