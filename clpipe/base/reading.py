@@ -93,7 +93,7 @@ def check_exists(path: Path) -> None:
     while not os.path.exists(place.parent) and place != place.parent:
         place, rest = place.parent, place.name / rest
     near = _similar(place)
-    hint = f"; did you mean {near / rest}?" if near else ""
+    hint = f". Did you mean {near / rest}?" if near else ""
     raise MissingError(str(path), f"{path}: there is no such file or folder{hint}")
 
 

@@ -227,17 +227,17 @@ def candidates(platform: Any, device: Any) -> list[Target]:
     if features is None or not _chooses_by_name(platform.version) or _place(device) is None:
         return [Target(own, f"PoCL's choice{f'; {VARIABLE} cannot change it' if forced else ''}")]
     if forced == DRIVERS:
-        return [Target(own, f"PoCL's choice, as {VARIABLE} says")]
+        return [Target(own, f"PoCL's choice, set by {VARIABLE}")]
     if forced:
-        return [Target(forced, f"{VARIABLE} names it")]
+        return [Target(forced, f"set by {VARIABLE}")]
     target = target_for(features)
     if row_of(own) == target:
-        return [Target(own, "PoCL's choice, and what the CPU's features say")]
-    failed = f"since {target}, which the CPU's features say, does not work"
+        return [Target(own, "PoCL's choice, which matches the CPU's features")]
+    failed = f"because {target}, which matches the CPU's features, does not work"
     return [
-        Target(target, f"the CPU's features say so; PoCL takes it for {own}"),
+        Target(target, f"from the CPU's features; PoCL's choice is {own}"),
         *([] if own == "generic" else [Target(own, f"PoCL's choice, {failed}")]),
-        Target("x86-64", f"what every such CPU has, {failed}"),
+        Target("x86-64", f"works on every such CPU, {failed}"),
     ]
 
 

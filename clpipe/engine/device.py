@@ -65,7 +65,10 @@ class Device:
                 self._programs.context, self.info.alignment if self.info.in_place else None
             )
         except self._cl.Error as error:
-            raise DeviceError(f"{self.info.label} cannot be opened: {error}") from None
+            raise DeviceError(
+                f"{self.info.label} cannot be opened: {error}. Close other programs that use it, "
+                "or choose another device."
+            ) from None
 
     @property
     def bytes_held(self) -> int:

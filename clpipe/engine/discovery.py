@@ -217,7 +217,10 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
             raise DeviceError(one_of("device", selector, [*names, "numpy"]))
         usable = [d for d in matching if not d.problem]
         if not usable:
-            raise DeviceError(f"device {matching[0].label}: {matching[0].problem}")
+            raise DeviceError(
+                f"device {matching[0].label}: {matching[0].problem}. To find another one, run "
+                "clpipe devices."
+            )
         return min(usable, key=rank)
     usable = [d for d in devices if d.type in ("GPU", "CPU") and not d.problem]
     if not usable:

@@ -53,7 +53,10 @@ class Programs:
             with kept_signals():
                 self.context = cl.Context([info.handle])
         except cl.Error as error:
-            raise DeviceError(f"{info.label} cannot be opened: {error}") from None
+            raise DeviceError(
+                f"{info.label} cannot be opened: {error}. Close other programs that use it, or "
+                "choose another device."
+            ) from None
         self._programs: BoundedCache[Any] = BoundedCache(PROGRAMS)
         self._lock = threading.Lock()  # lets one thread compile at a time
         self._options = ["-cl-std=CL1.2", "-w"]

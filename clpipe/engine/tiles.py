@@ -25,8 +25,8 @@ from clpipe.engine.ops import Op
 from clpipe.engine.work_items import PARTIALS, RUN, columns_of, round_up
 from clpipe.reference.resample import Axis
 
-# Larger tiles are not faster, and allocating memory takes time. 600 megapixels took 28 s in tiles
-# of 1 GiB, and 39 s in tiles of 4 GiB (PoCL, two busy cores).
+# Larger tiles are not faster, and allocating memory takes time. A render of 600 megapixels took
+# 28 s in tiles of 1 GiB, and 39 s in tiles of 4 GiB (PoCL, two busy cores).
 LARGEST_TILE = 2**30  # bytes
 
 

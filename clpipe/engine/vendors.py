@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError
+from clpipe.base.extras import installing
 from clpipe.base.process_folder import process_folder
 from clpipe.engine.cache_folder import prepare_environment
 
@@ -57,7 +58,8 @@ def loaded() -> Any:
     try:
         import pyopencl as cl
     except (ImportError, OSError) as error:
-        raise DeviceError(f"pyopencl cannot be loaded: {error}") from None
+        way = f"Use --device numpy, or run: {installing('--force-reinstall', 'pyopencl')}"
+        raise DeviceError(f"pyopencl cannot be loaded: {error}. {way}") from None
     return cl
 
 
@@ -89,7 +91,10 @@ def platforms(hidden: Collection[str] = ()) -> list[Any]:
     except cl.Error as error:
         if "PLATFORM_NOT_FOUND" in str(error):
             return []
-        raise DeviceError(f"OpenCL cannot be used: {error}") from None
+        raise DeviceError(
+            f"the OpenCL platforms cannot be listed: {error}. Reinstall the driver of your GPU, or "
+            "use --device numpy."
+        ) from None
 
 
 @contextmanager
