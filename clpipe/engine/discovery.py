@@ -87,7 +87,7 @@ def find_devices(again: bool = False) -> list[DeviceInfo]:
     if _process not in (None, os.getpid()):
         raise DeviceError(
             "this process was forked from one that had used OpenCL, so OpenCL would hang here. "
-            'Use multiprocessing\'s "spawn" or "forkserver", or fork before the first use of OpenCL'
+            'Use multiprocessing\'s "spawn" or "forkserver", or fork before OpenCL is used.'
         )
     check_addresses(ADDRESSES + OF_THREAD * processors(), "an OpenCL runtime")
     _process = os.getpid()

@@ -138,7 +138,7 @@ class Recovery:
         if self._failures >= FAILURES:
             raise DeviceError(
                 f"{self._device.info.label} failed for {self._failures} images in a row, so it is "
-                f"no longer used: {error}"
+                f"no longer used: {error}. To choose another one, run clpipe devices."
             ) from None
 
 

@@ -298,9 +298,10 @@ class Runner:
         channels = len(self.chain.source.channels)
         shape = image.shape[2] if image.ndim == 3 else 1
         if image.ndim not in (2, 3) or shape != channels or 0 in image.shape:
+            axes = "(height, width)" if channels == 1 else f"(height, width, {channels})"
             raise ImageError(
                 f"the image has shape {image.shape}, but the chain starts on "
-                f"{self.chain.source.label} with {channels} channel(s)"
+                f"{self.chain.source.label}, {axes}"
             )
 
     def _estimates_for(self, width: int, height: int) -> dict[str, dict[str, float]]:
