@@ -94,7 +94,9 @@ def test_devices_that_cannot_be_used(devices, monkeypatch):
     with pytest.raises(DeviceError, match="no OpenCL platform"):
         choose(None, [])
     monkeypatch.setenv("OCL_ICD_VENDORS", "/nowhere")
-    with pytest.raises(DeviceError, match=r"was found .OCL_ICD_VENDORS is '/nowhere'.; what helps"):
+    with pytest.raises(
+        DeviceError, match=r"was found .OCL_ICD_VENDORS is '/nowhere'.. On this machine, try"
+    ):
         choose(None, [])
 
 
@@ -171,7 +173,7 @@ def test_what_drivers_say_of_hardware(device, monkeypatch):
 
 def test_devices_are_opened():
     assert open_devices(["numpy"]) == []
-    with pytest.raises(DeviceError, match="found devices pocl, NumPy; numpy is used alone"):
+    with pytest.raises(DeviceError, match="devices pocl, NumPy: numpy cannot be combined"):
         open_devices(["pocl", "NumPy"])
     (one,) = open_devices(["0", "0"], memory=2**30)
     assert one.memory == 2**30
@@ -239,7 +241,7 @@ def test_after_an_image_that_is_too_large_the_next_one_works(device):
     image = np.full((20, 30, 3), 0.5, np.float16)
     expected = runner.run(image, "k").encoded
     for _ in range(2):
-        with pytest.raises(ImageError, match="allowed are 97"):
+        with pytest.raises(ImageError, match=r"[Tt]he limit is 97"):
             runner.run(np.zeros((1, 30000, 3), np.float16), "k")
     assert np.array_equal(runner.run(image, "k").encoded, expected)
 
@@ -270,5 +272,5 @@ def test_pixels_into_an_array_that_is_there(device):
     result = runner.run(image, "k", RunOptions(into=room))
     assert result.encoded is room
     assert np.array_equal(room, runner.run(image, "k").encoded)
-    with pytest.raises(ValueError, match=r"into is \(20, 30\)"):
+    with pytest.raises(ValueError, match=r"into has shape \(20, 30\)"):
         runner.run(image, "k", RunOptions(into=room[..., 0]))

@@ -103,7 +103,7 @@ def test_a_device_that_fails_at_everything_is_given_up(device, monkeypatch):
     for _ in range(FAILURES - 1):
         with pytest.raises(DeviceFailedError):
             runner.run(IMAGE, "k")
-    with pytest.raises(DeviceError, match="failed at 3 images in a row and is given up"):
+    with pytest.raises(DeviceError, match="failed for 3 images in a row, so it is no longer used"):
         runner.run(IMAGE, "k")
     with pytest.raises(DeviceError, match="OUT_OF_RESOURCES"):
         Runner(runner.chain, Device(device.info)).compile()

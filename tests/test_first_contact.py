@@ -68,8 +68,8 @@ def folder(write_exr):
             "to make one from a DNG or a noise model, use 'clpipe ca",
         ),
         ((*RUN, "--set", "camera.iso=800"), "use --iso 800"),
-        (("run", "rendr.exr", "-o", "out"), "rendr.exr: {}; did you mean render.exr?"),
-        (("run", "rendrs/a.exr", "-o", "out"), "rendrs/a.exr: {}; did you mean renders/a.exr?"),
+        (("run", "rendr.exr", "-o", "out"), "rendr.exr: {}. Did you mean render.exr?"),
+        (("run", "rendrs/a.exr", "-o", "out"), "rendrs/a.exr: {}. Did you mean renders/a.exr?"),
         (("run", "pngs", "-o", "out"), "the folder has 3 .png. Finished pictures are not linear"),
         (("explore", "pngs"), "For renders, add --transfer srgb; for photographs, use -c unproc"),
     ],
@@ -145,7 +145,7 @@ def test_formats_have_other_names(clpipe, folder, name):
 def test_a_file_in_the_place_of_a_folder_is_named(clpipe, folder, command, output):
     Path("in_the_way").touch()
     said = clpipe(*command.split(), "-o", output, status=2).stderr
-    assert said == "clpipe: --output: in_the_way is a file; name a folder to write to\n"
+    assert said == "clpipe: --output: in_the_way is a file. Name an output directory.\n"
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_an_array_of_numpy_is_called_one(clpipe, folder, words):
     clpipe(*RUN, "--device", "numpy", "--format", "npy")
     words = words.format("out/render.npy")
     said = clpipe(*words.split(), status=2).stderr
-    assert said.startswith("clpipe: out/render.npy: it is an array of NumPy")
+    assert said.startswith("clpipe: out/render.npy: this is a NumPy array")
     assert "numpy.load" in said
 
 

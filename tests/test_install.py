@@ -56,7 +56,7 @@ def test_packages_that_are_missing_are_named(clpipe, monkeypatch, command, messa
     monkeypatch.setattr(extras, "find_spec", lambda name: None if name in absent else found(name))
     error = clpipe(*command, status=2).stderr
     packages = message.partition(" needs ")[2].replace(" and ", " ")
-    assert f"{message}; pip install {packages}\n" in error
+    assert f"{message}. Run: pip install {packages}\n" in error
 
 
 def test_no_text_installs_another_project_of_that_name():

@@ -146,7 +146,7 @@ def test_nothing_is_put_elsewhere(tmp_path):
 def test_without_room_to_compile_pocl_is_not_asked(tmp_path, monkeypatch):
     monkeypatch.setattr(builders, "has_room", lambda _: False)
     builder = PoclBuilder(None, Store(None), tmp_path / "pocl")
-    with pytest.raises(DeviceError, match=r"needs 32 MiB of room there .* TMPDIR"):
+    with pytest.raises(DeviceError, match=r"needs 32 MiB of free space there .* TMPDIR"):
         builder.build(TEXT, [])
     monkeypatch.undo()
     with pytest.raises(DeviceError, match=r"removed while this process used it .* start again"):
@@ -154,7 +154,7 @@ def test_without_room_to_compile_pocl_is_not_asked(tmp_path, monkeypatch):
     monkeypatch.setattr(builders, "has_room", lambda _: True)
     monkeypatch.setattr(PoclBuilder, "_has_compiled", False)
     monkeypatch.setattr(builders, "memory_left", lambda: Left(50 << 20, "ulimit -v"))
-    with pytest.raises(DeviceError, match=r"takes about 112.0 MiB .* 50.0 MiB are left by ulimit"):
+    with pytest.raises(DeviceError, match=r"needs about 112.0 MiB .* 50.0 MiB are left by ulimit"):
         builder.build(TEXT, [])
 
 

@@ -21,7 +21,7 @@ def test_sizes(text, size):
     "text", ["", "M", "8X", "-1G", "0", "1e3", "nan", "8 G G", "9" * 30, "9" * 400]
 )
 def test_what_is_no_size(text):
-    with pytest.raises(RequestError, match=r"expected a size such as 512M or 8G"):
+    with pytest.raises(RequestError, match=r"is not a size. Use a size such as 512M or 8G"):
         parse_size(text)
 
 

@@ -220,7 +220,7 @@ def test_address_space_counts(tmp_path, monkeypatch):
 
 def test_no_runtime_is_loaded_where_addresses_are_too_few(monkeypatch):
     monkeypatch.setattr(memory, "address_space", lambda: 2**20)
-    with pytest.raises(DeviceError, match=r"an OpenCL runtime takes .* left by ulimit -v, which"):
+    with pytest.raises(DeviceError, match=r"an OpenCL runtime needs .* left by ulimit -v, which"):
         find_devices()
 
 
@@ -245,7 +245,7 @@ def test_the_program_starts_in_no_less_than_it_needs():
     text = "import sys; from clpipe.commands.main import main; main(['run', 'a', '-o', 'b'])"
     done = limited(text, 150)
     assert done.returncode == 3
-    assert "loading clpipe's libraries takes about" in done.stderr
+    assert "loading clpipe's libraries needs about" in done.stderr
     assert len(done.stderr.splitlines()) == 1
 
 

@@ -391,7 +391,7 @@ def test_images_of_two_sizes_cannot_both_be_cut(renders, device):
     stages = ["exposure", "mosaic", "sensor_noise", "quantize", "normalize", "demosaic", "resize"]
     small = {"stages": stages, "demosaic": {"method": "bilinear"}, "resize": {"scale": 0.5}}
     made = api.Dataset(renders, device=device, iso=ISO, patch=8, raw="mosaic", **small)
-    with pytest.raises(ImageError, match=r"r0\.exr: the image of quantize has 64x48 .* 32x24"):
+    with pytest.raises(ImageError, match=r"r0\.exr: the image after quantize has 64x48 .* 32x24"):
         made[0]
 
 

@@ -87,7 +87,7 @@ def test_reprs_are_short():
 
 def test_what_cannot_be_assigned_refuses():
     camera = clpipe.Pipeline(device="numpy")
-    with pytest.raises(AttributeError, match=r"cannot set iso: .* make another one with iso="):
+    with pytest.raises(AttributeError, match=r"cannot set iso: .* Create another one with iso="):
         camera.iso = 800
     with pytest.raises(AttributeError, match="cannot set truth"):
         clpipe.Dataset(STILL_LIFE).truth = True

@@ -54,7 +54,7 @@ def test_what_cannot_be_is_refused_at_once(renders):
         ({"jobs": -1}, "found jobs -1; expected a whole number from 1 to 1024"),
         ({"webdataset": 0}, "found webdataset 0; expected a whole number from 1 to"),
         ({"max_pixels": 0}, "found max_pixels 0; expected a whole number from 1 to"),
-        ({"memory": 0}, "--memory: found '0'; expected a size"),
+        ({"memory": 0}, "--memory: '0' is not a size"),
         ({"format": "gif"}, "unknown format 'gif'"),
         ({"transfer": "x"}, "found transfer 'x'; expected 'srgb', 'linear' or None"),
         ({"bracket": [1, 1]}, r"--bracket: found \[1, 1\], with \+1 EV twice"),

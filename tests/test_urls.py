@@ -306,7 +306,7 @@ def test_manifests_behind_urls_do_not_lead_out_of_their_bucket(bucket, clpipe, t
     for path in (b"../../../../tmp/x.exr", b"/etc/x.exr", b"..\\x.exr"):
         bucket.pipe_file("/b/lists/b.csv", b"path\n" + path + b"\n")
         told = clpipe("run", "flaky://b/lists/b.csv", "-o", "p", *RUN, status=2).stderr
-        assert "leads out of flaky://b" in told or "expected a URL without" in told
+        assert "leads out of flaky://b" in told or "a URL may not contain" in told
 
 
 def test_a_listing_that_fails_is_no_empty_bucket(bucket, clpipe, monkeypatch):

@@ -42,7 +42,7 @@ def test_what_ends_the_process_is_passed_over_and_the_rest_tried(program):
         esac""")
     found = tried(Verdicts())
     assert found.attempts == {
-        "a": "it ends the process (SIGILL): no such instruction",
+        "a": "it crashes the process (SIGILL): no such instruction",
         "b": "",
     }
     assert found.lasting and found.problems
@@ -53,7 +53,7 @@ def test_a_platform_that_ends_the_process_is_named(program):
         *SIGABRT*) ;;
         *) {say(at="platform", name="A")}; kill -ABRT $$;;
         esac""")
-    assert tried(Verdicts()).platforms == {"A": "it ends the process (SIGABRT)"}
+    assert tried(Verdicts()).platforms == {"A": "it crashes the process (SIGABRT)"}
 
 
 def test_the_driver_that_ends_the_listing_is_hidden(program, monkeypatch):
@@ -63,9 +63,9 @@ def test_the_driver_that_ends_the_listing_is_hidden(program, monkeypatch):
         *'"bad":'*) {say(at="list")};;
         *) {say(at="list")}; kill -SEGV $$;;
         esac""")
-    assert tried(Verdicts()).hidden == {"bad": "it ends the process (SIGSEGV)"}
+    assert tried(Verdicts()).hidden == {"bad": "it crashes the process (SIGSEGV)"}
     monkeypatch.setattr(verdicts, "installed_drivers", list)
-    assert tried(Verdicts()).listing == "it ends the process (SIGSEGV)"
+    assert tried(Verdicts()).listing == "it crashes the process (SIGSEGV)"
 
 
 @pytest.mark.parametrize("script", ["exit 1", "kill -KILL $$", f"{say(at='list')}; kill -KILL $$"])
@@ -137,10 +137,11 @@ def test_this_machines_device_computes_as_numpy_does(device, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(trial, "TEXT", trial.TEXT.replace("a / divisor", "a * divisor"))
         assert (
-            trial.problem_of(info.handle, info.lanes) == "it computes 1024 of 2048 numbers wrongly"
+            trial.problem_of(info.handle, info.lanes)
+            == "1024 of 2048 numbers that it computes are wrong"
         )
         patch.setattr(trial, "TEXT", "this is no C")
-        assert trial.problem_of(info.handle, info.lanes).startswith("it compiles nothing: ")
+        assert trial.problem_of(info.handle, info.lanes).startswith("it cannot compile kernels: ")
 
 
 def test_the_cpu_that_llvm_does_not_know_is_found(device):
@@ -152,7 +153,7 @@ def test_the_cpu_that_llvm_does_not_know_is_found(device):
         problem = trial.problem_of(info.handle, 8)
     finally:
         compile_for(info.handle, info.target)
-    assert problem == "it compiles nothing: unknown target CPU 'generic'"
+    assert problem == "it cannot compile kernels: unknown target CPU 'generic'"
 
 
 @pytest.mark.slow
@@ -167,30 +168,28 @@ def test_what_fails_is_passed_over_and_what_helps_is_said(device, monkeypatch):
     platform, handle = device.info.handle.platform, device.info.handle
     failed = dict.fromkeys(
         [attempt(platform, handle, t) for t in discovery.candidates(platform, handle)],
-        "it ends the process (SIGILL)",
+        "it crashes the process (SIGILL)",
     )
-    known = Verdicts(attempts=failed, hidden={"/etc/bad.icd": "it ends the process (SIGABRT)"})
+    known = Verdicts(attempts=failed, hidden={"/etc/bad.icd": "it crashes the process (SIGABRT)"})
     monkeypatch.setattr(discovery, "verdicts", lambda *_, **__: known)
     monkeypatch.setattr(discovery, "platforms", lambda _: [platform])
     devices = find_devices()
     rows = device_rows(devices)
-    assert rows[0]["status"] == "passed over: it ends the process (SIGILL)"
+    assert rows[0]["status"] == "passed over: it crashes the process (SIGILL)"
     assert rows[1]["platform"] == "/etc/bad.icd" and "SIGABRT" in rows[1]["status"]
     monkeypatch.setattr(discovery.this_system, "system", lambda: "Linux")
     monkeypatch.setattr(discovery.this_system, "machine", lambda: "x86_64")
     with pytest.raises(DeviceError, match=r"SIGILL.*intel-opencl-rt.*pocl-opencl-icd.*numpy"):
         choose(None, devices)
     monkeypatch.setattr(discovery.this_system, "machine", lambda: "aarch64")
-    with pytest.raises(
-        DeviceError, match=r"helps here: your GPU's driver, or apt-get install pocl"
-    ):
+    with pytest.raises(DeviceError, match=r"try: your GPU's driver, or apt-get install pocl"):
         choose(None, devices)
-    gone = Verdicts(platforms={platform_id(platform): "it ends the process (SIGABRT)"})
+    gone = Verdicts(platforms={platform_id(platform): "it crashes the process (SIGABRT)"})
     monkeypatch.setattr(discovery, "verdicts", lambda *_, **__: gone)
     monkeypatch.setattr(cl.Platform, "get_devices", lambda _: pytest.fail("it would end here"))
-    assert "asked for its devices, it ends" in find_devices()[0].problem
+    assert "when asked for its devices, it crashes" in find_devices()[0].problem
     monkeypatch.setattr(discovery, "verdicts", lambda *_, **__: Verdicts(listing="it ends"))
-    with pytest.raises(DeviceError, match=r"drivers cannot be listed: it ends; what helps here"):
+    with pytest.raises(DeviceError, match=r"listed: it ends. On this machine, try"):
         find_devices()
 
 

@@ -2,7 +2,7 @@
 
     python -m tools.prose [PATH...]
 
-It reads Markdown, and of Python files the docstrings, comments and messages. Code, tables and names
+It reads Markdown, and in Python files docstrings, comments and messages. Code, tables and names
 in backquotes are skipped. Without paths it checks :data:`CHECKED`. The exit status is 1 if it finds
 anything. The rules are those of CONTRIBUTING.md, "Writing".
 """
@@ -20,11 +20,13 @@ from tools import ROOT
 # The texts that follow the rules so far. Add to this list what you have rewritten.
 CHECKED = (
     "tools/prose.py",
+    "clpipe/base",
     "clpipe/batch",
     "clpipe/dataset",
     "clpipe/explorer",
     "clpipe/pipeline.py",
     "clpipe/reports",
+    "clpipe/engine",
     "clpipe/stage/signal.py",
     "clpipe/torch/raw_noise.py",
     "docs/batches.md",
@@ -166,6 +168,8 @@ def texts_of(path: Path) -> Iterator[Text]:
             text = node.value if isinstance(node, ast.Constant) else message_of(node)
             if isinstance(text, str) and len(text.split()) > 3:
                 yield from paragraphs(text, node.lineno)
+            if isinstance(text, str) and len(text.split()) > 3 and "__global " not in text:
+                yield node.lineno, text
     comments: list[Text] = []  # lines, of which those on lines of their own belong together
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:

@@ -1,5 +1,6 @@
-"""Helpers that every other room may use: errors, array types, texts, memory, files, clocks.
+"""Helpers for every other package: errors, array types, text, memory, files, clocks.
 
-Nothing here knows what an image, a stage or a device is. ``system`` has what only some systems
-have, and what stands in for it. This room imports the standard library, NumPy, pydantic and fsspec.
+No module here knows images, stages or devices. ``system`` contains the functions that only some
+operating systems have, and their substitutes. The package imports the standard library, NumPy,
+pydantic and fsspec.
 """

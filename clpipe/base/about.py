@@ -1,9 +1,8 @@
 """The version of this program, in one place; ``pyproject.toml`` reads it from here.
 
-There are two, because they answer two questions. :data:`__version__` is the release that this is,
-or becomes: it marks files as clpipe's. :func:`full_version` says which code it was, for people:
-``--version``, sidecars, measurements. Neither decides what a run makes again: that is the digest of
-:mod:`clpipe.outputs.program`.
+:data:`__version__` is the present or next release. It marks files as written by clpipe.
+:func:`full_version` also identifies the commit, for ``--version``, sidecars and measurements.
+Neither decides which images a run recomputes; the digest of :mod:`clpipe.outputs.program` does.
 """
 
 from functools import cache
@@ -19,15 +18,17 @@ _ARCHIVED = "$Format:%h %(describe:tags=true)$"  # git archive fills it in; see 
 
 @cache
 def full_version() -> str:
-    """The version with the commit, as PEP 440 writes it.
+    """Return the version with the commit, in the form of PEP 440.
 
-    ``0.1.0`` is the commit with the tag ``v0.1.0``, ``0.1.0.post5+g1234567`` the fifth one after
-    it, and ``0.1.0.dev632+g1234567`` one of 632 before it; ``dev0`` where their number is not
-    known, as in a shallow clone. What ends in ``dirty`` has other files in ``clpipe`` or
-    ``kernels`` than the commit. A wheel or an sdist says what its checkout said when it was built,
-    and a copy of a checkout that has no history says ``0.1.0.dev0+unknown``.
+    ``0.1.0`` is the commit with the tag ``v0.1.0``. ``0.1.0.post5+g1234567`` is the fifth commit
+    after this tag. ``0.1.0.dev632+g1234567`` is a commit before the tag, number 632 of the history.
+    The number is 0 if it is unknown, for example in a shallow clone. A copy of a checkout without
+    its history has the version ``0.1.0.dev0+unknown``.
 
-    It is found when it is first asked for: git takes longer than importing clpipe.
+    The version ends in ``dirty`` if files in ``clpipe`` or ``kernels`` differ from the commit. A
+    wheel or an sdist has the version of the checkout from which it was built.
+
+    The version is computed at the first call, because git takes longer than importing clpipe.
     """
     from pathlib import Path
 
@@ -36,7 +37,7 @@ def full_version() -> str:
 
 
 def _frozen(root: "Path") -> str:
-    """What an sdist or an installed wheel says of itself; "" where this is neither."""
+    """Return the version in the metadata of an sdist or an installed wheel; "" if there is none."""
     said = "Version: "
     for path in (root / "PKG-INFO", *root.glob("clpipe-*.dist-info/METADATA")):
         if path.is_file():
@@ -46,11 +47,11 @@ def _frozen(root: "Path") -> str:
 
 
 def _of_checkout(root: "Path") -> str:
-    """What git says of a checkout; "" where there is none, or no git."""
+    """Return the version of a git checkout; "" if this is no checkout or git is missing."""
     import subprocess
 
-    # Named, because variables may name others (within hooks), and root's git would refuse to look
-    # into another user's checkout (within containers). Who owns it owns the code that runs here.
+    # The folders are explicit for two reasons. In hooks, variables may name other folders. In
+    # containers, root's git rejects another user's checkout, although its code runs here anyway.
     git = ["git", f"--git-dir={root / '.git'}", f"--work-tree={root}", "--no-optional-locks"]
 
     def said(*arguments: str) -> str:
@@ -73,18 +74,18 @@ def _of_checkout(root: "Path") -> str:
 
 
 def _of_archive(filled: str) -> str:
-    """The version of what git archive has filled in; "" where it has not."""
+    """Return the version that ``git archive`` has filled in; "" if it has not."""
     commit, _, described = filled.partition(" ")
     return "" if commit.startswith("$") else _named(described, f"g{commit}", 0)
 
 
 def _named(described: str, commit: str, count: int) -> str:
-    """The name of a version.
+    """Return the version of a commit.
 
     Args:
-        described: what ``git describe`` says, such as v0.1.0 or v0.1.0-5-g1234567.
-        commit: its name.
-        count: how many commits there are.
+        described: the output of ``git describe``, such as v0.1.0 or v0.1.0-5-g1234567.
+        commit: the commit's name, such as g1234567.
+        count: the number of commits up to this one; 0 if unknown.
     """
     tag, _, since = described.partition("-")
     if tag != f"v{__version__}":

@@ -1,4 +1,4 @@
-"""Caches in memory: values by their keys, of which those are kept that were used last."""
+"""Caches in memory, which drop the least recently used values."""
 
 import threading
 from collections import OrderedDict
@@ -9,9 +9,9 @@ V = TypeVar("V")
 
 
 class Identity:
-    """An object as a key that is equal to no other's, for what is too large to be compared.
+    """A cache key that compares an object by identity, for objects too large to compare by value.
 
-    It keeps the object, so that no other can come to lie in its place.
+    The key holds a reference to the object, so that no other object can get the same ``id``.
     """
 
     __slots__ = ("of",)
@@ -27,14 +27,13 @@ class Identity:
 
 
 class BoundedCache(Generic[V]):
-    """Values by their keys, of which those go first that were not used for longest.
+    """A cache that drops the least recently used values above a bound.
 
-    Threads may share it. In another process it begins empty.
+    Threads may share it. A pickled copy is empty.
 
     Args:
-        bound: how much all values may take together: how many they are, or where there is a
-            ``size``, the sum of their sizes.
-        size: how much one takes.
+        bound: the most values that it keeps or, with ``size``, the largest sum of their sizes.
+        size: returns the size of a value.
 
     >>> squares = BoundedCache(2)
     >>> [squares.get(n, lambda n=n: n * n) for n in (2, 3, 2, 4)], squares.taken
@@ -51,7 +50,7 @@ class BoundedCache(Generic[V]):
         self._size = size
         self._lock = threading.Lock()  # guards the values and the sum of their sizes
         self._values: OrderedDict[Hashable, Any] = OrderedDict()
-        self.taken = 0  # of the bound
+        self.taken = 0  # the part of the bound in use
 
     def __contains__(self, key: Hashable) -> bool:
         return key in self._values
@@ -60,9 +59,9 @@ class BoundedCache(Generic[V]):
         return len(self._values)
 
     def get(self, key: Hashable, make: Callable[[], V]) -> V:
-        """The value of a key: the one that is kept, else what ``make`` gives, which is then kept.
+        """Return the value of a key. If the cache has none, call ``make`` and keep its result.
 
-        A value that is larger than the bound is not kept. What ``make`` raises is passed on.
+        A value larger than the bound is not kept. Exceptions of ``make`` are passed on.
         """
         with self._lock:
             known = self._values.get(key, self)

@@ -1,13 +1,21 @@
-"""The control groups of this process (Linux, version 1 or 2), which limit memory and processors."""
+"""The control groups of this process (Linux, version 1 or 2), which limit memory and processors.
+
+Version 1 and version 2 use different file names.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
 
 
 def group_folders(controller: str, root: Path) -> Iterator[tuple[Path, bool]]:
-    """The folders of this process's groups of a controller and of the groups above them.
+    """Yield the folders of this process's control groups and of their parents, for a controller.
 
-    With each comes whether it is of version 1, whose files have other names.
+    Args:
+        controller: "memory" or "cpu".
+        root: the root of the file system; tests use another one.
+
+    Yields:
+        Each folder, and whether its group is of version 1.
     """
     try:
         lines = (root / "proc/self/cgroup").read_text().splitlines()

@@ -1,7 +1,7 @@
-"""CPU time by step, from the clocks of the threads that do it; for benchmarks.
+"""CPU time per step, from the clocks of threads; for benchmarks.
 
-A step is marked where it is done, with :class:`CpuTimer`. That costs well under a microsecond
-unless :class:`CpuTimes` counts.
+:class:`CpuTimer` marks a step in the code. It costs well under a microsecond unless
+:class:`CpuTimes` is counting.
 """
 
 import threading
@@ -11,9 +11,9 @@ from typing import Self
 
 
 class CpuTimer(ContextDecorator):
-    """Marks what a thread does inside as a step; a context, and a decorator of functions.
+    """A context manager and decorator that marks the code inside as a step.
 
-    A step within another one counts as the inner one alone.
+    The time of an inner step does not count for the outer one.
     """
 
     def __init__(self, name: str) -> None:
@@ -30,10 +30,11 @@ class CpuTimer(ContextDecorator):
 
 
 class CpuTimes:
-    """CPU time of this process while it is entered; one at a time.
+    """A context manager that counts this process's CPU time. Only one may be active at a time.
 
-    ``seconds`` is by step, ``elsewhere`` what threads took that were in no step, such as those of a
-    device's driver.
+    Attributes:
+        seconds: the CPU time of each step, in s.
+        elsewhere: the CPU time outside steps, in s, such as that of a driver's threads.
 
     >>> with CpuTimes() as times, CpuTimer("all"):
     ...     with CpuTimer("part"):
@@ -60,25 +61,25 @@ class CpuTimes:
         self.elsewhere = time.process_time() - self._process - sum(self.seconds.values())
 
     def enter(self, name: str) -> None:
-        """Begin a step of this thread, in place of the one around it until it is left."""
+        """Begin a step of this thread. The outer step pauses until :meth:`leave`."""
         self._count()
         self._steps.append(name)
 
     def leave(self) -> None:
-        """End the latest step of this thread; one that began before the counting is not known."""
+        """End the innermost step of this thread, unless it began before the counting."""
         if self._steps:
             self._count()
             self._steps.pop()
 
     @property
     def _steps(self) -> list[str]:
-        """The steps that this thread is in, the innermost last."""
+        """The open steps of this thread, the innermost last."""
         if not hasattr(self._threads, "steps"):
             self._threads.steps = []
         return self._threads.steps
 
     def _count(self) -> None:
-        """Add what this thread took since it was last asked to the step that it is in."""
+        """Add this thread's CPU time since the last call to its innermost step."""
         now = time.thread_time()
         if self._steps:
             name, seconds = self._steps[-1], now - self._threads.since

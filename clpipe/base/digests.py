@@ -1,4 +1,4 @@
-"""SHA-256 of files, computed again only where a file has changed."""
+"""SHA-256 of files, recomputed only if a file has changed."""
 
 import hashlib
 from collections.abc import Iterable, Sequence
@@ -11,20 +11,20 @@ from clpipe.base.urls import stamp_of_url, url_of
 
 
 def stamp_of(path: Path) -> tuple[int, int]:
-    """The size of a file in bytes and its time of change in ns; zeros where it has no status.
+    """Return a file's size in bytes and its modification time in ns; zeros if it is missing.
 
-    Of one that stands for a URL, see :func:`clpipe.base.urls.stamp_of_url`.
+    For a path that represents a URL, see :func:`clpipe.base.urls.stamp_of_url`.
     """
     try:
         info = path.stat()
-    except (OSError, ValueError):  # or no file can have this name
+    except (OSError, ValueError):  # missing, or the name is invalid
         url = url_of(path)
         return stamp_of_url(url) if url else (0, 0)
     return info.st_size, info.st_mtime_ns
 
 
 def digests(files: Iterable[str]) -> dict[str, str]:
-    """The SHA-256 of each file, by its name; files that cannot be read are left out."""
+    """Return the SHA-256 of each file, by name, without files that cannot be read."""
     by_name = {}
     for file in files:
         with suppress(OSError):
@@ -33,7 +33,7 @@ def digests(files: Iterable[str]) -> dict[str, str]:
 
 
 def joint_digest(digests: Sequence[str]) -> str:
-    """One SHA-256 of several: that of their texts; of one, itself.
+    """Return one SHA-256 for several, computed from their texts; for a single one, itself.
 
     >>> joint_digest(["ab"]), joint_digest(["ab", "cd"])[:8]
     ('ab', '88d4266f')

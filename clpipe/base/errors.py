@@ -6,7 +6,7 @@ from typing import Any, Self
 
 from clpipe.base.text import one_line
 
-LONGEST = 4000  # characters of a message; what it repeats of a file can have any length
+LONGEST = 4000  # characters of a message, because text quoted from a file can have any length
 
 
 class ClpipeError(Exception):
@@ -43,7 +43,7 @@ class RequestError(ClpipeError, ValueError):
 
 
 class MissingError(RequestError):
-    """A file or folder that was named does not exist; ``name`` is what was written."""
+    """A named file or folder does not exist. ``name`` is the name as the user wrote it."""
 
     def __init__(self, name: str, message: str) -> None:
         super().__init__(message)
@@ -54,7 +54,7 @@ class MissingError(RequestError):
 
 
 class KeyedError(RequestError):
-    """A bad setting; ``key`` is its dotted name, such as ``sensor_noise.a``."""
+    """A setting is invalid. ``key`` is its dotted name, such as ``sensor_noise.a``."""
 
     def __init__(self, key: str, message: str) -> None:
         super().__init__(message)
@@ -89,16 +89,16 @@ class ImageError(ClpipeError):
 
     @property
     def with_way(self) -> Self:
-        """The error with the options that help in its text."""
+        """The same error with the sentence ``way`` in its message."""
         return type(self)(f"{self}. {self.way}") if self.way else self
 
 
 class NoPictureError(ImageError):
-    """A file is a whole image, but has no channels of the kind that is read, such as only depth."""
+    """A file is a valid image, but lacks the channels to read. For example, it has only depth."""
 
 
 class KindError(ImageError):
-    """A kept image lacks the channels that are needed; ``attributes`` are those of the file."""
+    """A kept image lacks the required channels. ``attributes`` are those of the file."""
 
     def __init__(self, path: Path, attributes: Mapping[str, str]) -> None:
         stage = attributes.get("stage", "a stage that it does not name")
@@ -108,7 +108,7 @@ class KindError(ImageError):
 
 
 class DeviceFailedError(ImageError):
-    """A device failed at one image, though it was tried again; it may do for others."""
+    """A device failed for one image, also at the second try. Other images may succeed."""
 
 
 class DeviceError(ClpipeError):
@@ -126,12 +126,12 @@ class DeviceError(ClpipeError):
 
 
 class OutputError(ClpipeError):
-    """Nothing more can be written: the disk is full, or the folder has gone."""
+    """No more files can be written: the disk is full, or the output directory is missing."""
 
     exit_status = 1
 
 
 class ClusterError(ClpipeError):
-    """The cluster was lost during a run; the images finished until then are written."""
+    """The cluster was lost during a run. The images finished before are written."""
 
     exit_status = 1

@@ -1,4 +1,4 @@
-"""Libraries that only some users need, and how to install them."""
+"""Optional libraries, and the command that installs them."""
 
 from importlib.util import find_spec
 
@@ -6,28 +6,28 @@ from clpipe.base.errors import RequestError
 
 
 def require(purpose: str, *modules: str) -> None:
-    """See that libraries are installed whose packages have the names of their modules.
+    """Check that modules are installed. Each must have the name of its package.
 
     Args:
-        purpose: what needs them, for the message, such as "clpipe calibrate".
-        modules: the modules.
+        purpose: the feature that needs them, for the message, such as "clpipe calibrate".
+        modules: the names of the modules.
 
     Raises:
-        RequestError: a module is missing; the message says how to install it.
+        RequestError: a module is missing. The message contains the command that installs it.
 
-    >>> require("this example", "json", "no_such_module")
+    >>> require("this example", "json", "no_module")
     Traceback (most recent call last):
-    clpipe.base.errors.RequestError: this example needs no_such_module; pip install no_such_module
+    clpipe.base.errors.RequestError: this example needs no_module. Run: pip install no_module
     """
     missing = [name for name in modules if find_spec(name) is None]
     if missing:
-        raise RequestError(f"{purpose} needs {' and '.join(missing)}; {installing(*missing)}")
+        raise RequestError(f"{purpose} needs {' and '.join(missing)}. Run: {installing(*missing)}")
 
 
 def installing(*packages: str) -> str:
-    """The command that installs packages.
+    """Return the command that installs packages.
 
-    It names no extra of clpipe, since on the public index that name is another project's.
+    The command does not use clpipe's extras, because another project has this name on PyPI.
 
     >>> installing("scipy", "matplotlib")
     'pip install scipy matplotlib'

@@ -1,4 +1,4 @@
-"""Whole files: their digest, and writing them so that none is ever left half-written."""
+"""Digests of files, and atomic writes: no file is ever left half-written."""
 
 import contextlib
 import hashlib
@@ -19,10 +19,10 @@ from clpipe.base.system import begin_writing, bring_to_disk, file_to_disk
 
 @CpuTimer("hash")
 def sha256_of(path: Path) -> tuple[str, int]:
-    """The SHA-256 of a file, and its size in bytes.
+    """Return the SHA-256 of a file, and its size in bytes.
 
     Raises:
-        OSError: it cannot be read, or is no regular file.
+        OSError: the file cannot be read, or is not a regular file.
     """
     check_regular(path)
     with open(path, "rb", buffering=0) as file:
@@ -31,22 +31,22 @@ def sha256_of(path: Path) -> tuple[str, int]:
 
 @dataclass(frozen=True)
 class Stored:
-    """A file as it was written: its size in bytes, and its SHA-256."""
+    """The size in bytes and the SHA-256 of a file that was written."""
 
     size: int
     sha256: str
 
 
 _unfinished: set[Path] = set()  # temporary files of this process, for `remove_temporary_files`
-# Guards the moment in which a temporary file is made and noted in _unfinished. A signal handler may
-# take it although its own thread holds it.
+# Guards the creation of a temporary file together with its entry in _unfinished. It is reentrant,
+# because a signal handler may acquire it while its own thread holds it.
 _beginning = threading.RLock()
 
-LONGEST = 200  # bytes of a name that its temporary name repeats; file systems hold 255
+LONGEST = 200  # bytes of a name that its temporary name repeats; file systems allow 255
 
 
 def shortened(name: str) -> str:
-    """A name as far as a temporary name repeats it.
+    """Return the first :data:`LONGEST` bytes of a name, for a temporary name.
 
     >>> shortened("render"), len(shortened("x" * 255))
     ('render', 200)
@@ -57,12 +57,12 @@ def shortened(name: str) -> str:
 
 
 class FileGroup:
-    """Files that are written, but are to be brought to the disk, and under their names, together.
+    """Files that are written under temporary names, and later synchronised and renamed together.
 
-    The last one says of the others that they are whole, as a sidecar of its pictures.
+    The last file confirms that the others are complete, like the sidecar of an image.
 
     Attributes:
-        paths: their names to be, in the order in which they were written.
+        paths: the final names, in the order in which the files were written.
     """
 
     def __init__(self) -> None:
@@ -71,12 +71,12 @@ class FileGroup:
         self._folders: set[Path] = set()
 
     def add(self, beside: Path, path: Path) -> None:
-        """Take a file that is written, under its temporary name."""
+        """Add a written file, with its temporary and its final name."""
         self._beside.append(beside)
         self.paths.append(path)
 
     def add_folder(self, folder: Path) -> None:
-        """Have a folder's names outlive a loss of power, too."""
+        """Add a folder whose entries must also survive a power failure."""
         self._folders.add(folder)
 
     def discard(self) -> None:
@@ -95,21 +95,22 @@ class FileGroup:
         for number, (beside, path) in enumerate(zip(self._beside, self.paths, strict=True)):
             with _named(path):
                 if number == last:
-                    os.utime(beside)  # it is later than what it tells of
+                    os.utime(beside)  # so that it is newer than the files that it describes
                 beside.replace(path)
             _unfinished.discard(beside)
 
     @staticmethod
     @CpuTimer("write")
     def commit(groups: Sequence["FileGroup"]) -> list[ImageError | None]:
-        """Bring groups to the disk, and give their files their names; a loss of power at any time
-        leaves of each file the old one or the new one, whole, and the last of a group only behind
-        all others.
+        """Synchronise groups to the disk, and rename their files to the final names.
 
-        Many at a time take little more time than one: the disk orders what it is told together.
+        After a power failure, each file is the complete old or the complete new one. The last file
+        of a group gets its name only after all others. Many groups together take little more time
+        than one, because the disk combines their writes.
 
         Returns:
-            For each group, why it could not be; what has no name yet is removed then.
+            For each group, the error or None. After an error, the files of the group that still
+            have temporary names are removed.
         """
         for group in groups:
             for beside in group._beside:
@@ -125,7 +126,7 @@ class FileGroup:
             except ImageError as error:
                 group.discard()
                 errors.append(error)
-            except BaseException:  # which nobody expected
+            except BaseException:  # unexpected
                 for left in groups[number:]:
                     left.discard()
                 raise
@@ -134,14 +135,14 @@ class FileGroup:
         return errors
 
 
-_thread = threading.local()  # has "group" in a thread whose files are deferred; None is passing
+_thread = threading.local()  # "group": the group of deferred files, or None for passing files
 
 
 @contextlib.contextmanager
 def deferred_files() -> Iterator[FileGroup]:
-    """Files that this thread writes inside get their names when the group is committed.
+    """Defer this thread's files: they get their final names when the group is committed.
 
-    Where the body raises, they are removed.
+    If the body raises, the files are removed.
     """
     group = FileGroup()
     with _writing_to(group):
@@ -154,7 +155,7 @@ def deferred_files() -> Iterator[FileGroup]:
 
 @contextlib.contextmanager
 def passing_files() -> Iterator[None]:
-    """Files that this thread writes inside need not outlive a loss of power, which saves time."""
+    """Do not synchronise this thread's files to the disk: a power failure may lose them."""
     with _writing_to(None):
         yield
 
@@ -172,7 +173,7 @@ def _writing_to(group: FileGroup | None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Errors of the system as an ImageError about a file."""
+    """Convert an OSError to an ImageError about a file."""
     try:
         yield
     except OSError as error:
@@ -180,7 +181,7 @@ def _named(path: Path) -> Iterator[None]:
 
 
 def _begun(beside: Path) -> BinaryIO:
-    """A new temporary file, open."""
+    """Create and open a temporary file."""
     with _beginning:
         _unfinished.add(beside)
         return open(beside, "xb")
@@ -188,10 +189,10 @@ def _begun(beside: Path) -> BinaryIO:
 
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[BinaryIO]:
-    """A file to write to, which takes the place of ``path`` when all of it is on the disk.
+    """Open a new file that replaces ``path`` when all of it is on the disk.
 
-    It is new, so it follows no link. Where it cannot be written, or the body raises, ``path`` stays
-    as it was. See :func:`passing_files` and :func:`deferred_files`, too.
+    Links are not followed. If the file cannot be written, or the body raises, ``path`` does not
+    change. See also :func:`passing_files` and :func:`deferred_files`.
 
     Raises:
         ImageError: the file cannot be written.
@@ -204,7 +205,7 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
                 yield file
                 file.flush()
                 if not hasattr(_thread, "group"):
-                    os.fsync(file.fileno())  # else a loss of power leaves an empty file of its name
+                    os.fsync(file.fileno())  # else a power failure can leave an empty file
             if group := getattr(_thread, "group", None):
                 group.add(beside, path)
             else:
@@ -219,11 +220,11 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
 
 @CpuTimer("write")
 def write_whole(path: Path, *parts: bytes | memoryview) -> Stored:
-    """Write a file, all of it or nothing; an existing one is replaced.
+    """Write a file completely or not at all. An existing file is replaced.
 
     Args:
         path: the file.
-        *parts: its bytes, one behind the other; views are of bytes.
+        *parts: its bytes, in order. The items of a memoryview must be bytes.
 
     Raises:
         ImageError: the file cannot be written.
@@ -239,13 +240,13 @@ def write_whole(path: Path, *parts: bytes | memoryview) -> Stored:
 
 
 def check_folder(folder: Path) -> None:
-    """See that no file stands where a folder is to be made, or above it.
+    """Check that neither an output directory nor one of its parents is an existing file.
 
     Raises:
-        RequestError: one does.
+        RequestError: one is a file.
     """
     if place := _file_among(folder):
-        raise RequestError(f"--output: {place} is a file; name a folder to write to")
+        raise RequestError(f"--output: {place} is a file. Name an output directory.")
 
 
 def _file_among(folder: Path) -> Path | None:
@@ -253,10 +254,10 @@ def _file_among(folder: Path) -> Path | None:
 
 
 def make_folder_of(path: Path) -> None:
-    """Make the folders above a file that is to be written, where they are missing.
+    """Create the missing parent folders of a file.
 
     Raises:
-        ImageError: they cannot be made.
+        ImageError: a folder cannot be created.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -267,7 +268,7 @@ def make_folder_of(path: Path) -> None:
 
 
 def write_new(path: Path, data: bytes) -> Stored:
-    """Make the folders above a file where they are missing, then :func:`write_whole`.
+    """Create the missing parent folders of a file, then write it with :func:`write_whole`.
 
     Raises:
         ImageError: the file cannot be written.
@@ -277,7 +278,7 @@ def write_new(path: Path, data: bytes) -> Stored:
 
 
 def discard(path: Path) -> None:
-    """Remove a file, or a folder and all in it; what cannot be removed stays."""
+    """Remove a file, or a folder with its contents. Errors are ignored."""
     with contextlib.suppress(OSError):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -286,11 +287,11 @@ def discard(path: Path) -> None:
 
 
 def keep_names(folder: Path, at_once: bool = False) -> None:
-    """Have the names of a folder outlive a loss of power, as far as its file system can.
+    """Synchronise the entries of a folder to the disk, if its file system can.
 
     Args:
         folder: the folder.
-        at_once: also where files are deferred, see :func:`deferred_files`.
+        at_once: whether to do so now even if files are deferred, see :func:`deferred_files`.
     """
     if hasattr(_thread, "group") and not (_thread.group and at_once):
         if _thread.group:
@@ -301,9 +302,9 @@ def keep_names(folder: Path, at_once: bool = False) -> None:
 
 
 def remove_temporary_files() -> None:
-    """Delete the temporary files that are being written now; call it just before exiting.
+    """Remove the unfinished temporary files. Call this just before the process exits.
 
-    No other thread begins one afterwards: it waits for the end of the process.
+    Afterwards, a thread that creates a temporary file blocks until the process ends.
     """
     _beginning.acquire()
     for path in list(_unfinished):

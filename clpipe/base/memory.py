@@ -1,4 +1,4 @@
-"""Amounts of memory: parsed from text, formatted as text, and how much is free on this machine."""
+"""Memory sizes as text, and the free memory of this machine."""
 
 import re
 from dataclasses import dataclass
@@ -9,27 +9,27 @@ from clpipe.base.errors import DeviceError, RequestError
 from clpipe.base.system import address_space
 
 UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
-NO_LIMIT = 2**60  # bytes; first-version groups without a limit have the largest number of pages
+NO_LIMIT = 2**60  # bytes; without a limit, groups of version 1 report the largest page count
 
 
 def parse_size(text: str) -> int:
-    """Bytes, from a number with a unit: K, M, G or T, in powers of 1024.
+    """Return the bytes of a number with a unit: K, M, G or T, in powers of 1024.
 
     >>> parse_size("512M"), parse_size("1.5 GiB"), parse_size("4096")
     (536870912, 1610612736, 4096)
 
     Raises:
-        RequestError: the text is not a size, or the size is 0 or beyond 63 bits.
+        RequestError: the text is not a size, or the size is 0 or does not fit into 63 bits.
     """
     match = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*([kmgt]?)(?:i?b)?", text.strip(), re.IGNORECASE)
     size = float(match[1]) * UNITS[match[2].upper()] if match else 0
     if not 1 <= size < 2**63:
-        raise RequestError(f"--memory: found '{text}'; expected a size such as 512M or 8G")
+        raise RequestError(f"--memory: '{text}' is not a size. Use a size such as 512M or 8G.")
     return int(size)
 
 
 def in_words(size: float) -> str:
-    """A number of bytes as text, rounded to a tenth of KiB, MiB or GiB.
+    """Return a number of bytes as text, rounded to a tenth of a KiB, MiB or GiB.
 
     >>> in_words(8.2 * 2**30), in_words(5_000_000), in_words(1000)
     ('8.2 GiB', '4.8 MiB', '1.0 KiB')
@@ -43,46 +43,55 @@ def in_words(size: float) -> str:
 
 @dataclass(frozen=True)
 class Left:
-    """How many bytes a process can still take, and by what it is limited, in words."""
+    """How many bytes a process can still allocate, and the name of the limit, in words."""
 
     bytes: int
     by: str
 
 
 def memory_left(root: Path = Path("/")) -> Left | None:
-    """What this process can still allocate: the least that one of its limits leaves.
+    """Return the bytes that this process can still allocate, under its tightest limit.
 
-    These are MemAvailable, its control groups' and ``ulimit -v``. None where the system has none
-    of them, as outside Linux. ``root`` is for tests.
+    The limits are MemAvailable, control groups and ``ulimit -v``.
+
+    Args:
+        root: the root of the file system; tests use another one.
+
+    Returns:
+        The bytes and the limit. None if there is no limit, for example outside Linux.
     """
     limits = [_available(root), *_left_in_groups(root), _left_of_addresses(root)]
     return min(filter(None, limits), key=lambda left: left.bytes, default=None)
 
 
 def available_memory(root: Path = Path("/")) -> int | None:
-    """The bytes of :func:`memory_left`."""
+    """Return the bytes of :func:`memory_left`."""
     left = memory_left(root)
     return left.bytes if left else None
 
 
 def check_addresses(needed: int, what: str) -> None:
-    """See that ``ulimit -v`` leaves so many bytes; libraries crash where it does not.
+    """Check that ``ulimit -v`` leaves enough address space. Libraries crash without it.
+
+    Args:
+        needed: the required address space in bytes.
+        what: what needs it, for the message.
 
     Raises:
-        DeviceError: it does not.
+        DeviceError: too little address space is left.
     """
     left = _left_of_addresses(Path("/"))
     if left and left.bytes < needed:
         raise DeviceError(
-            f"{what} takes about {in_words(needed)} of address space; {in_words(left.bytes)} are "
-            f"left by {left.by}; allow more"
+            f"{what} needs about {in_words(needed)} of address space, but {in_words(left.bytes)} "
+            f"are left by {left.by}. Raise the limit."
         )
 
 
 def peak_memory(root: Path = Path("/")) -> int | None:
-    """The most bytes that this process has held at a time; None outside Linux.
+    """Return this process's peak memory in bytes; None outside Linux.
 
-    The system's ru_maxrss goes on from the process that started this one.
+    The system's ru_maxrss is not used, because it includes the peak of the parent process.
     """
     return _listed(root / "proc/self/status", "VmHWM")
 
@@ -93,7 +102,7 @@ def _available(root: Path) -> Left | None:
 
 
 def _left_of_addresses(root: Path) -> Left | None:
-    """What is left of the limit of ``ulimit -v``, which also counts what is reserved."""
+    """Return the address space left under ``ulimit -v``, which also counts reserved memory."""
     limit, used = address_space(), _listed(root / "proc/self/status", "VmSize")
     if limit is None or used is None:
         return None
@@ -101,7 +110,7 @@ def _left_of_addresses(root: Path) -> Left | None:
 
 
 def _listed(path: Path, name: str) -> int | None:
-    """The bytes of an entry of one of the system's lists, which has KiB."""
+    """Return the bytes of an entry in a file of /proc, whose values are in KiB."""
     try:
         match = re.search(rf"^{name}:\s+(\d+) kB", path.read_text("utf-8"), re.MULTILINE)
     except OSError:
@@ -110,7 +119,7 @@ def _listed(path: Path, name: str) -> int | None:
 
 
 def _left_in_groups(root: Path) -> list[Left | None]:
-    """What is left in each control group of this process and in its parents."""
+    """Return the memory left in each control group of this process and in the groups' parents."""
     first = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_{}_file", "total_mapped_file")
     second = ("memory.max", "memory.current", "{}_file", "file_mapped")
     return [
@@ -120,9 +129,9 @@ def _left_in_groups(root: Path) -> list[Left | None]:
 
 
 def _left_in_group(folder: Path, limit: str, used: str, cached: str, mapped: str) -> Left | None:
-    """What is left in one group; None without a limit.
+    """Return the memory left in one group; None without a limit.
 
-    Cached files count as free, since they can go, but for those that programs run from.
+    Cached files count as free, because the system can drop them, unless they are mapped.
     """
     try:
         most = int((folder / limit).read_text("utf-8"))
@@ -130,7 +139,7 @@ def _left_in_group(folder: Path, limit: str, used: str, cached: str, mapped: str
             return None
         rest = most - int((folder / used).read_text("utf-8"))
         lines = (folder / "memory.stat").read_text("utf-8").splitlines()
-    except (OSError, ValueError):  # not there, or "max": no limit
+    except (OSError, ValueError):  # missing, or "max": no limit
         return None
     values = {name: int(value) for name, _, value in (line.partition(" ") for line in lines)}
     both = (values.get(cached.format(state), 0) for state in ("active", "inactive"))

@@ -1,8 +1,8 @@
-"""A folder of this process alone, in which runtimes compile, removed when the process ends.
+"""A folder that only this process uses, in which runtimes compile. It is removed at the end.
 
-A process locks its folder, and the system releases the lock when the process ends, however that
-happens. So later processes remove the folders that killed ones left, and no folder in use.
-Programs that clean up temporary files, like systemd-tmpfiles, skip locked folders too.
+A process locks its folder, and the system releases the lock whenever the process ends. Later
+processes therefore remove the folders of killed processes, but no folder in use. Programs that
+clean up temporary files, like systemd-tmpfiles, also skip locked folders.
 """
 
 import atexit
@@ -24,10 +24,10 @@ NAME = re.compile(r"clpipe-\d+-\w+")  # of a process's folder: its number, and r
 
 @cache
 def process_folder() -> Path | None:
-    """Return this process's folder, which is made at the first call.
+    """Return this process's folder. The first call creates it.
 
     Returns:
-        A folder with :data:`ROOM` bytes free, from which programs may be run; None if no folder for
+        A folder with :data:`ROOM` bytes free, in which programs may run. None if no folder for
         temporary files allows that.
     """
     for place in temporary_places():
@@ -38,7 +38,7 @@ def process_folder() -> Path | None:
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=process_folder.cache_clear)  # a child makes its own
+    os.register_at_fork(after_in_child=process_folder.cache_clear)  # a child creates its own
 
 
 def temporary_places() -> Iterator[Path]:
@@ -58,16 +58,16 @@ def has_room(folder: Path) -> bool:
 
 
 def _folder_in(place: Path) -> Path:
-    """Make a locked folder below one for temporary files; remove those that killed processes left.
+    """Create a locked folder below a temporary one, and remove the folders of killed processes.
 
     Raises:
-        OSError: it cannot be made.
+        OSError: the folder cannot be created.
     """
     ours = place / f"clpipe-processes-{os.getuid() if hasattr(os, 'getuid') else 'kernels'}"
     with suppress(OSError):
         ours.mkdir(mode=0o700)
     if ours.is_symlink() or not ours.is_dir() or writable_by_others(ours):
-        ours = place  # somebody else has made it
+        ours = place  # another user has created it
     elif fcntl:
         for folder in ours.iterdir():
             if NAME.fullmatch(folder.name) and not folder.is_symlink():
@@ -102,5 +102,5 @@ def _remove_if_left(folder: Path) -> None:
 
 
 def _remove(folder: Path, process: int) -> None:
-    if os.getpid() == process:  # a forked child runs this too
+    if os.getpid() == process:  # a forked child also runs this
         shutil.rmtree(folder, ignore_errors=True)

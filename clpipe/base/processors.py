@@ -7,22 +7,25 @@ from clpipe.base.system import processors
 
 
 def available_processors(root: Path = Path("/")) -> int:
-    """The number of processors that this process may run on, within the quotas of its groups.
+    """Return the number of processors that this process may use, within its groups' quotas.
 
-    A quota of one and a half counts as two. ``root`` is for tests.
+    A quota of one and a half counts as two.
+
+    Args:
+        root: the root of the file system; tests use another one.
     """
     quotas = [quota for quota in (_quota(*group) for group in group_folders("cpu", root)) if quota]
     return max(min([processors(), *quotas]), 1)
 
 
 def _quota(folder: Path, is_first_version: bool) -> int | None:
-    """The processors that a group may use; None without a limit."""
+    """Return the number of processors that a group may use; None without a limit."""
     try:
         if is_first_version:
             names = ("cpu.cfs_quota_us", "cpu.cfs_period_us")
             quota, period = (int((folder / name).read_text()) for name in names)
         else:
             quota, period = map(int, (folder / "cpu.max").read_text().split())
-    except (OSError, ValueError):  # not there, or "max": no limit
+    except (OSError, ValueError):  # missing, or "max": no limit
         return None
     return -(-quota // period) if quota > 0 and period > 0 else None

@@ -1,7 +1,7 @@
-"""Other people's files: regular ones only, no larger than they can be, and their text as values.
+"""Safe reading of untrusted files: only regular files, limited in size; and parsing of their text.
 
-Reading a device or a pipe may never end, and a small file may ask for more memory than there is.
-Errors of files are an OSError with a clear ``strerror``, errors of their content a ValueError.
+Reading a device or a pipe may never end, and a small file may need more memory than there is. File
+errors are an OSError with a clear ``strerror``. Errors in the contents are a ValueError.
 """
 
 import errno
@@ -23,11 +23,11 @@ from clpipe.base.text import alike
 
 T = TypeVar("T")
 
-TEXT_BYTES = 16 * 2**20  # the largest text but a manifest: a configuration, a curve, a sidecar
+TEXT_BYTES = 16 * 2**20  # the limit for configurations, curves and sidecars, not for manifests
 
-KEY_PARTS = 32  # of a dotted key; tomllib takes memory with their square
+KEY_PARTS = 32  # limit for dotted keys, because tomllib's memory grows with the square of the parts
 
-SEARCHED = 20_000  # names in a folder, among which a similar one is looked for
+SEARCHED = 20_000  # the most names of a folder to search for a similar one
 
 KINDS = {
     stat.S_IFDIR: "a folder",
@@ -42,10 +42,10 @@ _LONG_KEY = re.compile(rf"(?<![\w-])(?:{_PART}){{{KEY_PARTS}}}", re.ASCII)
 
 
 def check_regular(path: Path) -> os.stat_result:
-    """The status of a regular file, or of one that a link leads to; nothing is opened.
+    """Return the status of a regular file, following links, without opening it.
 
     Raises:
-        OSError: it is missing, or a folder, a device, a pipe or a socket.
+        OSError: the file is missing, or is a folder, a device, a pipe or a socket.
     """
     try:
         status = path.stat()
@@ -58,9 +58,9 @@ def check_regular(path: Path) -> os.stat_result:
 
 
 def read_when_changed(read: Callable[[str], T]) -> Callable[[str], T]:
-    """A function of a file's path that keeps what it reads, and reads again when it changes.
+    """Decorate a function that reads a file, so that it reads again only if the file has changed.
 
-    It raises an OSError where the path is no regular file.
+    The function raises an OSError if the path is not a regular file.
     """
 
     @lru_cache(maxsize=16)
@@ -76,44 +76,44 @@ def read_when_changed(read: Callable[[str], T]) -> Callable[[str], T]:
 
 
 def check_exists(path: Path) -> None:
-    """See that a file or folder exists that was named.
+    """Check that a named file or folder exists.
 
     Raises:
-        MissingError: it does not; the message suggests a name that is similar and exists.
+        MissingError: it does not exist. The message suggests a similar existing name.
     """
     try:
         os.stat(path)
         return
     except (FileNotFoundError, NotADirectoryError):
         pass
-    except (OSError, ValueError):  # reading it tells why
+    except (OSError, ValueError):  # reading the file later reports the reason
         return
-    os.getcwd()  # where that has gone, it is what is wrong
+    os.getcwd()  # raises if the working directory is missing, which is then the actual error
     place, rest = path, Path()
     while not os.path.exists(place.parent) and place != place.parent:
         place, rest = place.parent, place.name / rest
     near = _similar(place)
-    hint = f"; did you mean {near / rest}?" if near else ""
+    hint = f". Did you mean {near / rest}?" if near else ""
     raise MissingError(str(path), f"{path}: there is no such file or folder{hint}")
 
 
 def check_input(path: Path) -> None:
-    """See that a file or folder that was named as an input exists and is no array of NumPy.
+    """Check that a named input exists and is not a NumPy array.
 
     Raises:
         MissingError: it does not exist.
-        RequestError: it is an array, which clpipe writes and does not read.
+        RequestError: it is a NumPy array, which clpipe writes but does not read.
     """
     check_exists(path)
     if path.suffix.lower() == ".npy":
         raise RequestError(
-            f"{path}: it is an array of NumPy, as --format npy writes it, which clpipe does not "
-            "read. Load it with numpy.load, or write a file that clpipe reads with --format exr"
+            f"{path}: this is a NumPy array, which clpipe writes (--format npy) but does not read. "
+            "Load it with numpy.load. For a file that clpipe reads, use --format exr."
         )
 
 
 def _similar(path: Path) -> Path | None:
-    """What is called like a missing file, in its folder; one with its suffix comes first."""
+    """Return a file with a similar name in a missing file's folder, preferably of its extension."""
     try:
         with os.scandir(path.parent) as entries:
             names = [entry.name for entry in islice(entries, SEARCHED)]
@@ -128,15 +128,15 @@ def _similar(path: Path) -> Path | None:
 
 @contextmanager
 def unchanged(path: Path) -> Iterator[None]:
-    """See that a file stays the same while it is read, so that its digest is that of its pixels.
+    """Check that a file does not change in the ``with`` block, so that its digest fits its pixels.
 
     Raises:
-        ImageError: it was written to, replaced or removed.
+        ImageError: the file was changed, replaced or removed.
     """
     before = _state(path)
     yield
     if _state(path) != before:
-        raise ImageError(f"{path}: was written to while it was read; run it again")
+        raise ImageError(f"{path}: the file changed while it was read. Run the command again.")
 
 
 def _state(path: Path) -> tuple[int, ...]:
@@ -148,10 +148,10 @@ def _state(path: Path) -> tuple[int, ...]:
 
 
 def read_bytes(path: Path, most: int = TEXT_BYTES) -> bytes:
-    """The content of a regular file of at most ``most`` bytes.
+    """Return the contents of a regular file of at most ``most`` bytes.
 
     Raises:
-        OSError: it cannot be read, is no regular file, or is larger.
+        OSError: the file cannot be read, is not a regular file, or is larger.
     """
     size = check_regular(path).st_size
     with path.open("rb") as file:
@@ -160,15 +160,15 @@ def read_bytes(path: Path, most: int = TEXT_BYTES) -> bytes:
             data += file.read(most + 1 - len(data))
     if max(size, len(data)) > most:
         found = in_words(max(size, len(data)))
-        raise OSError(errno.EFBIG, f"it has {found}; at most {in_words(most)} are read")
+        raise OSError(errno.EFBIG, f"it has {found}, but the limit is {in_words(most)}")
     return data
 
 
 def read_named(option: str, path: Path, most: int) -> bytes:
-    """The content of a file that an option names, of at most ``most`` bytes.
+    """Return the contents of a file that an option names, of at most ``most`` bytes.
 
     Raises:
-        RequestError: as :func:`read_bytes`.
+        RequestError: the file cannot be read, is not a regular file, or is larger.
     """
     try:
         return read_bytes(path, most)
@@ -177,20 +177,20 @@ def read_named(option: str, path: Path, most: int) -> bytes:
 
 
 def read_text(path: Path) -> str:
-    """The text of a small file in UTF-8, with or without a byte order mark.
+    """Return the text of a small UTF-8 file, with or without a byte order mark.
 
     Raises:
-        OSError: as :func:`read_bytes`.
-        UnicodeDecodeError: it is not UTF-8.
+        OSError: as for :func:`read_bytes`.
+        UnicodeDecodeError: the file is not UTF-8.
     """
     return read_bytes(path).decode("utf-8-sig")
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The values of a TOML text.
+    """Return the values of a TOML text.
 
     Raises:
-        ValueError: it is not valid, or is nested too deeply to be read.
+        ValueError: the text is not valid TOML, or is nested too deeply.
     """
     if _LONG_KEY.search(text):
         raise ValueError(f"a key has more than {KEY_PARTS} parts")
@@ -201,15 +201,15 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """The value of a JSON text.
+    """Return the value of a JSON text.
 
     Raises:
-        ValueError: it is not valid, is nested too deeply to be read, or holds half a character.
+        ValueError: the text is not valid JSON, is nested too deeply, or has an unpaired surrogate.
     """
     text = text.decode("utf-8-sig") if isinstance(text, bytes) else text
     try:
         value = json.loads(text)
-        if "\\ud" in text.lower():  # perhaps half a character, which can name no file
+        if "\\ud" in text.lower():  # perhaps an unpaired surrogate, invalid in file names
             os.fsencode(json.dumps(value, ensure_ascii=False))
         return value
     except RecursionError:

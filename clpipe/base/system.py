@@ -1,7 +1,7 @@
-"""What only some systems have, and what stands in for it on the others.
+"""Functions that only some operating systems have, and their substitutes on others.
 
-Elsewhere in clpipe nothing is needed that Linux, macOS and Windows do not all have. What is there
-is used, whichever system it is.
+All other modules need only what Linux, macOS and Windows have in common. The functions test for
+each feature, not for the name of the system.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 
 
 def _optional(name: str) -> Any:
-    """A module of the standard library; None where this system has none."""
+    """Return a module of the standard library; None if this system lacks it."""
     try:
         return importlib.import_module(name)
     except ImportError:
@@ -30,22 +30,24 @@ def _optional(name: str) -> Any:
 
 fcntl, msvcrt, resource = (_optional(name) for name in ("fcntl", "msvcrt", "resource"))
 
-# Bytes of a file that can be held, of which none need be there. Windows's C runtime counts with
-# 31 bits.
+# Bytes of a file that can be locked, also beyond its end. Windows's C runtime counts with 31 bits.
 HOLDABLE = 2**40 if fcntl else 2**30
 
 _ARENA_MAX = -8  # of glibc's mallopt: the most heaps
-_SYNC_FILE_RANGE_WRITE = 2  # of Linux: begin with what was not begun
+_SYNC_FILE_RANGE_WRITE = 2  # Linux: start to write all dirty pages that are not being written
 
 # Without O_BINARY, Windows writes "\r\n" for "\n".
 _PLAIN = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
 
 
 def open_plain(path: Path, flags: int) -> int:
-    """A descriptor of a file, as ``os.open``, but following no link and waiting for no pipe.
+    """Open a file like ``os.open``, but without following links or waiting for pipes.
+
+    Returns:
+        The file descriptor.
 
     Raises:
-        OSError: it cannot be opened, or is a link.
+        OSError: the file cannot be opened, or is a link.
     """
     if not hasattr(os, "O_NOFOLLOW") and path.is_symlink():
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
@@ -53,20 +55,20 @@ def open_plain(path: Path, flags: int) -> int:
 
 
 def hold(file: int, first: int, length: int) -> bool:
-    """Hold a range of a file's bytes against other processes, until the file is closed.
+    """Lock a range of a file's bytes against other processes, until the file is closed.
 
-    The system lets go of it when the process ends, however that comes about.
+    The system also releases the lock whenever the process ends.
 
     Args:
         file: a descriptor, open for writing.
         first: the first byte.
-        length: how many; the last one is within :data:`HOLDABLE`.
+        length: the number of bytes. The range must end within :data:`HOLDABLE` bytes.
 
     Returns:
-        False where another process holds one of them.
+        False if another process has locked a part of the range.
 
     Raises:
-        OSError: there are no such locks on this system, or in this file system.
+        OSError: this system or file system has no such locks.
     """
     try:
         if fcntl:
@@ -84,18 +86,19 @@ def hold(file: int, first: int, length: int) -> bool:
 
 
 def use(file: int, alone: bool = False, wait: bool = True) -> bool:
-    """Share a file with other processes that use it, or have it alone, until it is closed.
+    """Lock a whole file, shared or exclusively, until the file is closed.
 
-    The system lets go of it when the process ends. It is another lock than that of :func:`hold`,
-    and nothing where the system or the file system has none.
+    The system also releases the lock when the process ends. This lock is independent of those of
+    :func:`hold`.
 
     Args:
         file: a descriptor.
-        alone: whether to have it alone.
-        wait: whether to wait until the others let that be.
+        alone: whether the lock is exclusive.
+        wait: whether to wait until other processes release their locks.
 
     Returns:
-        Whether it is had; True on a system without such locks, False in a file system without them.
+        Whether the file is locked. True on a system without such locks, and False in a file system
+        without them.
     """
     if not fcntl:
         return True
@@ -108,10 +111,10 @@ def use(file: int, alone: bool = False, wait: bool = True) -> bool:
 
 
 def writable_by_others(folder: Path) -> str:
-    """Why others than this user may write to a folder, in words; "" where they may not.
+    """Return why other users may write to a folder, in words; "" if they may not.
 
     Raises:
-        OSError: the folder cannot be looked at.
+        OSError: the folder's status cannot be read.
     """
     if not hasattr(os, "geteuid"):
         return ""
@@ -123,12 +126,12 @@ def writable_by_others(folder: Path) -> str:
 
 
 def let_go(path: Path, file: int, first: int, length: int) -> None:
-    """Close a file of which this process holds a range, and remove it if no other holds any.
+    """Close a file with a range that this process has locked, and remove it if no other has locks.
 
     Args:
         path: the file.
         file: its descriptor.
-        first, length: the range, as in :func:`hold`.
+        first, length: the range, as for :func:`hold`.
     """
     with contextlib.suppress(OSError):
         if fcntl:
@@ -139,15 +142,15 @@ def let_go(path: Path, file: int, first: int, length: int) -> None:
             msvcrt.locking(file, msvcrt.LK_UNLCK, length)
     os.close(file)
     if msvcrt and not fcntl:
-        with contextlib.suppress(OSError):  # Windows refuses while another process has it open
+        with contextlib.suppress(OSError):  # fails on Windows if another process has it open
             path.unlink()
 
 
 def reserve(file: BinaryIO, size: int) -> None:
-    """See that a new file can take a number of bytes.
+    """Reserve space for a number of bytes in a new file, or check that it is free.
 
     Raises:
-        OSError: it cannot.
+        OSError: the disk has too little space.
     """
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(file.fileno(), 0, size)
@@ -156,20 +159,23 @@ def reserve(file: BinaryIO, size: int) -> None:
 
 
 def _check_room(path: str, size: int) -> None:
-    """See that a number of bytes are free where a path lies.
+    """Check that the disk of a path has a number of bytes free.
 
     Raises:
-        OSError: they are not.
+        OSError: the disk has too little space.
     """
     if shutil.disk_usage(path).free < size:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def forbids_programs(folder: Path) -> bool:
-    """Whether no library in a folder can be loaded ("noexec"), as far as the system says.
+    """Return whether a folder's file system forbids loading libraries ("noexec").
+
+    Returns:
+        False if the system cannot report this.
 
     Raises:
-        OSError: the folder cannot be looked at.
+        OSError: the file system's status cannot be read.
     """
     if not hasattr(os, "statvfs"):
         return False
@@ -178,15 +184,15 @@ def forbids_programs(folder: Path) -> bool:
 
 @contextlib.contextmanager
 def passing_file(size: int) -> Iterator[str]:
-    """The path of a file for a library to write; it is gone afterwards.
+    """Yield the path of a temporary file for a library to write. It is removed afterwards.
 
-    It is in memory where the system has such files, else in the folder for temporary files.
+    The file is in memory if the system supports that, else in the folder for temporary files.
 
     Args:
-        size: bytes that must be free in that folder.
+        size: the bytes that must be free in that folder.
 
     Raises:
-        OSError: they are not, or there is no such folder.
+        OSError: the folder is missing or has too little space.
     """
     if hasattr(os, "memfd_create"):
         memory = os.memfd_create("passing")
@@ -201,17 +207,17 @@ def passing_file(size: int) -> Iterator[str]:
 
 
 def largest_file() -> int | None:
-    """The most bytes that a file of this process may have (``ulimit -f``); None without a limit."""
+    """Return the file size limit of this process in bytes (``ulimit -f``); None without a limit."""
     return _limit("RLIMIT_FSIZE")
 
 
 def address_space() -> int | None:
-    """The most bytes of addresses of this process (``ulimit -v``); None without a limit."""
+    """Return the address space limit of this process in bytes (``ulimit -v``); None without one."""
     return _limit("RLIMIT_AS")
 
 
 def _limit(name: str) -> int | None:
-    """The limit that the system sets this process; None where it sets none."""
+    """Return a resource limit of this process; None without a limit."""
     if not resource:
         return None
     limit = int(resource.getrlimit(getattr(resource, name))[0])
@@ -219,9 +225,9 @@ def _limit(name: str) -> int | None:
 
 
 def save_addresses() -> None:
-    """Have all threads of this process, and of its children, share one heap.
+    """Make all threads of this process and of its children share one heap.
 
-    The C library reserves 64 MiB of addresses for the heap of each thread, of which it uses little.
+    Otherwise glibc reserves 64 MiB of address space for each thread's heap and uses little of it.
     """
     os.environ["MALLOC_ARENA_MAX"] = "1"
     with contextlib.suppress(OSError, TypeError, AttributeError):  # another C library
@@ -229,7 +235,7 @@ def save_addresses() -> None:
 
 
 def give_back_memory() -> None:
-    """Give memory that was freed, and that the C library keeps for later, back to the system."""
+    """Return freed memory that the C library keeps for later to the system."""
     with contextlib.suppress(OSError, TypeError, AttributeError):  # another C library
         _libc().malloc_trim(0)
 
@@ -253,12 +259,12 @@ def blocked_signals(numbers: Collection[int]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def kept_signals() -> Iterator[None]:
-    """Have signals go where they went before, whatever a library that is begun inside does.
+    """Restore this process's signal handlers after the ``with`` block.
 
-    A compiler in the process (LLVM in PoCL) takes them over at its first use, to remove its files,
-    and passes them on once; a second one that comes meanwhile ends the process where it stands.
+    LLVM, which compiles for PoCL in this process, installs its own handlers at its first use, to
+    remove its files. These pass on only one signal. A second signal would kill the process.
 
-    Only the main thread can do so; in any other nothing is done.
+    Only the main thread can restore handlers. In other threads this does nothing.
     """
     before = {number: signal.getsignal(number) for number in signal.valid_signals()}
     try:
@@ -271,10 +277,10 @@ def kept_signals() -> Iterator[None]:
 
 
 def bring_to_disk(folder: Path) -> None:
-    """Have the names in a folder outlive a loss of power; nothing on Windows, which opens none.
+    """Synchronise a folder's entries to the disk. Windows cannot open folders, so it skips this.
 
     Raises:
-        OSError: its file system cannot do that.
+        OSError: the file system cannot do that.
     """
     if not hasattr(os, "O_DIRECTORY"):
         return
@@ -287,28 +293,28 @@ def bring_to_disk(folder: Path) -> None:
 
 @cache
 def _libc() -> ctypes.CDLL:
-    """The C library.
+    """Return the C library.
 
     Raises:
-        TypeError: this system does not give it so.
+        TypeError: this system cannot load it in this way.
     """
     return ctypes.CDLL(None)
 
 
 def file_to_disk(path: Path) -> None:
-    """Have a file's bytes outlive a loss of power.
+    """Synchronise a file's bytes to the disk.
 
     Raises:
-        OSError: they cannot be brought to the disk.
+        OSError: the bytes cannot be written to the disk.
     """
     with open(path, "r+b", buffering=0) as file:
         os.fsync(file.fileno())
 
 
 def begin_writing(path: Path) -> None:
-    """Begin to bring a file's bytes to the disk, and do not wait; nothing where that is unknown.
+    """Start to write a file's bytes to the disk without waiting, if the system supports that.
 
-    Of several files the disk then makes one piece of work.
+    The disk can then combine the writes of several files.
     """
     with contextlib.suppress(OSError, TypeError, AttributeError):  # another C library
         begin = _libc().sync_file_range
@@ -318,21 +324,21 @@ def begin_writing(path: Path) -> None:
 
 
 def processors() -> int:
-    """How many processors this process may run on; all, where the system does not tell it."""
+    """Return the number of processors that this process may use; all if the system does not say."""
     return len(processor_numbers()) or os.cpu_count() or 1
 
 
 def processor_numbers() -> list[int]:
-    """The processors that this process may run on; none where the system does not tell it."""
+    """Return the processors that this process may use; an empty list if the system does not say."""
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
     return []
 
 
 def stay_on(numbers: Collection[int]) -> None:
-    """Have all threads of this process that start from now on stay on some processors.
+    """Bind the threads that this process starts from now on to some processors.
 
-    Nothing happens where the system cannot do it, or has taken one of them away.
+    This does nothing if the system cannot do it, or if one of the processors is not available.
     """
     if hasattr(os, "sched_setaffinity"):
         with contextlib.suppress(OSError):

@@ -1,23 +1,23 @@
-"""Text for messages: suggestions for misspelt names, and text that is safe to print."""
+"""Text for messages: suggestions for misspelt names, and escaping of unprintable characters."""
 
 import re
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
-LONG = 4  # letters of a word that may stand for a name
+LONG = 4  # the fewest letters of a word that can match a misspelt name
 
 
 def alike(text: str, names: Iterable[str], cutoff: float = 0.55) -> list[str]:
-    """The names that a shortened or misspelt one may stand for, in their order.
+    """Return the names that a shortened or misspelt name may mean, in their order.
 
-    These are all that have its words. If there is none, it is the most similar one, or those that
-    have the most similar word.
+    These are the names that contain all of its words. If there are none, the function returns the
+    most similar name, or the names that contain the most similar word.
 
     Args:
-        text: what was written.
-        names: those that there are.
-        cutoff: the least similarity, 0 to 1.
+        text: the name as the user wrote it.
+        names: the existing names.
+        cutoff: the least similarity, from 0 to 1.
 
     >>> alike("canon 5d", ["canon-5d2", "canon-6d", "canon-5d3"])
     ['canon-5d2', 'canon-5d3']
@@ -36,7 +36,7 @@ def alike(text: str, names: Iterable[str], cutoff: float = 0.55) -> list[str]:
 
 
 def with_words(text: str, names: Iterable[str]) -> list[str]:
-    """The names that have all words of a text, and perhaps others, in their order.
+    """Return the names that contain all words of a text, in their order.
 
     >>> with_words("noise", ["sensor_noise", "denoise", "row_noise"])
     ['sensor_noise', 'row_noise']
@@ -50,7 +50,7 @@ def _words(text: str) -> set[str]:
 
 
 def either(names: Iterable[str]) -> str:
-    """Names as alternatives.
+    """Return names as alternatives, in quotes.
 
     >>> either(["a", "b", "c"])
     "'a', 'b' or 'c'"
@@ -60,13 +60,13 @@ def either(names: Iterable[str]) -> str:
 
 
 def one_of(what: str, found: str, allowed: Iterable[str], nearest: str | None = None) -> str:
-    """A message for an unknown name, with a suggestion.
+    """Return a message about an unknown name, with a suggestion.
 
     Args:
-        what: the name is of.
-        found: the name.
-        allowed: the names that there are.
-        nearest: the name to suggest; None is the most similar of those that are allowed.
+        what: the kind of thing that the name means, such as "stage".
+        found: the unknown name.
+        allowed: the existing names.
+        nearest: the name to suggest. None suggests the most similar of the allowed names.
 
     >>> one_of("stage", "demosiac", ["mosaic", "demosaic"])
     "unknown stage 'demosiac' (did you mean 'demosaic'?); allowed: mosaic, demosaic"
@@ -78,9 +78,9 @@ def one_of(what: str, found: str, allowed: Iterable[str], nearest: str | None = 
 
 
 def one_line(text: str) -> str:
-    r"""The text in one line, with an escape for each character that cannot be printed.
+    r"""Return a text in one line, with escapes for unprintable characters.
 
-    A file's name may hold such characters; they would break a line, or change the terminal.
+    File names may contain such characters, which would break lines or change the terminal's state.
 
     >>> one_line("in/a" + chr(10) + chr(27) + "[31m.exr")
     'in/a\\n\\x1b[31m.exr'
@@ -91,7 +91,7 @@ def one_line(text: str) -> str:
 
 
 def printable(text: str) -> str:
-    """The text in one line, with ? for each character that cannot be printed.
+    """Return a text in one line, with a question mark for each unprintable character.
 
     >>> printable("R" + chr(1) + chr(10) + "G")
     'R? G'
@@ -104,9 +104,10 @@ MOST_DIGITS = 18  # of a whole number; int() raises ValueError for more than 430
 
 
 def whole_number(text: str) -> int:
-    """Returns the whole number that a text of decimal digits stands for.
+    """Return the whole number of a text of decimal digits.
 
-    Returns -1 if the text has other characters, no digits, or more than 18 digits.
+    Returns:
+        The number; -1 if the text has other characters, no digits, or more than 18 digits.
 
     >>> whole_number("42"), whole_number("-3"), whole_number("9" * 5000)
     (42, -1, -1)
@@ -115,7 +116,7 @@ def whole_number(text: str) -> int:
 
 
 def duration(seconds: float) -> str:
-    """A length of time for people.
+    """Return a length of time as text.
 
     >>> duration(5.21), duration(83), duration(7265)
     ('5.2 s', '1 min 23 s', '2 h 01 min')
@@ -129,7 +130,7 @@ def duration(seconds: float) -> str:
 
 
 def several(values: str | int | Path | Sequence[str | int | Path] | None) -> tuple[str, ...]:
-    """Return one value or several as texts; none for None.
+    """Return one value or several as a tuple of texts; an empty tuple for None.
 
     >>> several("a"), several((0, Path("b"))), several(None)
     (('a',), ('0', 'b'), ())

@@ -1,9 +1,9 @@
-"""Tracing: run code once on numbers that remember what is computed from them, then repeat that.
+"""Tracing: run code once on numbers that record their computation, then repeat the computation.
 
-The code runs on a :class:`Traced` in place of each float. Each operation becomes a line of a Python
-function, and each comparison a guard. The function repeats the computation for other numbers, in
-the same order and precision, without the code around it. Where a guard fails, the code would have
-taken another path, and has to be traced again. PyTorch's Dynamo and JAX work in this way.
+A :class:`Traced` replaces each float. Each operation becomes a line of a Python function, and each
+comparison a guard. The function repeats the computation for other numbers, in the same order and
+precision, without the surrounding code. If a guard fails, the code would have taken another path,
+so it must be traced again. PyTorch's Dynamo and JAX work in the same way.
 """
 
 import math
@@ -40,15 +40,15 @@ PLAIN = float, int, np.number
 
 
 class NotTraceableError(Exception):
-    """A result holds traced numbers where they cannot be replaced, such as in a closure."""
+    """A result contains traced numbers where they cannot be replaced, such as in a closure."""
 
 
 class Traced:
-    """A number of which a :class:`Trace` knows how it was computed.
+    """A number whose computation a :class:`Trace` records.
 
     It has the operators of a float. NumPy's functions of scalars are traced, and :func:`call`
-    traces any other function. Code that needs a plain float gets the value, and a guard then allows
-    no other one. It has no hash, so that no cache keeps it.
+    traces any other function. Code that needs a plain float gets the value, and a guard then
+    requires this value. A traced number is not hashable, so that no cache keeps it.
     """
 
     __slots__ = ("name", "trace", "value")
@@ -93,7 +93,7 @@ class Traced:
 
 
 def _calculation(function: Callable[..., Any], swapped: bool = False) -> Callable[..., Any]:
-    """A method of :class:`Traced` for an operator; swapped, for numbers on its right."""
+    """Return a method of :class:`Traced` for an operator; swapped, for the reflected operator."""
 
     def calculated(self: Traced, *others: Any) -> Any:
         if not all(isinstance(other, (Traced, *PLAIN)) for other in others):
@@ -122,14 +122,14 @@ for _name in ("lt", "le", "gt", "ge", "eq", "ne"):
 
 
 def value_of(number: Any) -> Any:
-    """Return the value of a traced number; anything else as it is."""
+    """Return the value of a traced number; return any other object unchanged."""
     return number.value if isinstance(number, Traced) else number
 
 
 def call(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return what a pure function of numbers returns; traced where one of its arguments is.
+    """Return the result of a pure function of numbers, traced if one of its arguments is traced.
 
-    The function returns a number, or a tuple of numbers.
+    The function must return a number or a tuple of numbers.
 
     >>> call(max, 1.0, 2.0)
     2.0
@@ -145,7 +145,7 @@ def call(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def traceable(function: Callable[..., T]) -> Callable[..., T]:
-    """Make a pure function of numbers one that is traced as a whole, see :func:`call`.
+    """Decorate a pure function of numbers, so that it is traced as a whole; see :func:`call`.
 
     >>> traceable(math.hypot)(3.0, 4.0)
     5.0
@@ -166,10 +166,10 @@ sqrt = traceable(math.sqrt)
 
 
 class Trace:
-    """A computation as it is traced.
+    """A recorded computation.
 
     Args:
-        values: the numbers that it starts from.
+        values: the numbers that the computation starts from.
 
     >>> trace = Trace([3.0])
     >>> (x,) = trace.inputs
@@ -182,22 +182,22 @@ class Trace:
         self.inputs = [Traced(self, f"x{n}", value) for n, value in enumerate(values)]
         self.pinned = False  # whether code took the value of a number
         self._lines: list[str] = []
-        self._places: dict[str, int] = {}  # where a line computes a text, if it is still there
+        self._places: dict[str, int] = {}  # expression -> number of its line, if not removed
         self._constants: dict[str, Any] = {"altered": altered, "with_attributes": with_attributes}
-        self._names: dict[int, str] = {}  # of constants, by their identities
+        self._names: dict[int, str] = {}  # id of a constant -> its name
 
     def number(self, function: Callable[..., Any], arguments: Sequence[Any], result: Any) -> Traced:
         """Return the result of a function of numbers, traced."""
         text = self._text(function, arguments)
         place = self._places.get(text, len(self._lines))
         line = f"v{place} = {text}"
-        if self._lines[place : place + 1] != [line]:  # or it has been computed before
+        if self._lines[place : place + 1] != [line]:  # else it has been computed before
             place = self._places[text] = len(self._lines)
             self._lines.append(f"v{place} = {text}")
         return Traced(self, f"v{place}", result)
 
     def guard(self, function: Callable[..., Any], *arguments: Any) -> bool:
-        """Return the outcome of a comparison; the computation holds for the same outcome only."""
+        """Return the outcome of a comparison. The computation is valid only for this outcome."""
         outcome = bool(function(*map(value_of, arguments)))
         holds = self._text(function, arguments)
         line = f"if {'not ' if outcome else ''}({holds}): return None"
@@ -209,7 +209,11 @@ class Trace:
 
     @contextmanager
     def attempt(self) -> Iterator[None]:
-        """Trace a part that may be left out: nothing of it stays if it fails or takes a value."""
+        """Trace an optional part: its lines are removed if it fails or takes a number's value.
+
+        Raises:
+            NotTraceableError: the part failed, or took a number's value.
+        """
         before, count, self.pinned = self.pinned, len(self._lines), False
         try:
             yield
@@ -222,25 +226,24 @@ class Trace:
             self.pinned = before
 
     def holds(self, value: Any) -> bool:
-        """Whether an object holds traced numbers."""
+        """Return whether an object contains traced numbers."""
         count = len(self._lines)
         text = _Copies(self).text(value)
         del self._lines[count:]
         return text is not None
 
     def repeat(self, result: Any) -> Repeat:
-        """Return a function that computes the result of other numbers.
+        """Return a function that computes the result for other numbers.
 
         Args:
-            result: any object. Where it holds traced numbers, in tuples, lists, dicts and
-                attributes, the function returns copies with the numbers' new values; all other
-                parts are shared.
+            result: any object. Tuples, lists, dicts and attributes may contain traced numbers.
+                The function copies these parts with new values, and shares all other parts.
 
         Returns:
-            The function. It returns None for numbers with which a guard fails.
+            The function. It returns None if a guard fails.
 
         Raises:
-            NotTraceableError: the result holds traced numbers in other places.
+            NotTraceableError: the result contains traced numbers in other places.
         """
         text = _Copies(self).text(result) or self._constant(result)
         inputs = "".join(f"{each.name}, " for each in self.inputs)
@@ -258,14 +261,14 @@ class Trace:
         return f"{self._constant(function)}({', '.join(texts)})"
 
     def _constant(self, value: Any) -> str:
-        """The name of a constant."""
+        """Return the name of a constant."""
         name = self._names.setdefault(id(value), f"k{len(self._names)}")
         self._constants[name] = value
         return name
 
 
 def needed_lines(lines: Sequence[str]) -> list[str]:
-    """Return the lines of a function without those whose result no later one takes.
+    """Return the lines of a function without those whose result no later line uses.
 
     >>> needed_lines(["v0 = x0 + k0", "v1 = x0 * x0", "return v0"])
     ['v0 = x0 + k0', 'return v0']
@@ -281,7 +284,7 @@ def needed_lines(lines: Sequence[str]) -> list[str]:
 
 
 def altered(template: T, attributes: Mapping[str, Any]) -> T:
-    """Return a copy of an object with other attributes; nothing is checked."""
+    """Return a copy of an object with some attributes replaced, without validation."""
     other = with_attributes(type(template), {**vars(template), **attributes})
     if isinstance(template, BaseModel):
         for name in BaseModel.__slots__[1:]:
@@ -290,25 +293,25 @@ def altered(template: T, attributes: Mapping[str, Any]) -> T:
 
 
 def with_attributes(kind: type[T], attributes: dict[str, Any]) -> T:
-    """Return an object of a class with these attributes, which it keeps."""
+    """Return an object of a class whose ``__dict__`` is the given dict."""
     other = object.__new__(kind)
     object.__setattr__(other, "__dict__", attributes)
     return other
 
 
 class _Copies:
-    """Writes the lines that copy a result with new numbers; see :meth:`Trace.repeat`."""
+    """Writes the lines that copy a result with new numbers. See :meth:`Trace.repeat`."""
 
     def __init__(self, trace: Trace) -> None:
         self._trace = trace
-        self._texts: dict[int, tuple[Any, str | None]] = {}  # with the object, which stays so
+        self._texts: dict[int, tuple[Any, str | None]] = {}  # with the object, to keep it alive
         self._open: set[int] = set()
 
     def text(self, value: Any) -> str | None:
-        """The text of an expression for a value; None where no part of it is traced.
+        """Return an expression for a value; None if no part of the value is traced.
 
         Raises:
-            NotTraceableError: as :meth:`Trace.repeat`.
+            NotTraceableError: as for :meth:`Trace.repeat`.
         """
         if isinstance(value, Traced):
             return value.name
@@ -341,7 +344,7 @@ class _Copies:
         if not any(texts.values()):
             return None
         constant = self._trace._constant
-        # With all names, so that their order stays.
+        # With all names, to preserve their order.
         known = constant({n: None if text else attributes[n] for n, text in texts.items()})
         changes = ", ".join(f"{name!r}: {text}" for name, text in texts.items() if text)
         if isinstance(value, BaseModel):
@@ -365,7 +368,7 @@ class _Copies:
 
 
 def _hidden(value: Any) -> list[Any]:
-    """What an object holds beside its attributes."""
+    """Return the objects that an object refers to, apart from its attributes."""
     match value:
         case BaseModel():
             return [value.__pydantic_private__, value.__pydantic_extra__]

@@ -1,4 +1,4 @@
-"""Names for the array types that the whole package uses, and values without them."""
+"""Names for array types, and the conversion of NumPy values to plain Python values."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,7 +13,7 @@ Array = NDArray[Any]
 
 
 def plain(values: Any) -> Any:
-    """Values without NumPy types, as a configuration file can hold them."""
+    """Return values without NumPy types, suitable for a configuration file."""
     if isinstance(values, Mapping):
         return {key: plain(value) for key, value in values.items()}
     if isinstance(values, list | tuple):

@@ -4,7 +4,7 @@ The rest of clpipe handles paths only. A URL is represented by a path in this pr
 temporary files, which contains :data:`SPOOL` and then the URL's parts. :func:`path_of` makes that
 path, :func:`url_of` reads the URL from it, in any process, and :func:`fetched` puts the file there.
 
-fsspec finds the credentials: those of the environment, and of its own configuration.
+fsspec finds the credentials, in the environment and in its own configuration.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 
 from clpipe.base.errors import ClpipeError, ImageError, OutputError, RequestError
 from clpipe.base.extras import require
-from clpipe.base.process_folder import process_folder
+from clpipe.base.process_folder import ROOM, process_folder
 from clpipe.base.text import one_line
 
 T = TypeVar("T")
@@ -34,11 +34,11 @@ _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://(.+)")
 TRIES = 6
 FIRST_WAIT = 0.25  # s; doubled each time
 
-# What file systems call a file's checksum or its time of change. The first that is present counts.
+# The names of a file's checksum or modification time in file systems, in order of preference.
 CHANGES = ["ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime"]
 CHANGES += ["updated", "modified", "created"]
 
-# Errors that another try does not help.
+# Errors that are not retried.
 FINAL = (FileNotFoundError, PermissionError, IsADirectoryError, NotImplementedError)
 
 
@@ -68,7 +68,10 @@ def path_of(text: str) -> Path:
     _check_scheme(text)
     folder = process_folder()
     if folder is None:
-        raise RequestError(f"{text}: there is no folder for temporary files with room (TMPDIR)")
+        raise RequestError(
+            f"{text}: no folder for temporary files has {ROOM >> 20} MiB free and allows programs "
+            "to run. Set TMPDIR to such a folder."
+        )
     return _place(text, folder)
 
 
@@ -99,7 +102,7 @@ def joined(folder: Path, text: str) -> Path:
     bucket = rest.split("/")[0]
     inside = posixpath.normpath(posixpath.join(rest, text))
     if inside.split("/")[0] != bucket:
-        raise RequestError(f"path: found {text}, which leads out of {scheme}://{bucket}")
+        raise RequestError(f"path: {text} leads out of {scheme}://{bucket}. Use a path inside it.")
     return path_of(f"{scheme}://{inside}")
 
 
@@ -112,7 +115,7 @@ def listed(url: str) -> list[str]:
         The URLs, sorted. There may be none.
 
     Raises:
-        RequestError: it cannot be listed.
+        RequestError: the URL cannot be listed.
     """
     fixed = re.split(r"[*[]", url)[0].rpartition("/")[0] if is_glob(url) else url.rstrip("/")
 
@@ -141,13 +144,13 @@ def stamp_of_url(url: str) -> tuple[int, int]:
 
 @contextlib.contextmanager
 def fetched(paths: Iterable[Path]) -> Iterator[list[Path]]:
-    """Fetch the files of paths that represent URLs, each into a folder of its own.
+    """Fetch the files of paths that represent URLs, each into a separate folder.
 
     Yields:
-        The paths of the copies, which also represent the URLs; paths of other files stay the same.
+        The paths of the copies, which also represent the URLs. Paths of other files stay the same.
 
     Raises:
-        ImageError: one cannot be fetched.
+        ImageError: a file cannot be fetched.
     """
     with contextlib.ExitStack() as stack:
         found: list[Path] = []
@@ -187,7 +190,7 @@ def upload(path: Path, url: str) -> None:
         system.put_file(str(path), remote)
         system.invalidate_cache()
         if (size := system.info(remote).get("size")) != path.stat().st_size:
-            raise OSError(f"{size} of {path.stat().st_size} bytes are there")
+            raise OSError(f"only {size} of {path.stat().st_size} bytes were written")
 
     _retried(url, work, OutputError, "written")
 
@@ -208,10 +211,10 @@ def read_url(url: str) -> bytes | None:
 
 
 def _check_scheme(url: str) -> None:
-    """See that fsspec knows a URL's scheme. No server is asked.
+    """Check that fsspec knows a URL's scheme, without contacting a server.
 
     Raises:
-        RequestError: it does not, or a package is missing; the message names the package.
+        RequestError: the scheme is unknown, or a package is missing. The message names the package.
     """
     require(f"{url}:", "fsspec")
     from fsspec import get_filesystem_class
@@ -235,7 +238,7 @@ def _place(url: str, folder: Path) -> Path:
     parts = rest.split("/")
     has_drive = os.name == "nt" and ":" in rest
     if {"..", "."} & {*parts} or "" in parts[:-1] or "\\" in url or has_drive:
-        raise RequestError(f"{url}: expected a URL without '..', '.', backslashes and empty parts")
+        raise RequestError(f"{url}: a URL may not contain '..', '.', backslashes or empty parts")
     return folder / SPOOL / scheme / rest
 
 
@@ -245,7 +248,7 @@ def _fetch(url: str, path: Path, fails: type[ClpipeError]) -> None:
     Raises:
         ClpipeError: it cannot be fetched. The error has the given type.
     """
-    part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")  # others may fetch it too
+    part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")  # other threads may fetch it
 
     def work(system: Any, remote: str) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -253,7 +256,7 @@ def _fetch(url: str, path: Path, fails: type[ClpipeError]) -> None:
         size, modified = _stamp(info)
         system.get_file(remote, str(part))
         if info.get("size") is not None and part.stat().st_size != size:
-            raise OSError(f"{part.stat().st_size} of {size} bytes came")
+            raise OSError(f"only {part.stat().st_size} of {size} bytes were received")
         os.utime(part, ns=(modified, modified))
         part.replace(path)
 
@@ -264,20 +267,20 @@ def _fetch(url: str, path: Path, fails: type[ClpipeError]) -> None:
 
 
 def _stamp(info: Mapping[str, Any]) -> tuple[int, int]:
-    """Return the size, and a number made of what shows that a file changed."""
+    """Return a file's size in bytes, and a number that changes when the file does."""
     said = next((str(v) for name in CHANGES if (v := info.get(name)) is not None), "")
     number = int.from_bytes(hashlib.sha256(said.encode()).digest()[:7]) if said else 0
-    return int(info.get("size") or 0), number // 100 * 100  # as a file's time, of which NTFS keeps
+    return int(info.get("size") or 0), number // 100 * 100  # NTFS stores times in units of 100 ns
 
 
 def _retried(url: str, work: Callable[[Any, str], T], fails: type[ClpipeError], what: str) -> T:
-    """Return what a function returns for a URL's file system and the path in it.
+    """Return the result of a function for a URL's file system and the path in it.
 
-    It is called again after errors that may pass.
+    The function is retried after errors that may be temporary.
 
     Raises:
         RequestError: as for :func:`_check_scheme`.
-        ClpipeError: it failed. The error has the given type, and says what could not be done.
+        ClpipeError: all tries failed. The error has the type ``fails``.
     """
     _check_scheme(url)
     from fsspec.core import url_to_fs

@@ -1,4 +1,4 @@
-"""Errors of pydantic as one line for a user: the place of the value, the value, the reason."""
+"""Errors of pydantic as one line for a user: the value's key, the value and the reason."""
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,8 +20,11 @@ R = TypeVar("R")
 class Fault:
     """The first fault in a table of values.
 
-    ``path`` leads to the value, through tables by name and through lists by number; it is empty
-    where values only contradict each other. ``text`` names the value found and the reason.
+    Attributes:
+        path: the names of tables and the numbers of list items that lead to the value. It is empty
+            if values contradict each other.
+        problem: the kind of fault.
+        text: the value and the reason.
     """
 
     path: tuple[str | int, ...]
@@ -30,7 +33,7 @@ class Fault:
 
     @property
     def name(self) -> str:
-        """The last part of the path, "" where there is none."""
+        """The last part of the path; "" if the path is empty."""
         return str(self.path[-1]) if self.path else ""
 
     @property
@@ -45,7 +48,7 @@ class Fault:
 
 
 def first_fault(error: ValidationError) -> Fault:
-    """The first fault in an error of pydantic.
+    """Return the first fault of a pydantic error.
 
     >>> from pydantic import BaseModel, Field
     >>> class Lens(BaseModel):
@@ -70,7 +73,7 @@ def first_fault(error: ValidationError) -> Fault:
 
 
 def typed(function: Callable[P, R]) -> Callable[P, R]:
-    """A function that refuses arguments which are not of their annotated types; none is converted.
+    """Decorate a function, so that it rejects arguments of other types than annotated.
 
     >>> @typed
     ... def keep(names: str, truth: bool = False) -> None: ...
@@ -78,8 +81,10 @@ def typed(function: Callable[P, R]) -> Callable[P, R]:
     Traceback (most recent call last):
     clpipe.base.errors.RequestError: found truth 'mosaic'; expected true or false
 
+    The arguments are not converted.
+
     Raises:
-        RequestError: an argument is of another type.
+        RequestError: an argument has another type.
     """
     signature = inspect.signature(function)
     annotations = {
@@ -105,7 +110,7 @@ def typed(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def in_words(annotation: Any) -> str:
-    """The values that a type allows, for people.
+    """Return the values that a type allows, in words.
 
     >>> in_words(bool | Literal["clean", "noisy"] | None), in_words(str | Sequence[str | Path])
     ("true or false, 'clean', 'noisy' or None", 'a text or a list of texts or paths')

@@ -2,6 +2,6 @@
 
 TOML, ``--set``, manifest rows and sidecars become a :class:`~clpipe.chain.request.Request`, then
 :class:`~clpipe.chain.settings.Settings`, then a :class:`~clpipe.chain.chain.Chain`; random draws,
-truths and the registry of stages belong here too. No pixels and no devices; it imports ``images``
-(for the tables that describe files) and below.
+truths and the registry of stages also belong here. The package does not handle pixels or devices.
+It imports ``images`` (for the tables that describe files) and below.
 """

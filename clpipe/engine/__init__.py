@@ -1,5 +1,5 @@
 """How a chain runs: plan, generated OpenCL source, compiled programs, buffers, devices.
 
-Modules whose docstring says "Pure" need no device; only this room imports pyopencl.
-It knows nothing of files and batches, and imports ``chain`` and below.
+A module whose docstring says "Pure" needs no device. Only this package imports pyopencl. It does
+not know image files or batches, and imports ``chain`` and below.
 """

@@ -1,4 +1,4 @@
-"""How fast a chain is on a device, launch by launch, against the device's own copy speed."""
+"""Benchmarks of a chain on a device, per launch, compared with the device's copy speed."""
 
 import time
 from dataclasses import asdict, dataclass, replace
@@ -20,7 +20,15 @@ from clpipe.stage import Kind, Stage, variant_label, variants
 
 @dataclass(frozen=True)
 class Speed:
-    """One launch, or the chain: milliseconds, megapixels a second, GB/s and its share of a copy."""
+    """The speed of a launch or of the chain.
+
+    Attributes:
+        name: of the launch, or "chain".
+        ms: the time in ms.
+        mp_per_s: megapixels per second.
+        gb_per_s: device memory read and written, in GB/s.
+        share_of_copy: ``gb_per_s`` as a fraction of the device's copy speed.
+    """
 
     name: str
     ms: float
@@ -31,7 +39,7 @@ class Speed:
 
 @dataclass(frozen=True)
 class BenchReport:
-    """A benchmark: the chain, its launches, and what they were measured on."""
+    """The result of a benchmark: the speeds of a chain and of its launches, and the conditions."""
 
     device: str
     width: int
@@ -43,13 +51,13 @@ class BenchReport:
     launches: tuple[Speed, ...]
 
     def record(self) -> dict[str, Any]:
-        """The report as JSON values, with the chain's ``mp_per_s`` at the top."""
+        """Return the report as JSON values, with the chain's ``mp_per_s`` at the top level."""
         return {"mp_per_s": self.chain.mp_per_s} | asdict(self)
 
 
 @dataclass(frozen=True)
 class MethodSpeed:
-    """One method of a stage: how many launches it takes, milliseconds, megapixels a second."""
+    """The speed of one method of a stage: number of launches, time in ms, megapixels per second."""
 
     method: str
     launches: int
@@ -58,7 +66,7 @@ class MethodSpeed:
 
 
 def scene(width: int, height: int) -> Array:
-    """A picture to measure on, (height, width, 3) half: gradients, texture and edges."""
+    """Return a test image with gradients, texture and edges, (height, width, 3) float16."""
     x, y = np.linspace(0, 60, width, dtype=np.float32), np.linspace(0, 40, height, dtype=np.float32)
     shade = (np.sin(x)[None, :] * np.cos(y)[:, None] + 1) * 0.4
     shade[:, :: max(width // 50, 1)] *= 0.3
@@ -68,7 +76,10 @@ def scene(width: int, height: int) -> Array:
 
 
 def input_of(chain: Chain, width: int, height: int) -> Array:
-    """An image to measure on that a chain starts on: half (DN: float), (height, width[, 3])."""
+    """Return a test image of the kind that a chain starts on, (height, width[, 3]).
+
+    It is float16, or float32 for a chain that starts on a raw in DN.
+    """
     picture = scene(width, height)
     if len(chain.source.channels) > 1:
         return picture
@@ -82,10 +93,10 @@ def input_of(chain: Chain, width: int, height: int) -> Array:
 def bench(
     device: Device, chain: Chain, width: int = 6000, height: int = 4000, repeat: int = 7
 ) -> BenchReport:
-    """Time a chain from its input on the device, see :func:`input_of`, to eight-bit RGB there.
+    """Time a chain on the device, from its input (see :func:`input_of`) to eight-bit RGB.
 
-    The chain is timed whole, with one wait at its end; its launches by the device's own events.
-    Each figure is the best of ``repeat`` runs after a first one that compiles.
+    The time of the chain includes one wait at its end. The device's events time the launches. Each
+    figure is the best of ``repeat`` runs after a first run, which compiles.
     """
     runner = Runner(chain, device)
     image = input_of(chain, width, height)
@@ -140,12 +151,12 @@ def bench_methods(
     height: int = 4000,
     repeat: int = 7,
 ) -> list[MethodSpeed]:
-    """Time every method of a stage alone, from float planes to float planes on the device.
+    """Time every method of a stage separately, from float planes to float planes on the device.
 
-    A figure is the sum of the best times of a method's launches. A first launch that brings the
-    image into planes, with what is pointwise in it, is not counted: in a chain the stage before
-    does that. The settings' parameters of the stage hold for every method that has them; where
-    they name a method, it alone is timed.
+    A figure is the sum of the best times of a method's launches. A first launch that only converts
+    the source to planes is not counted, because the stage before does that in a chain. The
+    settings' parameters of the stage apply to every method that has them. If the settings name a
+    method, only this method is timed.
     """
     picture = scene(width, height).astype(np.float32)
     image = picture if len(stage.reads.channels) == 3 else np.ascontiguousarray(picture[..., 1])

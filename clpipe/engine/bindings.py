@@ -1,6 +1,6 @@
-"""Bindings: the values and buffers that the parameters of a kernel stand for at a launch.
+"""Bindings: the values and buffers that a launch passes to the parameters of a kernel.
 
-They are tuples because these classes are made seven times faster than dataclasses.
+These classes are named tuples, because Python creates them seven times faster than dataclasses.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,9 +13,9 @@ class Buffer(NamedTuple):
     """A buffer on the device.
 
     Args:
-        name: "src" and "dst" for the image that is sent and the pixels that are encoded, else as in
+        name: "src" for the uploaded image, "dst" for the encoded pixels, else a name of
             :func:`~clpipe.engine.tiles.buffer_sizes`.
-        written: whether the kernel writes it; else it only reads it.
+        written: whether the kernel writes to it.
     """
 
     name: str
@@ -23,14 +23,14 @@ class Buffer(NamedTuple):
 
 
 class ExtentNumber(NamedTuple):
-    """A number of the tile's extent, or of the ``larger`` image's that it is resampled from."""
+    """A number of the tile's extent or, if ``larger``, of the image from which it is resampled."""
 
     name: str
     larger: bool = False
 
 
 class TileNumber(NamedTuple):
-    """The number of tiles before this one."""
+    """The number of this tile, from 0."""
 
 
 class ArgumentValue(NamedTuple):
@@ -55,13 +55,13 @@ class EncodedCurves(NamedTuple):
 
 
 class ResamplingValue(NamedTuple):
-    """A value of the resampling that leads on from a level."""
+    """A value of the resampling from a level to the next."""
 
     level: int
     name: str
 
 
-# What follows from the image's chain, its key and its size.
+# The values that depend on the image's chain, noise key and size.
 Value = ArgumentValue | StreamWord | EncodedCurves | ResamplingValue
 
 Bind = Callable[[Sequence[Value]], list[Any]]  # returns NumPy scalars and arrays
@@ -71,9 +71,9 @@ Bound = Buffer | ExtentNumber | TileNumber | Value
 
 
 class Parameter(NamedTuple):
-    """One kernel parameter: its OpenCL declaration, and what is bound to it.
+    """One kernel parameter: its OpenCL declaration, and the value or buffer bound to it.
 
-    What is bound is not part of the kernel's text.
+    The binding is not part of the kernel's source.
     """
 
     declaration: str
@@ -81,10 +81,13 @@ class Parameter(NamedTuple):
 
 
 def slot_buffer(number: int) -> str:
-    """The name of a slot's buffer."""
+    """Return the name of a slot's buffer."""
     return f"slot{number}"
 
 
 def step_buffer(content: str, step: str) -> str:
-    """The name of a step's buffer: sums, partials, counts, histogram, estimates, a line table."""
+    """Return the name of a step's buffer.
+
+    ``content`` is "sums", "partials", "counts", "histogram", "estimates" or a line table's name.
+    """
     return f"{content}.{step}"

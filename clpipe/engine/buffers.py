@@ -1,4 +1,4 @@
-"""Memory of a run: buffers on the device, and arrays on the host for what comes back."""
+"""Memory of a run: buffers on the device, and arrays on the host for the results."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,11 +16,12 @@ from clpipe.stage import Kind
 
 @dataclass
 class HostImages:
-    """The results of a run on the host.
+    """The results of a run on the host. Images of patches are (patch, height, width[, channel]).
 
-    ``images`` are float images by their number in the plan, (height, width[, channel]);
-    ``encoded`` are eight-bit pixels of the same shape; ``estimates`` are four floats a step. Images
-    of patches are (patch, height, width[, channel]).
+    Attributes:
+        images: float32 images by their number in the plan, (height, width[, channel]).
+        encoded: the eight-bit pixels of the last image, (height, width[, channel]).
+        estimates: four floats for each step that estimates numbers from the image.
     """
 
     images: dict[int, Array]
@@ -32,7 +33,7 @@ PAGE = 4096
 
 
 def aligned_empty(shape: tuple[int, ...], dtype: Any) -> Array:
-    """A new array, unset, that begins at a memory page; NumPy's begin 16 bytes behind one.
+    """Return an uninitialised array that begins at a memory page, unlike NumPy's own arrays.
 
     >>> array = aligned_empty((3, 5), np.float32)
     >>> array.shape, array.ctypes.data % PAGE
@@ -47,21 +48,21 @@ def aligned_empty(shape: tuple[int, ...], dtype: Any) -> Array:
 def room_for(
     plan: Plan, width: int, height: int, into: Array | None, boxes: Sequence[Box] = ()
 ) -> HostImages:
-    """Empty arrays for all results of a plan.
+    """Return uninitialised arrays for all results of a plan.
 
     Args:
         plan: the plan.
-        width: of the source in pixels, and its height.
-        height: see above.
+        width: the width of the source in pixels.
+        height: its height.
         into: an array to use for the eight-bit pixels.
-        boxes: the patches that are made of the results, all of one size; () is all of them.
+        boxes: the patches of the results to compute, all of one size. () computes whole images.
 
     Raises:
-        ValueError: ``into`` has another shape or type, or patches differ in size.
+        ValueError: ``into`` has the wrong shape or type, or the patches differ in size.
     """
     shapes = {(box.height, box.width) for box in boxes}
     if len(shapes) > 1:
-        raise ValueError(f"patches of {sorted(shapes)}; expected one size")
+        raise ValueError(f"patches have the sizes {sorted(shapes)}, but all must have one size")
     sizes = plan.sizes(width, height)
 
     def shape(kind: Kind, level: int) -> tuple[int, ...]:
@@ -74,7 +75,10 @@ def room_for(
         own = shape(plan.encoded, len(sizes) - 1)
         encoded = aligned_empty(own, np.uint8) if into is None else into
         if encoded.shape != own or encoded.dtype != np.uint8:
-            raise ValueError(f"into is {encoded.shape} {encoded.dtype}; {own} uint8")
+            raise ValueError(
+                f"into has shape {encoded.shape} and type {encoded.dtype}, but the result has "
+                f"shape {own} and type uint8"
+            )
     return HostImages(
         images={i.number: np.empty(shape(i.kind, i.level), np.float32) for i in images},
         encoded=encoded,
@@ -83,13 +87,13 @@ def room_for(
 
 
 def core_of(extent: Extent, whole: Array) -> Array:
-    """The part of an image, (height, width[, channel]), that a tile makes."""
+    """Return the part of an image, (height, width[, channel]), that a tile computes."""
     core = extent.core
     return whole[core.top : core.bottom, core.left : core.right]
 
 
 def copy_encoded(extent: Extent, pixels: Array, room: Array) -> None:
-    """Copy the core of a tile's eight-bit pixels, unless they are there already."""
+    """Copy the core of a tile's eight-bit pixels, unless both arrays share memory."""
     if not np.may_share_memory(pixels, room):
         core, stored = extent.core, extent.stored
         part = pixels.reshape(stored.height, stored.width, *room.shape[2:])
@@ -99,7 +103,7 @@ def copy_encoded(extent: Extent, pixels: Array, room: Array) -> None:
 
 
 def copy_plane(extent: Extent, plane: Array, room: Array, channel: int) -> None:
-    """Copy the core of a tile's plane into a channel of (height, width[, channel])."""
+    """Copy the core of a tile's plane to a channel of an image, (height, width[, channel])."""
     core, stored, border = extent.core, extent.stored, extent.border
     height = extent.padded_height + 2 * border
     top = border + core.top - stored.top
@@ -110,24 +114,24 @@ def copy_plane(extent: Extent, plane: Array, room: Array, channel: int) -> None:
 
 
 class Pool:
-    """Device buffers by name, kept from image to image where they are large enough."""
+    """Device buffers by name, which later images reuse if they are large enough."""
 
     def __init__(self, make: Callable[[int], Any]) -> None:
         self._make = make
         self.buffers: dict[str, Any] = {}
-        self._sizes: dict[str, int] = {}  # asking a buffer takes longer
+        self._sizes: dict[str, int] = {}  # querying a buffer's size is slower
 
     def has(self, sizes: Mapping[str, int], memory: int) -> bool:
-        """Whether :meth:`reserve` would release none of its buffers and make none."""
+        """Return whether :meth:`reserve` would neither release nor allocate a buffer."""
         held = self._sizes
         is_there = all(name in held and held[name] >= size for name, size in sizes.items())
         return is_there and self.bytes <= memory
 
     def reserve(self, sizes: Mapping[str, int], memory: int) -> None:
-        """Make sure that there are buffers of at least these sizes (bytes by name).
+        """Allocate buffers of at least these sizes (bytes by name), if they are missing.
 
-        Buffers that only earlier images needed are kept while all together take no more than
-        ``memory`` bytes.
+        Buffers that only earlier images needed are kept as long as all buffers fit into ``memory``
+        bytes.
         """
         if self.has(sizes, memory):
             return
@@ -147,11 +151,11 @@ class Pool:
 
     @property
     def bytes(self) -> int:
-        """The size of all buffers together."""
+        """The size of all buffers together, in bytes."""
         return sum(self._sizes.values())
 
     def release(self) -> None:
-        """Give all buffers back to the device."""
+        """Release all buffers."""
         buffers, self.buffers, self._sizes = self.buffers, {}, {}
         for buffer in buffers.values():
             buffer.release()

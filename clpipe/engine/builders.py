@@ -1,10 +1,10 @@
-"""Programs, compiled or taken from what is kept of them between processes.
+"""Programs: compiled, or loaded from the cache on disk.
 
-A runtime believes what it is given: of a library that was cut, PoCL ends the process. So none
-reads the store itself.
+Runtimes do not validate cached programs; a truncated library crashes PoCL. Therefore clpipe reads
+and validates the cache itself.
 
-PoCL has no call that takes compiled kernels back; it maps libraries out of a folder. So each
-process has a folder for it, and what is kept of a program is its part of that folder.
+PoCL has no call that loads compiled kernels; it maps libraries from a folder. Therefore each
+process has a separate folder for PoCL, and the cache stores each program's part of this folder.
 """
 
 import io
@@ -27,11 +27,11 @@ COMPILER = 112 << 20  # bytes of memory; measured: 86 to 105 MiB for the default
 
 
 class BinaryBuilder:
-    """Builds programs with a runtime that gives binaries and takes them back.
+    """Builds programs with a runtime that can return and load binaries.
 
     Args:
         context: a ``pyopencl.Context`` of one device.
-        store: for the binaries.
+        store: the cache of binaries.
     """
 
     def __init__(self, context: Any, store: Store) -> None:
@@ -39,7 +39,7 @@ class BinaryBuilder:
         self._store = store
 
     def build(self, source: str, options: list[str]) -> Any:
-        """The ``pyopencl.Program``, of what is kept if the runtime takes it.
+        """Return the ``pyopencl.Program``, from the cached binary if the runtime accepts it.
 
         Raises:
             pyopencl.Error: it does not compile.
@@ -58,38 +58,38 @@ class BinaryBuilder:
         return program
 
     def keep(self) -> None:
-        """Nothing is left to be kept."""
+        """Do nothing, because :meth:`build` has stored the binaries."""
 
 
 class PoclBuilder:
-    """Builds programs with PoCL, out of and into its folder.
+    """Builds programs with PoCL, which keeps compiled programs in a folder.
 
-    PoCL has a folder for each program, named by a digest that only PoCL knows, with libraries that
-    come at the first launch of each local size. So what is kept is written after that.
+    PoCL has a subfolder for each program. Its name is a digest that only PoCL can compute. PoCL
+    adds a library at the first launch of each local size, so programs are stored after that.
 
     Args:
         context: a ``pyopencl.Context``.
-        store: for what is in PoCL's folder.
-        folder: PoCL's, of this process alone.
+        store: the cache of the contents of PoCL's folder.
+        folder: PoCL's folder, which only this process uses.
     """
 
     # One build at a time, because what a build added to the folder is found by comparing listings.
     _one_at_a_time = threading.Lock()
-    _has_compiled = False  # in this process, which has the compiler's memory then
+    _has_compiled = False  # whether this process has already allocated the compiler's memory
 
     def __init__(self, context: Any, store: Store, folder: Path) -> None:
         self._context = context
         self._store = store
         self._folder = folder
-        # The folders of programs, by text and options, with the files of each that are kept.
+        # The folder of each program and its stored files, by source and options.
         self._built: dict[tuple[str, tuple[str, ...]], tuple[str, frozenset[str]]] = {}
 
     def build(self, source: str, options: list[str]) -> Any:
-        """The ``pyopencl.Program``; what is kept is put back into PoCL's folder before.
+        """Return the ``pyopencl.Program``, after unpacking the cached program to PoCL's folder.
 
         Raises:
-            pyopencl.Error: it does not compile.
-            DeviceError: there is no room to compile in, where PoCL would end the process.
+            pyopencl.Error: the program does not compile.
+            DeviceError: there is too little space to compile, so PoCL would crash the process.
         """
         import pyopencl as cl
 
@@ -109,33 +109,33 @@ class PoclBuilder:
         return program
 
     def _check_room(self) -> None:
-        """Check that PoCL can compile. It ends the process if the disk or memory is full.
+        """Check that PoCL can compile. PoCL crashes the process if the disk or memory is full.
 
         Raises:
-            DeviceError: disk or memory are too small, or the folder has been removed.
+            DeviceError: there is too little disk space or memory, or the folder was removed.
         """
         try:
             enough = has_room(self._folder.parent)
         except OSError as error:
             raise DeviceError(
-                f"{self._folder.parent}: PoCL's folder has been removed while this process used it "
-                f"({error.strerror}); start again, and exclude it from clean-ups of temporary files"
+                f"{self._folder.parent}: PoCL's folder was removed while this process used it "
+                f"({error.strerror}). Exclude it from clean-ups of temporary files and start again."
             ) from None
         if not enough:
             raise DeviceError(
-                f"{self._folder}: PoCL needs {ROOM >> 20} MiB of room there to compile in; free "
-                "some, or name another folder for temporary files with TMPDIR"
+                f"{self._folder}: PoCL needs {ROOM >> 20} MiB of free space there to compile. Free "
+                "some space, or set TMPDIR to another folder for temporary files."
             )
         left = None if self._has_compiled else memory_left()
         if left and left.bytes < COMPILER:
             raise DeviceError(
-                f"PoCL's compiler takes about {in_words(COMPILER)} of memory; "
-                f"{in_words(left.bytes)} are left by {left.by}; allow more for the first run"
+                f"PoCL's compiler needs about {in_words(COMPILER)} of memory, but "
+                f"{in_words(left.bytes)} are left by {left.by}. Allow more for the first run."
             )
         PoclBuilder._has_compiled = True
 
     def keep(self) -> None:
-        """Store what PoCL has compiled since the programs were built."""
+        """Store the files that PoCL has compiled since the programs were built."""
         with self._one_at_a_time:
             for (source, options), (name, kept) in list(self._built.items()):
                 files = _files_of(self._folder / name)
@@ -147,11 +147,11 @@ class PoclBuilder:
 
 PROGRAM = re.compile(r"[A-Z]{2}/[A-Z]+")
 FILE = re.compile(rf"{PROGRAM.pattern}(/(?!\.\.?/)[^/\\\0]+)+")
-TOUCHED = "last_accessed"  # PoCL writes it at each use, and never reads it
+TOUCHED = "last_accessed"  # PoCL writes this file at each use, and never reads it
 
 
 def _programs_in(folder: Path) -> frozenset[str]:
-    """The programs in PoCL's folder, as "AB/CDE..."."""
+    """Return the names of the programs in PoCL's folder, in the form "AB/CDE..."."""
     groups = _names(folder)
     found = (f"{group}/{name}" for group in groups for name in _names(folder / group))
     return frozenset(name for name in found if PROGRAM.fullmatch(name))
@@ -160,12 +160,12 @@ def _programs_in(folder: Path) -> frozenset[str]:
 def _names(folder: Path) -> list[str]:
     try:
         return os.listdir(folder)
-    except OSError:  # it is a file, or not there yet
+    except OSError:  # it is a file, or does not exist yet
         return []
 
 
 def _files_of(program: Path) -> frozenset[str]:
-    """The files of a program, by their names below its folder."""
+    """Return the names of a program's files, relative to its folder."""
     return frozenset(
         os.path.relpath(os.path.join(place, name), program)
         for place, _, names in os.walk(program)
@@ -175,7 +175,7 @@ def _files_of(program: Path) -> frozenset[str]:
 
 
 def _packed(folder: Path, program: str, files: frozenset[str]) -> bytes:
-    """Files of a program, as a ZIP archive of names in PoCL's folder."""
+    """Return the files of a program as a ZIP archive, with names relative to PoCL's folder."""
     memory = io.BytesIO()
     with zipfile.ZipFile(memory, "w") as archive:
         for name in sorted(files):
@@ -186,9 +186,9 @@ def _packed(folder: Path, program: str, files: frozenset[str]) -> bytes:
 
 
 def _unpack(data: bytes, folder: Path) -> None:
-    """Write the files of a packed program that PoCL's folder does not have yet.
+    """Write the files of a packed program that are missing in PoCL's folder.
 
-    A library that is there may be mapped and running: writing to it would end the process (SIGBUS).
+    Existing libraries may be mapped and running. Writing to them would crash the process (SIGBUS).
     """
     with (
         suppress(ImageError, zipfile.BadZipFile),
@@ -201,7 +201,7 @@ def _unpack(data: bytes, folder: Path) -> None:
 
 
 def _contents(archive: zipfile.ZipFile) -> Iterator[tuple[str, bytes]]:
-    """The names and the bytes of files that belong into PoCL's folder."""
+    """Yield the name and the bytes of each file with a valid name in PoCL's folder."""
     for info in archive.infolist():
         if FILE.fullmatch(info.filename):
             yield info.filename, archive.read(info)

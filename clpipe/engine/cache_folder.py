@@ -1,15 +1,10 @@
-"""Where compiled programs are kept: by clpipe, by PoCL and by pyopencl.
+"""The folders in which clpipe, PoCL and pyopencl cache compiled programs.
 
-=========  =====================  ==================================================
-who        variable               folder
-=========  =====================  ==================================================
-clpipe     ``CLPIPE_CACHE_DIR``   the user's cache folder for clpipe, if not set
-PoCL       ``POCL_CACHE_DIR``     in the folder of this process, always
-pyopencl   ``XDG_CACHE_HOME``     the user's; that of this process if it is unusable
-=========  =====================  ==================================================
+clpipe uses the folder that ``CLPIPE_CACHE_DIR`` names, or else the user's cache folder. It runs the
+programs in this folder, so it uses the folder only if no other user may write to it.
 
-:func:`prepare_environment` sets the last two variables. clpipe runs the programs that it keeps, so
-it uses its folder only if nobody but this user may write to it.
+:func:`prepare_environment` sets two variables. ``POCL_CACHE_DIR`` always names a folder that only
+this process uses. ``XDG_CACHE_HOME``, for pyopencl, changes only if the user's folder is unusable.
 """
 
 import logging
@@ -29,7 +24,7 @@ log = logging.getLogger(__name__)
 
 
 def is_usable(folder: Path | None) -> bool:
-    """Whether files can be written to a folder, after it is made if need be."""
+    """Return whether files can be written to a folder. A missing folder is created."""
     if folder is None:
         return False
     try:
@@ -41,7 +36,7 @@ def is_usable(folder: Path | None) -> bool:
 
 
 def user_folder(name: str | None = None) -> Path | None:
-    """The user's cache folder, or that of a program; None for a user without a home."""
+    """Return the user's cache folder, or a program's folder in it; None if there is no home."""
     with suppress(RuntimeError):  # newer versions of platformdirs
         folder = platformdirs.user_cache_path(name)
         return None if folder.parts[:1] == ("~",) else folder  # older ones
@@ -66,25 +61,26 @@ def cache_folder() -> Path | None:
 
 
 def is_private(folder: Path) -> bool:
-    """Whether only this user may write to a folder; if not, that is logged."""
+    """Return whether only this user may write to a folder. If not, log a warning."""
     try:
         reason = writable_by_others(folder)
     except OSError:
         return False
     if reason:
         log.warning(
-            "%s: %s, and what lies there is run; kernels are not kept "
-            "(chmod 700, or name another folder with %s)",
+            "%s: %s, and clpipe runs the programs in it. Kernels are therefore not cached. "
+            "Use chmod 700, or name another folder with %s.",
             *(folder, reason, VARIABLE),
         )
     return not reason
 
 
 def later_runs() -> str:
-    """Return in words where later runs find what is compiled now."""
+    """Return in words where later runs find the kernels compiled now."""
     if folder := cache_folder():
         return f"later runs find them in {folder}"
-    return f"later runs do so again, because they cannot be kept in {wanted_folder() or 'a home'}"
+    place = wanted_folder() or "the home directory"
+    return f"later runs compile them again, because they cannot be cached in {place}"
 
 
 def pocl_folder() -> Path | None:
@@ -94,10 +90,10 @@ def pocl_folder() -> Path | None:
 
 
 def prepare_environment() -> None:
-    """Tell PoCL and pyopencl where to keep their caches. Call this before pyopencl is loaded.
+    """Set the cache folders of PoCL and pyopencl. Call this before pyopencl is loaded.
 
-    PoCL trusts every file that it finds, so it gets a folder that only this process uses, whatever
-    the variable says. pyopencl fails to start if its cache folder is unusable.
+    PoCL trusts every file in its folder. Therefore it gets a folder that only this process uses,
+    even if the variable is set. pyopencl fails to start if its cache folder is unusable.
     """
     if folder := pocl_folder():
         os.environ["POCL_CACHE_DIR"] = str(folder)
@@ -106,10 +102,10 @@ def prepare_environment() -> None:
 
 
 def pocl_problem() -> str:
-    """Why PoCL has no folder to compile in, or nothing."""
+    """Return why PoCL has no folder to compile in; "" if it has one."""
     if process_folder():
         return ""
     return (
-        "PoCL needs a folder for temporary files that can be written to and run from (no "
-        f"'noexec'), with {ROOM >> 20} MiB of room; name one with TMPDIR"
+        f"PoCL needs a writable folder for temporary files with {ROOM >> 20} MiB of free space, "
+        "mounted without 'noexec'. Set TMPDIR to such a folder"
     )

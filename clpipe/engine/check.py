@@ -1,4 +1,4 @@
-"""Every kernel against its NumPy reference, on a device."""
+"""Comparison of every kernel with its NumPy reference, on a device."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -19,12 +19,12 @@ from clpipe.stage import PERIOD, Kind, Method, Stage, variant_label, variants
 
 # Odd sizes, one pixel wide and high, smaller than the widest border, more than one work-group.
 SIZES = ((1, 1), (1, 9), (11, 1), (2, 3), (6, 5), (37, 53), (9, 530))
-ISO = 3200  # at which every stage has something to do
+ISO = 3200  # an ISO at which every stage has an effect
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Two results compared: how many samples, how many differ at all, and by how much at most."""
+    """The difference of two results: samples, differing samples, and the largest difference."""
 
     samples: int = 0
     differing: int = 0
@@ -40,7 +40,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Check:
-    """How one method of a stage did, over so many cases (images)."""
+    """The result of checking one method of a stage. ``cases`` is the number of images."""
 
     stage: str
     method: str
@@ -54,7 +54,7 @@ class Check:
         return self.difference.largest <= self.tolerance
 
     def record(self) -> dict[str, Any]:
-        """The check as JSON values."""
+        """Return the check as JSON values."""
         return {
             "stage": self.stage,
             "method": self.method,
@@ -66,9 +66,9 @@ class Check:
 
 
 def example(kind: Kind, size: tuple[int, int], half: bool = False, seed: int = 0) -> Array:
-    """A random image of a kind, (height, width[, channel]): shadows, highlights, below black.
+    """Return a random image of a kind, (height, width[, channel]).
 
-    Signals go from -0.05, which a 14-bit ADC clips at 0 DN, to 1.35.
+    Its signals range from -0.05, which a 14-bit ADC clips at 0 DN, to 1.35.
     """
     random = np.random.default_rng(seed)
     if kind is Kind.RAW:
@@ -79,14 +79,14 @@ def example(kind: Kind, size: tuple[int, int], half: bool = False, seed: int = 0
 
 
 def difference(one: Array | None, two: Array | None) -> Difference:
-    """Two images compared. NaN is infinitely far from anything.
+    """Return the difference of two images. NaN differs infinitely from any value.
 
     Raises:
-        ValueError: one is missing, or they differ in shape.
+        ValueError: an image is missing, or the shapes differ.
     """
     if one is None or two is None or one.shape != two.shape:
         shapes = [None if image is None else image.shape for image in (one, two)]
-        raise ValueError(f"found images of shapes {shapes}; expected two of one shape")
+        raise ValueError(f"the images have the shapes {shapes}, but both must have one shape")
     apart = np.nan_to_num(np.abs(one.astype(np.float64) - two), nan=np.inf)
     return Difference(apart.size, int(np.count_nonzero(apart)), float(apart.max()))
 
@@ -94,7 +94,10 @@ def difference(one: Array | None, two: Array | None) -> Difference:
 def compare(
     device: Device, chain: Chain, sizes: Sequence[tuple[int, int]] = SIZES, half: bool = False
 ) -> Difference:
-    """A chain on the device and in NumPy, in float, over images of these sizes (height, width)."""
+    """Return the difference of a chain's float results on the device and in NumPy.
+
+    ``sizes`` are the (height, width) of the test images.
+    """
     on_device, in_numpy = (Runner(chain, d, encode=False, final=True) for d in (device, None))
     total = Difference()
     for seed, size in enumerate(sizes):
@@ -104,17 +107,17 @@ def compare(
     return total
 
 
-# Filter arrays that are no Bayer patterns: of odd and even periods, with and without clear pixels.
+# Filter arrays that are not Bayer patterns: odd and even periods, with and without clear pixels.
 ARRAYS = ("x-trans", "RGBW", "RCCB", "RGB/GBR/BRG")
 
 
 def laid(pattern: str) -> dict[str, str]:
-    """The parameters of the stage mosaic that lay a Bayer pattern, or another array."""
+    """Return the parameters of the stage mosaic for a Bayer pattern or another filter array."""
     return {"pattern": pattern} if pattern in PATTERNS else {"method": "array", "array": pattern}
 
 
 def chain_for(stage: Stage, method: type[Method], values: Mapping[str, Any], pattern: str) -> Chain:
-    """One method of a stage as a chain that starts on what it reads, in that pattern or array."""
+    """Return a chain of one method that starts on its input, with a pattern or filter array."""
     if method.only_arrays and pattern not in method.only_arrays:
         pattern = method.only_arrays[0]
     before = {Kind.MOSAIC: ("mosaic",), Kind.RAW: ("mosaic", "quantize")}.get(stage.reads, ())
@@ -127,13 +130,13 @@ def chain_for(stage: Stage, method: type[Method], values: Mapping[str, Any], pat
 
 
 def depends_on_pattern(stage: Stage, method: type[Method], values: Mapping[str, Any]) -> bool:
-    """Whether the kernels of a method are compiled for a CFA pattern."""
+    """Return whether the kernels of a method are compiled for a CFA pattern."""
     step = chain_for(stage, method, values, PATTERNS[0]).steps[0]
     return any("pattern" in pass_.all_arguments for pass_ in step.passes)
 
 
 def arrays_of(stage: Stage, method: type[Method], values: Mapping[str, Any]) -> tuple[str, ...]:
-    """The filter arrays on which a method is checked beside Bayer patterns: where it tells them."""
+    """Return the filter arrays to check in addition to Bayer patterns, if the method uses them."""
     if values or not method.any_array or stage.reads is not Kind.MOSAIC or method.only_arrays:
         return ()
     step = chain_for(stage, method, values, ARRAYS[0]).steps[0]
@@ -149,11 +152,19 @@ def check_method(
     patterns: Sequence[Pattern] | None = None,
     values: Mapping[str, Any] | None = None,
 ) -> Check:
-    """One method of a stage, in these patterns (None is all) if it depends on the pattern; one that
-    takes any filter array in :data:`ARRAYS`, too.
+    """Check one method of a stage.
 
-    ``values`` are parameters that choose a variant of the method; a variant is checked in the first
-    of the patterns.
+    A method that accepts any filter array is also checked with :data:`ARRAYS`.
+
+    Args:
+        device: the device.
+        stage: the stage.
+        method: the method.
+        sizes: the (height, width) of the test images.
+        patterns: the Bayer patterns; None is all. A method that does not depend on the pattern is
+            checked with the first one only.
+        values: parameters that choose a variant of the method. A variant is checked with the first
+            pattern only.
     """
     values, patterns = values or {}, patterns or PATTERNS
     # A variant reads the pattern through the same functions as the method's default.
@@ -167,7 +178,7 @@ def check_method(
     return Check(stage.name, label, len(every) * len(sizes), total, method.tolerance)
 
 
-# Every source of noise at work.
+# Parameters that enable every source of noise.
 NOISE: Mapping[str, Mapping[str, Any]] = {
     "prnu": {"sigma": 0.01},
     "defect_pixels": {"hot_share": 0.01, "hot_level": 0.1, "dead_share": 0.01},
@@ -183,9 +194,9 @@ def check_raw(
     sizes: Sequence[tuple[int, int]] = SIZES,
     patterns: Sequence[Pattern] | None = None,
 ) -> Check:
-    """The whole way from half RGB to the raw: after quantize, device and NumPy must be equal.
+    """Check all stages from half RGB to the raw: device and NumPy must be equal after quantize.
 
-    ``noise`` is the method of sensor_noise.
+    ``noise`` is the method of the stage sensor_noise.
     """
     names, patterns = list(all_stages()), patterns or PATTERNS
     stages = tuple(names[: names.index("quantize") + 1])
@@ -200,11 +211,11 @@ def check_raw(
 
 
 def check_ends(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Check:
-    """How images enter and leave: as half and float, RGB and mosaic; as eight bits.
+    """Check the input and output formats: half and float, RGB and mosaic; eight-bit results.
 
-    Eight bits come by conversion, or by a table where the chain ends in curves. A difference of
-    one level is allowed, since an ulp before rounding can make it. No difference is allowed between
-    eight bits that are the only result and those that are made beside the float image.
+    Eight-bit pixels result from a conversion, or from a table if the chain ends in curves. A
+    difference of one level is allowed, because an ulp before rounding can cause it. The eight-bit
+    pixels must be equal with and without a float image as second result.
     """
     total, cases = Difference(), 0
     mosaic = Settings(stages=("mosaic", "inverse_white_balance"))
@@ -223,7 +234,7 @@ def check_ends(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Chec
                 levels = difference(one.encoded, two.encoded)
                 wrong = levels.largest if levels.largest > 1 else 0.0
                 total += Difference(levels.samples, 0, wrong)
-                if half:  # what is stored and encoded does not depend on the source
+                if half:  # storing and encoding do not depend on the source's type
                     beside = both.run(image, "check")
                     total += difference(beside.encoded, one.encoded)
                     total += difference(beside.final, two.final)
@@ -232,8 +243,9 @@ def check_ends(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Chec
 
 
 def check_stack(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Check:
-    """The default chain over images of several sizes and ISOs in common launches, which must give
-    the bits that each has alone.
+    """Check the default chain on images of several sizes and ISOs in common launches.
+
+    The results must equal those of separate launches, bit for bit.
     """
     total, images, alone = Difference(), [], []
     for seed, size in enumerate(sizes):
@@ -250,9 +262,9 @@ def check_stack(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Che
 def check_all(
     device: Device, stages: Sequence[Stage] = (), sizes: Sequence[tuple[int, int]] = SIZES
 ) -> Iterator[Check]:
-    """Every method of these stages, in all its variants.
+    """Check every method of some stages, in all variants.
 
-    If no stages are named: of all stages, then the raw, how images enter and leave, and stacks.
+    Without ``stages``, check all stages, then the raw, the input and output formats, and stacks.
     """
     for stage in stages or all_stages().values():
         for method in stage.methods:

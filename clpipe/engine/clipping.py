@@ -1,4 +1,4 @@
-"""The clipped share of a picture: a render in other units than the sensor's comes out white."""
+"""The share of clipped pixels, which warns about renders in other units than the sensor's."""
 
 import math
 
@@ -8,26 +8,26 @@ from clpipe.chain.chain import Chain
 from clpipe.engine.runner import Result
 from clpipe.stage import Kind
 
-MUCH = 0.25  # the share of clipped pixels from which on it is said
+MUCH = 0.25  # the smallest share of clipped pixels that causes a warning
 
-COUNTED = 1 << 18  # pixels, at least, where an image has as many; all would take too long
+COUNTED = 1 << 18  # the fewest pixels to count in large images; counting all would take too long
 
 
 def clipped_share(result: Result, chain: Chain) -> float | None:
-    """The share of clipped pixels in the last image of a chain, or in its patches, 0 to 1.
+    """Return the share of clipped pixels in the last image of a chain or in its patches, 0 to 1.
 
-    A pixel is clipped where any of its channels is at the upper end: that of display values, or the
-    white level of a raw. Of large images, pixels on a grid are counted.
+    A pixel is clipped if one of its channels has the largest display value or the white level of
+    the raw. In large images only pixels on a grid are counted.
 
     Args:
-        result: what was made of an image.
-        chain: by which it was made.
+        result: the result of an image.
+        chain: the chain that made it.
 
     Returns:
-        None where the last image has no upper end, or was not asked for.
+        The share; None if the last image has no upper limit, or was not requested.
     """
     image = result.final if result.encoded is None else result.encoded
-    # Of a chain that only has to give a raw, no more than that is run: it is final and kept.
+    # If only a raw is requested, the chain ends there: the raw is both final and kept.
     kept = [chain.step_named(name) for name, each in result.kept.items() if each is image]
     kind = kept[0].stage.writes if kept else chain.result
     top: float | None = None
@@ -49,10 +49,10 @@ def clipped_share(result: Result, chain: Chain) -> float | None:
 
 
 def clipping_text(share: float) -> str:
-    """The warning about a share of clipped pixels.
+    """Return the warning about a share of clipped pixels.
 
     >>> clipping_text(0.997)
-    '99.7 % of its pixels are clipped; are its values 0 to 255, or is exposure.ev too high?'
+    '99.7 % of its pixels are clipped. Check exposure.ev, and whether its values are 0 to 255.'
     """
     text = f"{100 * share:.3g} % of its pixels are clipped"
-    return f"{text}; are its values 0 to 255, or is exposure.ev too high?"
+    return f"{text}. Check exposure.ev, and whether its values are 0 to 255."

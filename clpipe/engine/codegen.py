@@ -1,12 +1,12 @@
-"""From a launch to OpenCL source. Pure text: what runs is what this prints.
+"""Generates the OpenCL source of a launch. Pure: the source that runs is the source returned here.
 
-A kernel is the library, the stage files it needs (with ``#line``, so that the compiler's messages
-name the right file and line) and one short function that loads, calls the stages and stores.
+A kernel's source contains the library, the stage files and one short function that loads, calls the
+stages and stores. ``#line`` directives make the compiler's messages name the right file and line.
 
-The text depends on what a launch does and on nothing else: not on its place in the plan, the slots
-it reads and writes, the names of its steps or the width of the border. Steps, planes and line
-tables are numbered in the order in which the text uses them, and the kernel is named by a digest of
-its text. So two plans that share a launch share its program, however else they differ.
+The source depends only on the operations of a launch. It does not depend on the launch's position
+in the plan, its slots, the names of its steps or the border's width. Steps, planes and line tables
+are numbered in the order of their first use, and the kernel's name is a digest of its source. Two
+plans with the same launch therefore share its program.
 """
 
 import hashlib
@@ -32,19 +32,19 @@ from clpipe.engine.work_items import PARTIALS, RUN, columns_of, local_size, summ
 from clpipe.reference.filter_array import MIRRORED
 from clpipe.stage import Kind, LineTable, TableLookup
 
-# What is known of the origin when compiling: it is in whole blocks, so the rows that share a
-# Philox call and the phase of a Bayer pattern are too.
+# The compiler knows that the origin is a whole number of blocks. Therefore it also knows which rows
+# share a Philox call, and the phase of a Bayer pattern.
 EXTENT = "{width, height, pitch, left * LANES, top * 4, columns, rows, border}"
 UNNAMED = "kernel_without_a_name_yet"
 
 
 def call(op: Op, arguments: Sequence[str]) -> str:
-    """The call of a pass's function."""
+    """Return the call of a pass's function."""
     return f"{op.pass_.function}({', '.join(arguments)})"
 
 
 def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
-    """The OpenCL source of one launch of a plan, for a device with that many lanes."""
+    """Return the OpenCL source of one launch of a plan, for a device with ``lanes`` lanes."""
     builder = KernelBuilder(plan, lanes)
     for number in ("width", "height", "pitch", "left", "top", "columns", "rows", "border"):
         builder.number(number)
@@ -74,7 +74,7 @@ def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
             at = "(uint)get_global_id(0), (uint)get_global_id(1)"
             down, across = (n if n > MIRRORED else 0 for n in launch.period or (0, 0))
             plane = builder.slot(launch.slot, True)
-            # Members differ in size.
+            # The members of a stack may differ in size.
             body = (
                 "    if (get_global_id(1) >= rows + 2 * border) return;\n"
                 f"    fill_border({plane}, {at}, {down}, {across}, e);\n"
@@ -85,7 +85,7 @@ def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
     size = 1 if isinstance(launch, Finalize) else local_size(lanes)
     setup = "".join(f"    {line}\n" for line in builder.setup)
     start = "".join(f"    {line}\n" for line in first)
-    # The hint keeps Intel's compiler from making vectors of our vectors, up to nine times slower.
+    # The hint prevents Intel's compiler from vectorising our vectors, up to nine times slower.
     text += (
         '#line 1 "launch"\n'
         f"__kernel __attribute__((vec_type_hint(vf), reqd_work_group_size({size}, 1, 1)))\n"
@@ -98,12 +98,12 @@ def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
 
 
 def kernels_of(ops: Sequence[Op | None]) -> list[str]:
-    """The kernel files of these passes."""
+    """Return the kernel files of these passes."""
     return [op.kernel for op in ops if op]
 
 
 def _prologue(builder: KernelBuilder, read: Read) -> list[tuple[Op, list[str], list[str]]]:
-    """The passes redone at a tap, each with its arguments and those that are run-time values."""
+    """Return the passes recomputed at a tap, with their arguments and their run-time arguments."""
     calls = []
     for op in read.prologue:
         arguments = builder.arguments(op)
@@ -113,7 +113,7 @@ def _prologue(builder: KernelBuilder, read: Read) -> list[tuple[Op, list[str], l
 
 
 def _source_image(builder: KernelBuilder, launch: Launch) -> str:
-    """The type and the tap function of a stencil's ``src``, with the passes redone at each tap."""
+    """Return the type and tap function of a stencil's ``src``, which recomputes passes at taps."""
     if not launch.stencil:
         return ""
     reads = dict(zip(launch.ops[0].pass_.reads, launch.reads, strict=True))
@@ -138,10 +138,11 @@ def _source_image(builder: KernelBuilder, launch: Launch) -> str:
 
 
 def _load(builder: KernelBuilder, launch: Launch) -> tuple[list[str], list[str], Kind]:
-    """Lines that make ``v0``, from the source, a stored image or the stencil; and its kind.
+    """Return the lines that compute ``v0`` from the source, a stored image or a stencil.
 
-    The first lines come once a work item (for a stencil that gives its whole block), the others
-    once a row.
+    Returns:
+        The lines per work item (for a stencil that computes a whole block), the lines per row, and
+        the kind of ``v0``.
     """
     plan, op = builder.plan, launch.opener
     if not launch.reads:
@@ -181,7 +182,7 @@ def _load(builder: KernelBuilder, launch: Launch) -> tuple[list[str], list[str],
 
 
 def _encode(builder: KernelBuilder, value: str, kind: Kind, curves: Sequence[Op]) -> str:
-    """The line that writes eight-bit pixels, through one table where curves come last."""
+    """Return the line that writes eight-bit pixels, through one table if curves come last."""
     builder.buffer("dst", "uchar", "dst", written=True)
     if not curves:
         return f"encode_{'mosaic' if kind.c_type == 'vf' else 'rgb'}({value}, dst, at, e);"
@@ -189,7 +190,7 @@ def _encode(builder: KernelBuilder, value: str, kind: Kind, curves: Sequence[Op]
 
 
 def _pixels(builder: KernelBuilder, launch: Launch) -> str:
-    """The body of a kernel over the image: load, the stages, store."""
+    """Return the body of a kernel over the image: it loads, calls the stages and stores."""
     plan = builder.plan
     once, lines, kind = _load(builder, launch)
     ops = list(launch.ops[1:] if launch.opener else launch.ops)
@@ -210,8 +211,8 @@ def _pixels(builder: KernelBuilder, launch: Launch) -> str:
         once.append("vi even_rows = (vi)(0), odd_rows = (vi)(0);")
     wide = launch.stencil and launch.stencil.vectors_per_row and builder.lanes > 1
     if not wide:
-        # All rows before the first store: what they have in common is then done once, because no
-        # store can have changed what they read.
+        # Compute all rows before the first store. The compiler can then share work between rows,
+        # because no store can change their inputs.
         once.append(f"{kind.c_type} {', '.join(f'values_{row}' for row in range(launch.rows))};")
         lines.append(f"values_ROW = {value};")
         value = "values_ROW"
@@ -232,7 +233,7 @@ def _pixels(builder: KernelBuilder, launch: Launch) -> str:
     )
     rows = "".join(f"    {line}\n" for line in [*once, *body])
     rows = f"    const site first = site_at(x, y);\n{rows}"
-    inside = "x - e.left < columns && y - e.top < rows"  # of which members may differ in size
+    inside = "x - e.left < columns && y - e.top < rows"  # members of a stack may differ in size
     outside = "x - e.left >= columns || y - e.top >= rows"
     if not launch.sums:
         return f"{place}    if ({outside}) return;\n{rows}"
@@ -240,7 +241,7 @@ def _pixels(builder: KernelBuilder, launch: Launch) -> str:
     if (together := summed_together(builder.lanes)) == 1:
         store = f"    store_sums({own}, sums, e);\n"
         return f"{place}    if ({outside}) return;\n{rows}{store}"
-    # No work item may leave before a barrier.
+    # No work item may return before a barrier.
     return (
         f"    __local int4 group[{together}];\n{place}    int4 own = (int4)(0);\n"
         f"    if ({inside}) {{\n{rows}    own = {own};\n    }}\n"
@@ -249,7 +250,7 @@ def _pixels(builder: KernelBuilder, launch: Launch) -> str:
 
 
 def _over_block(lines: Sequence[str], launch: Launch) -> list[str]:
-    """Lines for each vector of a stencil's block, which is in memory: no loop need be unrolled."""
+    """Return loops over the vectors of a stencil's block. It is in memory, so they stay rolled."""
     return [
         "#pragma unroll 1",
         f"for (uint row = 0; row < {launch.rows}; ++row) {{",
@@ -263,9 +264,9 @@ def _over_block(lines: Sequence[str], launch: Launch) -> list[str]:
 
 
 def _each_row(lines: Sequence[str], rows: int) -> list[str]:
-    """Lines for each row of a work item, written out with its number in place of ROW.
+    """Return the lines for each row of a work item, unrolled, with the row's number for ROW.
 
-    Mesa's compiler mixes up an array of rows that one loop fills and another reads.
+    Loops are not possible: Mesa's compiler mixes up an array that one loop fills and another reads.
     """
     if not lines:
         return []
@@ -275,7 +276,7 @@ def _each_row(lines: Sequence[str], rows: int) -> list[str]:
 
 
 def _store(writes: Sequence[str], kind: Kind, rows: int) -> list[str]:
-    """The stores of all rows of a work item: at edges in a loop of its own, which is slow code."""
+    """Return the stores of all rows of a work item, with a separate, slower loop near edges."""
     if not writes:
         return []
     inside = [line.replace("(", "_inside(", 1) for line in writes]
@@ -315,7 +316,7 @@ def _count(builder: KernelBuilder, launch: Histogram) -> str:
     counts = builder.buffer("counts", "uint", buffer, written=True, restrict=False)
     arguments = [*origins, "x", "y", "e", *builder.arguments(op)]
     core = builder.core()
-    if builder.lanes == 1:  # a work-group counts together, each of its work items other columns
+    if builder.lanes == 1:  # a work-group counts together, each work item in different columns
         row, first, step = "get_group_id(0)", "(uint)get_local_id(0)", "(uint)get_local_size(0)"
         wait, count = "    barrier(CLK_GLOBAL_MEM_FENCE);\n", "atomic_inc(own + bin)"
     else:

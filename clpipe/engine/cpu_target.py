@@ -1,14 +1,16 @@
-"""Chooses the CPU that the PoCL of pip compiles for, by the features of the processor.
+"""Chooses the CPU for which pip's PoCL compiles, by the features of the processor.
 
-PoCL up to 4 compiles for the CPU name that LLVM reports. LLVM 14, in pip's PoCL 3.0, calls an AMD
-Zen 5 "generic", for which nothing compiles, takes others for CPUs without AVX-512 or AVX, and
-ignores features that a hypervisor masks, so that launches end in SIGILL (PoCL's issue 1049).
+PoCL up to version 4 compiles for the CPU name that LLVM reports. LLVM 14, in pip's PoCL 3.0, calls
+an AMD Zen 5 "generic", for which nothing compiles. It takes some CPUs for ones without AVX-512 or
+AVX. It also ignores that a hypervisor masks features, so that launches end in SIGILL (PoCL's issue
+1049).
 
-It acts only for a PoCL below 5 on x86-64 Linux whose name for the CPU has other features than the
-processor. It then replaces the pointer to that name in PoCL's device record, which no option can
-change. It does so only where two adjacent pointers to the target triple and to the name, both known
-from the device's version, are found exactly once. It uses /proc/self/mem, where a wrong address is
-an error, not a crash. To switch it off, set ``CLPIPE_CPU_TARGET=driver``.
+This module acts only on x86-64 Linux, for a PoCL below 5 that names a CPU with other features than
+the processor has. It then replaces the pointer to the CPU name in PoCL's device record, because no
+option can change the name. The device's version contains the target triple and the CPU name. The
+module acts only if two adjacent pointers to these texts exist exactly once in the record. It uses
+/proc/self/mem, where a wrong address causes an error, not a crash. To switch this off, set
+``CLPIPE_CPU_TARGET=driver``.
 """
 
 import ctypes
@@ -26,12 +28,12 @@ from clpipe.base.errors import DeviceError
 from clpipe.base.text import one_of
 
 VARIABLE = "CLPIPE_CPU_TARGET"  # forces a target, for tests and support
-DRIVERS = "driver"  # its value that leaves the driver's choice
+DRIVERS = "driver"  # the value that keeps the driver's choice
 
 _AVX2 = frozenset({"avx2", "fma", "f16c", "bmi1", "bmi2", "abm", "cx16", "popcnt"})
 _AVX512 = frozenset({"avx512f", "avx512bw", "avx512dq", "avx512cd", "avx512vl"})
-# The targets of PoCL 5 and later, the widest first, with the features that each needs as Linux
-# calls them. PoCL's library of functions, which is linked to every kernel, has the same ones.
+# The targets of PoCL 5 and later, the widest first, with the features that each needs, as named by
+# Linux. PoCL's built-in library, which is linked to every kernel, has the same targets.
 TARGETS: dict[str, frozenset[str]] = {
     "skx": _AVX2 | _AVX512,
     "haswell": _AVX2,
@@ -41,7 +43,7 @@ TARGETS: dict[str, frozenset[str]] = {
     "core2": frozenset({"ssse3"}),
     "x86-64": frozenset(),
 }
-# LLVM's names for CPUs that have just what a target has, as far as vectors go.
+# LLVM's names for CPUs with the same vector features as a target.
 SAME_AS = {
     "skx": (
         "skylake-avx512",
@@ -70,17 +72,17 @@ SAME_AS = {
     "penryn": ("nehalem", "westmere", "silvermont", "goldmont", "goldmont-plus", "tremont"),
     "core2": ("bonnell",),
 }
-RECORD = 1200  # bytes of the device record to look through; in PoCL 3.0 the pointer is at 640
-_texts: dict[int, ctypes.Array[ctypes.c_char]] = {}  # set names, by device; PoCL keeps pointers
+RECORD = 1200  # bytes of the device record to search; in PoCL 3.0 the pointer is at 640
+_texts: dict[int, ctypes.Array[ctypes.c_char]] = {}  # names set, by device; PoCL points to them
 
 
 @dataclass(frozen=True)
 class Target:
-    """What a runtime compiles for.
+    """The CPU for which a runtime compiles.
 
     Args:
-        name: a CPU, as LLVM calls it; "" where the runtime does not say.
-        reason: who chose it, in words.
+        name: LLVM's name of the CPU; "" if the runtime does not report it.
+        reason: why this CPU was chosen, in words.
     """
 
     name: str
@@ -88,19 +90,19 @@ class Target:
 
     @property
     def is_wide(self) -> bool:
-        """Whether it has vector registers of 512 bits."""
+        """Whether the CPU has vector registers of 512 bits."""
         return row_of(self.name) == "skx"
 
 
 def row_of(name: str) -> str | None:
-    """The one of :data:`TARGETS` that has what a CPU has; None for a name that is not known."""
+    """Return the one of :data:`TARGETS` with a CPU's features; None for an unknown name."""
     if name in TARGETS:
         return name
     return next((target for target, names in SAME_AS.items() if name in names), None)
 
 
 def target_for(features: frozenset[str]) -> str:
-    """The widest of :data:`TARGETS` whose features are there, as Linux calls them.
+    """Return the widest of :data:`TARGETS` whose features, as named by Linux, are all present.
 
     >>> target_for(frozenset({"sse4_1", "avx", "f16c", "avx512f"}))
     'ivybridge'
@@ -108,7 +110,7 @@ def target_for(features: frozenset[str]) -> str:
     return next(name for name, needed in TARGETS.items() if needed <= features)
 
 
-# Of glibc's <sys/platform/x86.h>: leaf, register and bit of each feature that a target needs.
+# The leaf, register and bit of each required feature, from glibc's <sys/platform/x86.h>.
 _ACTIVE = {
     "ssse3": (0, 2, 9),
     "fma": (0, 2, 12),
@@ -134,7 +136,7 @@ CPUINFO = Path("/proc/cpuinfo")
 
 @cache
 def cpu_text() -> str:
-    """The text of this CPU: maker, model and features, as Linux lists them, or ""."""
+    """Return the vendor, model and features of this CPU as Linux lists them, or ""."""
     try:
         lines = CPUINFO.read_text("utf-8").splitlines()
     except (OSError, UnicodeDecodeError):
@@ -145,10 +147,11 @@ def cpu_text() -> str:
 
 @cache
 def cpu_features() -> frozenset[str] | None:
-    """The features of this x86-64 CPU that programs may use; None where they are not known.
+    """Return the features of this x86-64 CPU that programs may use; None if they are unknown.
 
-    They are what Linux lists and glibc (2.33 and later) found usable, each as far as it can be
-    asked: emulators and containers pass the host's list on, which may have more than is there.
+    A feature must be listed by Linux and usable according to glibc (2.33 and later), as far as each
+    source is available. Linux alone is not enough: emulators and containers pass on the host's
+    list, which may contain features that are missing here.
     """
     if this_system.machine() not in ("x86_64", "AMD64"):
         return None
@@ -157,18 +160,18 @@ def cpu_features() -> frozenset[str] | None:
 
 
 def _listed() -> frozenset[str] | None:
-    """The features that all processors have, as Linux lists them."""
+    """Return the features that Linux lists for all processors."""
     lines = re.findall(r"^flags\s*:(.*)$", cpu_text(), re.MULTILINE)
     return frozenset.intersection(*(frozenset(line.split()) for line in lines)) if lines else None
 
 
 def _usable() -> frozenset[str] | None:
-    """The features that CPU and system let programs use, as glibc found them; None without it."""
+    """Return the features that glibc found usable; None without a suitable glibc."""
     try:
         query = ctypes.CDLL(None).__x86_get_cpuid_feature_leaf
     except (OSError, AttributeError, TypeError):
         return None
-    # struct cpuid_feature: what the CPU has, then what is active, EAX to EDX each.
+    # struct cpuid_feature: the CPU's features, then the active ones, each in EAX to EDX.
     query.restype = ctypes.POINTER(ctypes.c_uint32 * 8)
     query.argtypes = [ctypes.c_uint32]
     active = {
@@ -183,7 +186,7 @@ def forced_target() -> str | None:
     """Return the target that :data:`VARIABLE` names, or :data:`DRIVERS`; None if it is not set.
 
     Raises:
-        DeviceError: there is no such target.
+        DeviceError: the variable names an unknown target.
     """
     name = os.environ.get(VARIABLE) or None
     if name and name not in (*TARGETS, DRIVERS):
@@ -192,9 +195,11 @@ def forced_target() -> str | None:
 
 
 def own_target(version: str) -> tuple[str, str] | None:
-    """The triple and the CPU that a PoCL on Linux compiles for by itself, by its device's version.
+    """Return the target triple and the CPU that PoCL on Linux chooses, from its device's version.
 
-    None where that names no CPU: Debian's for arm64 says "(null)", as it compiles for all of them.
+    Returns:
+        None if the version names no CPU. Debian's PoCL for arm64 has "(null)", because it compiles
+        for all CPUs.
 
     >>> own_target("OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-znver3")
     ('x86_64-unknown-linux-gnu', 'znver3')
@@ -204,14 +209,14 @@ def own_target(version: str) -> tuple[str, str] | None:
 
 
 def candidates(platform: Any, device: Any) -> list[Target]:
-    """Targets of a device, of which the first that works is taken; see :func:`compile_for`.
+    """Return the targets to try for a device, in order; see :func:`compile_for`.
 
     Args:
         platform: a ``pyopencl.Platform``.
         device: one of its devices.
 
     Raises:
-        DeviceError: :data:`VARIABLE` names no target.
+        DeviceError: :data:`VARIABLE` names an unknown target.
     """
     forced = forced_target()
     known = own_target(device.version) if "Portable Computing" in platform.name else None
@@ -222,24 +227,24 @@ def candidates(platform: Any, device: Any) -> list[Target]:
     if features is None or not _chooses_by_name(platform.version) or _place(device) is None:
         return [Target(own, f"PoCL's choice{f'; {VARIABLE} cannot change it' if forced else ''}")]
     if forced == DRIVERS:
-        return [Target(own, f"PoCL's choice, as {VARIABLE} says")]
+        return [Target(own, f"PoCL's choice, set by {VARIABLE}")]
     if forced:
-        return [Target(forced, f"{VARIABLE} names it")]
+        return [Target(forced, f"set by {VARIABLE}")]
     target = target_for(features)
     if row_of(own) == target:
-        return [Target(own, "PoCL's choice, and what the CPU's features say")]
-    failed = f"since {target}, which the CPU's features say, does not work"
+        return [Target(own, "PoCL's choice, which matches the CPU's features")]
+    failed = f"because {target}, which matches the CPU's features, does not work"
     return [
-        Target(target, f"the CPU's features say so; PoCL takes it for {own}"),
+        Target(target, f"from the CPU's features; PoCL's choice is {own}"),
         *([] if own == "generic" else [Target(own, f"PoCL's choice, {failed}")]),
-        Target("x86-64", f"what every such CPU has, {failed}"),
+        Target("x86-64", f"works on every such CPU, {failed}"),
     ]
 
 
 def compile_for(device: Any, target: Target) -> None:
-    """Have a ``pyopencl.Device`` compile for one of its :func:`candidates`.
+    """Make a ``pyopencl.Device`` compile for one of its :func:`candidates`.
 
-    It counts for what is compiled from now on, in all contexts of this process.
+    This applies to everything compiled from now on, in all contexts of this process.
     """
     known = own_target(device.version)
     set_before = _texts.get(device.int_ptr)
@@ -254,13 +259,13 @@ def compile_for(device: Any, target: Target) -> None:
 
 
 def _chooses_by_name(version: str) -> bool:
-    """Whether a PoCL, by its platform's version, is one that takes LLVM's name for the CPU."""
+    """Return whether a PoCL with this platform version uses LLVM's name for the CPU."""
     found = re.search(r"PoCL (\d+)\.", version, re.IGNORECASE)
     return found is not None and int(found[1]) < 5
 
 
 def _place(device: Any) -> int | None:
-    """The address of the pointer to the name of the CPU; None where it cannot be proven."""
+    """Return the address of the pointer to the CPU name; None if it cannot be found for certain."""
     known = own_target(device.version)
     if known is None:
         return None
@@ -284,7 +289,7 @@ def _place(device: Any) -> int | None:
 
 
 def _read(memory: int, address: int, size: int) -> bytes:
-    """Bytes of this process; fewer where no more can be read."""
+    """Return bytes of this process's memory; fewer if not all can be read."""
     if not 4096 <= address < 2**47:
         return b""
     try:

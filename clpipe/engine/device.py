@@ -1,4 +1,4 @@
-"""An open OpenCL device: it puts images through plans, whole or in tiles."""
+"""An open OpenCL device, which runs plans on images, whole or in tiles."""
 
 import logging
 import time
@@ -30,17 +30,17 @@ log = logging.getLogger(__name__)
 
 
 class Device:
-    """An open device with its queue, compiled kernels and buffers, kept from image to image.
+    """An open device with its queue, compiled kernels and buffers, which images share.
 
-    One thread may use it at a time; several devices can run at once, each in a thread of its own.
+    Only one thread may use it at a time. Several devices may run at once, each in its own thread.
 
     Args:
-        chosen: which device.
-        memory: bytes that its buffers may take; None is what it reports. A CPU shares its memory
-            with everybody, so it is at most half of what is available now.
+        chosen: the device to open.
+        memory: the most bytes that its buffers may use. None is the default of
+            :func:`~clpipe.engine.discovery.usable_memory`.
 
     Raises:
-        DeviceError: it cannot be opened.
+        DeviceError: the device cannot be opened.
     """
 
     def __init__(self, chosen: DeviceInfo, memory: int | None = None) -> None:
@@ -53,7 +53,7 @@ class Device:
         self._open()
 
     def _open(self) -> None:
-        """Make queues, and nothing else yet, in the context that all on this device share.
+        """Create the queues, in the context that all objects on this device share.
 
         Raises:
             DeviceError: the device cannot be opened.
@@ -65,41 +65,44 @@ class Device:
                 self._programs.context, self.info.alignment if self.info.in_place else None
             )
         except self._cl.Error as error:
-            raise DeviceError(f"{self.info.label} cannot be opened: {error}") from None
+            raise DeviceError(
+                f"{self.info.label} cannot be opened: {error}. Close other programs that use it, "
+                "or choose another device."
+            ) from None
 
     @property
     def bytes_held(self) -> int:
-        """Device memory of the buffers that are kept from image to image."""
+        """The bytes of the buffers that are kept for the next image."""
         return self.flow.pool.bytes
 
     def limit(self, memory: int) -> None:
-        """Let its buffers take no more than these bytes; nothing may be on the way."""
+        """Limit the device's buffers to ``memory`` bytes. No image may be in flight."""
         self.memory = memory
         self._recovery.abandon()
 
     @property
     def depth(self) -> int:
-        """The number of images that it can work on at a time."""
+        """The number of images that the device can process at a time."""
         return self.flow.depth
 
     def is_compiled(self, plan: Plan) -> bool:
-        """Whether the kernels of a plan are compiled."""
+        """Return whether the kernels of a plan are compiled."""
         return plan in self._kernels
 
     def submit(self, works: Sequence[Work[R]]) -> list[Callable[[], R]]:
-        """Enqueue images, in tiles where they do not fit, and small ones of a plan in stacks.
+        """Enqueue images: large ones in tiles, small ones of the same plan in stacks.
 
-        So many stacks are on the way at a time as :attr:`depth` says; before one more is enqueued,
-        the oldest is waited for.
+        At most :attr:`depth` stacks are in flight. Before another one is enqueued, this waits for
+        the oldest.
 
         Returns:
-            For each image, a callable that waits for its result and returns it, called once and in
-            the order of images. One that fails together with others is done again by itself; see
+            For each image, a callable that waits for its result and returns it. Call each once, in
+            the order of the images. Images that fail together are retried one by one; see
             :meth:`clpipe.engine.recovery.Recovery.output`.
 
         Raises:
-            ImageError: an image does not fit into the device's memory, not even in tiles; of
-                several it is not said which.
+            ImageError: an image does not fit into the device's memory, even in tiles. The message
+                does not name the image.
             DeviceError: a kernel does not compile.
         """
         groups: dict[Any, list[Work[R]]] = {}
@@ -114,17 +117,17 @@ class Device:
         return [waits[work] for work in works]
 
     def stacks(self, width: int, height: int) -> bool:
-        """Whether images of that size share launches: whether a stack holds a few."""
+        """Return whether images of this size share launches, at least :data:`FEWEST` in a stack."""
         return width * height * BYTES_OF_PIXEL * FEWEST <= STACK_BYTES[self.info.in_place]
 
     def enqueue(self, works: Sequence[Work[Any]], memory: int) -> Flight | Exception:
-        """Enqueue images, whose plans have the same kernels, within so many bytes.
+        """Enqueue images whose plans have the same kernels, within ``memory`` bytes.
 
         Returns:
-            What is on the way, or what the device raises.
+            The images in flight, or the exception that the device raised.
 
         Raises:
-            ImageError, DeviceError: as :meth:`submit`.
+            ImageError, DeviceError: as for :meth:`submit`.
         """
         plan = works[0].plan
         is_new = plan not in self._kernels
@@ -132,7 +135,7 @@ class Device:
             with announced(self.info) if is_new else nullcontext():
                 flight = self._enqueued(works, memory)
                 if is_new:
-                    self.drain()  # PoCL is done with a kernel when it has been launched
+                    self.drain()  # PoCL finishes compiling a kernel at its first launch
                     self._programs.keep()
             return flight
         except (self._cl.Error, MemoryError) as error:
@@ -160,24 +163,24 @@ class Device:
         return flight
 
     def reopen(self) -> None:
-        """Leave a context that is of no more use, with all that is in it, for a new one.
+        """Replace a broken context, with all programs and buffers in it, by a new one.
 
         Raises:
             DeviceError: the device cannot be opened again.
         """
-        log.warning("%s failed, and is opened again", self.info.label)
+        log.warning("%s failed. It is opened again.", self.info.label)
         forget_programs(self.info, self._programs)
         self._open()
 
     def drain(self) -> None:
-        """Wait for what was enqueued, so that it uses no memory of the host any more."""
+        """Wait for all enqueued commands, so that none of them uses the host's memory any more."""
         self.flow.drain()
 
     def tiling(self, work: Work[Any], memory: int) -> Tiling:
-        """Return the tiles of an image within so many bytes.
+        """Return the tiles of an image for a limit of ``memory`` bytes.
 
         Raises:
-            ImageError: it does not fit, not even in tiles.
+            ImageError: the image does not fit, even in tiles.
         """
         largest, lanes = min(memory, self.info.max_buffer), self.info.lanes
         tiling = tiling_of(work.plan, *work.size, lanes, memory, largest, self.depth)
@@ -186,7 +189,7 @@ class Device:
         return with_patches(work.plan, work.options.boxes, tiling, lanes, memory, self.depth)
 
     def copy_speed(self, size: int = 96 * 2**20) -> float:
-        """Bytes a second, read plus written, of the device's own buffer copy; the best of five."""
+        """Return the speed of a buffer copy, read plus written, in bytes/s: the best of six."""
         cl = self._cl
         one, two = (self.flow.new_buffer(size) for _ in range(2))
         best = 0.0
@@ -200,12 +203,17 @@ class Device:
 
 
 def open_device(selector: str | None, memory: int | None = None) -> Device | None:
-    """Open the device that a selector names, see :func:`choose`; None stands for "numpy".
+    """Open the device that a selector names; see :func:`choose`.
 
-    ``memory`` is how many bytes its buffers may take.
+    Args:
+        selector: the device; None is the default device.
+        memory: the most bytes that its buffers may use.
+
+    Returns:
+        The device; None for the selector "numpy".
 
     Raises:
-        DeviceError: there is no device, none matches, or the one that matches cannot be used.
+        DeviceError: there is no device, none matches, or the matching one cannot be used.
     """
     if selector is not None and selector.lower() == "numpy":
         return None
@@ -215,21 +223,27 @@ def open_device(selector: str | None, memory: int | None = None) -> Device | Non
 def open_devices(
     selectors: Sequence[str] = (), memory: int | None = None, share: tuple[int, int] = (0, 1)
 ) -> list[Device]:
-    """Open the devices that selectors name, see :func:`choose_all`; an empty list for "numpy".
+    """Open the devices that selectors name; see :func:`choose_all`.
 
     Args:
-        selectors: of the devices.
-        memory: bytes that the buffers of each may take; without it, CPUs share what is free, and
-            processes share a GPU's.
-        share: the number of this process and of how many, where several of this machine share the
-            devices, see :func:`~clpipe.engine.discovery.shared_out`.
+        selectors: the devices; () is the default.
+        memory: the most bytes that each device's buffers may use. None divides the free memory
+            among CPUs, and a GPU's memory among processes.
+        share: the number of this process, and how many processes of this machine share the
+            devices; see :func:`~clpipe.engine.discovery.shared_out`.
+
+    Returns:
+        The devices; an empty list for the selector "numpy".
 
     Raises:
-        DeviceError: as :func:`open_device`, or "numpy" stands beside others.
+        DeviceError: as for :func:`open_device`, or "numpy" is combined with other devices.
     """
     if any(selector.lower() == "numpy" for selector in selectors):
         if len(selectors) > 1:
-            raise DeviceError(f"found devices {', '.join(selectors)}; numpy is used alone")
+            named = ", ".join(selectors)
+            raise DeviceError(
+                f"devices {named}: numpy cannot be combined with other devices. Name it alone."
+            )
         return []
     chosen = choose_all(selectors, find_devices())
     processes = share[1]

@@ -1,4 +1,4 @@
-"""The OpenCL devices of this machine, and which of them to use."""
+"""Finds the OpenCL devices of this machine, and chooses which to use."""
 
 import os
 import platform as this_system
@@ -27,7 +27,7 @@ from clpipe.engine.runtimes import (
 from clpipe.engine.vendors import platforms
 from clpipe.engine.verdicts import Verdicts, verdicts
 
-# Bytes of addresses: of PoCL with its compiler at work, and of a thread on each processor.
+# Bytes of address space: of PoCL while it compiles, and of one thread per processor.
 ADDRESSES = 256 << 20
 OF_THREAD = 8 << 20
 
@@ -36,67 +36,65 @@ _process: int | None = None  # the process id that first used OpenCL, here or be
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """A device that an OpenCL platform offers.
-
-    ``problem`` says why it cannot be used; it is empty where it can.
-    """
+    """A device of an OpenCL platform. ``problem`` is the reason why it is unusable, or ""."""
 
     index: int
     platform: str
     name: str
     type: str  # "GPU", "CPU", "emulator" or "accelerator"
-    version: str  # of OpenCL, as the device tells it
+    version: str  # of OpenCL, as reported by the device
     driver: str
     compute_units: int
     memory: int  # bytes
     max_buffer: int  # bytes
     lanes: int
-    target: Target  # what kernels are compiled for
+    target: Target  # the CPU for which kernels are compiled
     problem: str
     handle: Any
     hardware: Hardware
 
     @property
     def label(self) -> str:
-        """Name and platform, as people tell devices apart."""
+        """The device's name and platform."""
         return f"{self.name.strip()} ({self.platform})"
 
     @property
     def in_place(self) -> bool:
-        """Whether kernels can use the host's memory where it is, at the speed of their own."""
+        """Whether kernels use the host's memory directly and at full speed."""
         return self.type == "CPU" and bool(self.handle.host_unified_memory)
 
     @property
     def alignment(self) -> int:
-        """What the address of such memory must be a multiple of, in bytes.
+        """The alignment, in bytes, of host memory that kernels use directly.
 
-        Intel's runtime copies all that is not, which takes five times as long as a copy of ours;
-        PoCL takes any.
+        Intel's runtime copies unaligned memory, five times slower than clpipe does. PoCL accepts
+        any address.
         """
         return 1 if is_pocl(self.platform) else self.handle.mem_base_addr_align // 8
 
 
 def find_devices(again: bool = False) -> list[DeviceInfo]:
-    """Every device of every OpenCL platform, in the platforms' order, each tried once.
+    """Return every device of every OpenCL platform, in the platforms' order. Each is tested once.
 
-    ``again`` is whether to try once more what did not work when it was tried.
+    Args:
+        again: whether to repeat failed tests.
 
     Raises:
-        DeviceError: pyopencl cannot be loaded, or this process cannot use it, or has too small an
-            address space for it.
+        DeviceError: pyopencl cannot be loaded, this process cannot use it, or the address space is
+            too small.
     """
     global _process
     if _process not in (None, os.getpid()):
         raise DeviceError(
-            "this process was forked from one that had used OpenCL, which would hang here; let it "
-            'be spawned (multiprocessing\'s "spawn" or "forkserver"), or fork before'
+            "this process was forked from one that had used OpenCL, so OpenCL would hang here. "
+            'Use multiprocessing\'s "spawn" or "forkserver", or fork before OpenCL is used.'
         )
     check_addresses(ADDRESSES + OF_THREAD * processors(), "an OpenCL runtime")
     _process = os.getpid()
     forced_target()
     known = verdicts(again)
     if known.listing:
-        raise DeviceError(f"OpenCL's drivers cannot be listed: {known.listing}; {remedies()}")
+        raise DeviceError(f"OpenCL's drivers cannot be listed: {known.listing}. {remedies()}")
     found: list[DeviceInfo] = []
     for platform in platforms(known.hidden):
         devices, reason = devices_of(platform, known)
@@ -116,11 +114,11 @@ def find_devices(again: bool = False) -> list[DeviceInfo]:
 
 
 def devices_of(platform: Any, known: Verdicts) -> tuple[list[Any], str]:
-    """The devices of a ``pyopencl.Platform``, and, where there are none, why."""
+    """Return the devices of a ``pyopencl.Platform``, and the reason if there are none."""
     import pyopencl as cl
 
     if reason := known.platforms.get(platform_id(platform)):
-        return [], f"asked for its devices, {reason}"
+        return [], f"when asked for its devices, {reason}"
     problem = pocl_problem() if is_pocl(platform.name) else ""
     try:
         return list(platform.get_devices()), problem or "it offers no device"
@@ -129,7 +127,7 @@ def devices_of(platform: Any, known: Verdicts) -> tuple[list[Any], str]:
 
 
 def describe(index: int, platform: Any, device: Any, known: Verdicts) -> DeviceInfo:
-    """The description of a ``pyopencl.Device``, which compiles for its target from now on."""
+    """Return the description of a ``pyopencl.Device``, and make it compile for its target."""
     type_ = type_of(platform, device)
     problem = problem_with(type_, platform, device)
     target = candidates(platform, device)[0]
@@ -157,7 +155,7 @@ def describe(index: int, platform: Any, device: Any, known: Verdicts) -> DeviceI
 def without_device(
     index: int, platform: str, reason: str, version: str = "", handle: int = 0
 ) -> DeviceInfo:
-    """A platform that is installed and has nothing to offer; its user wants to know why."""
+    """Return an entry for an installed platform without devices, which contains the reason."""
     return DeviceInfo(
         index=index,
         platform=platform.strip(),
@@ -177,7 +175,7 @@ def without_device(
 
 
 def remedies() -> str:
-    """Advice for this machine where no OpenCL runtime works."""
+    """Return advice for a machine on which no OpenCL runtime works."""
     linux = this_system.system() == "Linux"
     x86 = this_system.machine() in ("x86_64", "AMD64")
     ways = [
@@ -186,23 +184,28 @@ def remedies() -> str:
         *(["apt-get install pocl-opencl-icd (Debian, Ubuntu)"] if linux else []),
     ]
     if name := forced_target():
-        ways.insert(0, f"to unset {TARGET_VARIABLE} (it is {name})")
-    return f"what helps here: {', or '.join(ways)}; --device numpy needs none, and is slow"
+        ways.insert(0, f"unset {TARGET_VARIABLE} (it is {name})")
+    return (
+        f"On this machine, try: {', or '.join(ways)}. "
+        "To run without OpenCL, use --device numpy, which is slow."
+    )
 
 
 def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
-    """The device to use: the one that a selector names, else the first usable one by :func:`rank`.
+    """Return the device that a selector names, or by default the usable device of least rank.
 
     Args:
         selector: an index from ``clpipe devices``, or a part of a device's or platform's name.
+            None is the default.
+        devices: the devices of this machine.
 
     Raises:
-        DeviceError: there is no device, none matches, or the one that matches cannot be used.
+        DeviceError: there is no device, none matches, or the matching one cannot be used.
     """
     if not devices:
-        places = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES")  # where the loader looks for platforms
+        places = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES")  # they limit the loader's search
         limits = "".join(f" ({n} is {os.environ[n]!r})" for n in places if n in os.environ)
-        raise DeviceError(f"no OpenCL platform was found{limits}; {remedies()}")
+        raise DeviceError(f"no OpenCL platform was found{limits}. {remedies()}")
     if selector is not None:
         matching = [
             d
@@ -214,17 +217,20 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
             raise DeviceError(one_of("device", selector, [*names, "numpy"]))
         usable = [d for d in matching if not d.problem]
         if not usable:
-            raise DeviceError(f"device {matching[0].label}: {matching[0].problem}")
+            raise DeviceError(
+                f"device {matching[0].label}: {matching[0].problem}. To find another one, run "
+                "clpipe devices."
+            )
         return min(usable, key=rank)
     usable = [d for d in devices if d.type in ("GPU", "CPU") and not d.problem]
     if not usable:
         reasons = "; ".join(f"{d.label}: {d.problem or 'an emulator'}" for d in devices)
-        raise DeviceError(f"no usable OpenCL device ({reasons}); {remedies()}")
+        raise DeviceError(f"no usable OpenCL device ({reasons}). {remedies()}")
     return min(usable, key=rank)
 
 
 def rank(device: DeviceInfo) -> int:
-    """A device's place among those to use by default: GPUs, CPUs by how fast their platform is."""
+    """Return a device's rank as default: first GPUs, then CPUs in the order of platform speed."""
     if device.type == "GPU":
         return 0
     if "Intel" in device.platform:
@@ -233,13 +239,14 @@ def rank(device: DeviceInfo) -> int:
 
 
 def choose_all(selectors: Sequence[str], devices: list[DeviceInfo]) -> list[DeviceInfo]:
-    """The devices that selectors name; each selector as in :func:`choose`.
+    """Return the devices that selectors name; each selector is one of :func:`choose`.
 
-    Without selectors: the default device and, if it is a GPU, all other GPUs of the same name,
-    because these give the same bits. Each device is there once, also where two drivers offer it.
+    Without selectors, these are the default device and, if it is a GPU, all other GPUs of the same
+    name, because these give the same bits. Each device is listed once, even if two drivers offer
+    it.
 
     Raises:
-        DeviceError: as :func:`choose`.
+        DeviceError: as for :func:`choose`.
     """
     if not selectors:
         first = choose(None, devices)
@@ -260,15 +267,15 @@ def choose_all(selectors: Sequence[str], devices: list[DeviceInfo]) -> list[Devi
 
 
 def shared_out(devices: list[DeviceInfo], number: int, of: int) -> list[DeviceInfo]:
-    """The devices of one of several processes of a machine, which take them in turn.
+    """Return the devices of one of several processes of a machine, distributed round-robin.
 
-    Where there are more processes than devices, several have the same one. All see the same order,
-    also where each was given the devices in another one.
+    If there are more processes than devices, several processes share a device. The distribution
+    does not depend on the order of ``devices``.
 
     Args:
-        devices: of all of the processes together.
-        number: of the process, from 0 on.
-        of: how many processes there are.
+        devices: the devices of all processes together.
+        number: the number of the process, from 0.
+        of: the number of processes.
     """
     if of == 1:
         return devices
@@ -277,17 +284,17 @@ def shared_out(devices: list[DeviceInfo], number: int, of: int) -> list[DeviceIn
 
 
 def matches(selector: str, device: DeviceInfo) -> bool:
-    """Whether a selector is a part of a device's name, type or platform ('pocl' counts)."""
+    """Return whether a selector is a part of a device's name, type or platform, or "pocl"."""
     alias = " pocl" if is_pocl(device.platform) else ""
     names = f"{device.name} {device.platform} {device.type}{alias}"
     return bool(selector) and selector.lower() in names.lower()
 
 
 def usable_memory(chosen: DeviceInfo) -> int:
-    """How many bytes of buffers a device may hold by default.
+    """Return the default limit for a device's buffers in bytes.
 
-    That is nine tenths of a GPU's memory. A CPU shares its memory with all other programs, so
-    there it is half of what is available now.
+    It is nine tenths of a GPU's memory. A CPU shares its memory with all other programs, so there
+    it is at most half of the memory that is available now.
     """
     if chosen.type == "GPU":
         return chosen.memory * 9 // 10

@@ -1,4 +1,4 @@
-"""The place of an image or a tile of it, and the size of its planes on a device. Pure."""
+"""The position of an image or a tile, and the size of its planes on a device. Pure."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from clpipe.engine.work_items import round_up, summed_together
 
 @dataclass(frozen=True)
 class Box:
-    """A part of an image: the columns from ``left`` to before ``right``, and rows likewise."""
+    """A part of an image: columns ``left`` to ``right - 1``, and rows ``top`` to ``bottom - 1``."""
 
     left: int
     top: int
@@ -29,7 +29,7 @@ class Box:
 
     @property
     def is_empty(self) -> bool:
-        """Whether it has no pixels."""
+        """Whether the box has no pixels."""
         return self.width <= 0 or self.height <= 0
 
 
@@ -38,7 +38,7 @@ NOTHING = Box(0, 0, 0, 0)
 
 @dataclass(frozen=True)
 class Extent:
-    """An image, or a tile of it with its halo, and the size of its planes on a device."""
+    """An image, or a tile with its halo, and the size of its planes on a device."""
 
     width: int  # of the image
     height: int
@@ -49,7 +49,7 @@ class Extent:
 
     @classmethod
     def whole(cls, width: int, height: int, lanes: int, border: int) -> "Extent":
-        """An image in one piece."""
+        """Return the extent of a whole image."""
         box = Box(0, 0, width, height)
         return cls(width, height, lanes, border, box, box)
 
@@ -57,17 +57,17 @@ class Extent:
     def pitch(self) -> int:
         """Floats from one row of a plane to the next."""
         pitch = self.padded_width + 2 * round_up(self.border, self.lanes)
-        # Rows a multiple of 4 KiB apart would fall into the same cache sets.
+        # Rows that are a multiple of 4 KiB apart would map to the same cache sets.
         return pitch + self.lanes * (pitch % 1024 == 0)
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing is stored, because nothing is needed."""
+        """Whether no pixels are stored, because none are needed."""
         return self.stored.is_empty
 
     @property
     def is_small(self) -> bool:
-        """Whether stores leave a part of the border to be filled, see ``kernels/lib/image.h``."""
+        """Whether stores leave a part of the border unfilled; see ``kernels/lib/image.h``."""
         return min(self.stored.width, self.stored.height) <= 2 * self.border + 1
 
     @property
@@ -82,18 +82,18 @@ class Extent:
 
     @property
     def blocks(self) -> int:
-        """The number of blocks, four rows high, each of which has sums of its own."""
+        """The number of blocks with separate sums. Each is four rows high."""
         across = -(-self.padded_width // (self.lanes * summed_together(self.lanes)))
         return across * (self.padded_height // 4)
 
     @property
     def plane_bytes(self) -> int:
-        """The bytes of a plane with its border, and a margin that the last block's loads need."""
+        """The bytes of a plane, its border, and a margin for the loads of the last block."""
         return ((self.padded_height + 2 * self.border) * self.pitch + 5 * self.lanes) * 4
 
     @cached_property
     def numbers(self) -> dict[str, int]:
-        """The values of the kernel parameters that describe it, by name."""
+        """The values of the kernel parameters that describe the extent, by name."""
         core = self.core
         return {
             "width": self.width,
@@ -112,12 +112,12 @@ class Extent:
         }
 
 
-# An image or a tile on each level of a plan.
+# The extents of an image or a tile on each level of a plan.
 Extents = tuple[Extent, ...]
 
 
 def enclosing(places: Sequence[Extents]) -> Extents:
-    """On each level an image and a tile of it that are as large as the largest of some."""
+    """Return, for each level, an extent with the largest image size and tile size of all places."""
     return tuple(
         Extent(
             max(extent.width for extent in extents),
@@ -137,5 +137,5 @@ def enclosing(places: Sequence[Extents]) -> Extents:
 
 
 def whole_image(plan: Plan, width: int, height: int, lanes: int) -> Extents:
-    """An image in one piece, from the width and height of the source."""
+    """Return the extents of a whole image, from the width and height of the source in pixels."""
     return tuple(Extent.whole(*size, lanes, plan.border) for size in plan.sizes(width, height))

@@ -1,8 +1,8 @@
-"""Stacks on their way through a device: what is enqueued, and what is still to be fetched.
+"""Stacks in flight on a device: commands that are enqueued, and results that are yet to be fetched.
 
-A stack is sent, launched and fetched; it has landed when its results are in the host's arrays. An
-image that is too large goes through in tiles, once in each phase, each of which is a stack of one.
-Several stacks may be on the way together.
+A stack is sent, launched and fetched. It has landed when its results are in the host's arrays. An
+image that is too large is processed in tiles, once in each phase. Each tile is a stack of one.
+Several stacks may be in flight together.
 """
 
 from collections import deque
@@ -28,22 +28,22 @@ from clpipe.engine.transfers import InPlace, Staged
 from clpipe.engine.work import Member, Work
 
 ONE = np.ones(1, np.uint32)  # before the first row, so that no offset is 0
-TABLES = 1 << 26  # bytes of arrays that are kept on the device, 64 of them at most
+TABLES = 1 << 26  # bytes of arrays that are kept on the device, at most 64 arrays
 
 
 def room_of_table(buffer: Any) -> int:
-    """The room that a table's buffer takes of :data:`TABLES`: its bytes, but one may take all."""
+    """Return a buffer's share of :data:`TABLES`: its bytes, but at least 1/64 and at most all."""
     return min(max(buffer.size, TABLES // 64), TABLES)
 
 
 @dataclass
 class Flight:
-    """What goes through a device together, on its way.
+    """Stacks that were enqueued together and are in flight.
 
     Attributes:
-        events: of launches and transfers, by their names.
-        stacks_left: that have not landed.
-        error: the first one of a stack that has.
+        events: the names and events of launches and transfers.
+        stacks_left: the number of stacks that have not landed.
+        error: the first error of a stack that has landed.
     """
 
     events: list[tuple[str, Any]] = field(default_factory=list)
@@ -53,7 +53,7 @@ class Flight:
 
 @dataclass(frozen=True)
 class Sent:
-    """A stack on its way: the events to wait for, and the copies to make then."""
+    """A stack in flight: the events to wait for, and the copies to make after them."""
 
     flight: Flight
     events: list[Any]
@@ -61,11 +61,12 @@ class Sent:
 
 
 class Flow:
-    """The queues and buffers of a context, kept from image to image.
+    """The queues and buffers of a context, which all images share.
 
     Args:
         context: the ``pyopencl.Context``.
-        alignment: of the host's memory, in bytes, if the device works there; else None.
+        alignment: the required alignment of host memory in bytes, if the device uses host memory
+            directly; else None.
     """
 
     def __init__(self, context: Any, alignment: int | None) -> None:
@@ -83,18 +84,18 @@ class Flow:
         )
         self._tables: BoundedCache[Any] = BoundedCache(TABLES, room_of_table)
         self._sent: deque[Sent] = deque()
-        self._reads: list[Any] = []  # events of fetches from buffers that the next stack writes
+        self._reads: list[Any] = []  # events of fetches from buffers that the next stack writes to
         self._launch_cache = LaunchCache()
 
     def new_queue(self) -> Any:
-        """A queue whose commands are done in order, and timed."""
+        """Return a queue that executes commands in order, and times them."""
         profiling = self._cl.command_queue_properties.PROFILING_ENABLE
         return self._cl.CommandQueue(self.context, properties=profiling)
 
     def new_buffer(self, size: int) -> Any:
-        """A buffer on the device, or in the host's memory if the device works there.
+        """Return a buffer on the device, or in host memory if the device uses it directly.
 
-        PoCL allocates its own at the first launch, and crashes if there is no memory then.
+        PoCL would allocate its own memory at the first launch, and crash if there is too little.
         """
         flags = self._cl.mem_flags
         if not self._in_place:
@@ -104,7 +105,7 @@ class Flow:
 
     @property
     def depth(self) -> int:
-        """The number of stacks that may be on the way at a time."""
+        """The number of stacks that may be in flight at a time."""
         return self.transfers.depth
 
     def start_alone(
@@ -116,9 +117,9 @@ class Flow:
         borders: Callable[[Launch], Iterator[Call]],
         memory: int,
     ) -> None:
-        """Enqueue an image in its phases, while buffers take no more than ``memory`` bytes.
+        """Enqueue one image, phase by phase, with at most ``memory`` bytes of buffers.
 
-        Of an incremental plan, launches are left out whose results are on the device.
+        For an incremental plan, launches are skipped if their results are still on the device.
         """
         known, after = self.forget(), LaunchCache()
         self.reserve(tiling.sizes, memory)
@@ -150,27 +151,27 @@ class Flow:
         self._launch_cache = after
 
     def start(self, flight: Flight, stack: Stack, sizes: Mapping[str, int], memory: int) -> None:
-        """Enqueue a stack, while buffers of these sizes take no more than ``memory`` bytes."""
+        """Enqueue a stack that needs buffers of these sizes; all take at most ``memory`` bytes."""
         self.forget()
         self.reserve(sizes, memory)
         self._send(flight, stack)
 
     def forget(self) -> LaunchCache:
-        """What was known of the buffers' contents, of which nothing is known from now on."""
+        """Return the launch cache, and start an empty one, because buffers will be overwritten."""
         known, self._launch_cache = self._launch_cache, LaunchCache()
         return known
 
     def reserve(self, sizes: Mapping[str, int], memory: int) -> None:
-        """Have buffers of these sizes, in bytes by name, while all take at most ``memory``."""
+        """Allocate buffers of these sizes (bytes by name), with at most ``memory`` bytes in all."""
         needs = self.transfers.needs(sizes)
         if not self.pool.has(needs, memory):
-            self.drain()  # a buffer's memory on the host goes with it, whatever writes there
+            self.drain()  # releasing a buffer frees its host memory, even if a command uses it
         self.pool.reserve(needs, memory)
 
     def _send(self, flight: Flight, stack: Stack) -> None:
-        """Send a stack's pixels if a kernel reads them, launch, and fetch what comes of them.
+        """Send a stack's pixels if a kernel reads them, launch its kernels, and fetch the results.
 
-        Where more than :attr:`depth` stacks would be on the way, the oldest ones land.
+        If more than :attr:`depth` stacks would be in flight, this first waits for the oldest.
         """
         while len(self._sent) >= self.depth:
             self._land()
@@ -196,7 +197,7 @@ class Flow:
 
     @CpuTimer("upload")
     def _upload(self, flight: Flight, stack: Stack, is_whole: bool) -> tuple[Any, list[Any]]:
-        """Send what the members of a stack store of their sources, unless it is there already."""
+        """Send the source pixels of a stack's members, unless they are on the device already."""
         first, members = stack.members[0], stack.members
         options, source = first.work.options, first.work.source
         is_same = is_whole and (options.unchanged or not options.download)
@@ -214,7 +215,11 @@ class Flow:
     def _launch(
         self, flight: Flight, stack: Stack, ends: Mapping[str, Any], wait: list[Any]
     ) -> list[Any]:
-        """Launch the kernels of a stack, the first one after events; the last one's event."""
+        """Launch the kernels of a stack, the first one after the events ``wait``.
+
+        Returns:
+            The event of the last kernel; ``wait`` if there is none.
+        """
         buffers = {**self.pool.buffers, **ends}
         launches = list(stack.launches())
         if not launches:
@@ -241,7 +246,7 @@ class Flow:
         return done
 
     def _fetch(self, sent: Sent, name: str, buffer: Any, size: int, after: list[Any]) -> Array:
-        """Fetch the bytes of a buffer, when launches are done; they are there when it lands."""
+        """Enqueue a fetch of a buffer after launches. Its bytes are valid when the stack lands."""
         array, event = self.transfers.fetch(name, buffer, size, after)
         sent.flight.events.append(("download", event))
         sent.events.append(event)
@@ -252,12 +257,12 @@ class Flow:
     def _fetch_results(
         self, sent: Sent, stack: Stack, ends: Mapping[str, Any], after: list[Any]
     ) -> None:
-        """Fetch the results of a stack, when launches are done.
+        """Enqueue the fetches of a stack's results after its launches.
 
         Args:
-            sent: gets the copies that are to be made when it lands.
+            sent: receives the copies to make when the stack lands.
             stack: the stack.
-            ends: the buffers that are no pool's, "dst" of them.
+            ends: the buffers "src" and "dst", which are not in the pool.
             after: the events of the launches.
         """
         members = stack.members
@@ -297,10 +302,10 @@ class Flow:
                 sent.copies.append(partial(np.copyto, to, part.view(to.dtype)))
 
     def finish(self, flight: Flight) -> None:
-        """Wait until all stacks of a flight have landed, and any that were started before it.
+        """Wait until all stacks of a flight, and all stacks started before it, have landed.
 
         Raises:
-            pyopencl.Error: one has failed.
+            pyopencl.Error: a stack of the flight failed.
         """
         while flight.stacks_left:
             self._land()
@@ -308,12 +313,12 @@ class Flow:
             raise flight.error
 
     def drain(self) -> None:
-        """Wait until nothing is on the way."""
+        """Wait until no stack is in flight."""
         while self._sent:
             self._land()
 
     def abandon(self) -> None:
-        """After a failure: wait for all that is on the way, and give all memory back."""
+        """After a failure, wait for all commands in flight, drop their results, release memory."""
         self._sent.clear()
         self._reads.clear()
         for release in (
@@ -326,7 +331,7 @@ class Flow:
                 release()
 
     def _land(self) -> None:
-        """Wait for the oldest stack on the way, and copy its results; an error is its flight's."""
+        """Wait for the oldest stack in flight, and copy its results. Its flight stores an error."""
         sent = self._sent.popleft()
         sent.flight.stacks_left -= 1
         try:
@@ -341,10 +346,10 @@ class Flow:
             sent.flight.error = sent.flight.error or error
 
     def table(self, table: Array) -> Any:
-        """A constant array on the device, uploaded once while it is the same object."""
+        """Return a buffer with a constant array, which is uploaded once per array object."""
         return self._tables.get(Identity(table), lambda: self.new_table(table))
 
     def new_table(self, table: Array) -> Any:
-        """A constant array on the device."""
+        """Return a new buffer with a constant array."""
         flags = self._cl.mem_flags.READ_ONLY | self._cl.mem_flags.COPY_HOST_PTR
         return self._cl.Buffer(self.context, flags, hostbuf=table)

@@ -1,4 +1,4 @@
-"""The piece of hardware that a device is: two OpenCL drivers may offer the same one."""
+"""Identifies the hardware of a device, because two OpenCL drivers may offer the same hardware."""
 
 import ctypes
 import struct
@@ -11,12 +11,12 @@ PCI_BUS_INFO, UUID = 0x410F, 0x106A
 
 @dataclass(frozen=True)
 class Hardware:
-    """The hardware of a device, as far as its driver says; None where it does not.
+    """The hardware of a device. Values that the driver does not report are None.
 
     Args:
         platform: the platform's handle.
         pci: domain, bus, device and function on the PCI bus.
-        uuid: 16 bytes.
+        uuid: the device's UUID, 16 bytes.
     """
 
     platform: int
@@ -24,9 +24,9 @@ class Hardware:
     uuid: bytes | None = None
 
     def is_same(self, other: "Hardware") -> bool:
-        """Whether two devices are one piece of hardware, as far as their drivers say.
+        """Return whether two devices are the same hardware, as far as their drivers report.
 
-        Two of one platform are two, also where they are parts of one board.
+        Two devices of one platform are always different, even if they are on one board.
         """
         if self.platform == other.platform:
             return False
@@ -37,7 +37,7 @@ class Hardware:
 
 
 def hardware_of(device: Any) -> Hardware:
-    """The hardware of a ``pyopencl.Device``."""
+    """Return the hardware of a ``pyopencl.Device``."""
     uuid = queried(device, UUID)
     pci = queried(device, PCI_BUS_INFO)
     address = struct.unpack("4I", pci) if pci else vendor_address(device)
@@ -45,23 +45,23 @@ def hardware_of(device: Any) -> Hardware:
 
 
 def queried(device: Any, name: int, size: int = 16) -> bytes | None:
-    """A value of clGetDeviceInfo that pyopencl has no name for; None where there is none."""
+    """Return a value of clGetDeviceInfo for which pyopencl has no name; None if it is missing."""
     import pyopencl as cl
 
     try:
-        # The loader that pyopencl uses is one of the libraries that its extension needs.
+        # pyopencl's extension module is linked to the loader, so the function is found through it.
         query = ctypes.CDLL(cl._cl.__file__).clGetDeviceInfo
     except (OSError, AttributeError):
         return None
     value = ctypes.create_string_buffer(size)
     handle = ctypes.c_void_p(device.int_ptr)
     failed = query(handle, ctypes.c_uint(name), ctypes.c_size_t(size), value, None)
-    # Drivers that do not know a number leave zeros, and so do some that do.
+    # Drivers leave zeros for an unknown value. Some also do so for a known one.
     return None if failed or not any(value.raw) else value.raw
 
 
 def vendor_address(device: Any) -> tuple[int, ...] | None:
-    """The PCI address as older drivers of NVIDIA and AMD give it: domain, bus, device, function."""
+    """Return the PCI address of older NVIDIA and AMD drivers: domain, bus, device, function."""
     import pyopencl as cl
 
     try:

@@ -1,6 +1,6 @@
 """The parts of a plan: images, the launches that read and write them, and the plan itself. Pure.
 
-Images of one size are a level. The source is on level 0; each resampling leads to the next.
+Images of one size form a level. The source is on level 0. Each resampling leads to the next level.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -16,8 +16,8 @@ from clpipe.stage import Kind, Pointwise, Resample, Stencil
 class Image:
     """An image between launches.
 
-    ``period`` is that of a mosaic whose array a mirrored border would not go on with: its rows and
-    columns.
+    ``period`` is the (rows, columns) of a mosaic's filter array, if a mirrored border would not
+    continue this array; else None.
     """
 
     number: int
@@ -28,7 +28,7 @@ class Image:
 
 @dataclass(frozen=True)
 class Read:
-    """An image as a launch reads it: the passes of ``prologue`` are redone at each tap."""
+    """An image that a launch reads. The passes of ``prologue`` are recomputed at each tap."""
 
     image: Image
     prologue: tuple[Op, ...] = ()
@@ -38,10 +38,17 @@ class Read:
 class Launch:
     """One kernel call over the image.
 
-    ``reads`` has the images of the stencil if the first op is one, else the one image that is
-    loaded or resampled; it is empty if the launch reads the source. ``writes`` is the image that is
-    stored, ``encodes`` whether eight-bit pixels are written, ``sums`` a reduction of the result to
-    sums. ``level`` is that of the result.
+    Attributes:
+        name: the name of the launch, for people.
+        ops: the passes, in order.
+        reads: the images of the stencil if the first pass is one, else the image to load or
+            resample. It is empty if the launch reads the source.
+        writes: the image to store.
+        encodes: whether the launch writes eight-bit pixels.
+        sums: the reduction of the result to sums.
+        rows: the rows of a work item's block.
+        columns: the vectors of a work item's block; with one lane, always one.
+        level: the level of the result.
     """
 
     name: str
@@ -50,31 +57,31 @@ class Launch:
     writes: Image | None = None
     encodes: bool = False
     sums: Op | None = None
-    rows: int = 2  # of a work item's block
-    columns: int = 1  # of it, in vectors; on one lane it is one
+    rows: int = 2
+    columns: int = 1
     level: int = 0
 
     @property
     def opener(self) -> Op | None:
-        """The op that opens the group and reads images by itself, if one does."""
+        """The op that opens the group and reads images itself (stencil or resampling), or None."""
         opens = self.ops and isinstance(self.ops[0].pass_.access, Stencil | Resample)
         return self.ops[0] if opens else None
 
     @property
     def has_period(self) -> bool:
-        """Whether it writes a mosaic with a period, whose border it does not fill."""
+        """Whether the launch writes a mosaic with a period, whose border it does not fill."""
         return self.writes is not None and self.writes.period is not None
 
     @property
     def stencil(self) -> Stencil | None:
-        """The access of the opener, if it is a stencil."""
+        """The access of the opener if it is a stencil, else None."""
         access = self.opener.pass_.access if self.opener else None
         return access if isinstance(access, Stencil) else None
 
 
 @dataclass(frozen=True)
 class Lines:
-    """One launch that fills the line tables of all steps on a level that have one."""
+    """One launch that fills the line tables of all steps on a level."""
 
     ops: tuple[Op, ...]
     name: str = "lines"
@@ -83,7 +90,7 @@ class Lines:
 
 @dataclass(frozen=True)
 class Histogram:
-    """The first part of a histogram: each work item counts some of a stored image's rows."""
+    """The first part of a histogram: each work item counts pixels in some rows of an image."""
 
     op: Op
     reads: tuple[Read]
@@ -93,7 +100,7 @@ class Histogram:
 
 @dataclass(frozen=True)
 class Reduce:
-    """The second part of a reduction: block sums to partial sums, or counts to one histogram."""
+    """The second part of a reduction: it adds block sums to partial sums, or adds up counts."""
 
     op: Op
     name: str
@@ -102,7 +109,7 @@ class Reduce:
 
 @dataclass(frozen=True)
 class Finalize:
-    """The end of a reduction: one work item makes estimates from the sums or the histogram."""
+    """The end of a reduction: one work item computes estimates from the sums or the histogram."""
 
     op: Op
     name: str
@@ -113,8 +120,8 @@ class Finalize:
 class Border:
     """One launch that fills the border of a plane, after stores that do not fill it.
 
-    It is in no plan: only images that are hardly wider than two borders need it, and mosaics with a
-    ``period``.
+    No plan contains it. Only images that are hardly wider than two borders need it, and mosaics
+    with a ``period``.
     """
 
     slot: int
@@ -127,7 +134,7 @@ AnyLaunch = Launch | Lines | Histogram | Reduce | Finalize
 
 
 def unscaled(launch: AnyLaunch) -> AnyLaunch:
-    """A launch without the scale of the resampling that opens it, if one does."""
+    """Return a launch without the scale of the resampling that opens it, if there is one."""
     if not isinstance(launch, Launch) or not launch.opener or launch.stencil:
         return launch
     op = replace(launch.opener, pass_=replace(launch.opener.pass_, access=Pointwise()))
@@ -135,38 +142,53 @@ def unscaled(launch: AnyLaunch) -> AnyLaunch:
 
 
 def reads_of(launch: AnyLaunch) -> tuple[Read, ...]:
-    """The stored images that a launch reads."""
+    """Return the stored images that a launch reads."""
     return launch.reads if isinstance(launch, Launch | Histogram) else ()
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The launches that develop one image, in order, and the slots of its planes."""
+    """The launches that develop one image, in order, and the slots of its planes.
+
+    Attributes:
+        source: the kind of the source.
+        half: whether the source is float16, not float32.
+        planar: whether the source is stored as consecutive planes, not interleaved.
+        launches: the launches, in order.
+        slots: the slots of each image's planes, by the image's number.
+        slot_count: the number of slots.
+        kept: each step to keep, with its image.
+        final: the last image as float planes, if requested.
+        encoded: the kind of the eight-bit pixels, if requested.
+        border: the width of the planes' borders in pixels.
+        incremental: whether all images stay on the device, so that launches can be skipped.
+        resamplings: the resampling from each level to the next.
+    """
 
     source: Kind
     half: bool
-    planar: bool  # whether the source is planes one behind the other, not interleaved
+    planar: bool
     launches: tuple[AnyLaunch, ...]
-    slots: tuple[tuple[int, ...], ...]  # of the planes of each image, by its number
+    slots: tuple[tuple[int, ...], ...]
     slot_count: int = 0
-    kept: tuple[tuple[str, Image], ...] = ()  # step -> its image
-    final: Image | None = None  # the last image as float planes
-    encoded: Kind | None = None  # the kind that is encoded to eight bits
+    kept: tuple[tuple[str, Image], ...] = ()
+    final: Image | None = None
+    encoded: Kind | None = None
     border: int = 0
-    incremental: bool = False  # whether all images stay, so that launches can be left out
-    resamplings: tuple[Resampler, ...] = ()  # from each level to the next
+    incremental: bool = False
+    resamplings: tuple[Resampler, ...] = ()
 
     def __hash__(self) -> int:
         return self._hash
 
     @cached_property
     def _hash(self) -> int:
-        # A plan is looked up for each image, and hashing all that is in it takes a while.
+        # Cached, because a plan is looked up for each image and hashing its contents is slow.
         return hash(tuple(getattr(self, each.name) for each in fields(self)))
 
     @cached_property
     def unscaled(self) -> "Plan":
-        """The plan without the scales of resamplings, on which its kernels do not depend."""
+        """The plan without the scales of its resamplings. Kernels do not depend on the scales."""
         if not self.resamplings:
             return self
         launches = tuple(unscaled(launch) for launch in self.launches)
@@ -174,25 +196,25 @@ class Plan:
 
     @cached_property
     def estimates(self) -> dict[str, tuple[str, ...]]:
-        """The names of the numbers that steps estimate from the image, by step."""
+        """The names of the numbers that each step estimates from the image."""
         found = [launch.op for launch in self.launches if isinstance(launch, Finalize)]
         return {op.step: op.reduction.estimates for op in found}
 
     def sizes(self, width: int, height: int) -> tuple[tuple[int, int], ...]:
-        """The width and height of images on each level, from those of the source."""
+        """Return the width and height of each level's images, from those of the source."""
         return sizes(self.resamplings, width, height)
 
     def check_resamplings(self, width: int, height: int) -> None:
-        """Check that an image of that size can be resampled.
+        """Check that an image of this size can be resampled.
 
         Raises:
-            ImageError: it cannot, for example because a lens would fold it over.
+            ImageError: it cannot be resampled, for example because a lens would fold it over.
         """
         for resampling, size in zip(self.resamplings, self.sizes(width, height), strict=False):
             resampling.values(*size)
 
     def level_of(self, number: int) -> int:
-        """The level of an image that is a result, by its number."""
+        """Return the level of a result image, by its number."""
         results = [image for _, image in self.kept] + ([self.final] if self.final else [])
         return next(image.level for image in results if image.number == number)
 
@@ -208,7 +230,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Kernel:
-    """A launch as OpenCL: the kernel's name, its whole source and its parameters in order.
+    """The OpenCL kernel of a launch: its name, complete source and parameters in order.
 
     ``files`` are the kernel files that the source includes.
     """

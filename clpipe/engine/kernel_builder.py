@@ -1,4 +1,4 @@
-"""The parameters of a kernel, collected while its text is written, under canonical names."""
+"""The parameters of a kernel, collected under canonical names while its source is generated."""
 
 from collections.abc import Mapping, Sequence
 
@@ -24,15 +24,16 @@ LARGER = (
     "from_rows, border}"
 )
 
-# A kernel is over a stack of images, which the third dimension of the index space counts. It reads
-# its numbers from a table with a row for each image. The table begins at the global offset, so that
-# one buffer serves all launches; offsets are above 0, for which PoCL compiles kernels of their own.
+# A kernel processes a stack of images. The third dimension of the index space counts the images.
+# The kernel reads its numbers from a table with a row for each image. The table begins at the
+# global offset, so that one buffer serves all launches. No offset is 0, because PoCL compiles a
+# separate kernel for the offset 0.
 TABLE = "numbers"
 AS_TYPE = {"float": "as_float({})", "int": "as_int({})", "uint": "{}"}
 
 
 class KernelBuilder:
-    """Collects the parameters of one kernel and what is set up of them, under canonical names."""
+    """Collects the parameters of one kernel and its setup lines, under canonical names."""
 
     def __init__(self, plan: Plan, lanes: int) -> None:
         self.plan = plan
@@ -43,13 +44,13 @@ class KernelBuilder:
         self._slots: list[int] = []
 
     def name(self, step: str, item: str) -> str:
-        """The name in the text of something that belongs to a step, such as ``step0_gain``."""
+        """Return the canonical name of a step's item, such as ``step0_gain``."""
         if step not in self._steps:
             self._steps.append(step)
         return f"step{self._steps.index(step)}_{item}"
 
     def parameter(self, name: str, type_: str, bound: Bound) -> str:
-        """A parameter of the kernel, by its name in the text, and what is bound to it."""
+        """Add a kernel parameter and its binding, and return its name in the source."""
         space = "" if type_.endswith("*") else " "
         self.parameters[name] = Parameter(f"{type_}{space}{name}", bound)
         return name
@@ -57,40 +58,40 @@ class KernelBuilder:
     def buffer(
         self, name: str, element: str, buffer: str, written: bool = False, restrict: bool = True
     ) -> str:
-        """The parameter of a buffer, whose elements are of an OpenCL type."""
+        """Return the parameter for a buffer with elements of an OpenCL type."""
         type_ = f"__global {'' if written else 'const '}{element} *{'restrict' if restrict else ''}"
         return self.parameter(name, type_, Buffer(buffer, written))
 
     def number(self, name: str) -> str:
-        """The parameter of a number of the tile's extent."""
+        """Return the parameter for a number of the tile's extent."""
         return self.parameter(name, "uint", ExtentNumber(name))
 
     def tile_number(self) -> str:
-        """The parameter of the tile's own number."""
+        """Return the parameter for the number of the tile."""
         return self.parameter("tile", "uint", TileNumber())
 
     def core(self) -> str:
-        """The tile's core."""
+        """Return the variable with the tile's core."""
         sides = [self.number(f"core_{side}") for side in ("left", "top", "right", "bottom")]
         self.setup.append(f"const core c = {{{', '.join(sides)}}};")
         return "c"
 
     def larger(self) -> str:
-        """The extent of the image that a resampling reads."""
+        """Return the variable with the extent of the image that a resampling reads."""
         for number in ("width", "height", "pitch", "left", "top", "columns", "rows"):
             self.parameter(f"from_{number}", "uint", ExtentNumber(number, larger=True))
         self.setup.append(f"const extent from = {LARGER};")
         return "from"
 
     def taps(self, level: int) -> list[str]:
-        """The parameters of the resampling that leads on from a level."""
+        """Return the parameters for the resampling from a level to the next."""
         return [
             self.parameter(f"tap_{item}", type_, ResamplingValue(level, item))
             for item, type_ in self.plan.resamplings[level].parameters
         ]
 
     def slot(self, number: int, written: bool) -> str:
-        """The parameter of a plane."""
+        """Return the parameter for a plane."""
         if number not in self._slots:
             self._slots.append(number)
         return self.buffer(
@@ -98,27 +99,27 @@ class KernelBuilder:
         )
 
     def planes(self, read: Read) -> list[str]:
-        """Three plane parameters of an image that is read, the last repeated where it has less."""
+        """Return three plane parameters for an image; the last one is repeated if it has fewer."""
         slots = [self.slot(n, False) for n in self.plan.slots[read.image.number]]
         return (slots + [slots[-1]] * 2)[:3]
 
     def lines(self, step: str, item: str, written: bool) -> str:
-        """The parameter of one of a step's line tables."""
+        """Return the parameter for one of a step's line tables."""
         buffer = step_buffer(item, step)
         return self.buffer(self.name(step, item), "float", buffer, written, restrict=False)
 
     def estimates(self, step: str, written: bool) -> str:
-        """The parameter of the buffer with the numbers that a step estimates from the image."""
+        """Return the parameter for the buffer of the numbers that a step estimates."""
         name, buffer = self.name(step, "estimates"), step_buffer("estimates", step)
         return self.buffer(name, "float", buffer, written, restrict=False)
 
     def table8(self, curves: Sequence[Op]) -> str:
-        """The parameter of the table of curves and the conversion to eight bits."""
+        """Return the parameter for the table of curves and the conversion to eight bits."""
         type_, steps = "__global const uchar *restrict", tuple(op.step for op in curves)
         return self.parameter("table8", type_, EncodedCurves(steps))
 
     def stream(self, op: Op, scope: NoiseScope) -> str:
-        """The random stream of a pass, from three parameters."""
+        """Return an expression for the random stream of a pass, from three parameters."""
 
         words = {f"{scope.value}_key0": "key0", f"{scope.value}_key1": "key1", "stage": "stage"}
         names = [
@@ -128,7 +129,10 @@ class KernelBuilder:
         return f"(stream){{{', '.join(names)}}}"
 
     def arguments(self, op: Op, names: Sequence[str] | None = None) -> list[str]:
-        """The actual arguments of a pass, or those ``names``, after the pixel and its site."""
+        """Return the arguments of a pass that follow the pixel and its site.
+
+        ``names`` selects arguments; None is all arguments of the pass.
+        """
         pass_, types, literals = op.pass_, dict(op.types), dict(op.literals)
         estimates = self.plan.estimates.get(op.step, ())
         texts = [self.stream(op, pass_.random)] if pass_.random else []
@@ -150,9 +154,9 @@ class KernelBuilder:
 
 
 def in_order(parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
-    """Parameters in the order in which a table has their numbers.
+    """Return parameters in the order of the table's columns.
 
-    First those of extents, then pointers, and the values of an image's chain by their types.
+    The order is: extents, pointers, then the values of an image's chain by type.
     """
 
     def group(parameter: Parameter) -> int:
@@ -166,16 +170,16 @@ def in_order(parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
 
 
 def element_of(parameter: Parameter) -> str | None:
-    """The OpenCL type of what a parameter points to; None where it is a number."""
+    """Return the OpenCL type of a pointer parameter's elements; None for a number."""
     type_, star, _ = parameter.declaration.partition("*")
     return type_.split()[-1] if star else None
 
 
 def opening(parameters: Mapping[str, Parameter]) -> tuple[list[str], list[str]]:
-    """The parameters that a kernel is declared with, and its first lines.
+    """Return the declared parameters of a kernel, and its first lines, which read the table.
 
     Args:
-        parameters: all that it reads, by their names in the text.
+        parameters: all parameters, by their names in the source.
     """
     declared = [f"__global const uint *restrict {TABLE}"]
     lines = [

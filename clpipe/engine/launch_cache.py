@@ -1,8 +1,9 @@
-"""The contents of a device's buffers, so that a launch is left out that would write the same again.
+"""A record of the contents of a device's buffers, so that unchanged launches are skipped.
 
-What a launch writes follows from its kernel, the values of its arguments and what the buffers that
-it reads hold. A digest of these stands for it, and the source, which kernels do not make, has a
-number. So nothing is compared but digests, and a change reaches all that depends on it and no more.
+The kernel, the argument values and the contents of its input buffers determine the output of a
+launch. A digest of these represents the output. The source is no output of a kernel, so a number
+represents it. Comparing digests is therefore enough, and a change affects exactly the launches that
+depend on it.
 """
 
 import weakref
@@ -22,19 +23,19 @@ from clpipe.engine.stack import Call
 
 
 def digest_of(*parts: bytes) -> bytes:
-    """A digest of bytes, 16 bytes long."""
+    """Return a digest of bytes, 16 bytes long."""
     return blake2b(b"".join(parts), digest_size=16).digest()
 
 
 @dataclass(frozen=True)
 class LaunchCache:
-    """The contents of buffers after an image that went through whole; at first nothing is known.
+    """The contents of buffers after an image that was processed whole. Initially it is empty.
 
     Args:
-        source: that image's array.
-        number: how many sources there were, so that each differs from those before.
-        buffers: for each buffer by name, the buffer itself, since another may take its place, and
-            the digest of what made its content.
+        source: the image's array.
+        number: the number of sources so far, which distinguishes them.
+        buffers: for each name, the buffer itself, because another may replace it, and the digest
+            that represents its contents.
     """
 
     source: weakref.ref[Array] | None = None
@@ -50,19 +51,19 @@ class LaunchCache:
         extents: Extents,
         bind: Bind,
     ) -> tuple[tuple[int, ...], "LaunchCache"]:
-        """The launches to do for the next image, and the contents of buffers after them.
+        """Return the launches that the next image needs, and the contents of buffers after them.
 
         Args:
-            calls: of a plan whose launches write each buffer once.
+            calls: the calls of a plan whose launches write each buffer once.
             pool: the buffers.
             source: the image.
-            unchanged: whether it has the same pixels still, if it is the array of the image before.
-            extents: the image on each level.
-            bind: gives the values of a call.
+            unchanged: whether the array has the same pixels, if it is that of the image before.
+            extents: the image's extents on each level.
+            bind: returns the values of a call.
 
         Returns:
-            The numbers of the calls to launch: those whose results are not in their buffers, and
-            the last one, whose results need not stay on the device.
+            The numbers of the calls to launch, and the new cache. The last call is always launched,
+            because its results need not stay on the device.
         """
         same = unchanged and self.source is not None and self.source() is source
         number = self.number + (not same)

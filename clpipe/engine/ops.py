@@ -1,4 +1,4 @@
-"""The passes of a chain's steps, as launches are made of them."""
+"""The passes of a chain's steps, from which launches are built."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -26,31 +26,31 @@ class Op:
     step: str
     kernel: str  # file, relative to the kernel folder; a plug-in's is an absolute path
     pass_: Pass
-    source: Kind  # of the image that its stage reads, "src"
-    kind: Kind  # of the image that it writes
+    source: Kind  # of the image "src" that the stage reads
+    kind: Kind  # of the image that the pass writes
     types: tuple[tuple[str, str], ...]  # argument -> OpenCL type
     literals: tuple[tuple[str, str], ...]  # argument -> OpenCL text
-    undoes_previous: bool = False  # the pass before it, of another step
+    undoes_previous: bool = False  # whether it undoes the previous pass, of another step
 
     def __hash__(self) -> int:
-        # Of a part, which tells most apart: chains are looked up by all of their passes.
+        # These fields distinguish most passes. Hashing all fields would slow down plan look-ups.
         return hash((self.step, self.pass_.function, self.literals))
 
     @property
     def is_inlined(self) -> bool:
-        """Whether a stencil after it may redo it at each of its taps."""
+        """Whether a later stencil may recompute this pass at each of its taps."""
         access = self.pass_.access
         return isinstance(access, Pointwise) and access.inline_at_taps
 
     @property
     def radius(self) -> int:
-        """The largest distance from a place at which it reads."""
+        """The largest distance, in pixels, at which the pass reads."""
         access = self.pass_.access
         return access.radius if isinstance(access, Stencil | Resample) else 0
 
     @property
     def reduction(self) -> Reduction:
-        """The access of a reduction."""
+        """The access of the pass, which must be a reduction."""
         assert isinstance(self.pass_.access, Reduction)
         return self.pass_.access
 
@@ -58,11 +58,11 @@ class Op:
 def chain_ops(
     chain: Chain, arguments: Mapping[str, Mapping[str, Argument]]
 ) -> tuple[tuple[str, tuple[Op, ...]], ...]:
-    """The passes of each step of a chain, by its name. Chains with the same ones have one plan.
+    """Return each step's name and passes. Chains with the same passes share a plan.
 
     Args:
         chain: the chain.
-        arguments: of the steps' methods, by the steps' names.
+        arguments: the arguments of the steps' methods, by step.
     """
     steps: list[tuple[str, tuple[Op, ...]]] = []
     last: Op | None = None
@@ -80,7 +80,7 @@ def chain_ops(
 def undone(
     pass_: Pass, own: Mapping[str, Argument], before: Pass, others: Mapping[str, Argument]
 ) -> bool:
-    """Whether a pass with its step's arguments undoes the pass before, with those of its step."""
+    """Return whether a pass with its arguments undoes the previous pass with its arguments."""
     access = pass_.access
     if not isinstance(access, Pointwise) or access.inverse_of != before.function:
         return False
@@ -91,7 +91,7 @@ def undone(
 
 
 def ops_of(step: Step, arguments: Mapping[str, Argument]) -> tuple[Op, ...]:
-    """The passes of a step with the types of its arguments, which decide its kernels' text."""
+    """Return the passes of a step with the types of its arguments. They determine the source."""
     passes = step.passes
     if not passes:
         return ()

@@ -1,4 +1,4 @@
-"""Options of one run of an image, besides its chain."""
+"""Options for running a chain on one image."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,10 +9,13 @@ from clpipe.engine.extents import Box
 
 @dataclass(frozen=True)
 class Timing:
-    """The time that one launch or transfer took, in seconds on the device.
+    """The device time of one launch or transfer.
 
-    ``start`` is on the clock of :func:`time.perf_counter`. Transfers are called "upload" and
-    "download".
+    Attributes:
+        name: the launch, "upload" or "download".
+        seconds: the duration in s.
+        start: the start time on the clock of :func:`time.perf_counter`.
+        transfer: whether it is a transfer.
     """
 
     name: str
@@ -23,18 +26,18 @@ class Timing:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of one run: how an image is put through a chain, and what comes back.
+    """Options of one run of a chain on an image.
 
     Args:
-        timings: one entry a launch and transfer that is done is appended (devices only).
-        download: False leaves the results on the device, for measuring.
-        into: an array to use for the eight-bit pixels (devices only), of their shape; a used one
-            saves the time that new memory takes.
-        unchanged: the image, if it is the same array as that before, has the same pixels still.
-        boxes: the parts of the results that are made, all of one size, in their pixels; () is all
-            of them. Results are then stacks of patches.
-        later: what the exposures behind the first one see, see
-            :mod:`clpipe.chain.exposures`; () is the same image.
+        timings: a list that receives the timing of each launch and transfer (devices only).
+        download: False leaves the results on the device, for benchmarks.
+        into: an array for the eight-bit pixels, of their shape (devices only). Reusing an array
+            saves the time to allocate memory.
+        unchanged: whether the image, if it is the previous image's array, has the same pixels.
+        boxes: the parts of the results to compute, all of one size, in pixels. The results are
+            then stacks of patches. () computes whole images.
+        later: the images of all exposures but the first; see :mod:`clpipe.chain.exposures`. () uses
+            the same image.
     """
 
     timings: list[Timing] | None = None

@@ -1,7 +1,7 @@
-"""Parts of an image's result, made alone: each is a tile of its own. Pure.
+"""Patches: parts of an image's result that are computed alone, each as one tile. Pure.
 
-A patch is stored from whole blocks on, as every tile is, wherever it begins. So it has the bits
-that the whole result has there.
+Like every tile, a patch is stored in whole blocks, wherever it begins. Therefore it equals the same
+part of the whole result, bit for bit.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,29 +17,28 @@ from clpipe.engine.tiles import Tiling, buffer_sizes, cutter_of, phases_of
 def with_patches(
     plan: Plan, boxes: Sequence[Box], whole: Tiling, lanes: int, memory: int, ends: int = 1
 ) -> Tiling:
-    """The tiling that makes only parts of an image's result.
+    """Return the tiling that computes only patches of an image's result.
 
-    Numbers that are estimated from the whole image are still estimated from all of its tiles, in
-    the phases before the last.
+    Estimates from the whole image still use all of its tiles, in the phases before the last.
 
     Args:
         plan: the plan.
-        boxes: the parts, in pixels of the results, which are all of one size.
-        whole: how the whole image goes through the plan.
-        lanes: of the device.
-        memory: bytes that all buffers together may take.
+        boxes: the patches, in pixels of the results, all of one size.
+        whole: the tiling of the whole image.
+        lanes: the lanes of the device.
+        memory: the most bytes that all buffers together may use.
         ends: as for :func:`~clpipe.engine.tiles.tiling_of`.
 
     Raises:
-        ImageError: a part does not fit into the memory; of parts that go in stacks, that is seen
-            when these are made.
+        ImageError: a patch does not fit into the memory. For patches that run in stacks, this is
+            checked later, when the stacks are made.
     """
     source = whole.tiles[0][0]
     cut = cutter_of(plan, source.width, source.height, lanes)
     levels = {image.level for _, image in plan.kept} | {len(cut.whole) - 1}
     patches = tuple(cut.patch(box, levels) for box in boxes)
     phases = phases_of(plan)
-    if len(phases) == 1:  # they go in stacks
+    if len(phases) == 1:  # the patches run in stacks
         return replace(whole, phases=phases, sizes={}, patches=patches)
     sizes = dict(whole.sizes)
     for name, size in buffer_sizes(plan, enclosing(patches), ends).items():
@@ -49,13 +48,13 @@ def with_patches(
 
 
 def check_memory(sizes: Mapping[str, int], memory: int) -> None:
-    """See that the buffers of a patch, bytes by name, fit into memory.
+    """Check that the buffers of a patch (bytes by name) fit into ``memory`` bytes.
 
     Raises:
-        ImageError: they do not.
+        ImageError: the buffers do not fit.
     """
     if sum(sizes.values()) > memory:
         raise ImageError(
-            f"a patch needs {in_words(sum(sizes.values()))} of device memory; "
-            f"allowed are {in_words(memory)}"
+            f"a patch needs {in_words(sum(sizes.values()))} of device memory, but the limit is "
+            f"{in_words(memory)}. Raise the memory limit, or use smaller patches."
         )

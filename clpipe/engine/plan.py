@@ -1,9 +1,9 @@
-"""From a chain of stages to a plan: its launches. Pure: it needs no device.
+"""Makes the plan of a chain: its launches. Pure: it needs no device.
 
-Passes go into groups, and a group becomes one launch. A stencil opens a group, because the pixels
-around it must be stored first; pointwise passes join the group before them; sums and a kept image
-close it. Launches pass images of one to three planes to each other. A plane occupies a slot, a
-buffer on the device, from the launch that writes it to the last one that reads it.
+Passes form groups, and each group becomes one launch. A stencil opens a group, because the pixels
+around it must be stored first. Pointwise passes join the open group. Sums and a kept image close
+it. Launches exchange images of one to three planes. A plane occupies a slot, which is a buffer on
+the device, from the launch that writes it to the last launch that reads it.
 """
 
 from collections.abc import Sequence
@@ -26,25 +26,25 @@ from clpipe.engine.slots import assign_slots
 from clpipe.reference.resample import Resampler
 from clpipe.stage import Kind, LineTable, Pointwise, Reduction, Resample, Stencil, TableLookup
 
-# Borders are multiples of it where images stay on the device, so that planes lie alike in plans
-# whose widest stencils differ a little. A default chain's is 4; with 8 it takes 5 % longer (PoCL,
-# two cores).
+# In incremental plans, borders are multiples of this width. Plans whose widest stencils differ a
+# little then have the same plane layout. The default chain's border is 4 pixels; with 8 it takes
+# 5 % longer (PoCL, two cores).
 INCREMENTAL_BORDER = 4
 
 
 class _Planner:
     def __init__(self, source: Kind, fold: bool) -> None:
         self.kind = source
-        self.period: tuple[int, int] | None = None  # of the mosaic that the next step reads
+        self.period: tuple[int, int] | None = None  # period of the mosaic that the next step reads
         self.fold = fold
         self.launches: list[AnyLaunch] = []
         self.lines: dict[int, list[Op]] = {}  # by level
         self.resamplings: list[Resampler] = []
         self.images: list[Image] = []
-        self.group: Launch | None = Launch("load", ())  # open, still to be stored
-        self.stored: Image | None = None  # the current image, when no group is open
-        # Where the current image was kept, how a stencil reads it all the same; and the image that
-        # only keeping has stored, in the midst of a group.
+        self.group: Launch | None = Launch("load", ())  # the open group, not yet stored
+        self.stored: Image | None = None  # the current image, if no group is open
+        # If the current image is kept: the read with which a stencil can still fold it. And the
+        # image that was stored in the middle of a group, only because it is kept.
         self.folded: Read | None = None
         self.split: Image | None = None
 
@@ -59,17 +59,17 @@ class _Planner:
         return image
 
     def close(self, sums: Op | None = None) -> Image:
-        """End the open group and store its result. Without an open group the image is stored."""
+        """Close the open group and store its result, unless the image is stored already."""
         if self.group is None:
             assert self.stored is not None
             if not sums:
                 return self.stored
             self.group = Launch("sums", (), (Read(self.stored),))
         elif sums and self.group.stencil and self.group.stencil.vectors_per_row:
-            # Sums go over narrower blocks.
+            # Sums need narrower blocks.
             self.group = Launch("sums", (), (Read(self.close()),))
         if sums and not self.group.ops and self.group.reads:
-            image = self.group.reads[0].image  # nothing new to store
+            image = self.group.reads[0].image  # it is stored already
             self.emit(replace(self.group, sums=sums))
         else:
             image = self.new_image()
@@ -95,9 +95,9 @@ class _Planner:
         )
 
     def keep(self) -> Image:
-        """Store the current image because it is wanted.
+        """Store the current image because it is a result.
 
-        Stencils after it read what they would read otherwise, so they are the same kernels.
+        Later stencils read the same image as without the result, so their kernels do not change.
         """
         folded, is_open = self.foldable(), self.group is not None
         image = self.close()
@@ -107,7 +107,7 @@ class _Planner:
         return image
 
     def foldable(self) -> Read | None:
-        """The current image as passes on a stored one that taps may redo, if it is that."""
+        """Return the current image as a stored image with passes for taps to recompute, or None."""
         group = self.group
         if not (self.fold and group and group.reads) or group.opener:
             return self.folded
@@ -116,7 +116,7 @@ class _Planner:
         return read if is_inlined and read.image is not self.split else None
 
     def input_of_stencil(self) -> Read:
-        """The current image for a stencil, which may redo passes on a stored one at its taps."""
+        """Return the current image for a stencil, which may recompute passes at its taps."""
         read = self.foldable()
         if read is None:
             return Read(self.close())
@@ -140,7 +140,7 @@ class _Planner:
         local: dict[str, Read] = {}
         over_pixels = [op for op in ops if not isinstance(op.pass_.access, LineTable)]
         if any(isinstance(op.pass_.access, Stencil) and "src" in op.pass_.reads for op in ops):
-            # A pass before the stencil goes on from the image, not from what its taps redo.
+            # A pass before the stencil continues from the stored image, not from recomputed taps.
             is_first = isinstance(over_pixels[0].pass_.access, Stencil)
             local["src"] = self.input_of_stencil() if is_first else Read(self.close())
         written = "src"
@@ -164,7 +164,7 @@ class _Planner:
                     if self.group is None:
                         assert self.stored is not None
                         self.group = Launch("", (), (Read(self.stored),))
-                    # Where the pass that it undoes was stored, it is done all the same.
+                    # If the pass to undo is stored already, this pass is still needed.
                     undone = op.undoes_previous and self.group.ops
                     ops_ = self.group.ops[:-1] if undone else (*self.group.ops, op)
                     self.group = replace(self.group, ops=ops_)
@@ -182,22 +182,23 @@ def make_plan(
     planar: bool = False,
     incremental: bool = False,
 ) -> Plan:
-    """The plan of a chain.
+    """Return the plan of a chain.
 
     Args:
-        half: whether the source holds half floats, not floats.
-        keep: steps whose image is returned.
+        chain: the chain.
+        half: whether the source is float16, not float32.
+        keep: the steps whose images are returned.
         encode: whether the last image is returned in eight bits.
-        final: whether the last image is returned in float. Without either, the plan ends with the
-            last step to keep.
-        fold: whether a stencil may redo passes at its taps. It must not for images one pixel
-            wide or high, where mirroring changes the Bayer phase.
-        planar: whether the source is planes one behind the other, not interleaved.
-        incremental: whether each image has slots of its own, so that a launch whose results are on
-            the device already can be left out.
+        final: whether the last image is returned in float. Without ``encode`` and ``final``, the
+            plan ends with the last step to keep.
+        fold: whether a stencil may recompute passes at its taps. It may not for images one pixel
+            wide or high, because mirroring changes their Bayer phase.
+        planar: whether the source is stored as consecutive planes, not interleaved.
+        incremental: whether images share no slots, so that a launch can be skipped if its results
+            are still on the device.
 
     Raises:
-        RequestError: the chain has no such step to keep.
+        RequestError: the chain lacks a step to keep.
     """
     for name in keep:
         chain.step_named(name)

@@ -1,4 +1,4 @@
-"""The compiled kernels of plans, kept while they are in use."""
+"""The compiled kernels of recently used plans."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -9,15 +9,15 @@ from clpipe.engine.ir import AnyLaunch, Border, Launch, Plan
 from clpipe.engine.programs import Programs, tell_watchers
 from clpipe.engine.stack import Call
 
-PLANS = 64  # whose kernels stay at hand
+PLANS = 64  # the most plans whose kernels are cached
 
 
 class PlanKernels:
     """The kernels of plans, for a device.
 
     Args:
-        programs: compiled on the device.
-        lanes: of the device.
+        programs: the compiled programs of the device.
+        lanes: the lanes of the device.
     """
 
     def __init__(self, programs: Programs, lanes: int) -> None:
@@ -27,14 +27,14 @@ class PlanKernels:
         self._borders: BoundedCache[Call] = BoundedCache(PLANS)
 
     def __contains__(self, plan: Plan) -> bool:
-        """Whether the kernels of a plan are compiled."""
+        """Return whether the kernels of a plan are compiled."""
         return plan.unscaled in self._plans
 
     def of(self, plan: Plan) -> list[Call]:
-        """The kernels of a plan, from the first call on without compiling.
+        """Return the kernels of a plan. The first call compiles them.
 
         Raises:
-            DeviceError: one does not compile; the message is the compiler's.
+            DeviceError: a kernel does not compile. The message contains the compiler's.
         """
         return self._plans.get(plan.unscaled, lambda: list(self._compiled(plan)))
 
@@ -50,7 +50,7 @@ class PlanKernels:
         return Call(kernel, self._programs.kernel(kernel))
 
     def borders(self, plan: Plan, written: Launch) -> Iterator[Call]:
-        """Those that fill the borders of the planes that a launch has written."""
+        """Yield the kernels that fill the borders of the planes written by a launch."""
         if not (image := written.writes):
             return
         for slot in plan.slots[image.number]:

@@ -1,7 +1,7 @@
-"""Compiled programs: one for each text and device of a process, on disk between processes.
+"""Compiled programs: one per source and device in a process, and a cache on disk.
 
-The text of a kernel depends only on what it does (see :mod:`clpipe.engine.codegen`), so plans
-share programs, and so do all :class:`~clpipe.engine.device.Device` objects on one device.
+The source of a kernel depends only on its operations (see :mod:`clpipe.engine.codegen`). Therefore
+plans share programs, and so do all :class:`~clpipe.engine.device.Device` objects of one device.
 """
 
 import logging
@@ -23,11 +23,11 @@ from clpipe.engine.ir import Kernel
 from clpipe.engine.runtimes import is_pocl
 from clpipe.engine.store import Store
 
-# PoCL includes the declarations of all of OpenCL's functions before a program. The first says that
-# it has done so; the second has those that are called declared in kernels/lib/builtins.h.
+# PoCL includes the declarations of all OpenCL functions before each program. The first option makes
+# PoCL skip this. The second makes kernels/lib/builtins.h declare the functions that kernels call.
 DECLARED_HERE = ("-D_OPENCL_H_", "-DDECLARED_HERE")
-PROGRAMS = 1024  # that a process keeps for each device
-LONG = 2.0  # s of compiling after which a user is told what is going on
+PROGRAMS = 1024  # the most programs that a process keeps for each device
+LONG = 2.0  # s of compiling after which this is logged
 log = logging.getLogger(__name__)
 _by_device: dict[int, "Programs"] = {}
 _lock = threading.Lock()  # guards _by_device
@@ -39,7 +39,7 @@ class Programs:
     """The OpenCL context of a device, and the programs that this process compiled in it.
 
     Attributes:
-        declares: whether OpenCL's functions are declared by us; see :data:`DECLARED_HERE`.
+        declares: whether clpipe declares OpenCL's functions; see :data:`DECLARED_HERE`.
 
     Raises:
         DeviceError: the device cannot be opened.
@@ -53,7 +53,10 @@ class Programs:
             with kept_signals():
                 self.context = cl.Context([info.handle])
         except cl.Error as error:
-            raise DeviceError(f"{info.label} cannot be opened: {error}") from None
+            raise DeviceError(
+                f"{info.label} cannot be opened: {error}. Close other programs that use it, or "
+                "choose another device."
+            ) from None
         self._programs: BoundedCache[Any] = BoundedCache(PROGRAMS)
         self._lock = threading.Lock()  # lets one thread compile at a time
         self._options = ["-cl-std=CL1.2", "-w"]
@@ -67,10 +70,10 @@ class Programs:
         return len(self._programs)
 
     def kernel(self, kernel: Kernel) -> Any:
-        """A compiled kernel, with arguments of its own.
+        """Return a compiled kernel, as a new object whose arguments are not shared.
 
         Raises:
-            RequestError: a user's stage file does not compile; the message is the compiler's.
+            RequestError: a user's stage file does not compile. The message contains the compiler's.
             DeviceError: another kernel does not compile.
         """
         with self._lock:
@@ -79,10 +82,10 @@ class Programs:
 
     def _compile(self, kernel: Kernel) -> Any:
         cl = self._cl
-        # Not within catch_warnings, which changes the filters of all threads.
+        # Not in catch_warnings, because that changes the filters of all threads.
         warnings.filterwarnings("ignore", category=cl.CompilerWarning)
         stage_files = [file for file in kernel.files if Path(file).is_absolute()]
-        if self.declares and not stage_files:  # which may call any function
+        if self.declares and not stage_files:  # stage files may call any function
             with suppress(cl.Error):
                 return self._build(kernel, [*self._options, *DECLARED_HERE])
         try:
@@ -93,8 +96,10 @@ class Programs:
             text = build_log(str(error))
             if stage_files:
                 raise RequestError(f"{stage_files[0]}: does not compile:\n{text}") from None
-            raise DeviceError(f"{kernel.launch.name}: does not compile:\n{text}") from None
-        self.declares &= bool(stage_files)  # it failed only with our declarations
+            raise DeviceError(
+                f"the kernel {kernel.launch.name} does not compile:\n{text}"
+            ) from None
+        self.declares &= bool(stage_files)  # it failed only with clpipe's declarations
         return program
 
     def _build(self, kernel: Kernel, options: list[str]) -> Any:
@@ -103,14 +108,14 @@ class Programs:
         return self._cl.Program(self.context, kernel.source).build(options, cache_dir=False)
 
     def keep(self) -> None:
-        """Keep for later processes what was compiled, and launched once, since the last time."""
+        """Cache on disk the programs that were compiled and launched since the last call."""
         if self._builder:
             with self._lock:
                 self._builder.keep()
 
 
 def builder_for(info: DeviceInfo, context: Any) -> BinaryBuilder | PoclBuilder | None:
-    """The builder of a device's programs; None where its driver keeps them itself."""
+    """Return the builder of a device's programs; None if the driver has its own cache."""
     from pyopencl.characterize import has_src_build_cache
 
     folder, of_pocl = cache_folder(), pocl_folder()
@@ -123,7 +128,7 @@ def builder_for(info: DeviceInfo, context: Any) -> BinaryBuilder | PoclBuilder |
 
 
 def programs_of(info: DeviceInfo) -> Programs:
-    """The context and programs of a device, one for all who use it in this process.
+    """Return the context and programs of a device, which this process shares.
 
     Raises:
         DeviceError: the device cannot be opened.
@@ -136,7 +141,7 @@ def programs_of(info: DeviceInfo) -> Programs:
 
 
 def forget_programs(info: DeviceInfo, dead: Programs) -> None:
-    """See that nobody gets a context that is of no more use; who asks next makes a new one."""
+    """Remove a broken context, so that the next call of :func:`programs_of` creates a new one."""
     with _lock:
         if _by_device.get(info.handle.int_ptr) is dead:
             del _by_device[info.handle.int_ptr]
@@ -144,9 +149,9 @@ def forget_programs(info: DeviceInfo, dead: Programs) -> None:
 
 @contextmanager
 def announced(info: DeviceInfo) -> Iterator[None]:
-    """Log that kernels are being compiled if that takes longer than :data:`LONG`; once a process.
+    """Log that kernels are being compiled, once per process, if it takes longer than :data:`LONG`.
 
-    The logger is ``clpipe.engine.programs``, the level INFO.
+    The logger is ``clpipe.engine.programs``. The level is INFO.
     """
 
     def announce() -> None:
@@ -165,7 +170,7 @@ def announced(info: DeviceInfo) -> Iterator[None]:
 
 @contextmanager
 def watched(watcher: Callable[[int, int], None]) -> Iterator[None]:
-    """Have a function told, by any thread, how many kernels of how many are compiled."""
+    """Call a function with the number of compiled kernels and of all kernels, from any thread."""
     _watchers.append(watcher)
     try:
         yield
@@ -174,13 +179,13 @@ def watched(watcher: Callable[[int, int], None]) -> Iterator[None]:
 
 
 def tell_watchers(compiled: int, of: int) -> None:
-    """Tell how many kernels of a plan are compiled."""
+    """Report to all watchers how many kernels of a plan are compiled."""
     for watcher in tuple(_watchers):
         watcher(compiled, of)
 
 
 def build_log(text: str) -> str:
-    """The compiler's messages, out of pyopencl's error message.
+    """Return the compiler's messages from pyopencl's error message.
 
     >>> build_log("failed\\n\\nBuild on <x>:\\n\\nerror: a.cl:2:7: no\\n\\n(options: -a)")
     'error: a.cl:2:7: no'

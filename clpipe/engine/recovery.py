@@ -1,4 +1,4 @@
-"""What happens when a device fails: images are tried again, in a new context if need be."""
+"""Recovery from device failures: images are retried, if necessary in a new context."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -15,17 +15,17 @@ from clpipe.engine.work import R, Work
 if TYPE_CHECKING:
     from clpipe.engine.device import Device
 
-FAILURES = 3  # images in a row that a device fails at, before it is given up
+FAILURES = 3  # images in a row for which a device may fail before it is no longer used
 
 
 class Recovery:
-    """Waits for images on a device, and tries again what fails.
+    """Waits for images on a device, and retries those that fail.
 
     Args:
         device: the device.
 
     Attributes:
-        generation: counts up when everything on the device is lost.
+        generation: a number that increases each time all data on the device is lost.
     """
 
     def __init__(self, device: "Device") -> None:
@@ -37,29 +37,29 @@ class Recovery:
         self._failures = 0  # images in a row
 
     def wait(self, work: Work[R], flight: Flight | Exception) -> Callable[[], R]:
-        """Return a callable that waits for an image that was enqueued and returns its result."""
+        """Return a callable that waits for an enqueued image and returns its result."""
         output, generation = self.output, self.generation
         return lambda: work.finish(output(work, flight, generation))
 
     def output(self, work: Work[Any], flight: Flight | Exception, generation: int) -> HostImages:
         """Wait for the output of an image that was enqueued in a generation.
 
-        If the device runs out of memory before the limit is reached, the buffers of earlier images
-        are released, then tiles become smaller. If a kernel fails, the image is tried once more, in
-        a new context if the old one is of no more use. An image that failed together with others
-        is tried again by itself, and only that counts.
+        If the device runs out of memory below the limit, the buffers of earlier images are released
+        first. Then the image is retried with smaller tiles. If a kernel fails, the image is retried
+        once, in a new context if the old one is broken. Images that fail together are retried one
+        by one, and only these failures count.
 
         Raises:
-            ImageError: memory is not enough for tiles of any size.
+            ImageError: the memory is too small even for the smallest tiles.
             DeviceFailedError: the device failed twice.
-            DeviceError: the device has failed at :data:`FAILURES` images in a row.
+            DeviceError: the device failed for :data:`FAILURES` images in a row.
         """
         cl, device = self._cl, self._device
         memory = device.memory
         full: Exception | None = None  # the device's error when its memory ran out
         failed = False
         while True:
-            if generation != self.generation:  # what was enqueued is lost
+            if generation != self.generation:  # the enqueued commands are lost
                 try:
                     flight, generation = device.enqueue([work], memory), self.generation
                 except ImageError:
@@ -67,8 +67,8 @@ class Recovery:
                         raise
                     width, height = work.size
                     raise ImageError(
-                        f"{width}x{height} pixels: {device.info.label} is out of memory, in tiles "
-                        f"of any size; others may be using it ({full})"
+                        f"{width}x{height} pixels: {device.info.label} is out of memory, even with "
+                        f"the smallest tiles ({full}). Close other programs that use the device."
                     ) from None
             try:
                 if isinstance(flight, Exception):
@@ -91,12 +91,15 @@ class Recovery:
             return work.output if work.options.download else HostImages({}, None, {})
 
     def abandon(self) -> None:
-        """Wait for everything on the device and release all memory; images must start again."""
+        """Wait for all commands and release all memory. Images in flight must be enqueued again."""
         self.generation += 1
         self._device.flow.abandon()
 
     def _context_survives(self) -> bool:
-        """Abandon everything after an error; open the device again if its context is of no use.
+        """Abandon all images after an error, and reopen the device if its context is broken.
+
+        Returns:
+            Whether the context still works.
 
         Raises:
             DeviceError: the device cannot be opened again.
@@ -108,10 +111,11 @@ class Recovery:
         return False
 
     def _works(self) -> bool:
-        """Whether the context still does what it is told, after an error.
+        """Return whether the context still works after an error. This copies a few bytes.
 
-        Codes do not say: NVIDIA reports a kernel that reads astray as CL_OUT_OF_RESOURCES, which is
-        also a lack of memory. But after it everything in that context fails.
+        Error codes are not enough. NVIDIA reports an invalid read in a kernel as
+        CL_OUT_OF_RESOURCES, which also means too little memory. But after an invalid read, every
+        command in that context fails.
         """
         cl, sent, back = self._cl, np.arange(4, dtype=np.uint8), np.zeros(4, np.uint8)
         flow = self._device.flow
@@ -125,21 +129,21 @@ class Recovery:
         return np.array_equal(sent, back)
 
     def _count_failure(self, error: Exception) -> None:
-        """Count an image that the device failed at, though it was tried again.
+        """Count an image for which the device failed twice.
 
         Raises:
-            DeviceError: there were too many in a row.
+            DeviceError: the device failed for too many images in a row.
         """
         self._failures += 1
         if self._failures >= FAILURES:
             raise DeviceError(
-                f"{self._device.info.label} failed at {self._failures} images in a row and is "
-                f"given up: {error}"
+                f"{self._device.info.label} failed for {self._failures} images in a row, so it is "
+                f"no longer used: {error}. To choose another one, run clpipe devices."
             ) from None
 
 
 def timed(events: Sequence[tuple[str, Any]]) -> list[Timing]:
-    """The timings of events. The queue has just been finished, so the last one ends now."""
+    """Return the timings of events. The last event must have just ended."""
     if not events:
         return []
     offset = time.perf_counter() - events[-1][1].profile.end * 1e-9

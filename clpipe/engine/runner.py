@@ -1,4 +1,4 @@
-"""One image through a chain, on a device or in NumPy."""
+"""Runs a chain on images, on a device or in NumPy."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -38,10 +38,14 @@ class Result:
     >>> result.image is result.encoded
     True
 
-    ``final`` is the last image in float32, ``encoded`` the same in eight bits; both are (height,
-    width[, channel]), and None where not requested. ``kept`` has the images of the steps to keep,
-    float32, by step. Those of patches are (patch, height, width[, channel]). ``estimates`` has the
-    numbers that stages estimated from the image, such as gains, by step and name.
+    The shape of patches is (patch, height, width[, channel]).
+
+    Attributes:
+        final: the last image, float32; None if not requested.
+        encoded: the last image in eight bits, uint8; None if not requested.
+        kept: the images after the steps to keep, float32, by step.
+        estimates: the numbers that stages estimated from the image, such as gains, by step and
+            name.
     """
 
     final: Floats | None
@@ -62,14 +66,14 @@ class Result:
         return f"Result({', '.join(parts)})"
 
     def _repr_png_(self) -> bytes | None:
-        """The last image as notebooks show it."""
+        """Return the last image as PNG bytes, for notebooks."""
         from clpipe.images.preview import png_bytes
 
         return None if self.final is None and self.encoded is None else png_bytes(self.image)
 
 
 def is_planar(image: Array) -> bool:
-    """Whether the channels of an image lie in memory as planes, one behind the other.
+    """Return whether the channels of an image are stored as consecutive planes.
 
     >>> is_planar(np.zeros((3, 4, 5)).transpose(1, 2, 0)), is_planar(np.zeros((4, 5, 3)))
     (True, False)
@@ -80,44 +84,44 @@ def is_planar(image: Array) -> bool:
 
 
 def cut_out(image: Array, boxes: Sequence[Box]) -> Array:
-    """Parts of an image, all of one size, behind each other: (patch, height, width[, channel])."""
+    """Return parts of an image, all of one size, as (patch, height, width[, channel])."""
     return np.stack([image[box.top : box.bottom, box.left : box.right] for box in boxes])
 
 
 @of_structure
 def may_estimate(chain: Chain) -> bool:
-    """Whether numbers follow from the size of an image."""
+    """Return whether a stage derives numbers from the size of the image."""
     return any(type(s.method).estimates_for is not Method.estimates_for for s in chain.steps)
 
 
 def check_sizes(plan: Plan, width: int, height: int) -> None:
-    """See that all images of a result are of one size, so that patches are, too.
+    """Check that all images of a result have one size, which patches need.
 
     Raises:
-        ImageError: they are not.
+        ImageError: the sizes differ.
     """
     *_, last = sizes = plan.sizes(width, height)
     for name, kept in plan.kept:
         own = sizes[kept.level]
         if own != last:
             raise ImageError(
-                f"the image of {name} has {own[0]}x{own[1]} pixels, but the last one "
-                f"{last[0]}x{last[1]}; patches are cut of images of one size"
+                f"the image after {name} has {own[0]}x{own[1]} pixels, but the last image has "
+                f"{last[0]}x{last[1]}. Patches need images of one size. Do not keep {name}."
             )
 
 
 class Runner:
-    """Runs one chain over images, on a device or in NumPy.
+    """Runs one chain on images, on a device or in NumPy.
 
     Args:
         chain: the chain.
-        device: where to run; None is NumPy.
-        keep: steps whose image is returned.
+        device: the device; None is NumPy.
+        keep: the steps whose images are returned.
         encode: whether the last image is returned in eight bits.
         final: whether the last image is returned in float.
-        incremental: whether the device keeps all images between launches. Where an image goes
-            through whole, and again, only launches are then done that a change touches, and the
-            last one: results are the same, in less time and more memory.
+        incremental: whether the device keeps all intermediate images. If an image that is processed
+            whole is run again, only the last launch and those affected by a change run again. The
+            results are the same; this needs less time and more memory.
     """
 
     def __init__(
@@ -142,9 +146,9 @@ class Runner:
         self._tables: BoundedCache[Array] = BoundedCache(32)
 
     def for_chain(self, chain: Chain) -> "Runner":
-        """A runner for another chain that shares plans and tables with this one.
+        """Return a runner for another chain that shares plans and tables with this one.
 
-        A chain that differs in run-time values alone is neither planned nor compiled again.
+        A chain that differs only in run-time values is neither planned nor compiled again.
         """
         other = Runner(chain, self.device, self.keep, self.encode, self.final, self.incremental)
         other._plans, other._tables = self._plans, self._tables
@@ -160,7 +164,7 @@ class Runner:
         return runners
 
     def plan(self, half: bool = True, fold: bool = True, planar: bool = False) -> Plan:
-        """The plan for a source of half floats or floats, interleaved or in planes."""
+        """Return the plan for a float16 or float32 source, interleaved or in planes."""
         chain, key = self.chain, (half, fold, planar)
 
         def plan() -> Plan:
@@ -175,15 +179,15 @@ class Runner:
         )
 
     def plan_for(self, image: Array) -> Plan:
-        """The plan for an image."""
+        """Return the plan for an image."""
         size = self.chain.size(*image.shape[1::-1])
         return self.plan(image.dtype == np.float16, min(size) > 1, is_planar(image))
 
     def compile(self, half: bool = True) -> None:
-        """Compile everything, so that the first image does not wait for it.
+        """Compile all kernels, so that the first image does not wait for the compiler.
 
         Raises:
-            ImageError: not even a tiny image fits into the device's memory.
+            ImageError: even a tiny image does not fit into the device's memory.
             DeviceError: a kernel does not compile, or the device fails.
         """
         if self.device:
@@ -194,9 +198,9 @@ class Runner:
                 raise DeviceError(str(error)) from None
 
     def _compile_plan(self, plan: Plan) -> None:
-        """Compile the kernels of a plan, by running it on a tiny image.
+        """Compile the kernels of a plan by running it on a tiny image.
 
-        PoCL compiles a kernel again when it is first launched.
+        A launch is necessary because PoCL compiles a kernel again at its first launch.
         """
         assert self.device
         if not self.device.is_compiled(plan):
@@ -206,11 +210,11 @@ class Runner:
             try:
                 plan.check_resamplings(width, height)
             except ImageError:
-                return  # which larger images need not be refused for
+                return  # larger images may still be possible
             self.device.submit([self._work(plan, tiny, "", DEFAULTS)])[0]()
 
     def run(self, image: Array, noise_key: str, options: RunOptions = DEFAULTS) -> Result:
-        """Put one image through, and wait for it; see :meth:`submit`."""
+        """Run the chain on one image, and return the result. See :meth:`submit`."""
         return self.submit(image, noise_key, options)()
 
     def submit(
@@ -220,30 +224,31 @@ class Runner:
 
         Args:
             image: (height, width, 3) linear RGB, or (height, width) for a chain that starts on a
-                mosaic; finite, of float16 or any type that fits into float32.
-            noise_key: what the noise is made of, see :func:`clpipe.chain.identity.noise_key`.
-            options: what comes back, and how.
+                mosaic. It must be finite, of float16 or any type that converts to float32.
+            noise_key: the text from which the noise is seeded; see
+                :func:`clpipe.chain.identity.noise_key`.
+            options: the options of the run.
 
         Returns:
-            What waits for the result and gives it; it raises ImageError, DeviceFailedError and
-            DeviceError, too.
+            A callable that waits for the result and returns it. It raises the same errors.
 
         Raises:
-            ImageError: an image of the wrong shape, or one that does not fit the device.
-            DeviceFailedError: the device fails.
-            DeviceError: a kernel does not compile, or the device is given up.
+            ImageError: the image has the wrong shape, or does not fit into the device's memory.
+            DeviceFailedError: the device failed for this image.
+            DeviceError: a kernel does not compile, or the device failed for too many images.
         """
         return submit_together([(self, image, noise_key, options)])[0]
 
     def work(
         self, image: Array, noise_key: str, options: RunOptions = DEFAULTS
     ) -> Work[Result] | Callable[[], Result]:
-        """One image for :meth:`clpipe.engine.device.Device.submit`.
+        """Return the work of one image for :meth:`clpipe.engine.device.Device.submit`.
 
-        All its exposures but the first are done at once. Arguments and errors as :meth:`submit`.
+        This call already runs all exposures but the first. Arguments and errors are those of
+        :meth:`submit`.
 
         Returns:
-            The work, or a callable that returns the result where no device is needed.
+            The work; if no device is needed, a callable that returns the result.
         """
         self.check(image)
         runner = self._merging(image, noise_key, options.later)
@@ -261,7 +266,7 @@ class Runner:
         return runner._work(plan, image, noise_key, options)
 
     def _work(self, plan: Plan, image: Array, noise_key: str, options: RunOptions) -> Work[Result]:
-        """See :meth:`work`; of an image whose other exposures are done."""
+        """Return the work of one image whose other exposures are done. See :meth:`work`."""
         width, height = image.shape[1::-1]
         estimates = self._estimates_for(width, height) if may_estimate(self.chain) else {}
         return Work(
@@ -274,16 +279,18 @@ class Runner:
         )
 
     def _merging(self, image: Array, noise_key: str, later: Sequence[Array]) -> "Runner":
-        """The runner that merges an image's exposures, of which all but the first are done; this
-        one where there are no others.
+        """Run all exposures but the first, and return a runner that merges them with the first.
 
         Args:
-            image: what the first of them sees.
-            noise_key: what the noise is made of.
-            later: what the others see; () is the same.
+            image: the image of the first exposure.
+            noise_key: the text from which the noise is seeded.
+            later: the images of the other exposures; () uses ``image``.
+
+        Returns:
+            The runner; this one if the chain has only one exposure.
 
         Raises:
-            ImageError, DeviceFailedError, DeviceError: as :meth:`submit`.
+            ImageError, DeviceFailedError, DeviceError: as for :meth:`submit`.
         """
         if not self._exposures or not (self.encode or self.final or self.keep):
             return self
@@ -292,21 +299,22 @@ class Runner:
         return self.for_chain(self._exposures.merging(seen))
 
     def check(self, image: Array) -> None:
-        """See that an image is one that the chain starts on.
+        """Check that an image has the shape that the chain starts on.
 
         Raises:
-            ImageError: it is not.
+            ImageError: the image has another shape.
         """
         channels = len(self.chain.source.channels)
         shape = image.shape[2] if image.ndim == 3 else 1
         if image.ndim not in (2, 3) or shape != channels or 0 in image.shape:
+            axes = "(height, width)" if channels == 1 else f"(height, width, {channels})"
             raise ImageError(
-                f"found an image of shape {image.shape}, but the chain starts on "
-                f"{self.chain.source.label} with {channels} channel(s)"
+                f"the image has shape {image.shape}, but the chain starts on "
+                f"{self.chain.source.label}, {axes}"
             )
 
     def _estimates_for(self, width: int, height: int) -> dict[str, dict[str, float]]:
-        """Numbers that follow from the size of the steps' images, by step."""
+        """Return the numbers that each step derives from the size of its image."""
         found = {}
         for step in self.chain.steps:
             if values := step.method.estimates_for(width, height):
@@ -318,7 +326,7 @@ class Runner:
 
     @staticmethod
     def _result(plan: Plan, from_size: dict[str, dict[str, float]], output: HostImages) -> Result:
-        """The results that the device made of an image, by steps."""
+        """Return the results of an image, from the device's output."""
         names = plan.estimates
         return Result(
             final=output.images.get(plan.final.number) if plan.final else None,
@@ -360,16 +368,18 @@ class Runner:
 def submit_together(
     images: Sequence[tuple[Runner, Array, str, RunOptions]],
 ) -> list[Callable[[], Result]]:
-    """Enqueue images, and small ones of alike chains in common launches.
+    """Enqueue images. Small images of similar chains share launches.
 
     Args:
-        images: of each its runner, all on one device, and the arguments of :meth:`Runner.submit`.
+        images: for each image, its runner and the arguments of :meth:`Runner.submit`. All runners
+            must use one device.
 
     Returns:
-        A callable for each, which waits for its result and returns it; called once and in order.
+        For each image, a callable that waits for its result and returns it. Call each once, in
+        order.
 
     Raises:
-        ImageError, DeviceFailedError, DeviceError: as :meth:`Runner.submit`.
+        ImageError, DeviceFailedError, DeviceError: as for :meth:`Runner.submit`.
     """
     works = [runner.work(image, key, options) for runner, image, key, options in images]
     device = images[0][0].device

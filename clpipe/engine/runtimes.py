@@ -1,4 +1,4 @@
-"""Kinds of devices that OpenCL runtimes offer, and how kernels are compiled for them."""
+"""The types of OpenCL devices, and how kernels are compiled for them."""
 
 import shutil
 from typing import Any
@@ -8,26 +8,26 @@ from clpipe.engine.cpu_target import Target
 
 
 def is_pocl(platform: str) -> bool:
-    """Whether a platform is PoCL, by its name."""
+    """Return whether a platform is PoCL, by its name."""
     return "Portable Computing" in platform
 
 
 def type_of(platform: Any, device: Any) -> str:
-    """The type of a ``pyopencl.Device``: "GPU", "CPU", "emulator" or "accelerator"."""
+    """Return the type of a ``pyopencl.Device``: "GPU", "CPU", "emulator" or "accelerator"."""
     import pyopencl as cl
 
     if "oclgrind" in platform.name.lower():
-        return "emulator"  # it finds errors in kernels, slowly, and says it is all types
+        return "emulator"  # Oclgrind finds errors in kernels, is slow, and reports all types
     if not device.type & (cl.device_type.GPU | cl.device_type.CPU):
         return "accelerator"
     return "GPU" if device.type & cl.device_type.GPU else "CPU"
 
 
 def lanes_for(type_: str, platform: Any, device: Any, target: Target) -> int:
-    """The lanes that kernels are compiled for: one vector register on a CPU, 1 on a GPU.
+    """Return the lanes for which kernels are compiled: one vector register on a CPU, 1 on a GPU.
 
-    A CPU whose natural vectors are one wide has a compiler like a GPU's: Mesa's rusticl, which gets
-    the pictures of wider ones wrong.
+    A CPU that reports a native vector width of 1 has a compiler like a GPU's. This is Mesa's
+    rusticl, which computes wrong images with more lanes.
     """
     if type_ != "CPU":
         return 1
@@ -38,30 +38,30 @@ def lanes_for(type_: str, platform: Any, device: Any, target: Target) -> int:
 
 
 def problem_with(type_: str, platform: Any, device: Any) -> str:
-    """Why a device cannot be used, as far as can be told without trying it; "" where it can."""
+    """Return why a device is unusable, as far as this is known without a test; else ""."""
     if type_ == "accelerator":
-        return "neither a GPU nor a CPU (an emulator or an FPGA)"
+        return "it is neither a GPU nor a CPU, but an emulator or an FPGA"
     if not device.available or not device.compiler_available:
         return "it is not available or has no compiler"
     if is_pocl(platform.name) and not shutil.which("ld"):
         return (
-            "PoCL needs a linker and there is no 'ld' on the PATH "
-            "(Debian, Ubuntu: apt-get install binutils; conda: binutils)"
+            "PoCL needs a linker, but there is no 'ld' on the PATH. "
+            "Install binutils (Debian, Ubuntu: apt-get install binutils)"
         )
     return pocl_problem() if is_pocl(platform.name) else ""
 
 
 def is_tried(type_: str, platform: Any, device: Any) -> bool:
-    """Whether a device computes something before it is trusted; emulators would take long."""
+    """Return whether a device is tested before it is used. Emulators would take too long."""
     return type_ in ("GPU", "CPU") and not problem_with(type_, platform, device)
 
 
 def platform_id(platform: Any) -> str:
-    """A platform in one text, with its version."""
+    """Return a text that identifies a platform and its version."""
     return f"{platform.name.strip()}, {platform.version.strip()}"
 
 
 def attempt(platform: Any, device: Any, target: Target) -> str:
-    """The conditions that the result of a trial depends on, in one text."""
+    """Return a text that identifies all conditions on which the result of a test depends."""
     parts = (platform_id(platform), device.name, device.version, device.driver_version, target.name)
     return " | ".join(part.strip() for part in parts)

@@ -1,4 +1,4 @@
-"""Slots: the buffers that the planes of a plan's images are in, by liveness. Pure."""
+"""Slots: the assignment of buffers to the planes of a plan's images, by liveness. Pure."""
 
 from collections.abc import Sequence
 
@@ -8,15 +8,16 @@ from clpipe.engine.ir import AnyLaunch, Image, Launch, reads_of
 def assign_slots(
     launches: Sequence[AnyLaunch], images: Sequence[Image], pinned: set[int]
 ) -> tuple[tuple[tuple[int, ...], ...], int]:
-    """Slots for the planes of every image, by liveness.
+    """Assign slots to the planes of every image, by liveness.
 
     Args:
-        launches: in order.
-        images: that they write.
-        pinned: numbers of images whose slots are never reused, since they are results or held.
+        launches: the launches, in order.
+        images: the images that the launches write.
+        pinned: the numbers of images whose slots are never reused: results, and images that stay on
+            the device.
 
     Returns:
-        The slots of each image, by its number, and how many slots there are.
+        The slots of each image, by its number, and the number of slots.
     """
     last_use = {
         read.image.number: i for i, launch in enumerate(launches) for read in reads_of(launch)

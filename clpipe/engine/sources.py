@@ -1,4 +1,4 @@
-"""The kernel files: where they are, and their text with includes in place."""
+"""The kernel files: their folder, and their text with includes expanded."""
 
 import re
 from collections.abc import Sequence
@@ -25,18 +25,18 @@ LIBRARY = (
 
 @cache
 def kernel_folder() -> Path:
-    """The folder of the kernel files: inside the package, or beside it in a checkout."""
+    """Return the folder of the kernel files: in the package or, in a checkout, next to it."""
     packaged = Path(str(resources.files("clpipe") / "kernels"))
     return packaged if packaged.is_dir() else Path(__file__).resolve().parents[2] / "kernels"
 
 
 def file_text(name: str, seen: set[str]) -> str:
-    """The text of a kernel file with its includes in place.
+    """Return the text of a kernel file with includes expanded.
 
     Args:
-        name: the file, relative to the kernel folder; a plug-in's file by its absolute path. A
-            plug-in's includes are looked up beside its file, then in the kernel folder.
-        seen: the files that the source has already, which are left out; this one is added.
+        name: the file, relative to the kernel folder, or the absolute path of a plug-in's file. A
+            plug-in's includes are searched first next to its file, then in the kernel folder.
+        seen: the files that the source already contains. They are skipped, and this file is added.
     """
     if name in seen:
         return ""
@@ -56,5 +56,5 @@ def file_text(name: str, seen: set[str]) -> str:
 
 
 def files_text(names: Sequence[str], seen: set[str]) -> str:
-    """The text of several kernel files; arguments as for :func:`file_text`."""
+    """Return the text of several kernel files. The arguments are those of :func:`file_text`."""
     return "".join(file_text(name, seen) for name in names)

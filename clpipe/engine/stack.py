@@ -1,10 +1,10 @@
-"""Stacks: members that go through a device in common launches, each with values of its own.
+"""Stacks: images, tiles or patches (members) that share launches, each with different values.
 
-A launch costs a few microseconds on the host and leaves a GPU empty where the image is small. The
-members of a stack are launched together, in buffers that hold all of them one behind the other, and
-each has the bits that it has alone. What differs between them, kernels read from a table of numbers
-with a row for each member, see :func:`~clpipe.engine.kernel_builder.opening`. A large image is a
-stack of one.
+A launch costs a few microseconds on the host, and a small image leaves a GPU mostly idle. Therefore
+the members of a stack are launched together, in buffers that contain all of them. The results are
+bit for bit those of separate launches. Kernels read the numbers that differ between members from a
+table with a row for each member; see :func:`~clpipe.engine.kernel_builder.opening`. A large image
+is a stack of one.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -34,27 +34,27 @@ from clpipe.engine.tiles import buffer_sizes
 from clpipe.engine.work import Member
 from clpipe.engine.work_items import PARTIALS, columns_of, local_size, round_up, summed_together
 
-ENDS = ("src", "dst")  # buffers that are an image's own
+ENDS = ("src", "dst")  # the buffers of an image's source and eight-bit result
 
-# Bytes of the buffers of a stack, by whether the device works in the host's memory. A CPU does
-# images of 128x128 pixels twice as fast in stacks as alone and 256x256 a third faster, but loses a
-# tenth with 512x512, which leave its cache between two launches.
+# The most bytes of a stack's buffers, by whether the device uses host memory directly. On a CPU,
+# stacks are twice as fast as single launches for images of 128x128 pixels, and a third faster for
+# 256x256. They are a tenth slower for 512x512, which do not stay in the cache between two launches.
 STACK_BYTES = {True: 2**24, False: 2**29}
 BYTES = {"uchar": 1, "half": 2, "float": 4, "uint": 4, "int4": 16, "long4": 32}
-BYTES_OF_PIXEL = 36  # of the buffers of the default chain
-FEWEST = 4  # members, or images are so large that launches are few
-# Of numbers in a table, in the order in which their columns end it.
+BYTES_OF_PIXEL = 36  # bytes of the default chain's buffers per pixel
+FEWEST = 4  # members of a stack; with fewer, images are so large that launches hardly matter
+# The types of a table's last columns, in this order.
 TYPES = {"float": np.float32, "int": np.int32, "uint": np.uint32}
 
 
 class Call:
-    """A compiled kernel, and where the rows of its table have what.
+    """A compiled kernel, and the layout of its table's rows.
 
     Attributes:
-        reads_source: whether it reads the image that is sent.
-        reads: the names of buffers that stay on the device, of those that it only reads.
-        writes: of those that it writes.
-        values: what an image's chain gives.
+        reads_source: whether it reads the source.
+        reads: the names of the buffers that it only reads, without "src" and "dst".
+        writes: the names of the buffers that it writes to, without "src" and "dst".
+        values: the values that depend on the image's chain.
     """
 
     def __init__(self, kernel: Kernel, compiled: Any) -> None:
@@ -63,10 +63,10 @@ class Call:
         self.reads: list[str] = []
         self.writes: list[str] = []
         self.values: list[Value] = []
-        self._pointers: list[tuple[int, str | int]] = []  # places; a buffer, or one of the values
-        self._elements: dict[int, int] = {}  # bytes, by the places of buffers
-        self._numbers: dict[bool, list[str]] = {False: [], True: []}  # of the extent, the larger
-        self._scalars: dict[str, list[int]] = {type_: [] for type_ in TYPES}  # numbers of values
+        self._pointers: list[tuple[int, str | int]] = []  # column; buffer, or index into values
+        self._elements: dict[int, int] = {}  # column of a buffer -> bytes of an element
+        self._numbers: dict[bool, list[str]] = {False: [], True: []}  # by whether of the larger
+        self._scalars: dict[str, list[int]] = {type_: [] for type_ in TYPES}  # indices into values
         self._tile: int | None = None
         for place, parameter in enumerate(kernel.parameters):
             element = element_of(parameter)
@@ -87,7 +87,7 @@ class Call:
                         self._scalars[parameter.declaration.split()[0]].append(len(self.values))
                     self.values.append(value)
         self.reads_source = any(name == "src" for _, name in self._pointers)
-        self._of_one: tuple[Extents, Array] = (), np.zeros(0, np.uint32)  # the last one's places
+        self._of_one: tuple[Extents, Array] = (), np.zeros(0, np.uint32)  # of the last single one
 
     def table(
         self,
@@ -97,14 +97,17 @@ class Call:
         constant: Callable[[Array], Any],
         new: Callable[[Array], Any],
     ) -> tuple[Array, list[Any]]:
-        """The rows of numbers of a stack's members, and the buffers that are the other arguments.
+        """Return the table of a stack, and the buffers that are the kernel's other arguments.
 
         Args:
             stack: the stack.
-            values: those that are asked for, of each member.
-            buffers: on the device, by name.
-            constant: returns a buffer that holds an array, the same one for the same object.
-            new: returns a new buffer that holds an array.
+            values: the values of each member.
+            buffers: the buffers on the device, by name.
+            constant: returns a buffer with an array's contents, one per array object.
+            new: returns a new buffer with an array's contents.
+
+        Returns:
+            The table, (member, column) uint32, and the buffers.
         """
         rows = self._places(stack)
         if self._tile is not None:
@@ -126,7 +129,7 @@ class Call:
         return rows, pointers
 
     def _places(self, stack: "Stack") -> Array:
-        """Rows with the numbers of the members' extents and of their places in buffers."""
+        """Return a table with the numbers of the members' extents and their offsets in buffers."""
         members, is_one = stack.members, len(stack.members) == 1
         if is_one and members[0].extents is self._of_one[0]:
             return self._of_one[1].copy()
@@ -147,16 +150,16 @@ class Call:
 
 @dataclass(frozen=True)
 class Stack:
-    """Members that go through launches together.
+    """Members that share launches.
 
     Args:
-        members: of one plan but for the scales of its resamplings.
+        members: the members. Their plans may differ only in the scales of resamplings.
         calls: the launches, in order.
-        borders: returns those that fill the borders of what a launch has written.
-        strides: bytes from a member to the next, in each buffer.
-        tile: the number of tiles before it.
-        fetches: whether results come back; else it is a phase that only measures the image.
-        is_last: whether numbers that are estimated from the image come back too.
+        borders: returns the calls that fill the borders of the planes written by a launch.
+        strides: the bytes from one member to the next in each buffer.
+        tile: the number of the tile, from 0.
+        fetches: whether results are fetched. If not, the phase only measures the image.
+        is_last: whether the estimates from the image are also fetched.
     """
 
     members: Sequence[Member]
@@ -169,7 +172,7 @@ class Stack:
     _numbers: dict[Any, list[Any]] = field(default_factory=dict, init=False)
 
     def numbers(self, level: int, names: tuple[str, ...]) -> list[Any]:
-        """Numbers of the members' extents on a level, a row for each member."""
+        """Return numbers of the members' extents on a level, one row per member."""
         if (level, names) not in self._numbers:
             chosen = itemgetter(*names)
             rows = [chosen(member.extents[level].numbers) for member in self.members]
@@ -177,7 +180,7 @@ class Stack:
         return self._numbers[level, names]
 
     def launches(self) -> Iterator[tuple[Call, tuple[int, ...], tuple[int, ...]]]:
-        """The kernels to launch, each with its global and its local size in work items."""
+        """Yield the kernels to launch, each with its global and local size in work items."""
         places = [member.extents for member in self.members]
         are_small = [any(e.is_small for e in level) for level in zip(*places, strict=True)]
         largest = enclosing(places)
@@ -196,7 +199,7 @@ class Stack:
 
 
 def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """The global and the local size of a kernel over one member, in work items."""
+    """Return the global and the local size of a kernel for one member, in work items."""
     lanes, local = extent.lanes, local_size(extent.lanes)
     match kernel.launch:
         case Launch(rows=rows) as launch:
@@ -221,20 +224,23 @@ def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[
 def cut(
     members: Sequence[Member], in_place: bool, memory: int, largest: int, ends: int
 ) -> Iterator[tuple[Sequence[Member], Mapping[str, int], Mapping[str, int]]]:
-    """Members as stacks that fit into memory, with the strides and the sizes of their buffers.
+    """Divide members into stacks that fit into memory.
 
-    They go one by one, without strides, where few would fit, or some have nothing to do where
-    others have.
+    Each member is a separate stack, without strides, if fewer than :data:`FEWEST` would fit, or if
+    some members are empty on levels where others are not.
 
     Args:
-        members: all of one plan.
-        in_place: whether the device works in the host's memory.
-        memory: bytes that all buffers together may take.
-        largest: bytes that one may take.
-        ends: how many sources and results there are at a time.
+        members: the members, all of one plan.
+        in_place: whether the device uses host memory directly.
+        memory: the most bytes that all buffers together may use.
+        largest: the most bytes of a single buffer.
+        ends: the number of sources and results that exist at a time.
+
+    Yields:
+        The members of each stack, with the strides and the sizes of its buffers in bytes.
 
     Raises:
-        ImageError: one does not fit into the memory by itself.
+        ImageError: a single member does not fit into the memory.
     """
     strides: dict[str, int] = {}
     count = 1
@@ -259,7 +265,9 @@ def cut(
 
 
 def side_by_side(arrays: Sequence[Array]) -> tuple[Array, int]:
-    """Arrays one behind the other, and the elements from each to the next: 0 if all are one object.
+    """Return arrays in one array, padded to equal length, and this length.
+
+    If all arrays are one object, return this object and 0.
 
     >>> side_by_side([np.array([1, 2, 3]), np.array([4])])[0].tolist()
     [1, 2, 3, 4, 0, 0]

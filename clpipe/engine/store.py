@@ -1,7 +1,8 @@
-"""A store of what is kept between processes, as files that are looked at before they are believed.
+"""A cache on disk, shared by processes. Its files are validated before they are used.
 
-Each file begins with its digest, is written whole or not at all, and is named after all that
-decides what is in it. So there is no lock, nothing goes stale, and what is damaged is not there.
+Each file begins with a digest of its contents and is written atomically. Its name is a digest of
+everything that determines its contents. Therefore the cache needs no lock, no entry becomes stale,
+and damaged files count as missing.
 """
 
 import hashlib
@@ -15,11 +16,11 @@ DIGEST = hashlib.sha256().digest_size  # bytes at the beginning of a file
 
 
 class Store:
-    """A folder of kept things.
+    """A cache in a folder.
 
     Args:
-        folder: for the files, made when the first one is written; None keeps nothing.
-        of: what decides all of them; the parts of a key decide each.
+        folder: the folder, which the first write creates. None caches nothing.
+        of: texts that are part of every key.
     """
 
     def __init__(self, folder: Path | None, *of: str) -> None:
@@ -27,12 +28,12 @@ class Store:
         self._of = of
 
     def path(self, *key: str) -> Path | None:
-        """The file of a key; None without a folder."""
+        """Return the file of a key; None without a folder."""
         parts = b"\0".join(hashlib.sha256(part.encode()).digest() for part in (*self._of, *key))
         return self.folder / hashlib.sha256(parts).hexdigest()[:40] if self.folder else None
 
     def load(self, *key: str) -> bytes | None:
-        """The bytes that are kept under a key; None where it is not there, or damaged."""
+        """Return the bytes of a key; None if they are missing or damaged."""
         path = self.path(*key)
         if path is None:
             return None
@@ -48,7 +49,7 @@ class Store:
         return None
 
     def keep(self, data: bytes, *key: str) -> None:
-        """Keep something, if there is room, in place of what was there."""
+        """Store bytes under a key, in place of earlier ones. Errors are ignored."""
         path = self.path(*key)
         if path is not None:
             with suppress(ImageError), passing_files():

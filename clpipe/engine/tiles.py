@@ -1,11 +1,13 @@
-"""An image on a device, whole or in tiles: where its planes begin, and what memory they take. Pure.
+"""Divides an image into tiles that fit into device memory, and computes buffer sizes. Pure.
 
-A tile is a core, the part of the result that it makes, with a halo around it for stencils to read.
-Cores begin with whole blocks of lanes and of four rows, so a pixel has the same place in its work
-item as in the whole image: its noise, its CFA phase and its arithmetic are the same, bit for bit.
+A tile consists of a core, which is the part of the result that it computes, and a halo for stencils
+to read. Cores begin at whole blocks of lanes and of four rows. Therefore each pixel has the same
+position in its work item as in the whole image. Its noise, CFA phase and arithmetic are the same,
+bit for bit.
 
-A tile has an extent on each level of the plan. Its cores cover the images of each level once; what
-it stores of a level is enough for its core there and for what it stores of the next level.
+A tile has an extent on each level of the plan. The cores of all tiles cover each level's image
+exactly once. On each level, a tile stores the pixels that its core needs there, and those that it
+needs for the next level.
 """
 
 import math
@@ -23,22 +25,22 @@ from clpipe.engine.ops import Op
 from clpipe.engine.work_items import PARTIALS, RUN, columns_of, round_up
 from clpipe.reference.resample import Axis
 
-# Larger ones are no faster, and memory that is new to a process costs time: 600 megapixels took
-# 28 s in tiles of 1 GiB and 39 s in tiles of 4 GiB (PoCL, two busy cores).
+# Larger tiles are not faster, and allocating memory takes time. A render of 600 megapixels took
+# 28 s in tiles of 1 GiB, and 39 s in tiles of 4 GiB (PoCL, two busy cores).
 LARGEST_TILE = 2**30  # bytes
 
 
 def source_bytes(plan: Plan, extent: Extent) -> int:
-    """The bytes of the source that kernels may read: whole blocks, also beyond its last pixel."""
+    """Return the bytes of the source that kernels may read: whole blocks, even past its end."""
     stored = extent.stored
     pixels = (extent.padded_height - 1) * stored.width + extent.padded_width
     return pixels * len(plan.source.channels) * (2 if plan.half else 4)
 
 
 def buffer_sizes(plan: Plan, extents: Extents, ends: int = 1) -> dict[str, int]:
-    """The device buffers that a plan needs for an image or a tile: bytes by name.
+    """Return the device buffers that a plan needs for an image or a tile, as bytes by name.
 
-    ``ends`` is how many sources and eight-bit results there are at a time.
+    ``ends`` is the number of sources and eight-bit results that exist at a time.
     """
     first, last = extents[0], extents[-1]
     sizes = {f"src{i}": source_bytes(plan, first) for i in range(ends)}
@@ -51,7 +53,7 @@ def buffer_sizes(plan: Plan, extents: Extents, ends: int = 1) -> dict[str, int]:
         match launch:
             case Lines(ops=ops, level=level):
                 image, lanes = extents[level], first.lanes
-                # They are the image's, not the tile's: whole blocks of rows, and the last vector.
+                # Line tables cover the image, not the tile: whole blocks of rows, and one vector.
                 longest = round_up(max(image.width, image.height), max(lanes, 4)) + 2 * lanes
                 sizes |= {step_buffer(op.pass_.writes, op.step): longest * 4 for op in ops}
             case Launch(sums=sums, level=level) if sums:
@@ -68,7 +70,7 @@ def buffer_sizes(plan: Plan, extents: Extents, ends: int = 1) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Phase:
-    """Launches, by their numbers: once at first, for each tile, once at the end."""
+    """The numbers of launches that run once before all tiles, for each tile, and once after."""
 
     first: tuple[int, ...]
     each: tuple[int, ...]
@@ -77,9 +79,13 @@ class Phase:
 
 @dataclass(frozen=True)
 class Tiling:
-    """The way of an image through a plan: its tiles, in which phases, and the bytes it takes.
+    """How an image is processed: its tiles, its phases, and the sizes of its buffers.
 
-    Where only ``patches`` of the result are made, these are the tiles of the last phase.
+    Attributes:
+        tiles: the tiles of the image.
+        phases: the phases, in order.
+        sizes: the bytes of each buffer, by name.
+        patches: the tiles of the last phase, if only patches of the result are computed.
     """
 
     tiles: tuple[Extents, ...]
@@ -88,21 +94,21 @@ class Tiling:
     patches: tuple[Extents, ...] = ()
 
     def tiles_of(self, phase: Phase) -> tuple[Extents, ...]:
-        """The tiles that go through a phase."""
+        """Return the tiles that a phase processes."""
         return self.patches if self.patches and phase is self.phases[-1] else self.tiles
 
     @property
     def bytes(self) -> int:
-        """Device memory of all buffers."""
+        """The device memory of all buffers, in bytes."""
         return sum(self.sizes.values())
 
 
 @lru_cache(maxsize=256)
 def phases_of(plan: Plan) -> tuple[Phase, ...]:
-    """The phases in which tiles go through a plan, one for each pass over all tiles.
+    """Return the phases of a plan. Each phase is one pass over all tiles.
 
-    A number that is estimated from the whole image ends a phase: each phase but the last goes, over
-    all tiles, as far as one reduction, and the next begins again at the source.
+    A number that is estimated from the whole image ends a phase. Each phase but the last processes
+    all tiles up to one reduction. The next phase starts again at the source.
     """
     numbered = tuple(enumerate(plan.launches))
     lines = tuple(i for i, launch in numbered if isinstance(launch, Lines))
@@ -124,14 +130,14 @@ def phases_of(plan: Plan) -> tuple[Phase, ...]:
 
 
 def reduction_of(launch: AnyLaunch) -> Op | None:
-    """The reduction that a launch is a part of, but for the reduction's end."""
+    """Return the reduction that a launch belongs to; None for a reduction's last launch."""
     if isinstance(launch, Launch):
         return launch.sums
     return launch.op if isinstance(launch, Histogram | Reduce) else None
 
 
 def leading_to(plan: Plan, ends: set[int]) -> tuple[int, ...]:
-    """The launches with these numbers, and all that they depend on."""
+    """Return the numbers of these launches and of all launches that they depend on."""
     images: set[int] = set()
     chosen = []
     for number, launch in reversed(tuple(enumerate(plan.launches))):
@@ -143,10 +149,8 @@ def leading_to(plan: Plan, ends: set[int]) -> tuple[int, ...]:
 
 
 def halos_of(plan: Plan) -> tuple[int, ...]:
-    """How many pixels around each the first image of each level is read, through all stencils in a
-    row.
-    """
-    reach: dict[int, int] = {}  # around each image that is stored
+    """Return the halo of each level: the radius of all its stencils in a row, in pixels."""
+    reach: dict[int, int] = {}  # of each stored image
     halos = [0] * (len(plan.resamplings) + 1)
     for launch in reversed(plan.launches):
         own = 0
@@ -162,7 +166,7 @@ def halos_of(plan: Plan) -> tuple[int, ...]:
 
 
 class Cutter:
-    """Cuts an image into tiles that begin at multiples of ``across`` and of 4."""
+    """Cuts an image into tiles whose columns begin at multiples of ``across``, and rows of 4."""
 
     def __init__(self, plan: Plan, width: int, height: int, lanes: int) -> None:
         self.whole = whole_image(plan, width, height, lanes)
@@ -173,16 +177,19 @@ class Cutter:
         self._sizes = plan.sizes(width, height)
 
     def spans(self, axis: Axis, begin: int, end: int) -> list[tuple[int, ...]]:
-        """The rows or columns of a tile on each level: of its core, and of what is stored.
+        """Return the rows or columns of a tile on each level.
 
         Args:
             axis: "rows" or "columns".
-            begin: the first of the core on level 0.
-            end: behind the last of it.
+            begin: the first row or column of the core on level 0.
+            end: one after the last row or column of the core on level 0.
+
+        Returns:
+            For each level, begin and end of the core, then begin and end of the stored part.
         """
         step = self.across if axis == "columns" else 4
         sizes = [e.width if axis == "columns" else e.height for e in self.whole]
-        # Rounded up, so that the first tile has a core on every level.
+        # Rounded up, so that the first tile's core is not empty on any level.
         cores = [
             (
                 min(round_up(-(-begin * size // sizes[0]), step), size),
@@ -193,11 +200,11 @@ class Cutter:
         return self.spans_of(axis, cores)
 
     def spans_of(self, axis: Axis, cores: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
-        """The :meth:`spans` of a tile whose core on each level begins and ends anywhere."""
+        """Return the :meth:`spans` of a tile with any core on each level."""
         step = self.across if axis == "columns" else 4
         sizes = [e.width if axis == "columns" else e.height for e in self.whole]
         spans: list[tuple[int, ...]] = []
-        low = high = 0  # what the next level needs of this one
+        low = high = 0  # the part of this level that the next one needs
         for level in reversed(range(len(sizes))):
             size, halo, core = sizes[level], self._halos[level], cores[level]
             if core[0] < core[1]:
@@ -211,14 +218,14 @@ class Cutter:
         return spans[::-1]
 
     def tile(self, left: int, top: int, columns: int, rows: int) -> Extents:
-        """The tile whose core begins there on level 0, and is of that size inside the image."""
+        """Return the tile with a core of this position and size on level 0, cut at the image."""
         width, height = self.whole[0].width, self.whole[0].height
         across = self.spans("columns", left, min(left + columns, width))
         down = self.spans("rows", top, min(top + rows, height))
         return self._extents(across, down)
 
     def patch(self, box: Box, levels: Set[int]) -> Extents:
-        """The tile that makes a part of the images of these levels, and nothing else."""
+        """Return the tile that computes only a part of the images of these levels."""
         every = range(len(self.whole))
         across = [(box.left, box.right) if level in levels else (0, 0) for level in every]
         down = [(box.top, box.bottom) if level in levels else (0, 0) for level in every]
@@ -240,18 +247,18 @@ class Cutter:
         )
 
     def amid(self, columns: int, rows: int) -> Extents:
-        """A tile of that size, on each level as large as one of that size can be."""
+        """Return the largest extents that a tile of this size can have on each level."""
         wide, high = self._longest("columns", columns), self._longest("rows", rows)
         boxes = [Box(0, 0, x, y) for x, y in zip(wide, high, strict=True)]
         pairs = zip(self.whole, boxes, strict=True)
         return tuple(replace(extent, core=box, stored=box) for extent, box in pairs)
 
     def _longest(self, axis: Axis, core: int) -> list[int]:
-        """The most that a tile can store on each level, of rows or columns."""
+        """Return the most rows or columns that a tile can store on each level."""
         step = self.across if axis == "columns" else 4
         sizes = [e.width if axis == "columns" else e.height for e in self.whole]
         found = []
-        low = high = 0  # what is needed before and behind the place of the core of level 0
+        low = high = 0  # what is needed before and after the position of the core of level 0
         for level in reversed(range(len(sizes))):
             size, halo = sizes[level], self._halos[level]
             rounding = step if level else 0
@@ -266,7 +273,7 @@ class Cutter:
 
 @lru_cache(maxsize=64)
 def cutter_of(plan: Plan, width: int, height: int, lanes: int) -> Cutter:
-    """The cutter of an image of that size, for a plan and a device of so many lanes."""
+    """Return the cutter for an image size, a plan and the lanes of a device."""
     return Cutter(plan, width, height, lanes)
 
 
@@ -274,21 +281,22 @@ def cutter_of(plan: Plan, width: int, height: int, lanes: int) -> Cutter:
 def tiling_of(
     plan: Plan, width: int, height: int, lanes: int, memory: int, largest: int, ends: int = 1
 ) -> Tiling:
-    """The tiling for limited memory: an image goes through a plan whole if it fits, else in tiles.
+    """Return the tiling of an image for limited memory: whole if it fits, else in tiles.
 
-    Of the divisions that fit, the one with the smallest share of halos is chosen. Among those that
-    differ by less than 2 %, it is the one into the fewest columns, since full rows are transferred
-    in one piece.
+    This chooses the tile size with the smallest share of halos. If shares differ by less than 2 %,
+    it prefers fewer columns of tiles, because full rows are transferred in one piece.
 
     Args:
-        width: of the image, and its height, in pixels.
-        lanes: of the device.
-        memory: bytes that all buffers together may take.
-        largest: bytes that a single buffer may take.
-        ends: how many sources and eight-bit results there are at a time.
+        plan: the plan.
+        width: the width of the image in pixels.
+        height: its height.
+        lanes: the lanes of the device.
+        memory: the most bytes that all buffers together may use.
+        largest: the most bytes of a single buffer.
+        ends: the number of sources and eight-bit results that exist at a time.
 
     Raises:
-        ImageError: not even the smallest tile fits; the message says what it needs.
+        ImageError: even the smallest tile does not fit. The message contains the required memory.
     """
     cut = cutter_of(plan, width, height, lanes)
     whole, across = cut.whole, cut.across
@@ -321,10 +329,10 @@ def tiling_of(
         least = cut.amid(across, 4)
         needs, wants = (buffer_sizes(plan, extents, ends) for extents in (least, whole))
         raise ImageError(
-            f"{width}x{height} pixels need {in_words(sum(wants.values()))} of "
-            f"device memory, or in the smallest tiles {in_words(sum(needs.values()))}, with "
-            f"{in_words(max(needs.values()))} in one piece; allowed are {in_words(memory)}, with "
-            f"{in_words(largest)} in one piece"
+            f"{width}x{height} pixels need {in_words(sum(wants.values()))} of device memory, or "
+            f"{in_words(sum(needs.values()))} in the smallest tiles, with a buffer of "
+            f"{in_words(max(needs.values()))}. The limit is {in_words(memory)}, with buffers of at "
+            f"most {in_words(largest)}. Raise the memory limit, or use another device."
         )
     _, columns, rows = best
     tiles = tuple(
@@ -336,7 +344,7 @@ def tiling_of(
 
 
 def divisions(most: int) -> Iterator[int]:
-    """Numbers of tiles to try: all small ones, then in steps of about a tenth.
+    """Yield the numbers of tiles to try: all small ones, then in steps of about 10 %.
 
     >>> list(divisions(12))
     [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]

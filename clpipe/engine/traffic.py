@@ -1,4 +1,4 @@
-"""Bytes that a plan takes on a device, and that its launches move. Pure."""
+"""The device memory of a plan, and the memory traffic of its launches. Pure."""
 
 import math
 
@@ -7,17 +7,17 @@ from clpipe.engine.work_items import summed_together
 
 
 def share(plan: Plan, level: int) -> float:
-    """About how many pixels an image on a level has for each of the source."""
+    """Return the approximate number of pixels on a level per pixel of the source."""
     return math.prod(each.scale for each in plan.resamplings[:level])
 
 
 def sum_bytes(lanes: int) -> float:
-    """Bytes per pixel of the sums that the blocks of an image have."""
+    """Return the bytes per pixel of the sums of an image's blocks."""
     return 16 / (lanes * summed_together(lanes) * 4)
 
 
 def bytes_per_pixel(plan: Plan, lanes: int) -> float:
-    """Bytes of device memory per pixel: source, slots, block sums and eight-bit result."""
+    """Return the device memory in bytes per pixel: source, slots, block sums, eight-bit result."""
     total = float(len(plan.source.channels) * (2 if plan.half else 4))
     total += sum(4 * share(plan, min(levels)) for levels in plan.levels_of_slots)
     for launch in plan.launches:
@@ -28,7 +28,7 @@ def bytes_per_pixel(plan: Plan, lanes: int) -> float:
 
 
 def launch_bytes(plan: Plan, launch: AnyLaunch, lanes: int) -> float:
-    """Bytes per pixel that a launch reads and writes in device memory, each sample once."""
+    """Return the bytes per pixel that a launch reads and writes, counting each sample once."""
     if isinstance(launch, Reduce) and not launch.op.reduction.bins:
         return sum_bytes(lanes) * share(plan, launch.level)
     images = [read.image for read in reads_of(launch)]

@@ -1,8 +1,8 @@
-"""Transfers of pixels to a device and back: where they lie in memory, or through staging buffers.
+"""Transfers of pixels to a device and back: in place, or through staging buffers.
 
-An image, or a tile of it, goes one way in three steps: ``upload``, ``target`` for the eight-bit
-pixels, and ``fetch`` for each result, whose array may be read when its event is complete and until
-``done``. At most ``depth`` may be between the first step and ``done``.
+An image or a tile needs three steps: ``upload``, ``target`` for the eight-bit pixels, and ``fetch``
+for each result. The array of a fetch is valid from the completion of its event until ``done``. At
+most ``depth`` images or tiles may be between ``upload`` and ``done``.
 """
 
 import weakref
@@ -14,14 +14,15 @@ import numpy as np
 from clpipe.base.types import Array
 from clpipe.engine.buffers import Pool, aligned_empty
 
-Sent = tuple[Any, list[Any]]  # a buffer, and the events after which it can be read
-Fetched = tuple[Array, Any]  # bytes, and the event after which they are there
+Sent = tuple[Any, list[Any]]  # a buffer, and the events after which kernels can read it
+Fetched = tuple[Array, Any]  # bytes, and the event after which they are valid
 
 
 def bytes_from(array: Array, size: int) -> Array | None:
-    """The ``size`` bytes from the first of a C-contiguous array on, in the memory that it lies in.
+    """Return ``size`` bytes of memory, starting at the first byte of a C-contiguous array.
 
-    None where that memory ends before.
+    The bytes may extend past the array, into the array that it is a view of. If that array ends
+    earlier, return None.
 
     >>> room = np.arange(6, dtype=np.uint8)
     >>> bytes_from(room[1:3], 4), bytes_from(room[1:3], 6)
@@ -38,7 +39,7 @@ def bytes_from(array: Array, size: int) -> Array | None:
 
 
 def fill(data: Array, parts: Sequence[Array], dtype: Any, stride: int) -> None:
-    """Copy arrays, as a type, to places of bytes that are ``stride`` apart."""
+    """Convert arrays to a type, and copy them to offsets in bytes that are ``stride`` apart."""
     for number, part in enumerate(parts):
         start, count = number * stride, part.size * np.dtype(dtype).itemsize
         to = data[start : start + count].view(dtype).reshape(part.shape)
@@ -46,15 +47,16 @@ def fill(data: Array, parts: Sequence[Array], dtype: Any, stride: int) -> None:
 
 
 def _unmap(array: Array, queue: Any) -> None:
-    """Give mapped memory back."""
+    """Unmap mapped memory."""
     base: Any = array.base
     base.release(queue)
 
 
 class InPlace:
-    """For a device that works in the host's memory: kernels use NumPy's arrays where they are.
+    """Transfers for a device that uses host memory directly: kernels work on NumPy's arrays.
 
-    An array that has not the right type, order, address or room behind it is copied first.
+    An array is copied first if its type, order or alignment is wrong, or if too little memory
+    follows it.
     """
 
     depth = 1
@@ -69,13 +71,13 @@ class InPlace:
         self._ends: list[Any] = []
 
     def needs(self, sizes: Mapping[str, int]) -> dict[str, int]:
-        """The buffers that are to be made, of those that a tiling names: bytes by name."""
+        """Return the buffers of a tiling that must be allocated, as bytes by name."""
         return {name: size for name, size in sizes.items() if name[:3] not in ("src", "dst")}
 
     def upload(self, source: Array, pixels: Array, dtype: Any, size: int) -> Sent:
-        """A buffer of ``size`` bytes that begins with an image, whose samples become ``dtype``.
+        """Return a buffer of ``size`` bytes that begins with an image, as samples of ``dtype``.
 
-        ``pixels`` are of the array ``source``.
+        ``pixels`` is a view of the array ``source``.
         """
         data = None
         if pixels.dtype == dtype and pixels.flags.c_contiguous:
@@ -86,19 +88,22 @@ class InPlace:
         return self._end(self._cl.mem_flags.READ_ONLY, data), []
 
     def upload_all(self, parts: Sequence[Array], dtype: Any, stride: int) -> Sent:
-        """A buffer of images, which begin ``stride`` bytes apart, as samples of ``dtype``."""
+        """Return a buffer of images, ``stride`` bytes apart, as samples of ``dtype``."""
         data = self._room("src", stride * len(parts))
         fill(data, parts, dtype, stride)
         return self._end(self._cl.mem_flags.READ_ONLY, data), []
 
     def again(self, source: Array) -> Sent | None:
-        """The last upload, if it was of that array; here it costs nothing to do one."""
+        """Return the last upload if it was of this array, else None.
+
+        This class always returns None, because its uploads cost nothing.
+        """
         return None
 
     def target(self, size: int, whole: Array | None) -> Any:
-        """A buffer for eight-bit pixels: the array ``whole``, where it is the result of one run.
+        """Return a buffer for eight-bit pixels, or None for size 0.
 
-        None where there are none, of size 0. It is called once for each image or tile.
+        The buffer uses the array ``whole`` if one is given. Call this once per image or tile.
         """
         if not size:
             return None
@@ -106,7 +111,7 @@ class InPlace:
         return self._end(self._cl.mem_flags.READ_WRITE, data)
 
     def fetch(self, name: str, buffer: Any, size: int, after: Sequence[Any]) -> Fetched:
-        """The bytes of a buffer on the host, when the launches ``after`` are done."""
+        """Enqueue a fetch of a buffer's first ``size`` bytes, after the events ``after``."""
         array, event = self._cl.enqueue_map_buffer(
             self._queue,
             buffer,
@@ -121,11 +126,11 @@ class InPlace:
         return array, event
 
     def flush(self) -> None:
-        """Have the device start what is enqueued."""
+        """Make the device start the enqueued commands."""
         self._queue.flush()
 
     def done(self) -> None:
-        """Give back what was fetched, which is not needed any more."""
+        """Release the fetched arrays. They must not be used any more."""
         maps, self._maps = self._maps, []
         ends, self._ends = self._ends, []
         for array in maps:
@@ -134,12 +139,12 @@ class InPlace:
             buffer.release()
 
     def release(self) -> None:
-        """Give all memory back."""
+        """Release all memory."""
         self._scratch.clear()
         self.done()
 
     def _room(self, name: str, size: int) -> Array:
-        """Memory of our own, kept from image to image where it is large enough."""
+        """Return scratch memory, which is reused if it is large enough."""
         if name not in self._scratch or self._scratch[name].size < size:
             self._scratch[name] = aligned_empty((size,), np.uint8)
         return self._scratch[name][:size]
@@ -151,10 +156,10 @@ class InPlace:
 
 
 class Staged:
-    """For a device with memory of its own: copies in both directions while kernels run.
+    """Transfers for a device with separate memory: copies in both directions while kernels run.
 
-    Queues of their own copy from and to page-locked memory, since from other memory the host would
-    wait for each copy. There are two of every buffer, used alternately.
+    Two extra queues copy from and to page-locked memory; with other memory, the host would wait for
+    each copy. Every buffer exists twice, and the two are used alternately.
     """
 
     depth = 2
@@ -165,7 +170,7 @@ class Staged:
         self._pool = pool
         self._up, self._down = new_queue(), new_queue()
         self._pinned: dict[str, tuple[Any, Array]] = {}
-        self._source = self._target = 0  # of the two
+        self._source = self._target = 0  # which of the two buffers is in use
         self._sent: tuple[weakref.ref[Array], Sent] | None = None
 
     def needs(self, sizes: Mapping[str, int]) -> dict[str, int]:
@@ -229,7 +234,7 @@ class Staged:
             buffer.release()
 
     def _page_locked(self, name: str, size: int) -> Array:
-        """Page-locked memory of that size at least, kept from image to image."""
+        """Return page-locked memory of at least this size, which is reused for later images."""
         cl = self._cl
         held = self._pinned.get(name)
         if held and held[1].size >= size:

@@ -1,8 +1,9 @@
-"""A program that tries OpenCL's runtimes, in a process of its own, because they may end it.
+"""A program that tests OpenCL runtimes in a separate process, because they may crash it.
 
-It has every runtime compute a little and looks at the result. ``clpipe.engine.verdicts`` starts it,
-writes to its standard input what is known already, and reads lines of JSON: before each step what
-is tried, so that it is known what ended the process, and after it what came of it.
+Every runtime computes a small kernel, and the program checks the result. ``clpipe.engine.verdicts``
+starts the program, writes the known results to its standard input, and reads lines of JSON. A line
+before each step names the step, so that a crash can be attributed to it. A line after the step
+contains its result.
 """
 
 import json
@@ -21,7 +22,8 @@ from clpipe.engine.vendors import loaded, platforms
 from clpipe.reference.math import square_root
 from clpipe.reference.random import Stream, normal_of, philox
 
-# What a raw is made of: halves, 64-bit products, roots, a division; on lanes, with a local size.
+# The operations that a raw needs: half floats, 64-bit products, square roots and a division. The
+# kernel uses lanes and a local size.
 TEXT = """
 __kernel void trial(__global const half *src, __global float *dst, float divisor) {
     const uint i = (uint)get_global_id(0) * LANES, count = (uint)get_global_size(0) * LANES;
@@ -36,23 +38,23 @@ COUNT, LOCAL, DIVISOR = 1024, 8, np.float32(0.7)
 
 
 def samples() -> np.ndarray:
-    """Halves of all sizes, (COUNT,) float16: subnormal, usual, large, of both signs."""
+    """Return float16 values of all magnitudes and both signs, (COUNT,)."""
     bits = np.random.default_rng(0).integers(0, 0x7C00, COUNT) | np.arange(COUNT) % 2 << 15
     return bits.astype(np.uint16).view(np.float16)
 
 
 def expected(source: np.ndarray) -> tuple[Floats, Floats]:
-    """The kernel's results for halves: noisy values, bit for bit, and quotients."""
+    """Return the kernel's expected results: noisy values, bit for bit, and quotients."""
     a, zero = source.astype(np.float32), np.zeros(1, np.uint32)
     word, *_ = philox(np.arange(COUNT, dtype=np.uint32), zero, zero, zero + 3, Stream(1, 2, 3))
     return a + square_root(np.abs(a)) * normal_of(word), a / DIVISOR
 
 
 def problem_of(device: Any, lanes: int) -> str:
-    """Why a ``pyopencl.Device`` is not to be trusted; "" where it computes as it should.
+    """Return why a ``pyopencl.Device`` is unusable; "" if it computes correctly.
 
     Raises:
-        pyopencl.Error: it cannot be opened, or has no memory.
+        pyopencl.Error: the device cannot be opened, or is out of memory.
     """
     import pyopencl as cl
 
@@ -65,7 +67,7 @@ def problem_of(device: Any, lanes: int) -> str:
     except cl.MemoryError:
         raise
     except cl.Error as error:
-        return f"it compiles nothing: {first_error(str(error))}"
+        return f"it cannot compile kernels: {first_error(str(error))}"
     source, results = samples(), np.zeros((2, COUNT), np.float32)
     flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
     src = cl.Buffer(context, flags, hostbuf=source)
@@ -76,23 +78,23 @@ def problem_of(device: Any, lanes: int) -> str:
     noisy, quotients = expected(source)
     wrong = int((results[0] != noisy).sum())
     wrong += int((np.abs(results[1] - quotients) > 4e-7 * np.abs(quotients)).sum())
-    return f"it computes {wrong} of {2 * COUNT} numbers wrongly" if wrong else ""
+    return f"{wrong} of {2 * COUNT} numbers that it computes are wrong" if wrong else ""
 
 
 def first_error(text: str) -> str:
-    """The first line of a compiler's output that names an error.
+    """Return the first line of a compiler's output that contains an error.
 
     >>> first_error("x failed\\nerror: unknown target CPU 'generic'\\nmore")
     "unknown target CPU 'generic'"
     """
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     errors = [line.partition("error: ")[2] for line in lines if "error: " in line]
-    return [*errors, *lines, "it does not say why"][0]
+    return [*errors, *lines, "the compiler gives no reason"][0]
 
 
 def try_all(known: dict[str, Any]) -> None:
-    """Try what is not known yet, and say what comes of it on the standard output."""
-    report = os.dup(sys.stdout.fileno())  # runtimes write to the usual one
+    """Test all runtimes without known results, and write the results to the standard output."""
+    report = os.dup(sys.stdout.fileno())  # because runtimes write to the standard output
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
 
     def say(**values: Any) -> None:
@@ -123,7 +125,7 @@ def try_all(known: dict[str, Any]) -> None:
                 passing = False
                 try:
                     problem = problem_of(device, lanes)
-                except cl.Error as error:  # others may be using it: not a fault that lasts
+                except cl.Error as error:  # perhaps temporary: other programs may use the device
                     problem, passing = "", True
                     sys.stderr.write(f"{error}\n")
                 say(attempt=name, problem=problem, passing=passing)
@@ -133,7 +135,7 @@ def try_all(known: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Read what is known from the standard input, and try the rest."""
+    """Read the known results from the standard input, and test the rest."""
     known = json.load(sys.stdin)
     try:
         try_all(known)

@@ -1,4 +1,4 @@
-"""Values of kernel parameters that follow from an image's chain, its size and its noise key."""
+"""The values of kernel parameters that depend on an image's chain, size and noise key."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -35,8 +35,8 @@ def binding(
         chain: the image's chain.
         plan: the chain's plan.
         size: width and height of the image in px.
-        noise_key: what the noise is made of.
-        tables: composed curves, which several chains may share.
+        noise_key: the text from which the noise is seeded.
+        tables: a cache of composed curves, which several chains may share.
     """
     arguments = chain.arguments
     streams: dict[tuple[str, NoiseScope], Stream] = {}
@@ -66,8 +66,8 @@ def encoding_table(curves: Sequence[Array], tables: BoundedCache[Array]) -> Arra
     """Return one table for curves in a row and the conversion to eight bits.
 
     Args:
-        curves: tables, each of which is one object for the same parameters.
-        tables: those that were made before.
+        curves: the tables of the curves. Equal parameters must give the same table object.
+        tables: the cache of composed tables.
     """
 
     def composed() -> Array:

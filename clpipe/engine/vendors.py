@@ -1,7 +1,7 @@
-"""Intel's OpenCL runtime for CPUs as pip installs it, shown to the loader of OpenCL platforms.
+"""Makes Intel's OpenCL runtime for CPUs, as installed by pip, visible to the OpenCL loader.
 
-A loader reads the path of each platform's library from an .icd file. The one in Intel's package is
-in no folder where loaders look, and names a path that is not there.
+A loader reads the path of each platform's library from an .icd file. The .icd file of Intel's
+package is in a folder that loaders do not search, and names a missing path.
 """
 
 import os
@@ -14,20 +14,21 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError
+from clpipe.base.extras import installing
 from clpipe.base.process_folder import process_folder
 from clpipe.engine.cache_folder import prepare_environment
 
 PACKAGE, LIBRARY = "intel-opencl-rt", "libintelocl.so"
-# With any of these a user says where platforms are; the first is what we set.
+# Each of these variables names the folders or files of platforms. clpipe sets the first one.
 VARIABLES = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES", "OPENCL_VENDOR_PATH")
-# The runtime that comes with pyopencl's wheel, which its loader finds through this variable.
+# The runtime in pyopencl's wheel, which its loader finds through this variable.
 BUNDLED, HOME = "PoCL of pip", "PYOPENCL_HOME"
-# Where loaders look by themselves: the system's folder, and conda's.
+# The folders that loaders search by default: the system's, and conda's.
 FOLDERS = (Path("/etc/OpenCL/vendors"), Path(sys.prefix, "etc/OpenCL/vendors"))
 
 
 def intel_library() -> Path | None:
-    """The library of Intel's runtime, if its package is installed."""
+    """Return the library of Intel's runtime; None if its package is not installed."""
     with suppress(PackageNotFoundError):
         for file in files(PACKAGE) or ():
             if file.name == LIBRARY:
@@ -37,7 +38,7 @@ def intel_library() -> Path | None:
 
 
 def icd_files() -> list[tuple[Path, str]]:
-    """The files that tell loaders of runtimes, and what each says; "" where it cannot be read."""
+    """Return the installed .icd files and their contents; "" if a file cannot be read."""
     found = []
     for path in (icd for folder in FOLDERS for icd in sorted(folder.glob("*.icd"))):
         try:
@@ -48,23 +49,24 @@ def icd_files() -> list[tuple[Path, str]]:
 
 
 def loaded() -> Any:
-    """Return pyopencl. Every use of OpenCL starts here, in an environment that suits it.
+    """Return pyopencl, after preparing the environment. Every use of OpenCL starts here.
 
     Raises:
-        DeviceError: it cannot be loaded.
+        DeviceError: pyopencl cannot be loaded.
     """
     prepare_environment()
     try:
         import pyopencl as cl
     except (ImportError, OSError) as error:
-        raise DeviceError(f"pyopencl cannot be loaded: {error}") from None
+        way = f"Use --device numpy, or run: {installing('--force-reinstall', 'pyopencl')}"
+        raise DeviceError(f"pyopencl cannot be loaded: {error}. {way}") from None
     return cl
 
 
 def installed_drivers() -> list[str]:
-    """The runtimes that can be hidden from the loader: paths of .icd files, and :data:`BUNDLED`.
+    """Return the runtimes that can be hidden from the loader: .icd files, and :data:`BUNDLED`.
 
-    Where the user said where platforms are, by one of :data:`VARIABLES`, the .icd files stay.
+    If the user has set one of :data:`VARIABLES`, the .icd files cannot be hidden.
     """
     bundled = [BUNDLED] if any(Path(loaded().__file__).parent.glob(".libs/*.icd")) else []
     named = any(name in os.environ for name in VARIABLES)
@@ -72,12 +74,12 @@ def installed_drivers() -> list[str]:
 
 
 def platforms(hidden: Collection[str] = ()) -> list[Any]:
-    """The OpenCL platforms of this machine, as ``pyopencl.Platform``.
+    """Return the OpenCL platforms of this machine, as ``pyopencl.Platform``.
 
-    A process that has listed them gets the same ones again.
+    Later calls in a process return the same platforms, whatever is hidden.
 
     Args:
-        hidden: some of :func:`installed_drivers`, which are not loaded.
+        hidden: the :func:`installed_drivers` that must not be loaded.
 
     Raises:
         DeviceError: pyopencl cannot be loaded, or the platforms cannot be listed.
@@ -89,16 +91,19 @@ def platforms(hidden: Collection[str] = ()) -> list[Any]:
     except cl.Error as error:
         if "PLATFORM_NOT_FOUND" in str(error):
             return []
-        raise DeviceError(f"OpenCL cannot be used: {error}") from None
+        raise DeviceError(
+            f"the OpenCL platforms cannot be listed: {error}. Reinstall the driver of your GPU, or "
+            "use --device numpy."
+        ) from None
 
 
 @contextmanager
 def drivers_visible(hidden: Collection[str] = ()) -> Iterator[None]:
-    """Within this, a loader that starts finds Intel's runtime beside all others but hidden ones.
+    """Make a loader that starts in the ``with`` block find Intel's runtime, and hide others.
 
-    Loaders start when a process first asks for platforms. Nothing changes where the user set one of
-    :data:`VARIABLES`, or where nothing is hidden and Intel's runtime is found anyhow, or not
-    installed.
+    Loaders start when a process first asks for platforms. This changes nothing if the user has set
+    one of :data:`VARIABLES`. It also changes nothing if no driver is hidden, and Intel's runtime is
+    either not installed or already visible.
     """
     home = os.environ.get(HOME)
     if BUNDLED in hidden:
@@ -131,6 +136,6 @@ def drivers_visible(hidden: Collection[str] = ()) -> Iterator[None]:
 
 
 def names_library(text: str) -> bool:
-    """Whether what an .icd file says is a library of Intel's runtime that is there."""
+    """Return whether the contents of an .icd file name an existing library of Intel's runtime."""
     path = Path(text.strip())
     return path.name.startswith(LIBRARY) and path.exists()

@@ -1,8 +1,8 @@
-"""Verdicts on OpenCL runtimes: each is tried once, in a child process, and the result is kept.
+"""Verdicts on OpenCL runtimes: each is tested once, in a child process, and the result is cached.
 
-A runtime that crashes, compiles nothing or computes wrongly is found there, by
-:mod:`clpipe.engine.trial`, and not by a user. What is known is bound to the CPU, the installed
-drivers, their versions and the trial itself; it lies in the cache folder.
+The test, :mod:`clpipe.engine.trial`, detects runtimes that crash, cannot compile or compute wrong
+results, before a user meets them. The results are in the cache folder. They are valid for one CPU,
+one set of drivers and versions, and one version of the test.
 """
 
 import json
@@ -25,23 +25,23 @@ from clpipe.engine.sources import LIBRARY, kernel_folder
 from clpipe.engine.store import Store
 from clpipe.engine.vendors import VARIABLES, drivers_visible, icd_files, installed_drivers
 
-LIMIT = 120  # seconds for one process; then the runtime that it is at counts as hanging
-WINDOWS_FAULT = 0xC0000000  # the status of a process that the system has ended is no smaller
+LIMIT = 120  # seconds for one process; after that, the runtime under test counts as hanging
+WINDOWS_FAULT = 0xC0000000  # the least exit status of a process that Windows has terminated
 SLOW = "it takes longer than"
 SENSITIVE = (*VARIABLES, VARIABLE, "POCL_DEVICES", "LD_LIBRARY_PATH", "LD_PRELOAD")
 
 
 @dataclass(frozen=True)
 class Verdicts:
-    """Results of trials.
+    """The results of tests.
 
     Args:
-        listing: why the platforms cannot be listed at all; "" where they can.
-        hidden: why a driver is kept from the loader, by its name among
+        listing: why the platforms cannot be listed; "" if they can.
+        hidden: why a driver is hidden from the loader, by its name in
             :func:`~clpipe.engine.vendors.installed_drivers`.
-        platforms: why a platform's devices cannot be asked for, by :func:`platform_id`.
-        attempts: why a device does not work, or "", by :func:`attempt`.
-        lasting: whether they hold for later processes, too.
+        platforms: why a platform's devices cannot be listed, by :func:`platform_id`.
+        attempts: why a device does not work, by :func:`attempt`; "" if it works.
+        lasting: whether the results are also valid for later processes.
     """
 
     listing: str = ""
@@ -52,11 +52,11 @@ class Verdicts:
 
     @property
     def problems(self) -> bool:
-        """Whether anything failed."""
+        """Whether any test failed."""
         return bool(self.listing or self.hidden or self.platforms or any(self.attempts.values()))
 
     def of(self, platform: Any, device: Any) -> tuple[Target, str] | None:
-        """The target of a device, and why it does not work, or ""; None if it was not tried."""
+        """Return a device's target, and why it does not work or ""; None if it was not tested."""
         targets = candidates(platform, device)
         found = {t: self.attempts.get(attempt(platform, device, t)) for t in targets}
         works = next((t for t, problem in found.items() if problem == ""), None)
@@ -67,12 +67,12 @@ class Verdicts:
 
 
 def verdicts(again: bool = False, missing: Sequence[str] = ()) -> Verdicts:
-    """The verdicts on this machine's runtimes, after they are tried if that is not known.
+    """Return the verdicts on this machine's runtimes. Runtimes without a verdict are tested.
 
     Args:
-        again: try what failed once more.
-        missing: what was not tried, as :func:`attempt` names it. What is still missing then, since
-            another process does not see it, is trusted.
+        again: whether to repeat failed tests.
+        missing: the names of missing tests, from :func:`attempt`. A device counts as working if its
+            test is still missing afterwards, because the child process does not see the device.
     """
     store, state = _store(), _state()
     known = _known(store.load("runtimes", state))
@@ -89,7 +89,7 @@ def verdicts(again: bool = False, missing: Sequence[str] = ()) -> Verdicts:
 
 
 def tried(known: Verdicts) -> Verdicts:
-    """Verdicts with all that was not known; what ends the process is passed over in the next."""
+    """Complete the verdicts. After a crash, the next process skips the runtime that caused it."""
     while True:
         lines, ending = _run(known)
         at: dict[str, str] = {}
@@ -102,9 +102,9 @@ def tried(known: Verdicts) -> Verdicts:
                 at = {}
         if ending is None:
             return known
-        # A machine may be too busy.
+        # A time-out may only mean that the machine is too busy.
         known = replace(known, lasting=known.lasting and not ending.startswith(SLOW))
-        if ending == "" or not at:  # it could not be tried, which says nothing of the runtimes
+        if ending == "" or not at:  # the test could not run, so no runtime is to blame
             return replace(known, lasting=False)
         if at["at"] == "list":
             found = _that_end_the_listing(known)
@@ -119,9 +119,10 @@ def tried(known: Verdicts) -> Verdicts:
 
 
 def _that_end_the_listing(known: Verdicts) -> dict[str, str]:
-    """The drivers that end a process which lists them and their devices, each alone; and how.
+    """Return the drivers that crash a process that lists only them, and how.
 
-    A loader that has several asks each for its devices, to have those first that have some.
+    The drivers' devices are also listed: if a loader has several drivers, it asks each for devices,
+    to put drivers with devices first.
     """
     drivers = [name for name in installed_drivers() if name not in known.hidden]
     found = {}
@@ -135,13 +136,15 @@ def _that_end_the_listing(known: Verdicts) -> dict[str, str]:
 
 
 def _run(known: Verdicts, only_listing: bool = False) -> tuple[list[dict[str, Any]], str | None]:
-    """Run the trial: the lines that it wrote, and what ended it, in words.
+    """Run the test in a child process.
 
-    The latter is None where it came to its end, and "" where that is not the runtimes' doing.
+    Returns:
+        The lines that it wrote, and why it ended early, in words. The reason is None if it ran to
+        its end, and "" if no runtime is to blame.
     """
     environment = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     try:
-        with drivers_visible(known.hidden):  # here, since a child that is ended tidies nothing up
+        with drivers_visible(known.hidden):  # here, because a killed child would not clean up
             done = subprocess.run(
                 [sys.executable, "-m", "clpipe.engine.trial"],
                 input=json.dumps(asdict(known) | {"only_listing": only_listing}).encode(),
@@ -153,16 +156,16 @@ def _run(known: Verdicts, only_listing: bool = False) -> tuple[list[dict[str, An
         output, errors, status = done.stdout, done.stderr, done.returncode
     except subprocess.TimeoutExpired as error:
         output, errors, status = error.stdout or b"", b"", None
-    except (OSError, ValueError):  # there is no such program, as within others
+    except (OSError, ValueError):  # no such program, for example in an embedded interpreter
         return [], ""
     lines = list(_parsed(output))
     if status is None:
         return lines, f"{SLOW} {LIMIT} s for a tiny kernel"
     if status >= WINDOWS_FAULT:
-        return lines, f"it ends the process ({status:#x})"
+        return lines, f"it crashes the process ({status:#x})"
     if status >= 0:
         return lines, None if status == 0 else ""
-    if -status == getattr(signal, "SIGKILL", None):  # most likely for want of memory
+    if -status == getattr(signal, "SIGKILL", None):  # most likely out of memory
         return lines, ""
     said = [line.strip() for line in errors.decode("utf-8", "replace").splitlines()]
     last = next((f": {line[:200]}" for line in reversed(said) if line), "")
@@ -170,7 +173,7 @@ def _run(known: Verdicts, only_listing: bool = False) -> tuple[list[dict[str, An
         name = signal.Signals(-status).name
     except ValueError:
         name = f"signal {-status}"
-    return lines, f"it ends the process ({name}){last}"
+    return lines, f"it crashes the process ({name}){last}"
 
 
 def _parsed(output: bytes) -> Iterator[dict[str, Any]]:
@@ -180,13 +183,13 @@ def _parsed(output: bytes) -> Iterator[dict[str, Any]]:
 
 
 def _store() -> Store:
-    """The store of verdicts; without a lasting folder, for this process."""
+    """Return the cache of verdicts; without a cache folder, it lasts as long as this process."""
     folder = cache_folder() or process_folder()
     return Store(folder / "known" if folder else None)
 
 
 def _state() -> str:
-    """The conditions of verdicts: this machine, its drivers and the trial, in one text."""
+    """Return a text with the conditions of verdicts: this machine, its drivers and the test."""
     parts = {
         "cpu": cpu_text(),
         "sys": Path("/sys/devices/system/cpu").is_dir(),
@@ -199,11 +202,11 @@ def _state() -> str:
 
 
 def _trial_files() -> list[Path]:
-    """The files of this program that a trial depends on."""
+    """Return the files of clpipe that the test depends on."""
     modules = [Path(__file__).with_name(f"{m}.py") for m in ("trial", "cpu_target", "runtimes")]
     return [*modules, *(kernel_folder() / f"lib/{name}.h" for name in LIBRARY)]
 
 
 def _known(data: bytes | None) -> Verdicts | None:
-    """Verdicts as they are kept; None for none."""
+    """Return verdicts from their cached form; None for None."""
     return Verdicts(**json.loads(data)) if data else None

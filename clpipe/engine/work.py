@@ -1,4 +1,4 @@
-"""Work for a device: one image that is to go through a plan, and where its results go."""
+"""Work for a device: one image, its plan, and the arrays for its results."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,16 +18,16 @@ R = TypeVar("R")
 
 @dataclass(frozen=True, eq=False)
 class Work(Generic[R]):
-    """An image that is to go through a device.
+    """One image for a device.
 
     Args:
-        plan: what is done.
-        source: the image, (height, width[, channel]), of a type that converts without loss to what
-            the plan reads, half or float. It must stay as it is until the results are taken.
+        plan: the plan.
+        source: the image, (height, width[, channel]), of a type that converts without loss to the
+            plan's float16 or float32. It must not change until the results are fetched.
         bind: returns the values of kernel parameters.
-        output: where the results go.
-        options: what comes back, and how.
-        finish: makes a result of the output.
+        output: the arrays for the results.
+        options: the options of the run.
+        finish: converts the output to the result.
     """
 
     plan: Plan
@@ -39,12 +39,12 @@ class Work(Generic[R]):
 
     @property
     def size(self) -> tuple[int, int]:
-        """The width and height of the image, in px."""
+        """The width and height of the image, in pixels."""
         return self.source.shape[1], self.source.shape[0]
 
     @property
     def is_for_itself(self) -> bool:
-        """Whether it shares no launch with other work: it is timed, or has an output of its own."""
+        """Whether the image must not share launches, for example because it is timed."""
         options = self.options
         is_usual = options.download and options.timings is None and options.into is None
         return self.plan.incremental or not is_usual
@@ -52,13 +52,13 @@ class Work(Generic[R]):
 
 @dataclass(frozen=True, eq=False)
 class Member:
-    """A part of an image that goes through a plan in one go: the image, a tile or a patch of it.
+    """A part of an image that one pass over a plan processes: the whole image, a tile or a patch.
 
     Args:
-        extents: its place on each level.
-        work: what is done to the image.
-        patch: which of the image's patches it is; None is no patch.
-        is_whole: whether it is the image.
+        extents: the extents of the part on each level.
+        work: the work of the image.
+        patch: the number of the patch; None if the part is no patch.
+        is_whole: whether the part is the whole image.
     """
 
     extents: Extents
@@ -68,7 +68,7 @@ class Member:
 
     @property
     def pixels(self) -> Array:
-        """What it stores of the source, as the plan reads it."""
+        """The stored part of the source, with the axes that the plan reads."""
         box = self.extents[0].stored
         pixels = self.work.source[box.top : box.bottom, box.left : box.right]
         return pixels.transpose(2, 0, 1) if self.work.plan.planar else pixels
@@ -79,5 +79,5 @@ class Member:
         return np.float16 if self.work.plan.half else np.float32
 
     def part_of(self, result: Array, extent: Extent) -> Array:
-        """The part of a result of its image that it makes."""
+        """Return the part of a result of the image that this member computes."""
         return core_of(extent, result) if self.patch is None else result[self.patch]

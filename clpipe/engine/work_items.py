@@ -1,26 +1,26 @@
-"""Numbers of work items and of lanes, and where planes begin for them. Pure."""
+"""The sizes of work-groups, blocks and reductions, by the lanes of a device. Pure."""
 
 from clpipe.engine.ir import AnyLaunch, Border, Launch
 
-PARTIALS = 256  # sums or histograms that a reduction's first half leaves
-RUN = 64  # bins of a histogram that are also added up
+PARTIALS = 256  # the number of partial sums or partial histograms of a reduction
+RUN = 64  # the number of consecutive histogram bins whose sum is also stored
 
 
 def round_up(value: int, step: int) -> int:
-    """The smallest multiple of ``step`` that is not below ``value``."""
+    """Return the smallest multiple of ``step`` that is at least ``value``."""
     return -(-value // step) * step
 
 
 def local_size(lanes: int) -> int:
-    """Work items of a work-group. On a GPU, 64 would not fill a multiprocessor."""
+    """Return the work items per work-group. On a GPU, 64 would not fill a multiprocessor."""
     return 128 if lanes == 1 else 64
 
 
 def summed_together(lanes: int) -> int:
-    """Work items that store one sum: on a GPU a work-group, on a CPU, where they are few, one."""
+    """Return the work items that share one sum: a work-group on a GPU, one work item on a CPU."""
     return local_size(lanes) if lanes == 1 else 1
 
 
 def columns_of(launch: AnyLaunch | Border, lanes: int) -> int:
-    """Vectors side by side in a work item's block: on a GPU one, so that work items share lines."""
+    """Return the vectors per row of a work item's block: on a GPU one, for coalesced accesses."""
     return launch.columns if isinstance(launch, Launch) and lanes > 1 else 1

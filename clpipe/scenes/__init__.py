@@ -1,4 +1,4 @@
 """Datasets of scenes: Blender in a separate process, the views, and the dataset's card.
 
-May import: base, reference, images, inputs, outputs.
+The package may import base, reference, images, inputs and outputs.
 """
