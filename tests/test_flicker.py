@@ -144,7 +144,7 @@ def test_what_is_refused(lit):
     ).stderr
     assert "no layer 'Sun' with a picture; its layers: " in told and "Lamp" in told
     pipeline = Pipeline(device="numpy", shutter={"flicker_duty": 0.5, "flicker_layer": "Lamp"})
-    with pytest.raises(RequestError, match="which an array has not"):
+    with pytest.raises(RequestError, match="which an array does not have"):
         pipeline.process(np.ones((4, 4, 3), np.float32), "a")
     wide = ("--set", "projection.method=kannala_brandt", "--set", "shutter.flicker_layer=Lamp")
     wide += ("--set", "shutter.flicker_duty=0.2", "--set", "projection.fx=10")

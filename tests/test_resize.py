@@ -205,6 +205,6 @@ def test_finished_pictures_are_resized_too(clpipe, write_exr):
 def test_what_a_jpeg_cannot_hold_may_become_what_it_can(clpipe, write_exr):
     write_exr("a.exr", np.full((1, 70_000, 3), 0.5))
     run = ("run", "a.exr", "-o", "o", "--device", "numpy", "--stages", "resize")
-    assert "at most 65500 pixels a side" in clpipe(*run, status=1).stderr
+    assert "at most 65500 per side" in clpipe(*run, status=1).stderr
     clpipe(*run, "--set", "resize.scale=0.5")
     assert size_of("o/a.jpg") == (35_000, 1)

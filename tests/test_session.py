@@ -45,7 +45,7 @@ def test_nothing_is_written_before_a_run_is_iterated(renders):
 
 def test_what_cannot_be_is_refused_at_once(renders):
     for options, message in (
-        ({"iso": [100, 100]}, r"--iso: found \[100, 100\], with 100 twice"),
+        ({"iso": [100, 100]}, r"--iso: found \[100, 100\], which lists 100 twice"),
         ({"truth": "cleen"}, r"unknown truth 'cleen' \(did you mean 'clean'"),
         ({"patch": 0}, "found patch 0; expected a whole number from 1"),
         ({"patch": package.Patches(8, 10**4)}, "found patches_per_image 10000; expected a whole"),
