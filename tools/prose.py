@@ -21,6 +21,8 @@ from tools import ROOT
 CHECKED = (
     "tools/prose.py",
     "clpipe/batch",
+    "clpipe/chain",
+    "clpipe/commands",
     "clpipe/stage/signal.py",
     "docs/batches.md",
     "docs/blender.md",
@@ -111,14 +113,14 @@ Text = tuple[int, str]  # the number of its first line, and the paragraph
 def paragraphs(text: str, first: int = 1) -> Iterator[Text]:
     """Yield the paragraphs of a text with their lines. Examples, code and tables are skipped."""
     lines: list[str] = []
-    start, in_fence = first, False
+    start, in_fence, in_commands = first, False, False
     for number, line in enumerate([*text.split("\n"), ""], first):
         bare = line.strip()
         fence = bare.startswith(("```", "~~~"))
         in_fence ^= fence
-        ends = (
-            fence or in_fence or not bare or bare.startswith((">>>", "...", "|", "#", "<", "!!!"))
-        )
+        in_commands = bool(bare) and (in_commands or bare == "\b")  # examples in click's help
+        skipped = fence or in_fence or in_commands or not bare
+        ends = skipped or bare.startswith((">>>", "...", "|", "#", "<", "!!!"))
         if lines and (ends or ENTRY.match(line)):
             yield start, " ".join(lines)
             lines = []

@@ -279,8 +279,8 @@ class Chain:
         left = [(step, step.method.without_noise()) for step in self.steps]
         if all(method is step.method for step, method in left):
             raise RequestError(
-                "no stage of this chain adds noise; every frame would be the same, "
-                "and there is no noise to know the truth of"
+                "no stage of this chain adds noise, so frames would be identical and there is no "
+                "ground truth to write; add a noise stage, or remove --frames and --truth"
             )
         return self._with(left, clean=False)
 

@@ -1,6 +1,6 @@
-"""The command line: one module a command, plus the options and tables they share.
+"""The command line: one module per command, and the options and tables that commands share.
 
-A command turns options into a request, calls one function of a room below and prints the result;
-a rule that a Python user would also need belongs there. It may import every other room, and is the
-only one that imports click and rich.
+A command converts options into a request, calls one function of a lower package and prints the
+result. A rule that a Python user also needs belongs in that package. This package may import every
+other one, and is the only one that imports click and rich.
 """
