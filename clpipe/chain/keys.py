@@ -64,7 +64,10 @@ class Key(NamedTuple):
         return WORDS[self.type_] + least * (self.above > -math.inf) + most * (self.most < math.inf)
 
     def allows(self, value: Any) -> bool:
-        """Whether a value has the type and is in the range. Lists and choices are not checked."""
+        """Return whether a value has the type and is in the range.
+
+        Lists and choices are not checked.
+        """
         if self.type_ is list:
             return True
         types: Any = (int, float) if self.type_ is float else self.type_

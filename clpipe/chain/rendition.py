@@ -62,7 +62,7 @@ class Rendition:
 
     @property
     def is_first(self) -> bool:
-        """Whether it is the noisy picture, or the first frame of its burst."""
+        """Whether this is the noisy picture, or the first frame of its burst."""
         return self.role == NOISY and not self.frame
 
     def beside(self, role: Role) -> "Rendition":

@@ -1,4 +1,4 @@
-"""Requests: plain values from options, a configuration, a manifest, a sidecar."""
+"""Requests: plain values from options, a configuration, a manifest or a sidecar."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -30,14 +30,14 @@ from clpipe.stage import Kind
 
 DEFAULTS = Settings()
 
-MADE = 8  # settings that a request, and those that it is replaced by, keep
+MADE = 8  # settings that a request and its copies cache
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """The part of a request that decides about a picture's bytes, as a sidecar stores it.
+    """The part of a request that determines a picture's bytes, as a sidecar stores it.
 
-    The rest of a request decides which pictures are made, or whether they are.
+    The rest of a request determines which pictures are made.
 
     Args:
         config: the values of a configuration, nested as in its file; None if none is named.
@@ -75,13 +75,12 @@ RECORDED = tuple(each.name for each in fields(Recorded))
 
 @dataclass(frozen=True)
 class Request(Recorded):
-    """A request: plain values for all that is asked for, so that it can be stored and sent.
+    """A request: plain values of all options, which can be stored and sent to other processes.
 
     Args:
         truths: which of :data:`clpipe.chain.rendition.TRUTHS` are written next to each picture.
         baselines: which of :data:`clpipe.chain.rendition.BASELINES` are made next to each picture.
-        made: the settings that were made of ``config`` and ``options``; requests that are replaced
-            by others share them.
+        made: a cache of the settings made of ``config`` and ``options``, which copies share.
 
     The other fields are those of :class:`Recorded`, and options.
     """
@@ -105,7 +104,7 @@ class Request(Recorded):
         truth: Sequence[str] = (),
         **others: Any,
     ) -> "Request":
-        """The request of options. None is an option that is not set.
+        """Return the request of options. None is an option that is not set.
 
         Args:
             config: built-in configurations or TOML files. Each overrides those before it.
