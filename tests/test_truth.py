@@ -200,7 +200,7 @@ def test_a_truth_that_enters_again_claims_no_noise(clpipe, write_exr):
     assert json.loads(Path("b/a.truth_mosaic.json").read_text())["noise"] is None
     found = clpipe("run", "o", "-o", "c", "--start-at", "white_balance", "--format", "exr")
     assert written(Path("c")) == ["a.truth_mosaic.exr", "a.truth_mosaic.json"]
-    assert "1 image in a directory is a kept image of another stage" in found.stderr
+    assert "1 image in a directory was kept after other stages" in found.stderr
     refused = ("run", "o/a.truth_variance.exr", "-o", "d", "--start-at", "white_balance")
     assert "holds variance" in clpipe(*refused, status=1).stderr
     # It does claim the noise that it is then given.

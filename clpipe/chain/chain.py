@@ -212,7 +212,7 @@ class Chain:
     def intrinsics_of_render(
         self, width: int, height: int, shot: Mapping[str, float]
     ) -> Intrinsics | None:
-        """Return the intrinsics of an input, its size without margins; see :meth:`intrinsics`."""
+        """Return the intrinsics of an input whose size excludes margins, see :meth:`intrinsics`."""
         known = {**shot, **self.optics.for_image(width, height)}
         if self.optics.is_sensor_of_lens and "sensor_width" in shot:
             known["sensor_width"] = shot["sensor_width"]

@@ -208,7 +208,7 @@ def rendering_of(
     own = dict(options)
     named = {name: own.pop(name) for name in VIEW_OPTIONS}
     views = asked_views(**named, poses=poses, seed=seed)
-    # Blender has a working directory of its own.
+    # Blender has another working directory.
     return Rendering(scene.absolute(), (output / RENDERS).absolute(), views, **own, seed=seed)
 
 

@@ -194,8 +194,8 @@ class Reporter:
             hold = "images in directories have" if len(without) > 1 else "image in a directory has"
             self.print(f"left out: {len(without)} {hold} no picture, such as {without[0]}")
         if (kept := self._summary.counts[LEFT_OUT] - len(without)) > 0:
-            were = "image in a directory is" if kept == 1 else "images in directories are"
-            self.print(f"left out: {kept} {were} kept images of other stages")
+            were = "image in a directory was" if kept == 1 else "images in directories were"
+            self.print(f"left out: {kept} {were} kept after other stages")
 
     def end(self) -> None:
         """Remove the bar and print the summary."""
