@@ -130,10 +130,10 @@ def test_it_is_made_again_alone_the_same(clpipe, render, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--skip", "picture_noise"], "has the noise of picture_noise, which this chain has not"),
+        (["--skip", "picture_noise"], "in the stage picture_noise, which this chain"),
         (["--set", "picture_noise.method=iid_gaussian", "--set", "picture_noise.sigma=0.1"],
-         "picture_noise adds noise already"),
-        (["--until", "normalize"], "which this chain has not"),
+         "picture_noise already adds noise"),
+        (["--until", "normalize"], "which this chain does not have"),
         (["--skip", "sensor_noise", "--skip", "row_noise"], "no stage of this chain adds noise"),
     ],
 )  # fmt: skip

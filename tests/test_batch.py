@@ -689,7 +689,7 @@ def test_what_a_trace_must_not_write_over(clpipe, renders):
 
 def test_an_output_or_memory_that_cannot_be(clpipe, renders):
     renders(1)
-    assert "--output: it is empty" in clpipe("run", "in", "-o", "", status=2).stderr
+    assert "--output: found an empty name" in clpipe("run", "in", "-o", "", status=2).stderr
     assert "--memory: too little" in clpipe("run", "in", *RUN, "--memory", "1K", status=2).stderr
 
 

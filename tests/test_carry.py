@@ -356,11 +356,11 @@ def test_what_cannot_be_carried_fails_alone(clpipe, render, write_exr, options, 
     ("options", "message"),
     [
         (("--carry", "Depth:metres"), "--carry Depth:metres: unknown kind 'metres'"),
-        (("--carry", ""), "it is the name of a layer, such as Depth"),
-        (("--carry", "a/b:label"), "it is the name of a layer, such as Depth"),
-        (("--carry", "Z", "--carry", "z"), "--carry z: it is there twice"),
-        (("--carry", "Z=d.exr"), "its pattern has no {name}, which stands for the image"),
-        (("--carry", "Z:png="), "its pattern has no {name}"),
+        (("--carry", ""), "expected a name such as Depth"),
+        (("--carry", "a/b:label"), "expected a name such as Depth"),
+        (("--carry", "Z", "--carry", "z"), "--carry z: the layer is named twice"),
+        (("--carry", "Z=d.exr"), "must contain {name}, the name of the"),
+        (("--carry", "Z:png="), "must contain {name}"),
     ],
 )
 def test_what_cannot_be_asked_for(clpipe, render, options, message):

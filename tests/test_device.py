@@ -220,11 +220,11 @@ def test_timings_are_those_of_a_trace(device, type_):
 def test_why_devices_are_passed_over(devices):
     status = [row["status"] for row in device_rows(devices)]
     assert status == [
-        "passed over: there is a GPU; --device 0",
-        "passed over: an emulator, slow; --device 1",
-        "passed over: it has no compiler",
+        "not used: there is a GPU; use it with --device 0",
+        "not used: an emulator is slow; use it with --device 1",
+        "not used: it has no compiler",
         "used by default",
-        "slow; --device numpy",
+        "slow; use it with --device numpy",
     ]
 
 

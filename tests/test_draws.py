@@ -255,29 +255,35 @@ def test_syb3r():
         ("iso = {}", "line 1: iso: found {}: unknown draw ''"),
         ("iso = { choice = [] }", "iso: choice: found .*at least 1 item"),
         ("iso = { choice = 3 }", "iso: choice: found 3: should be a valid list"),
-        ("iso = { choice = [100, 'x'] }", "iso: found 'x', but it is a number"),
-        ("iso = { choice = [[100]] }", r"iso: found \[100\], but it is a number"),
-        ("iso = { choice = [{ uniform = [1, 2] }] }", "choice is among plain values"),
-        ("iso = { uniform = [1, 2], choice = [3] }", "one law; found choice and uniform"),
-        ("iso = { uniform = [100] }", "iso: uniform: it needs|iso: uniform: .*found"),
+        ("iso = { choice = [100, 'x'] }", "iso: found 'x', but expected a number"),
+        ("iso = { choice = [[100]] }", r"iso: found \[100\], but expected a number"),
+        ("iso = { choice = [{ uniform = [1, 2] }] }", "list plain values only"),
+        (
+            "iso = { uniform = [1, 2], choice = [3] }",
+            "one distribution, but these are choice and uniform",
+        ),
+        ("iso = { uniform = [100] }", "iso: uniform: the draw uniform needs|iso: uniform: .*found"),
         ("iso = { uniform = [100, 200, 300] }", "iso: uniform: found"),
         ("iso = { uniform = ['a', 200] }", "iso: uniform: found 'a': should be a valid number"),
         ("iso = { uniform = [100, inf] }", "iso: uniform: found inf: .*finite"),
-        ("iso = { uniform = [200, 100] }", "uniform: found .200, 100.; the lower end comes first"),
+        ("iso = { uniform = [200, 100] }", "uniform: found .200, 100.; put the lower end first"),
         ("iso = { log_uniform = [0, 100] }", "both ends must be above 0"),
-        ("iso = { normal = [800, -1] }", "the standard deviation is 0 or above"),
+        ("iso = { normal = [800, -1] }", "a standard deviation is 0 or more"),
         ("iso = { uniform = [100, 200], sigma = 2 }", "unknown key of uniform 'sigma'"),
-        ("seed = { choice = [1, 2] }", "line 1: seed: found .*cannot be drawn; camera, iso, lens"),
+        (
+            "seed = { choice = [1, 2] }",
+            "line 1: seed: found .*cannot be drawn; only camera, iso, lens",
+        ),
         ("dump = { choice = ['8x8'] }", "dump: found .*cannot be drawn"),
-        ("camera = { uniform = [1, 2] }", "camera: found .*but it is drawn by choice"),
-        ("camera = { choice = [3] }", "camera: found 3, but it is text"),
+        ("camera = { uniform = [1, 2] }", "camera: found .*but a name can only be drawn by choice"),
+        ("camera = { choice = [3] }", "camera: found 3, but expected text"),
         ("[sensor_noise]\na = { uniform = [-1, 1] }", "line 2: sensor_noise.a: found -1.*greater"),
         ("[sensor_noise.a]\nuniform = [0, 2]", "line 1: sensor_noise.a: found 2.*less than"),
         ("[sensor_noise]\na.uniform = [0, 2]", "line 2: sensor_noise.a: found 2"),
         ("[sensor_noise]\na = { normal = [2, 1] }", "line 2: sensor_noise.a: found 2"),
         ("[sensor_noise]\naa = { uniform = [0, 1] }", "line 2: unknown parameter of sensor_noise"),
         ("[sensr_noise]\na = { uniform = [0, 1] }", "unknown stage 'sensr_noise'"),
-        ("[mosaic]\npattern = { uniform = [0, 1] }", "no single number, so it is drawn by choice"),
+        ("[mosaic]\npattern = { uniform = [0, 1] }", "no single number; draw it by choice"),
         ("[mosaic]\npattern = { choice = ['RGGB', 'RGBG'] }", "mosaic.pattern: found 'RGBG'"),
         ("[mosaic_denoise]\nsize = { uniform = [3, 7] }", "size: found 4: it must be odd"),
         ("[mosaic_denoise]\nsize = { uniform = [3.5, 7] }", "size: found 3.5: .*integer"),
@@ -295,22 +301,22 @@ def test_syb3r():
         ("[output]\njpeg_quality = { uniform = [0, 90] }", "output.jpeg_quality: found 0: "),
         ("[output]\nquality = { uniform = [50, 90] }", "unknown key of output 'quality'"),
         ("[exposure]\nev = { same_as = 'exposure.e' }", "line 2: exposure.ev: unknown value"),
-        ("[exposure]\nev = { same_as = 'exposure.ev' }", "exposure.ev: it follows itself"),
+        ("[exposure]\nev = { same_as = 'exposure.ev' }", "exposure.ev: the draw follows itself"),
         ("[exposure]\nev = { same_as = 'camera' }", "exposure.ev: found 'sony-a7r2'"),
         ("[exposure]\nev = { same_as = 3 }", "exposure.ev: same_as: found 3: should be .*string"),
         (
             "[row_noise]\nsigma = { same_as = 'dsnu.sigma' }\n"
             "[dsnu]\nsigma = { same_as = 'row_noise.sigma' }",
-            "line 2: row_noise.sigma: it follows itself: row_noise.sigma -> dsnu.sigma -> row_n",
+            "line 2: row_noise.sigma: the draw follows itself: row_noise.sigma -> dsnu.sigma",
         ),
         (
             "[sensor_noise]\nb = { log_normal_of = 'sensor_noise.a', slope = 1, intercept = 0 }",
-            "line 2: sensor_noise.b: sigma: it needs sigma",
+            "line 2: sensor_noise.b: sigma: the draw log_normal_of needs",
         ),
         (
             "[sensor_noise]\na = { normal = [0.01, 0.01] }\n"
             "b = { log_normal_of = 'sensor_noise.a', slope = 1, intercept = 0, sigma = 1 }",
-            "sensor_noise.b: found .*sensor_noise.a must be a number above 0, but can be 0",
+            "sensor_noise.b: found .*sensor_noise.a, which it follows, must be above 0",
         ),
         (
             "[quantize]\nblack_level = { uniform = [0, 600] }\nwhite_level = 500.0",
@@ -335,7 +341,7 @@ def test_a_draw_that_cannot_be(tmp_path, text, message):
         ),
         (
             {"iso": {"choice": [12800]}, "camera": {"choice": ["canon-5d2", "sony-a7r2"]}},
-            r"iso: found .*12800.*, but camera canon-5d2 goes from 100 to 6400 and has none of",
+            r"iso: found .*12800.*, but none of these ISOs is in the range of camera canon-5d2",
         ),
         ({"iso": 50, "camera": {"choice": ["sony-a7s2", "canon-5d2"]}}, "found 50, but camera can"),
         ({"camera": {"choice": ["sony-a7r2", "sony-a7r9"]}}, "unknown camera 'sony-a7r9'"),
@@ -380,7 +386,7 @@ def test_each_camera_draws_in_its_own_part_of_a_law(law, share):
             middle = np.sqrt(800 * highest)
             assert abs(np.mean(isos < middle) - 0.5) < 0.05
     says = draw_note(settings)
-    assert says in ("", "iso: drawn from what a camera has: canon-6d from 100 to 6400")
+    assert says in ("", "iso: drawn within each camera's range: canon-6d from 100 to 6400")
     assert bool(says) is ("normal" not in law)
 
 
@@ -394,7 +400,7 @@ def test_one_camera_is_pushed_where_a_law_goes_on(clpipe, write_exr):
     highest = camera.noise(6400)
     assert step.method.a == pytest.approx(highest.a * drawn.iso / 6400)
     assert step.method.b == pytest.approx(highest.b * (drawn.iso / 6400) ** 2)
-    note = "iso: drawn beyond 6400, where those of nikon-d800 end"
+    note = "iso: the draw goes above 6400, the highest ISO of nikon-d800"
     assert draw_note(settings).startswith(note)
     write_exr("a.exr", np.full((4, 6, 3), 0.25))
     Path("c.toml").write_text("camera = 'nikon-d800'\niso = { log_uniform = [12800, 25600] }\n")
@@ -421,4 +427,4 @@ def test_what_no_camera_has_is_refused_before_a_run(clpipe, write_exr):
         "camera = { choice = ['sony-a7r2', 'canon-6d'] }\niso = { log_uniform = [800, 12800] }\n"
     )
     said = clpipe(*run, "-c", "c.toml").stderr
-    assert said.count("iso: drawn from what a camera has: canon-6d from 100 to 6400") == 1
+    assert said.count("iso: drawn within each camera's range: canon-6d from 100 to 6400") == 1

@@ -230,8 +230,8 @@ def test_a_series_without_saturation_or_noise_in_the_dark_is_refused(series, clp
 def test_what_does_not_go_with_a_series_is_refused(series, clpipe):
     for more, found in (("a.dng",), "FRAMES"), (("--dark", "a.dng"), "--dark"):
         arguments = ("calibrate", "--emva", series.path, "-o", "c.toml", *more)
-        assert f"--emva: found {found}, too" in clpipe(*arguments, status=2).stderr
-    assert "found no FRAMES" in clpipe("calibrate", "-o", "c.toml", status=2).stderr
+        assert f"--emva: found {found} as well" in clpipe(*arguments, status=2).stderr
+    assert "FRAMES: none is named" in clpipe("calibrate", "-o", "c.toml", status=2).stderr
 
 
 def test_noise_is_greatest_where_it_scatters_little():

@@ -261,10 +261,10 @@ def program(monkeypatch):
 def test_pictures_of_another_program_are_made_again_and_that_is_said(again, clpipe, program):
     program("f" * 64)
     stderr = clpipe("run", "in", *RUN).stderr
-    assert "2 pictures were made by another clpipe" in stderr
-    assert "and are made again; --redo missing keeps them" in stderr
+    assert "2 pictures were made by another version of clpipe" in stderr
+    assert "and are recomputed; --redo missing keeps them" in stderr
     assert again() == []
-    assert "another clpipe" not in clpipe("run", "in", *RUN).stderr
+    assert "another version" not in clpipe("run", "in", *RUN).stderr
     assert read_log(Path("out/run.jsonl"))[-1]["of_another_program"] == 0
 
 
@@ -286,6 +286,6 @@ def test_a_tar_of_another_program(clpipe, write_exr, program):
     before = Path("out/000000.tar").read_bytes()
     assert "and stay (--redo missing)" in clpipe(*run, "--redo", "missing").stderr
     assert Path("out/000000.tar").read_bytes() == before
-    assert "and are made again" in clpipe(*run).stderr
+    assert "and are recomputed" in clpipe(*run).stderr
     assert Path("out/000000.tar").read_bytes() != before
-    assert "another clpipe" not in clpipe(*run).stderr
+    assert "another version" not in clpipe(*run).stderr

@@ -276,14 +276,14 @@ def test_beyond_an_edge_an_array_goes_on():
         (
             "x-trans",
             {"demosaic": {"method": "menon2007"}},
-            "demosaic.method=menon2007: it knows Bayer patterns alone, but the mosaic is x-trans; "
-            "take demosaic.method=linear_mmse$",
+            "demosaic.method=menon2007: this method supports only Bayer patterns, but the "
+            "mosaic is x-trans; use demosaic.method=linear_mmse$",
         ),
-        ("mono", {"demosaic": {"method": "menon2007"}}, "take demosaic.method=gray$"),
+        ("mono", {"demosaic": {"method": "menon2007"}}, "use demosaic.method=gray$"),
         (
             "x-trans",
             {"white_balance": {"method": "gray_world"}},
-            "white_balance.method=gray_world: .*take white_balance.method=as_shot or gains or none",
+            "white_balance.method=gray_world: .*use white_balance.method=as_shot or gains or none",
         ),
         (
             "x-trans",

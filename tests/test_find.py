@@ -142,7 +142,7 @@ def test_a_depth_file_in_a_folder_is_left_out(clpipe, write_exr):
     run = ("run", "-o", "out", "--device", "numpy")
     done = clpipe(*run, "in")
     assert "1 file is a companion of another image, such as in/a_depth.exr" in done.output
-    assert "left out: 1 image in a folder holds no picture, such as in/b_depth.exr" in done.output
+    assert "left out: 1 image in a directory has no picture, such as in/b_depth.exr" in done.output
     assert "_depth.exr: there are no R, G and B channels; found Z" in done.output
     assert "1 of 2 images done, 0 failed, 1 left out" in done.output
     assert written(Path("out")) == ["a.jpg", "a.json"]
@@ -185,7 +185,7 @@ def test_names_that_are_too_long_fail_alone(clpipe, write_exr):
 def test_a_run_that_leaves_everything_out_is_no_success(clpipe, write_exr):
     write_exr("in/a_depth.exr", np.ones((4, 6, 1)), "Z")
     done = clpipe("run", "in", "-o", "out", "--device", "numpy", status=1)
-    assert "left out: 1 image in a folder holds no picture, such as in/a_depth.exr" in done.output
+    assert "left out: 1 image in a directory has no picture, such as in/a_depth.exr" in done.output
 
 
 def test_a_dataset_leaves_out_what_is_excluded(write_exr, tmp_path):

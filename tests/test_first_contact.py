@@ -165,7 +165,7 @@ def test_the_explorer_starts_with_an_image_that_can_be_read(clpipe, folder, name
     Path(name).write_bytes(b"no image")
     said = clpipe("explore", name, "--device", "numpy", status=2).stderr
     assert said.startswith(f"clpipe: {name}: cannot be read as an image")
-    assert "clpipe explore takes what clpipe run takes" in said and said.count("\n") == 1
+    assert "clpipe explore reads the same inputs as clpipe run" in said and said.count("\n") == 1
 
 
 def test_one_image_is_counted_as_one(clpipe, folder):

@@ -269,7 +269,7 @@ def test_a_terminal_has_a_bar_with_the_share_and_the_time_left(burst, tmp_path):
         follower.advanced(0.5, best, scenes)
     assert (tmp_path / "a.toml").stat().st_ino == first  # the best is the same
     assert "50%; residuals of 1.5; about" in terminal.getvalue()
-    assert "the best after 25% of the search" in (tmp_path / "a.toml").read_text()
+    assert "the best result after 25% of the search" in (tmp_path / "a.toml").read_text()
     found = load_config(str(tmp_path / "a.toml"))
     assert found.settings.parameters["denoise"]["method"] == "mean"
     assert "stages" in found.values  # it is a whole chain, and so a look over another
@@ -296,11 +296,16 @@ def test_stopped_it_ends_with_the_best_so_far(clpipe, burst, tmp_path, monkeypat
 
     monkeypatch.setattr(Follower, "advanced", stopped)
     result = clpipe(*words, status=130)
-    assert f"stopped: wrote {tmp_path / 'a.toml'}, the best after 0% of the search" in result.stderr
+    assert (
+        f"stopped: wrote {tmp_path / 'a.toml'}, the best result after 0% of the search"
+        in result.stderr
+    )
     assert load_settings(str(tmp_path / "a.toml")).parameters["denoise"]["method"] == "mean"
     (tmp_path / "a.toml").unlink()
     monkeypatch.setattr(Follower, "is_stopping", True)
-    assert "nothing was found yet, and nothing is written" in clpipe(*words, status=130).stderr
+    assert (
+        "the search has no result yet, so nothing was written" in clpipe(*words, status=130).stderr
+    )
     assert not (tmp_path / "a.toml").exists()
 
 

@@ -304,7 +304,7 @@ def test_folders_of_photographs_are_a_burst_each_and_what_is_refused(tmp_path, m
         ([tmp_path / "empty"], "empty: this folder has no pictures (.jpg, "),
         (
             [photos / "a", files[3], files[4], "--truth", files[0]],
-            "one scene has it, but there are 2",
+            "found 2 bursts, but one truth",
         ),
     ):
         assert message in clpipe("measure", *arguments, status=2).stderr

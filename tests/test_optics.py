@@ -161,7 +161,7 @@ def test_px_and_mm_that_contradict_each_other_are_named(clpipe, write_exr):
 def test_what_counts_in_the_renders_pixels_comes_before_a_smaller_picture(later, parameter):
     (name,) = later
     settings = {"render": {"fx": 300.0, "cx": 90.0}, "resize": {"scale": 0.5}, **later}
-    said = f"{name}.{parameter}: found .*; put {name} before resize$"
+    said = f"{name}.{parameter}: found .*; list {name} before resize$"
     with pytest.raises(RequestError, match=said):
         make_chain(settings_from({**settings, "stages": ["resize", name]}))
     make_chain(settings_from({**settings, "stages": [name, "resize"]}))
@@ -279,7 +279,7 @@ def test_a_lens_that_no_step_takes_is_refused(lensfun):
     without = {"skip": ["distortion", "vignetting"]}
     replaced = {"distortion": {"method": "none"}, "vignetting": {"method": "none"}}
     for each in (without, replaced):
-        with pytest.raises(RequestError, match="lens: found a, but no step takes it"):
+        with pytest.raises(RequestError, match="lens: found a, but no step uses it"):
             make_chain(settings_from({"lens": "a", **each}))
         assert make_chain(settings_from(each))
     assert make_chain(settings_from({"lens": "a", "skip": ["vignetting"]}))
@@ -296,7 +296,7 @@ def test_a_lens_for_a_smaller_sensor_is_said_as_such(lensfun):
     folding = {"method": "ptlens", "b": -0.3, "unit": 0.3}
     image = np.ones((40, 60, 3), np.float32)
     for smaller, message in (
-        (True, "Maker 16mm was calibrated on a sensor smaller than"),
+        (True, "Maker 16mm was calibrated on a smaller sensor than"),
         (False, "fold the image over"),
     ):
         lensfun(by_name.LensCalibration("Maker 16mm", 16.0, folding, {}, 1.0, smaller))
@@ -307,7 +307,7 @@ def test_a_lens_for_a_smaller_sensor_is_said_as_such(lensfun):
 
 def test_a_lens_of_which_nothing_is_known_is_refused(lensfun):
     lensfun(by_name.LensCalibration("a", 24.0, {}, {}))
-    with pytest.raises(RequestError, match="knows neither distortion nor vignetting of it"):
+    with pytest.raises(RequestError, match="has neither distortion nor vignetting for it"):
         make_chain(settings_from({"lens": "a"}))
 
 

@@ -160,10 +160,7 @@ def test_an_image_of_another_kind_is_refused_and_the_others_go_on(
 def test_a_folder_gives_what_was_kept_right_before(kept, tmp_path):
     output = clpipe("run", kept, "-o", tmp_path, "--start-at", "denoise", *NUMPY)
     assert written(tmp_path) == ["crop.demosaic.jpg", "crop.demosaic.json"]
-    assert (
-        f"{len(DEFAULT_CHAIN) - 1} images in folders were kept after other stages and left out"
-        in output
-    )
+    assert f"{len(DEFAULT_CHAIN) - 1} images in directories were kept after other stages" in output
     assert f"1 of {len(DEFAULT_CHAIN)} images done, 0 failed" in output
 
 

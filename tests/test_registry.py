@@ -52,13 +52,13 @@ def test_without_its_file_the_stage_is_unknown(clpipe):
     ("change", "message"),
     [
         (("class CosineFourth(Method):", "class CosineFourth(Method:"), r"vignette.py, line \d+: "),
-        (("STAGE = ", "STAG = "), "vignette.py: STAGE is not there"),
+        (("STAGE = ", "STAG = "), "vignette.py: STAGE is missing"),
         (("import numpy as np", "import numpi as np"), r"vignette.py, line 5: ModuleNotFound"),
         (
             ('"vignette", "Darken', '"denoise", "Darken'),
             "'denoise', but that name is taken",
         ),
-        (('"vignette", "Darken', '"denoise_2", "Darken'), "no digit last"),
+        (('"vignette", "Darken', '"denoise_2", "Darken'), "does not end in a digit"),
         (("(CosineFourth,)", "(CosineFourth)"), r"the methods of vignette must be a tuple"),
         (('    method: ClassVar = "cosine_fourth"\n', ""), "CosineFourth lacks method"),
         (
@@ -66,7 +66,7 @@ def test_without_its_file_the_stage_is_unknown(clpipe):
             r"py, line \d\d: AttributeError: RBG",
         ),
         (('"px", gt=0)', '"px", gtt=0)'), r"vignette.py, line \d\d: TypeError: .*gtt; limits are"),
-        (('kernel: ClassVar = "vignette"', 'kernel: ClassVar = "vig"'), "vig.cl is not there"),
+        (('kernel: ClassVar = "vignette"', 'kernel: ClassVar = "vig"'), "vig.cl does not exist"),
     ],
 )
 def test_a_stage_file_with_a_mistake(clpipe, stage_file, change, message):
@@ -84,10 +84,10 @@ def test_a_stage_file_with_a_mistake(clpipe, stage_file, change, message):
         (("self.focal_length**-2", "1 / 0"), r"vignette.py, line \d\d: ZeroDivisionError"),
         (
             ('"scale": scale', '"scale": "x"'),
-            "arguments.. gives 'x' as 'scale'; allowed: float, float32",
+            "arguments.. returns 'x' as 'scale'; its type must be one of float, float32",
         ),
-        (('"scale": scale', '"skale": scale'), "vignette needs the argument 'scale'; .*skale"),
-        (('Pass("vignette"', 'Pass("vinette"'), "vignette.cl has no function vinette"),
+        (('"scale": scale', '"skale": scale'), "vignette needs the argument 'scale', but .*skale"),
+        (('Pass("vignette"', 'Pass("vinette"'), "a pass calls the function vinette, but"),
     ],
 )
 def test_a_stage_whose_parts_do_not_fit(clpipe, stage_file, change, message):

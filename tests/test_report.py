@@ -345,7 +345,7 @@ def test_many_pictures_are_sampled_within_the_budget(out, monkeypatch):
         (["nowhere"], "nowhere: there is no such file or folder"),
         (["."], "has no picture of clpipe with its sidecar"),
         ([".", "-o", "x.pdf"], "-o: found x.pdf; expected a name that ends in .html"),
-        ([".", ".", "."], "found 3 folders; one is reported on, or two are compared"),
+        ([".", ".", "."], "found 3 directories; name one for a report, or two to compare them"),
     ],
 )
 def test_bad_input(tmp_path, monkeypatch, arguments, message):

@@ -266,7 +266,7 @@ def test_scenes_that_cannot_be_rendered(clpipe, scene, blender, tmp_path, monkey
     assert "No such file" in clpipe("dataset", scene, "-o", "set", *none, status=2).stderr
     (tmp_path / "renders").mkdir()
     said = clpipe("dataset", "renders", "-o", "set", "--samples", 3, status=2).stderr
-    assert "--samples: it is for a .blend, not for renders that exist" in said
+    assert "--samples: this option applies only to a .blend" in said
 
 
 def example(folder, name, *words):

@@ -172,8 +172,8 @@ def test_a_lamp_flickers_in_each_exposure(develop):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"exposure": {"method": "auto"}}, "it would measure each of the exposures"),
-        ({"start_at": "mosaic"}, "an image that enters at mosaic is that of one"),
+        ({"exposure": {"method": "auto"}}, "this method would measure each exposure"),
+        ({"start_at": "mosaic"}, "an image that enters at mosaic shows one"),
     ],
 )
 def test_what_is_refused(settings, message):
@@ -186,4 +186,4 @@ def test_what_is_refused(settings, message):
 
 def test_a_variance_is_not_known(frames, clpipe):
     told = clpipe(*RUN, "-o", "o", "--truth", "variance", status=2).stderr
-    assert "sensor_noise (staggered) does not say what it makes of the variance" in told
+    assert "sensor_noise (staggered) cannot compute the variance" in told

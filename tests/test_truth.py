@@ -200,7 +200,7 @@ def test_a_truth_that_enters_again_claims_no_noise(clpipe, write_exr):
     assert json.loads(Path("b/a.truth_mosaic.json").read_text())["noise"] is None
     found = clpipe("run", "o", "-o", "c", "--start-at", "white_balance", "--format", "exr")
     assert written(Path("c")) == ["a.truth_mosaic.exr", "a.truth_mosaic.json"]
-    assert "1 image in a folder was kept after other stages" in found.stderr
+    assert "1 image in a directory was kept after other stages" in found.stderr
     refused = ("run", "o/a.truth_variance.exr", "-o", "d", "--start-at", "white_balance")
     assert "holds variance" in clpipe(*refused, status=1).stderr
     # It does claim the noise that it is then given.
@@ -311,11 +311,11 @@ def test_a_burst_has_each_truth_once(clpipe, write_exr):
     [
         (("--truth", "noise"), "is not one of 'development', 'clean', 'mosaic', 'variance'"),
         ((*ALL[2:], "--until", "quantize", "--format", "exr"), "ends in DN, at quantize"),
-        ((*ALL, "--skip", "sensor_noise", "--skip", "row_noise"), "no noise to know the truth of"),
-        ((*ALL, "--start-at", "white_balance"), "no noise to know the truth of"),
+        ((*ALL, "--skip", "sensor_noise", "--skip", "row_noise"), "no ground truth to write"),
+        ((*ALL, "--start-at", "white_balance"), "no ground truth to write"),
         (
             (*ALL, "--stages", "mosaic,sensor_noise,mosaic_denoise,row_noise,demosaic,gamma"),
-            "mosaic_denoise (non_local_means) does not say what it makes of the variance",
+            "mosaic_denoise (non_local_means) cannot compute the variance",
         ),
     ],
 )
@@ -332,14 +332,14 @@ def test_noise_behind_the_mosaic_alone_has_no_clean_mosaic(clpipe, write_exr):
     noise = ("--set", "picture_noise.method=iid_gaussian", "--set", "picture_noise.sigma=0.1")
     quiet = (*noise, "--skip", "sensor_noise", "--skip", "row_noise")
     run = ("run", crop(write_exr), "-o", "o", *quiet)
-    assert "that of picture_noise, behind the mosaic" in clpipe(*run, *ALL, status=2).stderr
+    assert "added by picture_noise, after the mosaic" in clpipe(*run, *ALL, status=2).stderr
     clpipe(*run, "--truth", "development", "--format", "exr")
     assert "a.truth.exr" in written(Path("o"))
 
 
 def test_a_stage_that_does_not_say_its_variance_is_named(monkeypatch):
     monkeypatch.setattr(RowNoise, "variance", Method.variance)
-    with pytest.raises(RequestError, match=r"row_noise \(gaussian\) does not say"):
+    with pytest.raises(RequestError, match=r"row_noise \(gaussian\) cannot compute"):
         chain_and_noise(VARIANCE, chain_of())
     chain_and_noise(MOSAIC, chain_of())
 

@@ -187,7 +187,7 @@ def test_what_is_wrong_with_a_url_is_said(bucket, clpipe, monkeypatch):
     text = told("in", "-o", "flaky://b/set", status=2)
     assert "found flaky://b/set; only tars are written to a URL, so add --webdataset N" in text
     text = clpipe("meter", "in", "-o", "flaky://b/m.csv", status=2).stderr
-    assert "only clpipe run writes behind URLs" in text
+    assert "only clpipe run writes to URLs" in text
     Flaky.forbidden = "r3"
     text = told("flaky://b/renders", "-o", "o", status=1)
     assert "flaky://b/renders/x1/r3.exr: cannot be read: the token has expired" in text

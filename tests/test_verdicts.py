@@ -175,7 +175,7 @@ def test_what_fails_is_passed_over_and_what_helps_is_said(device, monkeypatch):
     monkeypatch.setattr(discovery, "platforms", lambda _: [platform])
     devices = find_devices()
     rows = device_rows(devices)
-    assert rows[0]["status"] == "passed over: it crashes the process (SIGILL)"
+    assert rows[0]["status"] == "not used: it crashes the process (SIGILL)"
     assert rows[1]["platform"] == "/etc/bad.icd" and "SIGABRT" in rows[1]["status"]
     monkeypatch.setattr(discovery.this_system, "system", lambda: "Linux")
     monkeypatch.setattr(discovery.this_system, "machine", lambda: "x86_64")

@@ -250,7 +250,9 @@ def test_overlapping_views_and_what_no_view_shows(write, clpipe):
     Path("rig.json").write_text(json.dumps({"views": views}))
     options = options_of("kannala_brandt", views="rig.json")
     told = clpipe("run", "in", "-o", "o", *RUN, *options).output
-    assert "of the lens's field is black: no view shows what is there" in " ".join(told.split())
+    assert "of the lens's field of view is black, because no view covers it" in " ".join(
+        told.split()
+    )
     seen, lens = read_image(Path("o/a.exr")).pixels, lens_of("kannala_brandt")
     rays = places_of(lens)[2]
     shown = seen.any(-1)
@@ -297,15 +299,24 @@ def test_lenses_that_cannot_be(write, clpipe, options, status, message):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"vignetting": {"method": "cosine_fourth"}}, "vignetting.method=cosine_fourth: it counts"),
-        ({"vignetting": {"method": "cosine_fourth", "fx": 60.0}}, "makes that of a wide lens"),
+        (
+            {"vignetting": {"method": "cosine_fourth"}},
+            "vignetting.method=cosine_fourth: this method",
+        ),
+        (
+            {"vignetting": {"method": "cosine_fourth", "fx": 60.0}},
+            "makes the picture of a wide lens",
+        ),
         (
             {"distortion": {"method": "brown_conrady", "k1": -0.1}},
             "distortion.method=brown_conrady",
         ),
         ({"motion_blur": {"rotation": 1.0}}, "motion_blur.method=linear"),
         ({"defocus": {"method": "thin_lens"}}, "defocus.method=thin_lens"),
-        ({"lens": "Canon EF 24-70mm f/2.8L", "focal_length": 24.0}, "lens: it is of pictures in"),
+        (
+            {"lens": "Canon EF 24-70mm f/2.8L", "focal_length": 24.0},
+            "lens: a lens from lensfun needs a picture in",
+        ),
     ],
 )
 def test_what_is_of_perspective_pictures_is_refused_behind_a_wide_lens(more, message):

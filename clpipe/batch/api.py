@@ -116,8 +116,8 @@ def run(
         keep: a stage whose image is also written, or all. It is a float EXR.
         carry: a layer to warp with the picture. It has depth, normals, flow or object numbers, in
             the image's own file or in one next to it, and is written to OUT/NAME.carried.exr. KIND
-            is needed if the name does not say it: depth, label, normal, flow, colour or png. png is
-            depth in metres or object numbers, and also writes a PNG with 16 bits,
+            is needed if the name does not imply it: depth, label, normal, flow, colour or png. png
+            is depth in metres or object numbers. It also writes a PNG with 16 bits,
             OUT/NAME.LAYER.png, with depth in millimetres. FILE is the path from the image's
             directory, as in 'Depth=../depth/{name}.exr'. None is {name}_LAYER.exr or similar.
         truth: write the picture without noise (development), without noise and denoising (clean),
@@ -126,8 +126,8 @@ def run(
             is independent and as strong as the picture's. These two also write the ground truth
             from which they are made. The choices are "development", "clean", "mosaic", "variance",
             "iid", "intensity".
-        truth_at: the moment of an exposure of several files whose pose and layers go with the
-            picture. all has the layers of its start and end as well. The choices are "start",
+        truth_at: the moment of an exposure of several files whose pose and layers are written with
+            the picture. all also writes the layers of its start and end. The choices are "start",
             "middle", "end", "all". None is middle.
         frames: the number of frames of a burst. Each frame has its own noise, and the burst its
             ground truth.

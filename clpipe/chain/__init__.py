@@ -1,7 +1,7 @@
-"""Requests: from what the user asks for to a resolved chain of stages.
+"""Requests: from the user's options to a resolved chain of stages.
 
 TOML, ``--set``, manifest rows and sidecars become a :class:`~clpipe.chain.request.Request`, then
-:class:`~clpipe.chain.settings.Settings`, then a :class:`~clpipe.chain.chain.Chain`; random draws,
-truths and the registry of stages also belong here. The package does not handle pixels or devices.
-It imports ``images`` (for the tables that describe files) and below.
+:class:`~clpipe.chain.settings.Settings`, then a :class:`~clpipe.chain.chain.Chain`. Random draws,
+ground truth and the registry of stages are also in this package. It handles no pixels and no
+devices. It imports ``images`` (for the tables that describe files) and the packages below it.
 """

@@ -1,4 +1,4 @@
-"""Assignments of the form ``stage.parameter=value``, as --set takes them."""
+"""Parse assignments of the form ``stage.parameter=value``, for --set."""
 
 import re
 from typing import Any
@@ -12,15 +12,15 @@ from clpipe.chain.toml import toml_value
 
 
 def parse_assignment(text: str) -> tuple[str, str, Any]:
-    """The three parts of ``stage.parameter=value``.
+    """Return the three parts of ``stage.parameter=value``.
 
-    The value is that of :func:`clpipe.chain.toml.toml_value`.
+    The value is converted by :func:`clpipe.chain.toml.toml_value`.
 
     >>> parse_assignment("sensor_noise.a = 1e-4")
     ('sensor_noise', 'a', 0.0001)
 
     Raises:
-        RequestError: the text does not have that form; the message suggests one that has.
+        RequestError: the text does not have that form. The message suggests a correct one.
     """
     match = re.fullmatch(r"\s*(\w+)\.(\w+)\s*=\s*(.*)", text)
     if not match or (match[1] in KEYS and match[2] in KEYS):  # "iso.uniform" is a draw
@@ -29,7 +29,7 @@ def parse_assignment(text: str) -> tuple[str, str, Any]:
 
 
 def _suggestion(text: str) -> str:
-    """What was probably meant, as the end of a message.
+    """Return what the user probably meant, as the end of a message.
 
     >>> _suggestion("iso=800"), _suggestion("denoise=mean")
     ('; use --iso 800', "; did you mean 'denoise.method=mean'?")

@@ -1,6 +1,6 @@
-"""Baselines: the clean picture with independent noise, as strong as the noise of the noisy one.
+"""Baselines: the clean picture with independent noise, as strong as the noise of the noisy picture.
 
-It is what synthetic data usually has, to be compared with a camera's noise.
+Synthetic data usually has such noise. Baselines make it comparable with a camera's noise.
 """
 
 from dataclasses import replace
@@ -15,34 +15,42 @@ from clpipe.stages.picture_noise import IidGaussian, IntensityDependent, NoNoise
 
 
 def baseline_of(chain: Chain) -> Chain:
-    """The chain of a baseline: the clean picture's, with noise behind it that is not known yet.
+    """Return the chain of a baseline: the clean picture's, and a last step that adds noise.
+
+    The strength of this noise is 0 until :func:`with_noise` sets it.
 
     Args:
-        chain: of the noisy picture.
+        chain: the chain of the noisy picture.
 
     Raises:
-        RequestError: the chain adds no noise, has noise on the finished picture already, or has no
-            step for it.
+        RequestError: the chain adds no noise, already adds noise to the finished picture, or has
+            no step that can do so.
     """
     step = chain.step_in(StageRole.BASELINE)
     if step is None:
         name = stage_in(StageRole.BASELINE).name
-        raise RequestError(f"--truth: a baseline has the noise of {name}, which this chain has not")
+        raise RequestError(
+            f"--truth: a baseline adds its noise in the stage {name}, which this chain does not "
+            f"have; add {name} to the stages"
+        )
     if step.adds_noise:
-        raise RequestError(f"--truth: {step.name} adds noise already; leave one of them out")
+        raise RequestError(
+            f"--truth: {step.name} already adds noise to the picture, so a baseline cannot use it; "
+            f"remove iid and intensity from --truth, or skip {step.name}"
+        )
     clean = picture_without_noise(CLEAN, chain)
     steps = *(each for each in clean.steps if each.name != step.name), step
     return with_noise(replace(clean, steps=steps), IidGaussian(sigma=(0.0, 0.0, 0.0)))
 
 
 def matching_of(chain: Chain) -> NoNoise:
-    """The matching of a baseline's noise to that of the picture, as the chain says it."""
+    """Return the method that sets how a baseline's noise is matched to the picture's noise."""
     step = chain.step_in(StageRole.BASELINE)
-    assert step and isinstance(step.method, NoNoise)  # as baseline_of has seen
+    assert step and isinstance(step.method, NoNoise)  # checked by baseline_of
     return step.method
 
 
 def with_noise(chain: Chain, noise: IidGaussian | IntensityDependent) -> Chain:
-    """The chain of a baseline, with its noise."""
+    """Return the chain of a baseline with its noise set."""
     *others, step = chain.steps
     return replace(chain, steps=(*others, replace(step, method=noise.resolve(step.context))))

@@ -1,4 +1,4 @@
-"""Layers that go along with a picture, as they are asked for."""
+"""Parse the layers that are warped and written with a picture (--carry)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,10 +9,10 @@ from clpipe.base.text import one_of
 from clpipe.images.kinds import kind_named
 from clpipe.reference.carried import LayerKind
 
-VALID = "valid"  # the channel that says which pixels are known
+VALID = "valid"  # the channel that marks known pixels
 
 
-PNG = "png"  # a kind: depth or labels, which are written as a PNG, too
+PNG = "png"  # a kind: depth or labels that are also written as a PNG
 
 
 @dataclass(frozen=True)
@@ -20,10 +20,10 @@ class AovSpec:
     """A layer to carry.
 
     Args:
-        name: what it is called.
-        kind: what it holds; None where only the file may say that.
-        pattern: of the name of the file that holds it; "" is one of the usual names.
-        png: whether it is depth, or labels, that are written as a PNG, too.
+        name: the name of the layer.
+        kind: the kind of data; None if only the file can tell.
+        pattern: the pattern of the file's name; "" stands for the usual names.
+        png: whether the layer, depth or labels, is also written as a PNG.
     """
 
     name: str
@@ -33,7 +33,7 @@ class AovSpec:
 
 
 def parse_carry(texts: Sequence[str]) -> tuple[AovSpec, ...]:
-    """Layers from texts of the form NAME[:KIND][=PATTERN].
+    """Return the layers for texts of the form NAME[:KIND][=PATTERN].
 
     >>> parse_carry(["Depth", "nn:normal"])[1]
     AovSpec(name='nn', kind='normal', pattern='', png=False)
@@ -41,8 +41,8 @@ def parse_carry(texts: Sequence[str]) -> tuple[AovSpec, ...]:
     (AovSpec(name='Z', kind='depth', pattern='../z/{name}.exr', png=True),)
 
     Raises:
-        RequestError: a name is empty, cannot be a part of a file's name, or is there twice, a kind
-            does not exist, or a pattern has no place for the image's name.
+        RequestError: a name is empty, occurs twice, or cannot be part of a file name. Also if a
+            kind does not exist, or if a pattern lacks ``{name}``.
     """
     kinds = (*get_args(LayerKind), PNG)
     found: dict[str, AovSpec] = {}
@@ -54,15 +54,16 @@ def parse_carry(texts: Sequence[str]) -> tuple[AovSpec, ...]:
             raise RequestError(f"--carry {text}: {one_of('kind', kind, kinds)}")
         if not name or not name.isprintable() or "/" in name or name.lower() == VALID:
             raise RequestError(
-                f"--carry {text!r}: it is the name of a layer, such as Depth, and not {VALID}"
+                f"--carry {text!r}: found the layer name {name!r}; expected a name such as Depth, "
+                f"without '/', and not {VALID}"
             )
         if equals and ("{name}" not in pattern or "\0" in pattern):
             raise RequestError(
-                f"--carry {text!r}: its pattern has no {{name}}, which stands for the image's name "
-                "without its ending, as in 'Depth={name}_depth.exr' or 'Depth=../depth/{name}.exr'"
+                f"--carry {text!r}: the pattern {pattern!r} must contain {{name}}, the name of the "
+                "image without its extension; use 'Depth={name}_depth.exr', for example"
             )
         if name.lower() in found:
-            raise RequestError(f"--carry {name}: it is there twice")
+            raise RequestError(f"--carry {name}: the layer is named twice; name it once")
         own = kind_named(name)
         known = (own if own == "label" else "depth") if kind == PNG else kind or own
         found[name.lower()] = AovSpec(name, cast("LayerKind | None", known), pattern, kind == PNG)

@@ -1,4 +1,4 @@
-"""A chain: settings resolved for a camera, an ISO and each stage's place, ready to plan."""
+"""A chain: settings resolved for a camera, an ISO and the place of each stage, ready to plan."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -36,7 +36,7 @@ from clpipe.stage import (
 )
 from clpipe.stages.shutter import Rows
 
-# Properties of a chain, and those whose values are the same in chains of one structure.
+# Computed properties of a chain; the second tuple has those that depend only on its structure.
 COMPUTED = "optics", "filters", "context_after", "context_of_raw", "geometry"
 STRUCTURAL = "is_noisy", "lit_by_layers", "maker_of_raw", "result", "step_names", "_resamplings"
 
@@ -45,7 +45,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Step:
-    """A stage in its place in a chain: its method, resolved, and the context that it reads."""
+    """A stage at its place in a chain: its resolved method, and the context that it reads."""
 
     name: str
     stage: Stage
@@ -54,24 +54,24 @@ class Step:
 
     @cached_property
     def passes(self) -> tuple[Pass, ...]:
-        """The passes of its method."""
+        """The passes of the step's method."""
         return self.method.passes()
 
     @cached_property
     def arguments(self) -> Mapping[str, Argument]:
-        """The kernel arguments of its method, by name; none where it launches nothing."""
+        """The kernel arguments of the step's method, by name; none if it has no passes."""
         return typed_arguments(self.method.arguments(self.context)) if self.passes else {}
 
     @cached_property
     def adds_noise(self) -> bool:
-        """Whether it adds noise, as its method says."""
+        """Whether the step's method adds noise."""
         return self.method.without_noise() is not self.method
 
     def is_equal(self, other: "Step") -> bool:
-        """Whether another step does the same, with the same numbers."""
+        """Return whether another step does the same with the same numbers."""
         optics = self.context.optics, other.context.optics
         is_equal = self == other and optics[0] == optics[1] and self.passes == other.passes
-        if not is_equal or "arguments" not in vars(self):  # which were not computed with it
+        if not is_equal or "arguments" not in vars(self):  # then there is nothing else to compare
             return is_equal
         own, others = self.arguments, other.arguments
         return own.keys() == others.keys() and all(
@@ -86,17 +86,17 @@ class Step:
 class Chain:
     """A chain of stages, ready to plan.
 
-    Compared by identity, so that plans and runners can be cached per chain.
+    Chains are compared by identity, so that plans and runners can be cached per chain.
     """
 
     steps: tuple[Step, ...]
     source: Kind
     camera: Camera
     settings: Settings
-    names: tuple[str, ...]  # of all steps, with those before start_at and after until
-    draws: Mapping[str, Draw] = field(default_factory=dict)  # the settings are an example of these
-    margins: Margins = NO_MARGINS  # of what enters, beyond the picture
-    # What is known of all chains that differ in numbers only, see of_structure(); None is of none.
+    names: tuple[str, ...]  # of all steps, including those before start_at and after until
+    draws: Mapping[str, Draw] = field(default_factory=dict)  # the settings are an example of them
+    margins: Margins = NO_MARGINS  # the overscan of the image that enters
+    # Results that all chains of this structure share, see of_structure(); None if not shared.
     structure: dict[Any, Any] | None = field(default=None, init=False)
 
     def __repr__(self) -> str:
@@ -104,7 +104,7 @@ class Chain:
 
     @property
     def label(self) -> str:
-        """The first and the last step, for people."""
+        """The first and the last step, as text for people."""
         names = [step.name for step in self.steps]
         return f"{names[0]}..{names[-1]}" if len(names) > 1 else "".join(names)
 
@@ -119,9 +119,9 @@ class Chain:
         return self.settings.seed
 
     def stream(self, step: str, scope: NoiseScope, noise_key: str) -> Stream:
-        """A random stream of a step, by its name, for one image.
+        """Return the random stream of a step for one image.
 
-        Image noise is keyed on the seed and the noise key, fixed pattern noise on the camera.
+        Image noise is seeded by the seed and the noise key, fixed-pattern noise by the camera.
         """
         if scope is NoiseScope.IMAGE:
             return stream_of(f"image:{self.seed}:{noise_key}", step)
@@ -129,7 +129,7 @@ class Chain:
 
     @cached_property
     def arguments(self) -> Mapping[str, Mapping[str, Argument]]:
-        """The kernel arguments of its steps, by their names."""
+        """The kernel arguments of the steps, by step name."""
         return {step.name: step.arguments for step in self.steps}
 
     @cached_property
@@ -140,30 +140,30 @@ class Chain:
 
     @cached_property
     def context_after(self) -> Context:
-        """What is known of the image that comes out."""
+        """The context of the resulting image."""
         last = self.steps[-1]
         return last.method.next_context(last.context)
 
     @cached_property
     def step_names(self) -> tuple[str, ...]:
-        """The names of its steps."""
+        """The names of the steps."""
         return tuple(step.name for step in self.steps)
 
     @cached_property
     def lit_by_layers(self) -> tuple[str, ...]:
-        """The steps that must have the light of a layer of the image's file."""
+        """The names of the steps that need the light in a layer of the image's file."""
         named = ((step.name, step.method) for step in self.steps)
         return tuple(n for n, each in named if isinstance(each, Rows) and each.layer_of_light)
 
     @cached_property
     def maker_of_raw(self) -> str | None:
-        """The last step that makes a raw in DN; None where none does."""
+        """The name of the last step that makes a raw in DN; None if there is none."""
         raws = [step.name for step in self.steps if step.stage.writes is Kind.RAW]
         return raws[-1] if raws else None
 
     @cached_property
     def context_of_raw(self) -> Context:
-        """What is known of its raw in DN; without one, of what enters."""
+        """The context of the raw in DN; without a raw, of the image that enters."""
         if self.maker_of_raw is None:
             return self.steps[0].context
         maker = self.step_named(self.maker_of_raw)
@@ -171,7 +171,7 @@ class Chain:
 
     @cached_property
     def filters(self) -> FilterArray:
-        """The filter array of its raw, or of its mosaic where it makes no raw."""
+        """The filter array of the raw, or of the mosaic if the chain makes no raw."""
         if self.maker_of_raw:
             return self.context_of_raw.filters
         if self.result is Kind.MOSAIC:
@@ -183,28 +183,28 @@ class Chain:
 
     @cached_property
     def result(self) -> Kind:
-        """The kind of image that comes out."""
+        """The kind of the resulting image."""
         return self.steps[-1].stage.writes if self.steps else self.source
 
     def size(self, width: int, height: int) -> tuple[int, int]:
-        """The width and height of what comes out, in px, from those of what enters."""
+        """Return the width and height in px of the result, for the size of an input."""
         return sizes(self._resamplings, width, height)[-1]
 
     @cached_property
     def geometry(self) -> Composition | None:
-        """The map from pixels of what comes out to what enters; None if each stays."""
+        """The map from pixels of the result to pixels of the input; None if no pixel moves."""
         moves = tuple(filter(None, (step.method.geometry() for step in self.steps)))
         return Composition(moves) if moves else None
 
     def intrinsics(self, width: int, height: int, shot: Mapping[str, float]) -> Intrinsics | None:
-        """The intrinsics of what comes out; None where they are not known.
+        """Return the intrinsics of the result; None if they are unknown.
 
         Args:
-            width, height: of what enters, in px.
-            shot: what the image says itself, see :meth:`Intrinsics.of_render`.
+            width, height: the size of the input, in px.
+            shot: the camera values in the image's file, see :meth:`Intrinsics.of_render`.
 
         Raises:
-            RequestError: what is known contradicts itself.
+            RequestError: the camera's values contradict each other.
         """
         known = self.intrinsics_of_render(*self.margins.inside(width, height), shot)
         return self.geometry.intrinsics(known, width, height) if self.geometry else known
@@ -212,7 +212,7 @@ class Chain:
     def intrinsics_of_render(
         self, width: int, height: int, shot: Mapping[str, float]
     ) -> Intrinsics | None:
-        """The intrinsics of what enters, of its size without margins; see :meth:`intrinsics`."""
+        """Return the intrinsics of an input whose size excludes margins, see :meth:`intrinsics`."""
         known = {**shot, **self.optics.for_image(width, height)}
         if self.optics.is_sensor_of_lens and "sensor_width" in shot:
             known["sensor_width"] = shot["sensor_width"]
@@ -225,7 +225,7 @@ class Chain:
 
     @property
     def noise(self) -> NoiseModel | None:
-        """The sensor noise in the image that comes out; None where none was added."""
+        """The sensor noise in the result; None if none was added."""
         return self.context_after.noise
 
     @cached_property
@@ -234,11 +234,11 @@ class Chain:
         return any(p.random for s in self.steps for p in s.passes)
 
     def with_settings(self, settings: Settings) -> "Chain":
-        """The chain with the settings that it was made of."""
+        """Return the chain with other settings, which resolve to the same steps."""
         return altered(self, {"settings": settings})
 
     def settled(self, trace: Trace) -> "Chain":
-        """The chain with all that is computed of its steps, as far as it can be traced."""
+        """Return the chain with all properties computed, as far as they can be traced."""
         whole = True
         for step in self.steps:
             whole &= not trace.holds(step.passes)
@@ -255,20 +255,20 @@ class Chain:
         return altered(self, {"structure": {} if whole else None})
 
     def is_equal(self, other: "Chain") -> bool:
-        """Whether another chain has the same steps, with the same numbers."""
+        """Return whether another chain has the same steps with the same numbers."""
         pairs = list(zip(self.steps, other.steps, strict=False))
         return len(self.steps) == len(other.steps) and all(
             own.is_equal(step) for own, step in pairs
         )
 
     def derived(self, make: Callable[["Chain"], "Chain"]) -> "Chain":
-        """Return ``make(self)``."""
+        """Return ``make(self)``; subclasses may compute it."""
         return make(self)
 
     def without_noise(self) -> "Chain":
-        """The chain without the noise of its steps.
+        """Return the chain without the noise of its steps.
 
-        A step that only adds noise is left out, or, where it is the last, does nothing.
+        A step that only adds noise is skipped. If it is the last step, it does nothing.
 
         Raises:
             RequestError: no step adds noise.
@@ -279,16 +279,16 @@ class Chain:
         left = [(step, step.method.without_noise()) for step in self.steps]
         if all(method is step.method for step, method in left):
             raise RequestError(
-                "no stage of this chain adds noise; every frame would be the same, "
-                "and there is no noise to know the truth of"
+                "no stage of this chain adds noise, so frames would be identical and there is no "
+                "ground truth to write; add a noise stage, or remove --frames and --truth"
             )
         return self._with(left, clean=False)
 
     def cleaned(self) -> "Chain":
-        """The chain without noise and without all that its strength chose: nothing is denoised.
+        """Return the chain without noise, and without denoising chosen by the strength of noise.
 
         Raises:
-            RequestError: a user's stage does not allow it.
+            RequestError: a user's stage raises an error.
         """
         return self.derived(Chain._cleaned)
 
@@ -305,9 +305,9 @@ class Chain:
         return self._with(left, clean=True)
 
     def _with(self, methods: Sequence[tuple[Step, Method | None]], clean: bool) -> "Chain":
-        """The chain with other methods in its steps, and no noise; see :meth:`without_noise`."""
+        """Return the chain with other methods and without noise; see :meth:`without_noise`."""
         *others, (last, method) = methods
-        contexts: dict[int, Context] = {}  # of which most steps share theirs
+        contexts: dict[int, Context] = {}  # most steps share theirs
 
         def context_of(step: Step) -> Context:
             key = id(step.context)
@@ -323,7 +323,7 @@ class Chain:
         return replace(self, steps=steps)
 
     def select(self, names: Sequence[str]) -> tuple[str, ...]:
-        """The names of steps, each once; "all" is every step.
+        """Return the names of steps, each once; "all" is every step.
 
         Raises:
             RequestError: the chain has no such step.
@@ -333,16 +333,16 @@ class Chain:
         return tuple(self.step_named(name).name for name in dict.fromkeys(names))
 
     def through(self, names: Sequence[str]) -> "Chain":
-        """The chain up to the last of these steps; all of it where none is named."""
+        """Return the chain up to the last of these steps; the whole chain if none is named."""
         places = [place for place, step in enumerate(self.steps) if step.name in names]
         return replace(self, steps=self.steps[: places[-1] + 1]) if places else self
 
     def step_in(self, role: StageRole) -> Step | None:
-        """The first step whose stage has a role; None where the chain has none."""
+        """Return the first step whose stage has a role; None if there is none."""
         return next((step for step in self.steps if step.stage.role is role), None)
 
     def step_named(self, name: str) -> Step:
-        """The step of that name.
+        """Return the step with a name.
 
         Raises:
             RequestError: the chain has no such step.
@@ -354,9 +354,9 @@ class Chain:
 
 
 def of_structure(function: Callable[[Chain], T]) -> Callable[[Chain], T]:
-    """Compute a function of a chain once for all chains that differ in numbers only.
+    """Return a function that is computed once for all chains that differ only in numbers.
 
-    What it returns must follow from names, stages and passes alone.
+    Its result must depend only on names, stages and passes.
     """
 
     @wraps(function)

@@ -1,4 +1,4 @@
-"""Chains that need the depth of their image: which steps do, and how they get it."""
+"""Depth for the chains whose steps need it."""
 
 import weakref
 from dataclasses import replace
@@ -13,23 +13,24 @@ from clpipe.stage import OfDepth
 
 
 def depth_steps(chain: Chain) -> dict[str, OfDepth]:
-    """The methods of the steps of a chain that need depth, by the names of the steps."""
+    """Return the methods of the steps that need depth, by step name."""
     return {s.name: s.method for s in chain.steps if isinstance(s.method, OfDepth)}
 
 
 @of_structure
 def needs_depth(chain: Chain) -> bool:
-    """Whether a step of a chain needs the depth of its image."""
+    """Return whether a step of a chain needs the image's depth."""
     return bool(depth_steps(chain))
 
 
 def with_depth(chain: Chain, depth: Depth) -> Chain:
-    """The chain with the depth of an image, which must outlive its use there.
+    """Return the chain with the depth of an image.
 
-    Plans and kernels stay those of the chain.
+    The chain holds a weak reference, so the caller must keep ``depth`` alive. Plans and kernels do
+    not change.
 
     Raises:
-        RequestError: pixels were moved before, and depth was not.
+        RequestError: an earlier step moves pixels, which would misalign the depth.
     """
     reference = weakref.ref(depth)
     needing = depth_steps(chain)
@@ -37,8 +38,8 @@ def with_depth(chain: Chain, depth: Depth) -> Chain:
     for step in chain.steps[: max(map(names.index, needing))]:
         if step.method.geometry():
             raise RequestError(
-                f"stages: {step.name} moves pixels before {[*needing][-1]}, whose depth stays "
-                "where it is; put it behind"
+                f"stages: {step.name} moves pixels before {[*needing][-1]}, but does not move the "
+                f"depth that {[*needing][-1]} needs; list {step.name} after {[*needing][-1]}"
             )
     steps = tuple(
         replace(step, context=step.context.but(depth=reference)) if step.name in needing else step
@@ -48,24 +49,30 @@ def with_depth(chain: Chain, depth: Depth) -> Chain:
 
 
 def warnings_of(chain: Chain, depth: Depth) -> list[str]:
-    """Warnings of the steps that need depth, about that of an image.
+    """Return the warnings of the steps that need depth about an image's depth.
 
     Raises:
-        RequestError: one cannot use it.
+        RequestError: a step cannot use this depth.
     """
     found = {name: method.check_depth(depth) for name, method in depth_steps(chain).items()}
     return [f"{name}: {text}" for name, text in found.items() if text]
 
 
 def depth_of_array(pixels: Array | None, width: int, height: int) -> Depth:
-    """Depth that somebody gives with an image of that size.
+    """Return the depth for an image of that size in px, from an array, (height, width).
 
     Raises:
-        ImageError: it is missing, of another size, or no depth.
+        ImageError: the array is missing, has another shape, or holds no depth.
     """
     if pixels is None:
-        raise ImageError("the chain needs depth, (height, width): process(image, key, depth=depth)")
+        raise ImageError(
+            "the chain needs depth, (height, width), but none was passed; call "
+            "process(image, key, depth=depth)"
+        )
     found = np.shape(pixels)
     if found != (height, width):
-        raise ImageError(f"found depth of shape {found}; the image's is {(height, width)}")
+        raise ImageError(
+            f"found depth of shape {found}, but the image has {(height, width)}; pass depth of the "
+            "image's height and width"
+        )
     return Depth(checked_depth(pixels))

@@ -1,6 +1,6 @@
-"""Draws in the place of values: in which order, how far they reach, what an image gets.
+"""Random draws in place of values: their order, their extremes, and the values of an image.
 
-The laws themselves are in :mod:`clpipe.chain.draws`.
+The distributions are in :mod:`clpipe.chain.draws`.
 """
 
 import zlib
@@ -17,30 +17,36 @@ LimitsOf = Callable[[str], Limits | None]  # by the dotted name of a value
 
 
 def draw_of(key: str, table: Mapping[str, Any]) -> Draw:
-    """The draw that stands in the place of a value.
+    """Return the draw that a table declares in place of a value.
 
     Raises:
-        KeyedError: the table is no draw, or this value cannot be drawn, or not by such a law.
+        KeyedError: the table is no draw, or the value cannot be drawn from it.
     """
     if key in KEYS and not KEYS[key].is_drawn:
         drawn = ", ".join(known.name for known in KEYS.values() if known.is_drawn)
-        allowed = f"{drawn} and the parameters of stages can"
-        raise KeyedError(key, f"{key}: found {dict(table)!r}, but it cannot be drawn; {allowed}")
+        allowed = f"{drawn} and the parameters of stages can be"
+        raise KeyedError(
+            key, f"{key}: found {dict(table)!r}, but {key} cannot be drawn; only {allowed}"
+        )
     draw = parse_draw(key, table)
     if (key == "camera" or key.endswith(".method")) and not isinstance(draw, Choice):
-        raise KeyedError(key, f"{key}: found {dict(table)!r}, but it is drawn by choice")
+        raise KeyedError(
+            key,
+            f"{key}: found {dict(table)!r}, but a name can only be drawn by choice; "
+            "use {choice = ['A', 'B']}",
+        )
     return draw
 
 
 def ordered(draws: Mapping[str, Draw], constants: Mapping[str, Any]) -> list[str]:
-    """The names of what is drawn, each behind the value that it follows.
+    """Return the names of the draws, each after the value that it follows.
 
     Args:
-        draws: by the dotted name of what is drawn.
-        constants: the values that are not drawn, by their dotted names.
+        draws: the draws, by the dotted name of the drawn value.
+        constants: the values that are not drawn, by dotted name.
 
     Raises:
-        KeyedError: a draw follows a name that has no value, or itself in the end.
+        KeyedError: a draw follows a name that has no value, or follows itself through others.
     """
 
     def depth(key: str) -> int:
@@ -48,7 +54,11 @@ def ordered(draws: Mapping[str, Draw], constants: Mapping[str, Any]) -> list[str
         while (leader := draws[path[-1]].follows) in draws:
             path.append(leader)
             if leader in path[:-1]:
-                raise KeyedError(key, f"{key}: it follows itself: {' -> '.join(path)}")
+                raise KeyedError(
+                    key,
+                    f"{key}: the draw follows itself: {' -> '.join(path)}; "
+                    "set one of these to a value",
+                )
         if leader and leader not in constants:
             names = sorted({*constants, *draws} - {path[-1]})
             unknown = one_of("value", leader, names).replace("allowed", "set or drawn are")
@@ -61,15 +71,15 @@ def ordered(draws: Mapping[str, Draw], constants: Mapping[str, Any]) -> list[str
 def extremes_of(
     draws: Mapping[str, Draw], constants: Mapping[str, Any], limits: LimitsOf
 ) -> dict[str, Sequence[Any]]:
-    """For each draw, its extreme values: if these are allowed, so is all that can be drawn.
+    """Return the extreme values of each draw. If they are allowed, every drawn value is.
 
     Args:
         draws: as for :func:`ordered`.
         constants: as for :func:`ordered`.
-        limits: of the value of a name.
+        limits: returns the limits of a value by its dotted name.
 
     Raises:
-        KeyedError: a law does not fit the limits or the value that it follows; and as
+        KeyedError: a draw does not fit its limits or the value that it follows, or as for
             :func:`ordered`.
     """
     extremes: dict[str, Sequence[Any]] = {}
@@ -88,9 +98,9 @@ def extremes_of(
 def values_of(
     draws: Mapping[str, Draw], constants: Mapping[str, Any], limits: LimitsOf, owner: str
 ) -> dict[str, Any]:
-    """A value for each draw, by its name; arguments and errors as :func:`extremes_of`.
+    """Return a value for each draw, by name. Arguments and errors are those of :func:`extremes_of`.
 
-    ``owner`` is what the values belong to, a text made of the seed and the image key.
+    ``owner`` seeds the draws; it is a text made of the seed and the image key.
     """
     values = dict(constants)
     numbers = uniforms(owner, draws)
@@ -101,7 +111,7 @@ def values_of(
 
 
 def uniforms(owner: str, names: Iterable[str]) -> dict[str, float]:
-    """A number above 0 and below 1 for each name, of 52 bits, by Philox keyed on the owner.
+    """Return a number above 0 and below 1 for each name, of 52 bits, by Philox keyed on the owner.
 
     >>> {name: round(u, 3) for name, u in uniforms("draw:0:a.exr", ["iso", "camera"]).items()}
     {'iso': 0.282, 'camera': 0.608}

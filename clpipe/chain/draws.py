@@ -1,8 +1,7 @@
-"""The laws of random draws, which a configuration declares in the place of a value.
+"""The distributions of random draws, which a configuration declares in place of a value.
 
-A drawn value depends on the seed, the image key and the name of what is drawn, and on nothing else.
-It is rounded to nine digits, as many as a float32 needs, so that the last bit of a platform's
-``log`` changes nothing.
+A drawn value depends only on the seed, the image key and the name of the value. It is rounded to
+nine digits, enough for a float32, so that platforms whose ``log`` differs in the last bit agree.
 """
 
 import math
@@ -27,14 +26,14 @@ MAX_TRIED = 64  # whole numbers of a range that are validated
 
 @dataclass(frozen=True)
 class Limits:
-    """The range of a number, with both ends; ``whole`` where it must be a whole number."""
+    """The range of a number, including both ends; ``whole`` if it must be a whole number."""
 
     low: float = -math.inf
     high: float = math.inf
     whole: bool = False
 
     def nearest(self, value: float) -> float:
-        """The allowed number nearest to a value, to nine digits unless it is a limit.
+        """Return the allowed number nearest to a value, to nine digits unless it is a limit.
 
         >>> Limits(0, 1).nearest(-0.5), Limits().nearest(1 / 3), Limits(whole=True).nearest(2.7)
         (0.0, 0.333333333, 3)
@@ -44,7 +43,7 @@ class Limits:
         return min(max(rounded, self.low), self.high)
 
     def overlap(self, low: float, high: float) -> tuple[float, float] | None:
-        """The part of a range that is allowed; None where there is none.
+        """Return the part of a range that is allowed; None if there is none.
 
         >>> Limits(100, 6400).overlap(800, 12800), Limits(100, 400).overlap(800, 1600)
         ((800, 6400), None)
@@ -53,7 +52,7 @@ class Limits:
         return ends if ends[0] <= ends[1] else None
 
     def between(self, low: float, high: float) -> list[float]:
-        """Numbers of a range to validate: its ends, and whole numbers between them.
+        """Return numbers of a range to validate: its ends, and whole numbers between them.
 
         >>> Limits().between(1, 3), Limits(whole=True).between(1, 3)
         ([1, 3], [1, 2, 3, 3])
@@ -65,7 +64,7 @@ class Limits:
 
 @cache
 def limits_of(model: type[BaseModel], name: str) -> Limits | None:
-    """The limits of a field of a model; None where the field holds no number.
+    """Return the limits of a field of a model; None if the field holds no number.
 
     >>> from clpipe.images.encoding import Encoding
     >>> limits_of(Encoding, "jpeg_quality"), limits_of(Encoding, "jpeg_subsampling")
@@ -86,46 +85,47 @@ def limits_of(model: type[BaseModel], name: str) -> Limits | None:
 
 
 class Draw(BaseModel):
-    """A law that values are drawn from. The fields of a subclass are its keys in a table."""
+    """A distribution to draw values from. The fields of a subclass are its keys in a table."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     @property
     def follows(self) -> str:
-        """The dotted name of the value that this one follows; "" where it follows none."""
+        """The dotted name of the value that this one follows; "" if it follows none."""
         return ""
 
     def record(self) -> dict[str, Any]:
-        """The draw as a configuration holds it."""
+        """Return the draw as a configuration stores it."""
         values = self.model_dump()
         return {key: list(v) if isinstance(v, tuple) else v for key, v in values.items()}
 
     def extremes(self, limits: Limits | None, followed: Sequence[Any]) -> Sequence[Any]:
-        """The extreme values: if these are allowed, so is all that can be drawn.
+        """Return the extreme values. If they are allowed, every drawn value is.
 
         Args:
-            limits: of the drawn value; None where it is no number.
+            limits: the limits of the drawn value; None if it is no number.
             followed: the extremes of the value that it follows.
 
         Raises:
-            ValueError: the law does not fit such a value, or cannot follow such values.
+            ValueError: the distribution does not fit such a value, or cannot follow such values.
         """
         raise NotImplementedError(type(self).__name__)
 
     def within(self, limits: Limits) -> "Draw | None":
-        """The same law of what limits allow, so that nothing is heaped at a limit.
+        """Return the distribution truncated to limits, so that no values pile up at a limit.
 
-        None where they allow nothing, or not even the mean. A law that follows another value stays.
+        Returns None if the limits allow no value, or exclude the mean. A draw that follows another
+        value is returned unchanged.
         """
         return self
 
     def value(self, uniform: float, limits: Limits | None, followed: Any) -> Any:
-        """The value of a uniform number.
+        """Return the value for a uniform number.
 
         Args:
-            uniform: above 0 and below 1.
+            uniform: a number above 0 and below 1.
             limits: as for :meth:`extremes`.
-            followed: the value that it follows; None where it follows none.
+            followed: the value that it follows; None if it follows none.
         """
         raise NotImplementedError(type(self).__name__)
 
@@ -142,7 +142,7 @@ class Choice(Draw):
     def _plain(self) -> "Choice":
         for item in self.choice:
             if item is None or isinstance(item, Mapping):
-                raise ValueError(f"found {item!r} in the list; a choice is among plain values")
+                raise ValueError(f"found {item!r} in the list; list plain values only")
         return self
 
     def extremes(self, limits: Limits | None, followed: Sequence[Any]) -> Sequence[Any]:
@@ -157,11 +157,11 @@ class Choice(Draw):
 
 
 class NumberDraw(Draw):
-    """A law of numbers. Subclasses give its range, and the number of a uniform one."""
+    """A distribution of numbers. Subclasses define its range and its inverse CDF."""
 
     def extremes(self, limits: Limits | None, followed: Sequence[Any]) -> Sequence[Any]:
         if limits is None:
-            raise ValueError("it is no single number, so it is drawn by choice or same_as")
+            raise ValueError("the value is no single number; draw it by choice or same_as")
         return limits.between(*self.reach(limits, followed))
 
     def value(self, uniform: float, limits: Limits | None, followed: Any) -> Any:
@@ -169,16 +169,16 @@ class NumberDraw(Draw):
         return limits.nearest(self.number(uniform, limits, followed))
 
     def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
-        """The lowest and the highest value; arguments and errors as :meth:`extremes`."""
+        """Return the lowest and the highest value. Arguments and errors as :meth:`extremes`."""
         raise NotImplementedError(type(self).__name__)
 
     def number(self, uniform: float, limits: Limits, followed: Any) -> float:
-        """The value before it is rounded; arguments as :meth:`value`."""
+        """Return the value before it is rounded. Arguments as :meth:`value`."""
         raise NotImplementedError(type(self).__name__)
 
 
 class Uniform(NumberDraw):
-    """Any number of a range, with both ends; a whole number where the value must be whole.
+    """Any number of a range, including both ends; a whole number if the value must be whole.
 
     >>> Uniform(uniform=(3, 5)).value(0.99, Limits(whole=True), None)
     5
@@ -217,7 +217,7 @@ class LogUniform(NumberDraw):
     @model_validator(mode="after")
     def _ordered(self) -> "LogUniform":
         if self.log_uniform[0] <= 0:
-            raise ValueError(f"found {list(self.log_uniform)}; both ends must be above 0")
+            raise ValueError(f"found {list(self.log_uniform)}, but both ends must be above 0")
         _check_ascending(*self.log_uniform)
         return self
 
@@ -235,7 +235,7 @@ class LogUniform(NumberDraw):
 
 
 class Normal(NumberDraw):
-    """A Gaussian with a mean and a standard deviation; values beyond a limit become the limit.
+    """A Gaussian with a mean and a standard deviation. Values outside the limits are clamped.
 
     >>> Normal(normal=(0.8, 0.1)).value(0.5, Limits(), None)
     0.8
@@ -246,13 +246,13 @@ class Normal(NumberDraw):
     @model_validator(mode="after")
     def _spread(self) -> "Normal":
         if self.normal[1] < 0:
-            raise ValueError(f"found {list(self.normal)}; the standard deviation is 0 or above")
+            raise ValueError(f"found {list(self.normal)}, but a standard deviation is 0 or more")
         return self
 
     def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
         mean, sigma = self.normal
         if not limits.low <= mean <= limits.high:
-            return mean, mean  # validation will refuse it
+            return mean, mean  # validation will reject it
         return limits.nearest(mean - FAR * sigma), limits.nearest(mean + FAR * sigma)
 
     def within(self, limits: Limits) -> "Truncated | None":
@@ -266,7 +266,7 @@ class Normal(NumberDraw):
 
 
 class Truncated(Normal):
-    """A Gaussian of which only what lies between two ends is drawn.
+    """A Gaussian truncated to the range between two ends.
 
     >>> Truncated(normal=(0, 1), ends=(0, 8)).value(0.5, Limits(), None)
     0.67448975
@@ -299,11 +299,11 @@ class SameAs(Draw):
 
 
 class LogNormalOf(NumberDraw):
-    """A number whose logarithm is Gaussian about a line over the logarithm of another number.
+    """A number whose logarithm is Gaussian about a linear function of another number's logarithm.
 
     Read noise follows shot noise in this way: log b ~ N(2.18 log a + 1.2, 0.26) (Brooks et al.,
-    "Unprocessing images for learned raw denoising", CVPR 2019, sec. 3.1). Values beyond a limit
-    become the limit.
+    "Unprocessing images for learned raw denoising", CVPR 2019, sec. 3.1). Values outside the limits
+    are clamped.
 
     >>> read = LogNormalOf(log_normal_of="sensor_noise.a", slope=2.18, intercept=1.2, sigma=0.26)
     >>> read.value(0.5, Limits(), 1e-3)
@@ -326,7 +326,9 @@ class LogNormalOf(NumberDraw):
     def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
         for one in followed:
             if isinstance(one, bool) or not isinstance(one, int | float) or not one > 0:
-                raise ValueError(f"{self.follows} must be a number above 0, but can be {one!r}")
+                raise ValueError(
+                    f"{self.follows}, which it follows, must be above 0, but can be {one!r}"
+                )
         all_ = [limits.nearest(self._at(z, one)) for z in (-FAR, FAR) for one in followed]
         return min(all_), max(all_)
 
@@ -345,19 +347,19 @@ LAWS: dict[str, type[Draw]] = {
 
 
 def parse_draw(key: str, table: Mapping[str, Any]) -> Draw:
-    """The draw of a table such as ``{"uniform": [1, 2]}``.
+    """Return the draw of a table such as ``{"uniform": [1, 2]}``.
 
     >>> parse_draw("iso", {"choice": [100, 400]})
     Choice(choice=[100, 400])
 
     Raises:
-        KeyedError: the table is no draw; the message begins with ``key``, the name of the value.
+        KeyedError: the table is no draw. The message begins with ``key``, the name of the value.
     """
     laws = [law for law in LAWS if law in table]
     if len(laws) != 1:
         wrong = one_of("draw", next((str(k) for k in table), ""), LAWS)
         if laws:
-            wrong = f"a draw has one law; found {' and '.join(laws)}"
+            wrong = f"a draw has one distribution, but these are {' and '.join(laws)}; use one"
         raise KeyedError(key, f"{key}: found {dict(table)!r}: {wrong}")
     law = LAWS[laws[0]]
     try:
@@ -369,13 +371,13 @@ def parse_draw(key: str, table: Mapping[str, Any]) -> Draw:
         if fault.problem == "unknown":
             reason = one_of(f"key of {laws[0]}", field, law.model_fields)
         elif fault.problem == "missing":
-            reason = f"it needs {field}"
+            reason = f"the draw {laws[0]} needs this key; add it"
         raise KeyedError(key, f"{key}: {field}: {reason}") from None
 
 
 def _check_ascending(low: float, high: float) -> None:
     if low > high:
-        raise ValueError(f"found [{low:g}, {high:g}]; the lower end comes first")
+        raise ValueError(f"found [{low:g}, {high:g}]; put the lower end first")
 
 
 def _exp(log: float) -> float:
@@ -383,5 +385,5 @@ def _exp(log: float) -> float:
 
 
 def _normal(uniform: float) -> float:
-    """The standard normal of a uniform number, by inverse CDF (Wichura 1988, AS241)."""
+    """Return the standard normal for a uniform number, by inverse CDF (Wichura 1988, AS241)."""
     return NormalDist().inv_cdf(uniform)

@@ -1,4 +1,4 @@
-"""One way for an image into its chain: its camera, its overscan and its depth."""
+"""Prepare a chain for one image: its camera, its overscan and its depth."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -23,9 +23,9 @@ from clpipe.stage.method import optics_names
 
 @dataclass(frozen=True)
 class Entered:
-    """An image in its chain: the chain for it, and what of the image goes through that.
+    """An image with the chain prepared for it, and the pixels that enter the chain.
 
-    ``margins`` say how far ``pixels``, and depth, go on beyond the picture.
+    ``margins`` are the overscan of ``pixels`` and of the depth.
     """
 
     chain: Chain
@@ -43,20 +43,20 @@ def enter(
     shot: Mapping[str, float] | None = None,
     panorama: Panorama | None = None,
 ) -> Entered:
-    """An image with the chain for it.
+    """Return an image with the chain prepared for it.
 
     Args:
-        chain: for images of its kind.
-        pixels: of the image, (height, width[, channel]).
-        margins: how far they go on beyond the picture; cropped where the chain makes no use of it.
-        depth: gives the depth for a chain that needs it, of an image of some width and height with
-            some margins; None leaves it out.
-        shot: what the image says of its camera, which holds where nothing else is stated.
-        panorama: what the image is an atlas of, where it is one.
+        chain: the chain for images of this kind.
+        pixels: the image, (height, width[, channel]).
+        margins: the overscan of ``pixels``. It is cropped if the chain cannot use it.
+        depth: returns the image's depth, for a chain, a width and height in px, and margins. It is
+            called only if the chain needs depth. None skips depth.
+        shot: the camera values in the image's file. Settings override them.
+        panorama: the panorama, if the image is the atlas of one.
 
     Raises:
-        ImageError: what ``depth`` raises.
-        RequestError: what is known of the camera contradicts itself, or the depth is of no use.
+        ImageError: ``depth`` raises it.
+        RequestError: the camera's values contradict each other, or a step cannot use the depth.
     """
     if chain.step_names[0] == chain.names[0] and pixels.ndim == 3:
         width, height = margins.inside(*pixels.shape[1::-1])
@@ -84,7 +84,7 @@ def enter(
 
 @lru_cache(maxsize=64)
 def _with_shot(chain: Chain, shot: tuple[tuple[str, float], ...]) -> Chain:
-    """The chain with what an image says of its camera; the same one where no step needs that."""
+    """Return the chain with an image's camera values; the same chain if no step needs them."""
     active = [chain.settings.method(s.name) for s in chain.steps if s.passes]
     needed = {n for own in active for n in optics_names(type(own)) if getattr(own, n) is None}
     if chain.camera.dark_current:

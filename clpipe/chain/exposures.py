@@ -1,4 +1,4 @@
-"""Chains that make a picture of several exposures, between which the light changes."""
+"""Chains that merge several exposures of a scene whose light changes between them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,8 +20,8 @@ class Exposures:
 
     Args:
         chain: the chain.
-        place: of the step that merges them.
-        spans: when each of them is.
+        place: the index of the step that merges the exposures.
+        spans: the time span of each exposure.
     """
 
     chain: Chain
@@ -30,12 +30,12 @@ class Exposures:
 
     @property
     def step(self) -> Step:
-        """The step that merges them."""
+        """The step that merges the exposures."""
         return self.chain.steps[self.place]
 
     @cached_property
     def later(self) -> tuple[Chain, ...]:
-        """What all exposures but the first go through, up to that step."""
+        """The chains of all exposures except the first, up to the step that merges them."""
         return tuple(self._before(number) for number in range(1, len(self.spans)))
 
     def _before(self, number: int) -> Chain:
@@ -48,7 +48,7 @@ class Exposures:
         return replace(self.chain, steps=steps)
 
     def merging(self, images: Sequence[Floats]) -> Chain:
-        """The chain with what all exposures but the first became in :attr:`later`."""
+        """Return the chain that merges ``images``, the results of the chains in :attr:`later`."""
         method = self.step.method
         assert isinstance(method, Staggered)
         own = replace(self.step, method=method.with_later(np.stack(images)))
@@ -57,7 +57,7 @@ class Exposures:
 
 
 def exposures_of(chain: Chain) -> Exposures | None:
-    """The exposures of a chain; None where it has one, or the light does not change."""
+    """Return the exposures of a chain; None if it has one, or if the light does not change."""
     place = _place(chain)
     if place is None:
         return None
@@ -68,7 +68,7 @@ def exposures_of(chain: Chain) -> Exposures | None:
 
 @of_structure
 def _place(chain: Chain) -> int | None:
-    """The place of the step that merges the exposures of a chain, see :func:`exposures_of`."""
+    """Return the index of the step that merges a chain's exposures, see :func:`exposures_of`."""
     for place, step in enumerate(chain.steps):
         if isinstance(step.method, Staggered) and len(step.method.spans) > 1:
             return place
@@ -76,22 +76,23 @@ def _place(chain: Chain) -> int | None:
 
 
 def check_exposures(chain: Chain) -> None:
-    """See that each exposure of a chain can go through it by itself.
+    """Check that each exposure of a chain can be processed separately.
 
     Raises:
-        RequestError: it cannot.
+        RequestError: a step before the merging one does not allow it.
     """
     if not (exposures := exposures_of(chain)):
         return
     first, merging = chain.steps[0], exposures.step
     if first.context.light_changes:
         raise RequestError(
-            f"{merging.name}: each of its exposures sees another moment, but an image that enters "
-            f"at {first.name} is that of one; start earlier, or leave subframes and flicker out"
+            f"{merging.name}: each of its exposures sees another moment, but an image that "
+            f"enters at {first.name} shows one moment; start at an earlier stage, or remove "
+            "subframes and flicker"
         )
     for step in chain.steps[: exposures.place]:
         if any(isinstance(each.access, Reduction) for each in step.method.passes()):
             raise RequestError(
-                f"{step.name}.method={step.method.method}: it would measure each of the exposures "
-                f"of {merging.name} by itself; take another method, such as gain with an ev"
+                f"{step.name}.method={step.method.method}: this method would measure each exposure "
+                f"of {merging.name} separately; use another method, such as gain with an ev"
             )

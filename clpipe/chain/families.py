@@ -1,9 +1,9 @@
-"""Families: chains that differ in numbers only, of which one is made and the others computed.
+"""Families: chains that differ only in numbers, computed from one that was built.
 
-To make a chain, each stage's code runs. With an ISO or a parameter drawn for each image, the same
-code would run for each of them, to compute a few numbers. So it is traced once (see
-:mod:`clpipe.base.tracing`), and other numbers go through what was traced: the values are the same
-to the last bit, in a hundredth of the time. Code that cannot be traced runs again each time.
+Building a chain runs the code of each stage. If an ISO or a parameter is drawn for each image, the
+same code would run for each image to compute a few numbers. Therefore the code is traced once (see
+:mod:`clpipe.base.tracing`), and the trace is replayed with other numbers. The values are the same
+to the last bit, in a hundredth of the time. Code that cannot be traced runs every time.
 """
 
 from collections.abc import Callable, Hashable, Sequence
@@ -21,22 +21,22 @@ from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.stage import Method
 
-MOST_FAMILIES = 16  # of settings that differ in numbers, as ISOs on both sides of a gain stage
+MOST_FAMILIES = 16  # per settings that differ in numbers, such as ISOs of different gain stages
 MOST_SETTINGS = 256
 
-Numbers = Sequence[Any]  # floats, or what stands for them as they are traced
+Numbers = Sequence[Any]  # floats, or the objects that replace them while code is traced
 Making = Callable[[Numbers], Chain]
 
 
 class Family:
-    """Chains that differ in numbers only.
+    """Chains that differ only in numbers.
 
     Args:
-        make: makes a chain of numbers, which may be traced.
-        numbers: those that the family is traced with.
+        make: builds a chain from numbers, which may be traced.
+        numbers: the numbers to trace with.
 
     Raises:
-        NotTraceableError: what is computed is not all in numbers.
+        NotTraceableError: the computation cannot be traced.
     """
 
     def __init__(self, make: Making, numbers: Numbers) -> None:
@@ -50,19 +50,19 @@ class Family:
         self._attributes = trace.repeat({**vars(chain), "steps": None, "settings": None})
 
     def steps(self, numbers: Numbers) -> tuple[Step, ...]:
-        """Return the steps of the chain of numbers."""
+        """Return the steps of the chain for these numbers."""
         steps: tuple[Step, ...] = self._steps(numbers)
         return steps
 
     def chain(self, numbers: Numbers) -> Chain | None:
-        """Return the chain of numbers, None where it is none of the family.
+        """Return the chain for these numbers; None if it does not belong to the family.
 
-        The first one that was not traced is also made, and compared.
+        The first chain whose numbers were not traced is also built in full and compared.
         """
         try:
             attributes = self._attributes(numbers)
         except (ArithmeticError, ValueError):
-            return None  # the code says it in its own words
+            return None  # building the chain raises a better message
         if attributes is None:
             return None
         del attributes["steps"]
@@ -77,11 +77,11 @@ class Family:
     def _is_equal(self, chain: Chain, numbers: Numbers) -> bool:
         try:
             return chain.is_equal(self._make(numbers))
-        except Exception:  # arguments that cannot be computed: it is said when they are needed
+        except Exception:  # the arguments' error is reported when they are needed
             return False
 
     def derived(self, make: Callable[[Chain], Chain], chain: Chain, numbers: Numbers) -> Chain:
-        """Return ``make(chain)`` for the chain of numbers."""
+        """Return ``make(chain)`` for the chain of these numbers."""
         families = self._derived.setdefault(make, Families())
         return families.chain(
             numbers, lambda numbers: make(self._make(numbers)), lambda: make(chain)
@@ -89,9 +89,9 @@ class Family:
 
 
 class ComputedChain(Chain):
-    """A chain of a family. Its steps are computed when they are asked for."""
+    """A chain of a family. Its steps are computed on first access."""
 
-    family: Family | None = None  # None is a copy with other steps
+    family: Family | None = None  # None in a copy with other steps
     numbers: Numbers = ()
 
     @cached_property
@@ -108,7 +108,7 @@ class ComputedChain(Chain):
 
 
 class Families:
-    """The families of chains that are made in one way: one for each path that the code takes."""
+    """The families of chains with the same settings: one for each path through the code."""
 
     def __init__(self) -> None:
         self._known: list[Family] = []
@@ -116,21 +116,21 @@ class Families:
         self._may_trace = True
 
     def chain(self, numbers: Numbers, make: Making, plain: Callable[[], Chain]) -> Chain:
-        """Return the chain of numbers.
+        """Return the chain for these numbers.
 
         Args:
             numbers: the numbers.
-            make: makes a chain of numbers, which may be traced.
-            plain: makes the chain of these numbers.
+            make: builds a chain from numbers, which may be traced.
+            plain: builds the chain for these numbers without tracing.
 
         Raises:
-            RequestError: it cannot be made.
+            RequestError: the chain cannot be built.
         """
         for family in self._known:
             if chain := family.chain(numbers):
                 return chain
         chain = plain()
-        if self._may_trace and not self._is_new:  # what is asked for once is not traced
+        if self._may_trace and not self._is_new:  # the first request is not traced
             self._add(numbers, make, chain)
         self._is_new = False
         return chain
@@ -139,7 +139,7 @@ class Families:
         try:
             family = Family(make, numbers)
             computed = family.chain(numbers)
-        except Exception:  # whatever a stage's code does with numbers that are no floats
+        except Exception:  # a stage's code may raise anything when its numbers are no floats
             computed = None
         if computed and computed.is_equal(chain):
             self._known.append(family)
@@ -154,16 +154,16 @@ FAMILIES: BoundedCache[Families] = BoundedCache(MOST_SETTINGS)
 def chain_of_family(
     settings: Settings, camera: Camera, ends: Hashable, make: Callable[[Settings], Chain]
 ) -> Chain:
-    """Return the chain of settings, computed where one that differs in numbers only was made.
+    """Return the chain of settings. It is computed if one that differs only in numbers is known.
 
     Args:
-        settings: without draws.
-        camera: its camera.
-        ends: what else the chain depends on.
-        make: makes the chain.
+        settings: settings without draws.
+        camera: the camera of the settings.
+        ends: the other values that the chain depends on.
+        make: builds the chain.
 
     Raises:
-        RequestError: it cannot be made.
+        RequestError: the chain cannot be built.
     """
     others, numbers = numbers_of(settings)
     key = (
@@ -188,7 +188,7 @@ SHARED = ("stages", "skip", "lens", "focal_length", "aperture", "focus_distance"
 
 
 def numbers_of(settings: Settings) -> tuple[Hashable, tuple[float, ...]]:
-    """Return the floats among the values that are set, and all the other values."""
+    """Return all values that are not floats, and the floats among the values that are set."""
     numbers, others = [settings.iso], []
     for step, method in _set_methods(settings):
         table = settings.parameters[step]
@@ -213,6 +213,6 @@ def with_numbers(settings: Settings, numbers: Numbers) -> Settings:
 
 
 def _set_methods(settings: Settings) -> list[tuple[str, Method]]:
-    """The methods of the steps of which anything is set."""
+    """Return the methods of the steps that have a value set, with the steps' names."""
     set_ = (step for step in settings.step_names if step in settings.parameters)
     return [(step, settings.method(step)) for step in set_]

@@ -1,4 +1,4 @@
-"""Configurations: TOML files in, and a chain as such a file out."""
+"""Read configurations from TOML files, and write a chain as such a file."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -21,17 +21,18 @@ from clpipe.chain.toml import line_of, value_text
 
 
 def built_in_configs() -> dict[str, Path]:
-    """The configurations inside the package, by name."""
+    """Return the paths of the configurations inside the package, by name."""
     folder = Path(str(resources.files("clpipe.chain") / "configs"))
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
 @dataclass(frozen=True)
 class Config:
-    """A configuration: its values, nested as in its file, and the settings that they come to.
+    """A configuration: its values, nested as in its file, and the settings that result from them.
 
-    Names of files in it are absolute, or relative to the working directory. Its stage files stand
-    apart: whoever names a configuration trusts them, and no other values load code.
+    File names in it are absolute, or relative to the working directory. Its stage files are kept
+    apart from its values: you trust the code of a configuration that you name, and no other values
+    load code.
     """
 
     values: Mapping[str, Any]
@@ -40,18 +41,23 @@ class Config:
 
 
 def load_settings(*names: str) -> Settings:
-    """The settings of configurations, or the default ones; errors as :func:`load_configs`."""
+    """Return the settings of configurations; the defaults if none is named.
+
+    Errors are those of :func:`load_configs`.
+    """
     return load_configs(names).settings if names else Settings()
 
 
 def load_configs(names: Sequence[str]) -> Config:
-    """Configurations, each laid over those before it, see :func:`clpipe.chain.looks.laid_over`.
+    """Load configurations, each of which overrides those before it.
+
+    See :func:`clpipe.chain.looks.laid_over`.
 
     Args:
-        names: at least one, as for :func:`load_config`.
+        names: at least one name, as for :func:`load_config`.
 
     Raises:
-        RequestError: as :func:`load_config`, or one cannot be laid over those before it.
+        RequestError: as :func:`load_config`, or if one cannot override those before it.
     """
     found = load_config(names[0])
     for before, name in pairwise(names):
@@ -69,15 +75,14 @@ def load_configs(names: Sequence[str]) -> Config:
 
 
 def load_config(name: str) -> Config:
-    """A configuration, validated.
+    """Load a configuration and validate it.
 
     Args:
-        name: of a built-in configuration, or the path of a file (ending in .toml).
+        name: the name of a built-in configuration, or the path of a .toml file.
 
     Raises:
-        RequestError: there is no such configuration or file, it cannot be read, is not TOML, or
-            holds a name or value that is not allowed; the message gives the file and, where there
-            is one, the line.
+        RequestError: the configuration does not exist, cannot be read, is not TOML, or contains a
+            name or value that is not allowed. The message names the file and, if known, the line.
     """
     built_in = built_in_configs()
     path = built_in.get(name, Path(name))
@@ -88,11 +93,13 @@ def load_config(name: str) -> Config:
         text = read_text(path)
         values = parse_toml(text)
     except OSError as error:
-        raise RequestError(f"{path}: cannot read this configuration: {error.strerror}") from None
+        raise RequestError(f"{path}: cannot read the configuration: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise RequestError(f"{path}: not a text file, so not a TOML configuration") from None
+        raise RequestError(
+            f"{path}: this is not a text file; a configuration is a TOML file in UTF-8"
+        ) from None
     except ValueError as error:
-        raise RequestError(f"{path}: not valid TOML: {error}") from None
+        raise RequestError(f"{path}: the configuration is not valid TOML: {error}") from None
     try:
         stage_files = [path.parent / file for file in names_in(values, CODE, "files")]
         for file in stage_files:
@@ -109,7 +116,7 @@ def load_config(name: str) -> Config:
 
 
 def toml_text(chain: Chain) -> str:
-    """A chain as a configuration with every parameter.
+    """Return a chain as the text of a configuration with every parameter.
 
     Values that follow from the camera or the ISO are comments, and draws are printed as draws.
     """
@@ -134,11 +141,11 @@ def toml_text(chain: Chain) -> str:
 
 
 def config_text(values: Mapping[str, Any], stage_files: Sequence[Path] = ()) -> str:
-    """Nested values as the text of a configuration; names of files become absolute.
+    """Return nested values as the text of a configuration. File names become absolute.
 
     Args:
-        values: as :class:`Config` has them.
-        stage_files: that it loads.
+        values: nested values, as in :class:`Config`.
+        stage_files: the stage files that the configuration loads.
 
     >>> print(config_text({"iso": 800.0, "denoise": {"method": "mean"}, "skip": ["gamma"]}), end="")
     iso = 800
@@ -159,9 +166,9 @@ def config_text(values: Mapping[str, Any], stage_files: Sequence[Path] = ()) -> 
 
 
 def _step_lines(step: Step, settings: Settings, draws: Mapping[str, Any]) -> list[str]:
-    """The method and the parameters of a step, a line each."""
+    """Return the method and the parameters of a step, one per line."""
     shown = step.method
-    if not isinstance(shown, type(settings.method(step.name))):  # another has taken its place
+    if not isinstance(shown, type(settings.method(step.name))):  # another method replaced it
         shown = settings.method(step.name)
     method = draws.get(f"{step.name}.method", shown.method)
     constants = settings.parameters.get(step.name, {})
@@ -170,7 +177,7 @@ def _step_lines(step: Step, settings: Settings, draws: Mapping[str, Any]) -> lis
         extra: Any = field.json_schema_extra
         value = draws.get(f"{step.name}.{name}", getattr(shown, name))
         if value is None or (name not in constants and isinstance(method, Mapping)):
-            continue  # other methods than the one in the example may not have it
+            continue  # methods other than the one in the example may not have this parameter
         line = f"{name} = {value_text(value)}"
         if name not in constants and field.default is None:
             line = f"# {line}  # automatic: {extra['auto']}"
@@ -181,7 +188,7 @@ def _step_lines(step: Step, settings: Settings, draws: Mapping[str, Any]) -> lis
 
 
 def _other_tables(chain: Chain, draws: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The tables that belong to no step of a chain, and what a draw may follow."""
+    """Return the tables that belong to no step of a chain, and values that a draw may follow."""
     settings = chain.settings
     record = settings.record()
     tables = {name: dict(record.get(name, {})) for name in TABLES}

@@ -1,18 +1,18 @@
-"""The file formats that can be asked for."""
+"""The file formats of --format."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Format:
-    """A kind of file: the ending of its name, the bits of a sample, and whether it is a float."""
+    """A file format: its extension, the bits per sample, and whether samples are floats."""
 
     ending: str
     bits: int
     floats: bool = False
 
 
-FORMATS = {  # of the last image
+FORMATS = {  # of the picture
     "jpg": Format("jpg", 8),
     "png": Format("png", 8),
     "png16": Format("png", 16),
@@ -24,17 +24,17 @@ FORMATS = {  # of the last image
     "npy": Format("npy", 16, floats=True),
 }
 
-NPY = "npy"  # of NumPy: of images of steps, too
-DNG = "dng"  # of the raw
+NPY = "npy"  # also a format of kept images
+DNG = "dng"  # holds the raw instead of the picture
 
 EVERY_FORMAT = (*FORMATS, DNG)
 
-# What else formats are called.
+# Aliases of formats.
 OTHER_NAMES = {"jpeg": "jpg", "tiff": "tif", "tiff16": "tif16", "tiff32": "tif32"}
 
 
 def format_named(text: str) -> str:
-    """The format of a name, however it is spelt; the text itself where there is none.
+    """Return the format that a text names, in any case or by an alias; else the text itself.
 
     >>> format_named("JPEG"), format_named("tiff16"), format_named("webp")
     ('jpg', 'tif16', 'webp')
@@ -44,7 +44,7 @@ def format_named(text: str) -> str:
 
 
 def ending_of(format_: str) -> str:
-    """The ending of the name of a file of a format, without a dot.
+    """Return the extension of a format, without the dot.
 
     >>> ending_of("png16"), ending_of("dng")
     ('png', 'dng')

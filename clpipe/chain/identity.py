@@ -1,19 +1,19 @@
-"""Keys that noise belongs to, so that no two images share it by accident."""
+"""Keys that seed the noise of each image, so that no two images share noise by accident."""
 
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from clpipe.chain.settings import Settings
 
-MAX_FRAMES = 100_000  # of one image
+MAX_FRAMES = 100_000  # per image
 
-DIGITS = 16  # of the digest of an image's content, four bits each
+DIGITS = 16  # hexadecimal digits of the digest of an image's content
 
 
 def image_key(name: str, digest: str) -> str:
-    """The key of an image: its name among the inputs, and what it holds.
+    """Return the key of an image: its name among the inputs, and a digest of its content.
 
-    The name is its path below the folder that was given, else the file's name.
+    The name is the path relative to the input directory; for a single file, the file's name.
 
     >>> image_key("left/0001.exr", "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f0")
     'left/0001.exr@9f86d081884c7d65'
@@ -22,7 +22,7 @@ def image_key(name: str, digest: str) -> str:
 
 
 def name_in(key: str) -> str:
-    """The name in an image key, of which values are drawn; frames of a burst have one.
+    """Return the name in an image key, which seeds draws; all frames of a burst have the same one.
 
     >>> name_in("left/0001.exr@9f86d081884c7d65#3"), name_in("0001.exr")
     ('left/0001.exr', '0001.exr')
@@ -32,7 +32,7 @@ def name_in(key: str) -> str:
 
 
 def of_frame(key: str, frame: int | None) -> str:
-    """The key of a frame of a burst, counted from 0, for an image that is kept; None is no burst.
+    """Return the key of a burst's frame, counted from 0; None for an image without a burst.
 
     >>> of_frame("a.exr@9f86d081884c7d65", None), of_frame("a.exr@9f86d081884c7d65", 0)
     ('a.exr@9f86d081884c7d65', 'a.exr@9f86d081884c7d65#0')
@@ -41,7 +41,7 @@ def of_frame(key: str, frame: int | None) -> str:
 
 
 def of_bracket(key: str, ev: float) -> str:
-    """The key of an image's exposure in a bracket; that at 0 EV is the image's own.
+    """Return the key of an image's exposure in a bracket. At 0 EV it is the image's key.
 
     >>> of_bracket("a.exr@9f86d081884c7d65", -2), of_bracket("a.exr@9f86d081884c7d65", 0)
     ('a.exr@9f86d081884c7d65#ev-2', 'a.exr@9f86d081884c7d65')
@@ -50,12 +50,12 @@ def of_bracket(key: str, ev: float) -> str:
 
 
 def noise_key(settings: "Settings", key: str, frame: int | None = None) -> str:
-    """The key that noise is made of, beside the seed and the stage: the image and the ISO.
+    """Return the key that seeds noise together with the seed and the stage: the image and the ISO.
 
-    The first frame of a burst, or epoch, has the noise of the image alone.
+    The first frame of a burst, or epoch, has the same noise as the image without a burst.
 
-    Settings that have a ``noise_key`` of their own share the noise with all others that have it,
-    whatever the image and the ISO: common random numbers.
+    All settings with the same ``noise_key`` have the same noise, at any image and ISO (common
+    random numbers).
 
     >>> from clpipe.chain.settings import Settings
     >>> noise_key(Settings(iso=3200.0), "a.exr@9f86d081884c7d65", 1)

@@ -1,4 +1,4 @@
-"""The ISOs that settings ask for, beside those that their cameras have."""
+"""Compare the ISOs of settings with the ISO ranges of their cameras."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -12,13 +12,13 @@ from clpipe.chain.settings import Settings
 
 
 def check_cameras(settings: Settings) -> None:
-    """See that every camera that can be drawn exists, and that each ISO has a camera.
+    """Check that every camera that can be drawn exists, and that a camera has each ISO.
 
-    Where cameras differ, each draws in the part of a law that it has, and only there.
+    If cameras have different ranges, the ISO is drawn from the part that the drawn camera has.
 
     Raises:
-        RequestError: a camera cannot be loaded, an ISO is outside the range of every camera, or
-            a camera has no ISO that can be drawn.
+        RequestError: a camera cannot be loaded, an ISO is outside the range of every camera, or a
+            camera has no ISO that can be drawn.
     """
     cameras = [load_camera(name) for name in settings.names_of("camera")]
     draw = settings.draws.get("iso")
@@ -40,13 +40,13 @@ def check_cameras(settings: Settings) -> None:
         if draw.within(own) is None:
             low, high = camera.iso_range
             raise RequestError(
-                f"iso: found {draw.record()}, but camera {camera.name} goes from {low:g} to "
-                f"{high:g} and has none of that"
+                f"iso: found {draw.record()}, but none of these ISOs is in the range of camera "
+                f"{camera.name}, {low:g} to {high:g}; remove this camera, or change the range"
             )
 
 
 def draw_note(settings: Settings) -> str:
-    """What is to be said of a drawn ISO, "" where every camera draws from the whole law."""
+    """Return a note on the ISOs that are drawn; "" if every camera has all of them."""
     draw, parts = settings.draws.get("iso"), []
     if draw and not draw.follows and "camera" not in settings.draws:
         camera = load_camera(settings.camera)
@@ -54,11 +54,11 @@ def draw_note(settings: Settings) -> str:
         if max(draw.extremes(settings.drawn_isos(camera), ())) <= high:
             return ""
         return (
-            f"iso: drawn beyond {high:g}, where those of {camera.name} end: from there on "
-            "noise grows with the ISO as if the picture were pushed"
+            f"iso: the draw goes above {high:g}, the highest ISO of {camera.name}; above it, noise "
+            "grows with the ISO as in a picture that is pushed"
         )
     for camera in map(load_camera, settings.names_of("camera")) if draw else ():
         own = draw and draw.within(Limits(*camera.iso_range))
-        if own != draw and not isinstance(own, Truncated):  # of a normal, tails are left out
+        if own != draw and not isinstance(own, Truncated):  # a normal loses only its tails
             parts.append("{} from {:g} to {:g}".format(camera.name, *camera.iso_range))
-    return f"iso: drawn from what a camera has: {', '.join(parts)}" if parts else ""
+    return f"iso: drawn within each camera's range: {', '.join(parts)}" if parts else ""

@@ -1,4 +1,4 @@
-"""Keys: what a user may set by name, each with its type, range and help; those of a configuration.
+"""The keys of a configuration: values that a user may set by name, with type, range and help.
 
 The options of a run have the same form, see :mod:`clpipe.chain.options`.
 """
@@ -18,7 +18,7 @@ TABLES = (OUTPUT, RENDER)
 
 NOISE = "noise"  # under "skip": the noise of every stage
 
-MAX_STAGES = 256  # of a chain; an image can carry one
+MAX_STAGES = 256  # per chain, because files of others may contain one
 DEFAULT_ISO = 100.0
 
 WORDS = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
@@ -64,7 +64,10 @@ class Key(NamedTuple):
         return WORDS[self.type_] + least * (self.above > -math.inf) + most * (self.most < math.inf)
 
     def allows(self, value: Any) -> bool:
-        """Whether a value has the type and is in the range. Lists and choices are not checked."""
+        """Return whether a value has the type and is in the range.
+
+        Lists and choices are not checked.
+        """
         if self.type_ is list:
             return True
         types: Any = (int, float) if self.type_ is float else self.type_
@@ -74,7 +77,7 @@ class Key(NamedTuple):
 
 
 def _of_lens(name: str, text: str, unit: str = "") -> Key:
-    """What a lens is set to."""
+    """Return the key of a lens setting."""
     return Key(name, float, text, unit=unit, above=0, most=10**6, is_drawn=True)
 
 
@@ -146,16 +149,16 @@ def check_type(key: str, value: Any) -> None:
         KeyedError: it is not.
     """
     if (known := KEYS.get(key)) and not known.allows(value):
-        raise KeyedError(key, f"{key}: found {value!r}, but it is {known.allowed}")
+        raise KeyedError(key, f"{key}: found {value!r}, but expected {known.allowed}")
 
 
 def names_in(values: Mapping[str, Any], key: str, what: str) -> tuple[str, ...]:
-    """The list of texts under a key; empty where the key is missing.
+    """Return the list of texts under a key; empty if the key is missing.
 
     Args:
-        values: nested values, as a TOML file holds them.
-        key: one whose value is a list of texts; to skip one stage, a text will do.
-        what: what the texts are, for the message.
+        values: nested values, as in a TOML file.
+        key: a key whose value is a list of texts. For "skip", a single text is allowed.
+        what: a description of the texts, for the message.
 
     Raises:
         KeyedError: the value is no list, or an item is no text.
@@ -164,8 +167,8 @@ def names_in(values: Mapping[str, Any], key: str, what: str) -> tuple[str, ...]:
     if key == "skip" and isinstance(names, str):
         return (names,)
     if isinstance(names, str | Mapping) or not isinstance(names, Sequence):
-        raise KeyedError(key, f"{key}: found {names!r}, but it is a list of {what}")
+        raise KeyedError(key, f"{key}: found {names!r}, but expected a list of {what}")
     for name in names:
         if not isinstance(name, str):
-            raise KeyedError(key, f"{key}: found {name!r} in the list, but it is one of {what}")
+            raise KeyedError(key, f"{key}: found {name!r} in the list, but expected only {what}")
     return tuple(names)

@@ -1,7 +1,7 @@
-"""Looks: configurations over others, the way to the raw by one and the development by the next.
+"""Looks: combine the raw of one configuration with the development of another.
 
-A configuration with ``stages`` of its own is a whole chain. Over another one it is a look: of its
-steps those behind the raw count, and the steps that make the raw stay.
+A configuration with ``stages`` is a whole chain. If it overrides another configuration, it is a
+look: it replaces the steps after the raw, and the steps that make the raw stay.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,19 +16,19 @@ from clpipe.stage import Kind
 
 
 def laid_over(before: Settings, values: Mapping[str, Any]) -> Settings:
-    """Settings with a configuration over them; where it has ``stages``, with its development.
+    """Return settings overridden by a configuration, or by its development if it has ``stages``.
 
-    Then the steps behind the raw are its own, with their values, draws and skips, under the names
-    that they get in the new chain. What it has of steps that make its raw is left out. All else, as
-    the camera, the ISO and a configuration without ``stages``, is laid over by
-    :func:`~clpipe.chain.settings.overlay`.
+    With ``stages``, the steps after the raw are those of the configuration, with their values,
+    draws and skips. They are renamed to fit the new chain. The configuration's steps up to the raw
+    are ignored. All other values, such as camera and ISO, override the settings by
+    :func:`~clpipe.chain.settings.overlay`. So do all values of a configuration without ``stages``.
 
     Args:
-        before: what holds where the configuration has nothing.
-        values: of a configuration, nested as in its file.
+        before: the settings to override.
+        values: the values of a configuration, nested as in its file.
 
     Raises:
-        KeyedError: one of both chains has no raw, or a value is not allowed.
+        KeyedError: one of the two chains has no raw, or a value is not allowed.
     """
     if "stages" not in values:
         return overlay(before, values)
@@ -40,7 +40,7 @@ def laid_over(before: Settings, values: Mapping[str, Any]) -> Settings:
 
 
 def behind_raw(stages: Sequence[str]) -> int:
-    """The place in a chain's stages of the first that develops its raw.
+    """Return the index of the first stage after the raw in a chain's stages.
 
     >>> behind_raw(["exposure", "mosaic", "quantize", "normalize", "demosaic"])
     3
@@ -52,14 +52,14 @@ def behind_raw(stages: Sequence[str]) -> int:
     if not makers:
         raise KeyedError(
             "stages",
-            f"stages: found {', '.join(stages)}, of which none makes the raw (quantize does), so "
-            "none begins the development that goes behind another configuration's raw",
+            f"stages: found {', '.join(stages)}, but none of these makes the raw, so there is no "
+            "development to combine with another configuration's raw; add quantize",
         )
     return makers[-1] + 1
 
 
 def _raw_alone(settings: Settings, raw: Sequence[str], stages: tuple[str, ...]) -> Settings:
-    """Settings of other stages, with nothing left of steps but of those that make the raw."""
+    """Return settings with other stages. Only values of the steps that make the raw are kept."""
     names = {*numbered(raw), *TABLES, ""}
     skip = tuple(name for name in settings.skip if name in names or name == NOISE)
     parameters = {step: table for step, table in settings.parameters.items() if step in names}
@@ -76,11 +76,11 @@ def _raw_alone(settings: Settings, raw: Sequence[str], stages: tuple[str, ...]) 
 
 
 def _development(values: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
-    """The values of a configuration without its stages and what belongs to its raw.
+    """Return the values of a configuration, without its stages and the values of its raw.
 
     Args:
-        values: nested, as in its file.
-        names: of the steps that develop, in its own chain, and what they are called now.
+        values: the values, nested as in its file.
+        names: the new names of the steps after the raw, by their names in its own chain.
     """
     taken: dict[str, Any] = {}
     for key, value in values.items():
@@ -97,7 +97,7 @@ def _development(values: Mapping[str, Any], names: Mapping[str, str]) -> dict[st
 
 
 def _following(value: Any, names: Mapping[str, str]) -> Any:
-    """A value; a draw that follows a step's parameter by the name that the step has now."""
+    """Return a value. A draw that follows a parameter of a renamed step follows the new name."""
     if not isinstance(value, Mapping):
         return value
     followed = {k: v.partition(".") for k, v in value.items() if isinstance(v, str)}

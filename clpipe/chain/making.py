@@ -1,4 +1,4 @@
-"""Chains made of settings: each parameter resolved, and what does not fit refused."""
+"""Build chains from settings: resolve each parameter, and reject stages that do not fit."""
 
 from collections.abc import Mapping
 
@@ -35,23 +35,23 @@ def make_chain(
     start_at: str | None = None,
     until: str | None = None,
 ) -> Chain:
-    """The chain of settings, every parameter resolved.
+    """Return the chain of settings, with every parameter resolved.
 
-    A stage that is listed a second time is called ``stage_2``, and so on. Settings with draws give
-    an example, that of the image key "", after a check of all that can be drawn; the chain of an
-    image is made of its :meth:`Settings.drawn`.
+    A stage that is listed a second time is called ``stage_2``, and so on. For settings with draws,
+    all values that can be drawn are checked, and the chain is an example, for the image key "". To
+    get the chain of an image, pass the result of :meth:`Settings.drawn`.
 
     Args:
         settings: all values that are set.
-        source: the kind of image that enters; None is that of :func:`entry`, or, with ``start_at``,
-            what that step reads.
-        start_at: the first step to run. The steps before it are resolved too, because what they do
-            to the image (pattern, gains, noise, levels) has been done.
+        source: the kind of image that enters. None is the kind of :func:`entry`, or the kind that
+            ``start_at`` reads.
+        start_at: the first step to run. Earlier steps are resolved as well, because the image has
+            been through them (pattern, gains, noise, levels).
         until: the last step to run.
 
     Raises:
-        RequestError: image kinds that do not fit, an unknown camera, an ISO outside its range, or a
-            step that is not in the chain.
+        RequestError: the image kinds of two stages do not fit, the camera is unknown, the ISO is
+            outside its range, or a step is not in the chain.
     """
     check_cameras(settings)
     draws, settings = settings.draws, settings.drawn("")
@@ -72,7 +72,7 @@ def _made(
     start_at: str | None,
     until: str | None,
 ) -> Chain:
-    """See :func:`make_chain`; of settings without draws."""
+    """Return the chain of settings without draws, see :func:`make_chain`."""
     steps = resolved_steps(settings, camera, source or (None if start_at else entry(settings)))
     names = [step.name for step in steps]
     for name in settings.parameters:
@@ -88,9 +88,10 @@ def _made(
         last = names.index(until) + 1
     if first >= last:
         raise RequestError(
-            f"nothing is left to do; {start_at} comes after {until}"
+            f"no stage is left to run, because {start_at} comes after {until}; exchange --start-at "
+            "and --until"
             if steps
-            else "stages: nothing is left to do; no stage is listed, or every one was skipped"
+            else "stages: no stage is left to run; list at least one that is not skipped"
         )
     if source is None:
         source = steps[first].stage.reads
@@ -102,8 +103,9 @@ def _made(
 
 
 def entry(settings: Settings) -> Kind:
-    """The kind of image that enters a whole chain: linear RGB, or display where the first stage
-    reads that.
+    """Return the kind of image that enters a whole chain: linear RGB, or display values.
+
+    Display values enter if the first stage reads them.
 
     >>> entry(Settings(stages=("inverse_gamma", "mosaic"))).label, entry(Settings()).label
     ('display', 'rgb')
@@ -114,17 +116,17 @@ def entry(settings: Settings) -> Kind:
 
 
 def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:
-    """The steps of settings, in order, each resolved with what the steps before it did.
+    """Return the steps of settings in order, each resolved in the context after the earlier steps.
 
-    A step that does nothing is left out where it does not fit.
+    A step that does nothing is skipped if its image kind does not fit.
 
     Args:
         settings: all values that are set.
         camera: the camera of the settings.
-        kind: the kind of image that enters; None is what the first step reads.
+        kind: the kind of image that enters; None is the kind that the first step reads.
 
     Raises:
-        RequestError: image kinds do not fit.
+        RequestError: the image kinds of two stages do not fit.
     """
     methods = {name: settings.method(name) for name in settings.step_names}
     optics = optics_of(settings, camera, methods)
@@ -133,7 +135,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     context = Context(camera, settings.iso, light=light, optics=optics, exposure_time=time)
     steps: list[Step] = []
     before, takes_lens = "the input", not settings.lens
-    wide = ""  # the step behind which the picture is no longer in perspective
+    wide = ""  # the step after which the picture is no longer in perspective
     for name, as_set in methods.items():
         stage = all_stages()[base_name(name)].reading(kind)
         own = stage.chosen(as_set, bool(settings.parameters.get(name)), context)
@@ -155,7 +157,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
                 wide = f"{name}.method={method.method}"
             if not fits:
                 if isinstance(method, Unchanged) and stage.reads is stage.writes:
-                    continue  # so that gamma can be skipped without what does nothing behind it
+                    continue  # so that --skip gamma need not skip later idle stages as well
                 raise RequestError(misfit(name, stage, before, kind or stage.reads))
             _check_array(name, method, context)
             after = method.next_context(context)
@@ -173,18 +175,18 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
 
 
 def light_of(methods: Mapping[str, Method], camera: Camera) -> tuple[float, float]:
-    """The gains of red and blue that the light lacks: those that are set, else the camera's."""
+    """Return the gains of red and blue that balance the light: the set ones, else the camera's."""
     method = methods.get(stage_in(StageRole.BALANCE_OF_LIGHT).name)
     red, blue = camera.white_balance_gains
     return getattr(method, "red_gain", None) or red, getattr(method, "blue_gain", None) or blue
 
 
 def optics_of(settings: Settings, camera: Camera, methods: Mapping[str, Method]) -> Optics:
-    """The optics that settings, the render's camera and the steps of a chain state.
+    """Return the optics in the settings, the render's camera and the steps of a chain.
 
     Raises:
-        RequestError: two statements contradict each other, or the lens that is named cannot be
-            found, or set so.
+        RequestError: two values contradict each other, the lens is unknown, or the lens does not
+            have these settings.
     """
     stated = [
         (key, name, value)
@@ -202,39 +204,41 @@ def optics_of(settings: Settings, camera: Camera, methods: Mapping[str, Method])
     return optics.with_lens(lens)
 
 
-# By the keys of settings that state optics: what they state.
+# The optics that keys of settings set, by the keys.
 SETTINGS = dict(zip(LENS[1:], ("focal_length", "f_number", "focus_distance"), strict=True))
 
 
 def _check_behind(wide: str, name: str, method: Method) -> None:
-    """See that a step can stand behind one that makes the picture of a wide lens.
+    """Check that a step can follow one that makes the picture of a wide lens.
 
     Args:
-        wide: that one, for the message.
-        name: of the step, which does something.
-        method: as it was set.
+        wide: the step of the wide lens, for the message.
+        name: the name of the step, which does something.
+        method: the method of the step, as it was set.
 
     Raises:
-        RequestError: it is of pictures in perspective.
+        RequestError: the step needs a picture in perspective.
     """
     if isinstance(method, FromLens):
         raise KeyedError(
-            "lens", f"lens: it is of pictures in perspective, but {wide} is a lens; leave one out"
+            "lens",
+            f"lens: a lens from lensfun needs a picture in perspective, but {wide} is a lens as "
+            "well; remove one of them",
         )
     if "fx" in type(method).model_fields:
         raise KeyedError(
             name,
-            f"{name}.method={method.method}: it counts in the focal lengths of a picture in "
-            f"perspective, but {wide} makes that of a wide lens; leave it out, or take a method "
-            "that counts in px or in the picture's size",
+            f"{name}.method={method.method}: this method needs a picture in perspective, but "
+            f"{wide} makes the picture of a wide lens; skip {name}, or use a method with lengths "
+            "in px",
         )
 
 
 def _check_curve(chain: Chain) -> None:
-    """See that DN go back along a curve only where one made them fewer.
+    """Check that a chain inverts a piecewise linear curve only if it has applied one to the DN.
 
     Raises:
-        KeyedError: the chain makes linear DN, and goes back along a curve.
+        KeyedError: the chain makes linear DN, and a later step inverts a curve.
     """
     maker = None
     for step in chain.steps:
@@ -243,17 +247,17 @@ def _check_curve(chain: Chain) -> None:
             made = maker.name
             raise KeyedError(
                 f"{step.name}.knots",
-                f"{step.name}.knots: found a curve, but {made}.method={maker.method.method} made "
-                f"the DN; set {made}.method=pwl and {made}.knots, and leave {step.name}.knots out",
+                f"{step.name}.knots: found a curve, but {made}.method={maker.method.method} has "
+                f"none; set {made}.method=pwl and {made}.knots, and remove {step.name}.knots",
             )
         maker = step if step.stage.writes is Kind.RAW else maker
 
 
 def _check_pixels(steps: list[Step]) -> None:
-    """See that steps which count in the render's pixels get these, not fewer and larger ones.
+    """Check that no step with lengths in the render's pixels follows a step that rescales.
 
     Raises:
-        KeyedError: one does not.
+        KeyedError: such a step follows.
     """
     moving = [step for step in steps if type(step.method).geometry is not Method.geometry]
     scaled = next((step for step in moving if isinstance(step.method.geometry(), Scaling)), None)
@@ -264,14 +268,14 @@ def _check_pixels(steps: list[Step]) -> None:
         if stated and step.passes:
             raise KeyedError(
                 f"{step.name}.{stated}",
-                f"{step.name}.{stated}: found {getattr(step.method, stated):g}, which counts in "
-                f"pixels of the render, but {scaled.name} before it makes fewer of them; put "
+                f"{step.name}.{stated}: found {getattr(step.method, stated):g} px of the render, "
+                f"but the earlier stage {scaled.name} changes the size of pixels; list "
                 f"{step.name} before {scaled.name}",
             )
 
 
 def _check_array(name: str, method: Method, context: Context) -> None:
-    """See that a method which knows Bayer patterns alone has one.
+    """Check that a method that supports only Bayer patterns gets one.
 
     Raises:
         KeyedError: the mosaic has another filter array.
@@ -281,27 +285,27 @@ def _check_array(name: str, method: Method, context: Context) -> None:
         stage = all_stages()[base_name(name)]
         usual = stage.usual and stage.usual(context)
         fitting = [m.method for m in ((usual,) if usual else stage.methods) if m.any_array]
-        rest = f"take {name}.method={' or '.join(fitting)}" if fitting else f"skip {name}"
+        rest = f"use {name}.method={' or '.join(fitting)}" if fitting else f"skip {name}"
         raise KeyedError(
             name,
-            f"{name}.method={method.method}: it knows Bayer patterns alone, but the mosaic is "
-            f"{array.name}; {rest}",
+            f"{name}.method={method.method}: this method supports only Bayer patterns, but the "
+            f"mosaic is {array.name}; {rest}",
         )
 
 
 def _unused_lens(settings: Settings, methods: Mapping[str, Method]) -> str:
-    """The message for a lens that is named, and that no step takes."""
-    known = "lensfun knows neither distortion nor vignetting of it as it is set"
+    """Return the message for a lens that is set, but that no step uses."""
+    known = "lensfun has neither distortion nor vignetting for it at these settings; remove it"
     stages = " or ".join(s.name for s in all_stages().values() if "lens" in s.by_name)
     takes_it = any(isinstance(method, FromLens) for method in methods.values())
-    why = known if takes_it else f"no step takes it; that is done by {stages} with method lens"
-    return f"lens: found {settings.lens}, but {why}; leave it out"
+    why = known if takes_it else f"no step uses it; set the method of {stages} to lens"
+    return f"lens: found {settings.lens}, but {why}"
 
 
 def misfit(name: str, stage: Stage, before: str, kind: Kind) -> str:
-    """The message for a stage that cannot follow: why, and which stages could stand between."""
+    """Return the message for a stage that does not fit: why, and which stages could precede it."""
     bridges = [s.name for s in all_stages().values() if (s.reads, s.writes) == (kind, stage.reads)]
-    help_ = f"put {' or '.join(bridges)} between them" if bridges else f"leave out {name} as well"
+    help_ = f"list {' or '.join(bridges)} between them" if bridges else f"skip {name} as well"
     if before == "the input":
-        help_ += f", or enter there with an image of that kind: --start-at {name}"
+        help_ += f", or use an image of that kind with --start-at {name}"
     return f"stage {name} reads {stage.reads.label}, but {before} gives {kind.label}; {help_}"

@@ -1,4 +1,4 @@
-"""The methods of stages: found by their names, made from a table of parameters and validated."""
+"""Look up the methods of stages by name, and build them from validated tables of parameters."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,7 +20,7 @@ from clpipe.stage import Method, Stage
 
 @lru_cache(maxsize=1024)
 def base_name(step: str) -> str:
-    """The stage of a step that may be a repeated one.
+    """Return the stage name of a step, which may be a repeated stage.
 
     >>> base_name("denoise_2")
     'denoise'
@@ -29,7 +29,7 @@ def base_name(step: str) -> str:
 
 
 def numbered(stages: Sequence[str]) -> list[str]:
-    """The names of the steps of stages; a repeated stage gets a number.
+    """Return the names of the steps of stages. A repeated stage gets a number.
 
     >>> numbered(["denoise", "gamma", "denoise"])
     ['denoise', 'gamma', 'denoise_2']
@@ -41,12 +41,16 @@ def numbered(stages: Sequence[str]) -> list[str]:
 
 @lru_cache(maxsize=64)
 def step_names(stages: tuple[str, ...], skip: tuple[str, ...]) -> tuple[str, ...]:
-    """See :attr:`clpipe.chain.settings.Settings.step_names`."""
+    """Return the names of the steps, see :attr:`clpipe.chain.settings.Settings.step_names`."""
     return tuple(name for name in numbered(stages) if name not in skip)
 
 
 def stage_named(key: str, name: str) -> Stage:
-    """The stage of that name.
+    """Return the stage with a name.
+
+    Args:
+        key: the key or option that has this name, for the error.
+        name: the name of the stage.
 
     Raises:
         KeyedError: there is no such stage.
@@ -54,14 +58,14 @@ def stage_named(key: str, name: str) -> Stage:
     if name not in all_stages():
         if base_name(name) in all_stages():
             stage = base_name(name)
-            again = f"{name}: to repeat a stage, list {stage} again"
-            raise KeyedError(key, f"{again}; the second is then called {stage}_2")
+            again = f"{name}: this names a repeated stage; to repeat it, list {stage} again"
+            raise KeyedError(key, f"{again}. The second is then called {stage}_2")
         raise KeyedError(key, one_of("stage", name, all_stages()))
     return all_stages()[name]
 
 
 def parameter_names() -> list[str]:
-    """The parameters of all stages and tables, each once, as ``stage.parameter``."""
+    """Return the parameters of all stages and tables, each once, as ``stage.parameter``."""
     models = [(stage.name, method) for stage in all_stages().values() for method in stage.methods]
     pairs = [*models, *TABLE_MODELS.items()]
     return list(
@@ -70,13 +74,13 @@ def parameter_names() -> list[str]:
 
 
 def chosen_method(name: str, table: Mapping[str, Any]) -> Any:
-    """The name of the method in a step's table; without one, that of the stage's default method."""
+    """Return the name of the method in a step's table; else of the stage's default method."""
     stage = all_stages().get(base_name(name))
     return table.get("method", stage.methods[0].method if stage else None)
 
 
 def stage_of(step: str) -> Stage:
-    """Return the stage of a step, which may be a repeated one.
+    """Return the stage of a step, which may be a repeated stage.
 
     Raises:
         KeyedError: there is no such stage.
@@ -88,14 +92,14 @@ def make_model(name: str, table: Mapping[str, Any]) -> Any:
     """Validate a table.
 
     Args:
-        name: of a step, or of a table that belongs to no stage, see :data:`TABLE_MODELS`.
+        name: the name of a step, or of a table that belongs to no stage, see :data:`TABLE_MODELS`.
         table: values by name. In a step's table, "method" chooses the method.
 
     Returns:
         The method of the step, or the model of the other table.
 
     Raises:
-        KeyedError: an unknown stage, method or name, or a value that is not allowed.
+        KeyedError: a stage, method or name is unknown, or a value is not allowed.
     """
     if name in TABLE_MODELS:
         model = TABLE_MODELS[name]
@@ -110,7 +114,7 @@ def make_model(name: str, table: Mapping[str, Any]) -> Any:
 
 @lru_cache(maxsize=1024)
 def default_method(method: type[Method], name: str) -> Method:
-    """A method with all parameters at their defaults; methods are frozen, so one serves all.
+    """Return a method with all parameters at their defaults. It is cached, as methods are frozen.
 
     Raises:
         KeyedError: a parameter has no default.
@@ -120,7 +124,12 @@ def default_method(method: type[Method], name: str) -> Method:
 
 
 def method_named(stage: Stage, name: str, chosen: Any) -> type[Method]:
-    """The method of a stage by its name, ``chosen``; ``name`` is the step's, for the message.
+    """Return the method of a stage by its name.
+
+    Args:
+        stage: the stage.
+        name: the name of the step, for the message.
+        chosen: the name of the method.
 
     Raises:
         KeyedError: the stage has no such method.
@@ -137,11 +146,11 @@ TABLE_MODELS: dict[str, type[BaseModel]] = {OUTPUT: Encoding, RENDER: RenderCame
 
 @contextmanager
 def validation_errors(name: str, model: type[BaseModel]) -> Iterator[None]:
-    """Turn what pydantic refuses in a table into a message that names the table.
+    """Convert pydantic's errors about a table into messages that name the table.
 
     Args:
-        name: of the step, or of another table.
-        model: what declares the table's keys.
+        name: the name of the step, or of another table.
+        model: the model that declares the table's keys.
 
     Raises:
         KeyedError: a key is unknown, or its value is not allowed.
@@ -158,7 +167,7 @@ def validation_errors(name: str, model: type[BaseModel]) -> Iterator[None]:
 
 
 def unknown_parameter(step: str, model: type[BaseModel], parameter: str) -> KeyedError:
-    """The error for a parameter that a step, or another table, does not have."""
+    """Return the error for a parameter that a step, or another table, does not have."""
     key = f"{step}.{parameter}"
     if not issubclass(model, Method):
         return KeyedError(key, one_of(f"key of {step}", parameter, model.model_fields))

@@ -1,7 +1,7 @@
-"""The options of a run: of each, its name, type, range, choices, default and help.
+"""The options of a run, each with its name, type, range, choices, default and help.
 
 The options of ``clpipe run``, the checks and documentation of :func:`clpipe.run`, and the options
-that other commands share all follow from these keys.
+that other commands share are all derived from these keys.
 """
 
 from pathlib import Path
@@ -21,8 +21,8 @@ Moments = Literal["start", "middle", "end", "all"]
 Transfer = Literal["srgb", "linear"]
 RedoName = Literal["missing", "old", "damaged", "all"]
 
-MOST_PATCHES = 9999  # of an image; the names of their files have four digits
-PER_IMAGE = 16  # patches, unless another number is asked for
+MOST_PATCHES = 9999  # per image, because file names have four digits
+PER_IMAGE = 16  # patches by default
 
 DEVICE = Key(
     "device",
@@ -87,8 +87,8 @@ _ALL = (
         list,
         "A layer to warp with the picture. It has depth, normals, flow or object numbers, in the "
         "image's own file or in one next to it, and is written to OUT/NAME.carried.exr. "
-        f"KIND is needed if the name does not say it: {', '.join(RESAMPLING)} or png. png is depth "
-        "in metres or object numbers, and also writes a PNG with 16 bits, OUT/NAME.LAYER.png, "
+        f"KIND is needed if the name does not imply it: {', '.join(RESAMPLING)} or png. png is "
+        "depth in metres or object numbers. It also writes a PNG with 16 bits, OUT/NAME.LAYER.png, "
         "with depth in millimetres. FILE is the path from the image's directory, as in "
         "'Depth=../depth/{name}.exr'.",
         "NAME[:KIND][=FILE]",
@@ -106,8 +106,8 @@ _ALL = (
     Key(
         "truth_at",
         str,
-        "The moment of an exposure of several files whose pose and layers go with the picture. all "
-        "has the layers of its start and end as well.",
+        "The moment of an exposure of several files whose pose and layers are written with the "
+        "picture. all also writes the layers of its start and end.",
         usual="middle",
         choices=get_args(Moments),
     ),

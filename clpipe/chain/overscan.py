@@ -1,7 +1,7 @@
-"""Chains whose image goes on beyond the picture, where a lens shows what a render has there.
+"""Chains for images with overscan: pixels outside the picture that lens distortion can show.
 
-The stages up to the first one that moves pixels work on the whole image, and that one makes the
-picture of it. Where it is no lens, or a stage before it cannot do so, the image is the picture.
+The stages up to the first one that moves pixels work on the whole image, and that stage makes the
+picture from it. If an earlier stage does not support overscan, the image is cropped first.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from clpipe.reference.geometry import NO_MARGINS, Margins
 
 @of_structure
 def steps_of_overscan(chain: Chain) -> int:
-    """How many steps of a chain get an image that goes on beyond the picture; 0 is none."""
+    """Return how many steps of a chain get an image with overscan; 0 if the chain cannot use it."""
     for count, step in enumerate(chain.steps, 1):
         if step.passes and not step.method.overscan:
             return 0
@@ -25,9 +25,9 @@ def steps_of_overscan(chain: Chain) -> int:
 
 
 def with_overscan(chain: Chain, margins: Margins) -> Chain:
-    """The chain for an image that goes on beyond the picture, of which it can make use.
+    """Return the chain for an image with overscan, which the chain must be able to use.
 
-    Plans and kernels differ from those of the chain in numbers alone.
+    Plans and kernels differ from those of ``chain`` only in numbers.
     """
     count = steps_of_overscan(chain)
     steps = tuple(
@@ -38,10 +38,10 @@ def with_overscan(chain: Chain, margins: Margins) -> Chain:
 
 
 def margins_of_array(overscan: Sequence[int], image: Array) -> Margins:
-    """The margins that somebody gives with an image, (height, width[, channel]).
+    """Return the margins of an image, (height, width[, channel]), from numbers of px.
 
     Raises:
-        ImageError: they are no margins, or leave no picture.
+        ImageError: the numbers are no margins, or leave no picture.
     """
     if not any(overscan):
         return NO_MARGINS
@@ -50,6 +50,6 @@ def margins_of_array(overscan: Sequence[int], image: Array) -> Margins:
         if min(margins.inside(*image.shape[1::-1])) > 0:
             return margins
     raise ImageError(
-        f"found overscan {tuple(overscan)}; expected px to the left, at the top, to the right and "
-        f"at the bottom, which leave something of an image of shape {image.shape}"
+        f"found overscan {tuple(overscan)}; expected four numbers of px (left, top, right, bottom) "
+        f"that leave a picture of an image of shape {image.shape}"
     )

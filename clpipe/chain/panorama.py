@@ -1,4 +1,4 @@
-"""Chains whose image is an atlas of what is all around, as a wide lens sees it."""
+"""Chains whose image is the atlas of a panorama, seen through a wide lens."""
 
 from dataclasses import replace
 
@@ -9,9 +9,9 @@ from clpipe.stages.projection import Wide
 
 
 def with_panorama(chain: Chain, panorama: Panorama) -> Chain:
-    """The chain for an image that is the atlas of a panorama.
+    """Return the chain for an image that is the atlas of a panorama.
 
-    Plans and kernels differ from those of the chain in numbers alone.
+    Plans and kernels differ from those of ``chain`` only in numbers.
     """
     steps = tuple(
         replace(step, method=step.method.with_panorama(panorama))
@@ -23,6 +23,6 @@ def with_panorama(chain: Chain, panorama: Panorama) -> Chain:
 
 
 def projection_of(chain: Chain) -> Projection | None:
-    """The projection that moves a chain's pixels first; None where there is none."""
+    """Return the projection that is a chain's first move of pixels; None if there is none."""
     parts = chain.geometry.parts if chain.geometry else ()
     return parts[0] if parts and isinstance(parts[0], Projection) else None

@@ -1,4 +1,4 @@
-"""Names of files in settings: which parameters hold one, and what it is relative to."""
+"""File names in settings: the parameters that hold them, and the directory to resolve them in."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -11,7 +11,7 @@ from clpipe.stage import Stage
 
 
 def from_folder(folder: Path, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested values with the names of files joined to the folder that they are relative to."""
+    """Return nested values with file names joined to the directory that they are relative to."""
     moved = dict(values)
     for key, value in values.items():
         stage = all_stages().get(base_name(key))
@@ -25,14 +25,14 @@ def from_folder(folder: Path, values: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def file_parameters(stage: Stage) -> frozenset[str]:
-    """The parameters of a stage's methods that hold the name of a file."""
+    """Return the parameters of a stage's methods that hold a file name."""
     fields = [field for method in stage.methods for field in method.model_fields.items()]
     extras: dict[str, Any] = {name: field.json_schema_extra for name, field in fields}
     return frozenset(name for name, extra in extras.items() if extra["file"])
 
 
 def joined(folder: Path, value: Any, only: str = "") -> Any:
-    """The name of a file in a folder, or a draw among such names; other values as they are.
+    """Return a file name, or a draw among file names, joined to a directory; else the value.
 
     >>> joined(Path("a"), {"choice": ["b.toml", "sony-a7r2"]}, only=".toml")
     {'choice': ['a/b.toml', 'sony-a7r2']}

@@ -1,4 +1,4 @@
-"""What a chain makes of a scene's light: exposure, balance, vignetting and response, as truth."""
+"""Photometric ground truth of a picture: exposure, white balance, vignetting and response."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,9 +12,9 @@ from clpipe.chain.chain import Chain, Step
 from clpipe.stage import Kind, Method, ReferenceContext, StageRole, Unchanged
 from clpipe.stages.exposure.gain import Gain
 
-CODES = 256  # of a table of the response, and of its inverse
-FINE = 64  # steps between two of them, by which it is inverted
-DIGITS = 6  # that count, of what is written
+CODES = 256  # entries of a table of the response, and of its inverse
+FINE = 64  # steps between two entries, for the inversion
+DIGITS = 6  # significant digits of written numbers
 METERED = "metered_ev"  # among the estimates of exposure
 
 Estimates = Mapping[str, Mapping[str, float]]
@@ -28,9 +28,9 @@ class Exposure:
     """The exposure of a picture.
 
     Args:
-        ev: over that of the render as it is, with what was metered.
-        gain: what a render's 1.0 is over the sensor's full scale.
-        time: how long the shutter was open, s, where that is known.
+        ev: the exposure relative to the unchanged render, in EV. It includes the metered EV.
+        gain: the level of a render's 1.0, relative to the sensor's full scale.
+        time: the exposure time in s; None if it is unknown.
     """
 
     ev: float
@@ -39,11 +39,11 @@ class Exposure:
 
 
 def exposure_of(chain: Chain, estimates: Estimates) -> Exposure | None:
-    """The exposure of a picture; None where its chain exposes nothing, as that of a raw.
+    """Return the exposure of a picture; None if its chain has no exposure, like that of a raw.
 
     Args:
-        chain: of the picture.
-        estimates: what its steps found in the image, by their names.
+        chain: the chain of the picture.
+        estimates: the values that steps estimated from the image, by step name.
     """
     step = chain.step_in(StageRole.EXPOSURE)
     if step is None or not isinstance(step.method, Gain):
@@ -55,16 +55,18 @@ def exposure_of(chain: Chain, estimates: Estimates) -> Exposure | None:
 
 
 def photometry_of(chain: Chain, estimates: Estimates) -> dict[str, Any] | None:
-    """How a render's light became a picture's, as JSON values; None where nothing exposes it.
+    """Return how a render's light became a picture's, as JSON values; None without an exposure.
 
-    A grey of the render, L, is in the channel c of the picture ``response(x)`` with x = ``gain`` L
-    v ``applied[c]`` / ``light[c]`` (of ``gains``) and v the falloff there, but for noise. Tables of
-    the response are over x = i / 255, and of its inverse over the codes i / 255: where several x
-    have one code, the least of them. x = 1 is the sensor's full scale.
+    Apart from noise, a grey L of the render has the value ``response(x)`` in channel c of the
+    picture, where x = ``gain`` L v ``applied[c]`` / ``light[c]``. ``applied`` and ``light`` are in
+    ``gains``, and v is the falloff at this pixel. x = 1 is the sensor's full scale.
+
+    The response has 256 entries, for x = i / 255. Its inverse has an entry for each code i / 255,
+    the smallest x that has this code.
 
     Args:
-        chain: of the picture.
-        estimates: what its steps found in the image, by their names.
+        chain: the chain of the picture.
+        estimates: the values that steps estimated from the image, by step name.
     """
     exposure = exposure_of(chain, estimates)
     if exposure is None:
@@ -82,7 +84,7 @@ def photometry_of(chain: Chain, estimates: Estimates) -> dict[str, Any] | None:
 
 
 def _gains(chain: Chain, estimates: Estimates) -> dict[str, list[float]]:
-    """The gains of red, green and blue that the light lacks, and those by which it is balanced."""
+    """Return the gains of red, green and blue that the light needs, and those that were applied."""
     context = chain.context_after
     step = chain.step_in(StageRole.BALANCE)
     found = estimates.get(step.name, {}) if step else {}
@@ -93,7 +95,7 @@ def _gains(chain: Chain, estimates: Estimates) -> dict[str, list[float]]:
 
 
 def _falloff(chain: Chain) -> dict[str, Any] | None:
-    """The law by which light falls off towards the corners; None where it does not."""
+    """Return the model of the vignetting, as JSON values; None without vignetting."""
     step = chain.step_in(StageRole.FALLOFF)
     if step is None or isinstance(step.method, Unchanged) or not step.passes:
         return None
@@ -102,7 +104,10 @@ def _falloff(chain: Chain) -> dict[str, Any] | None:
 
 
 def response_of(chain: Chain) -> Tables | None:
-    """What greys become, as 256 numbers, and the inverse; None of a chain that ends before."""
+    """Return the response to greys and its inverse, 256 numbers each.
+
+    Returns None if the chain ends before display values.
+    """
     if chain.result is not Kind.DISPLAY:
         return None
     steps = [step for step in chain.steps if step.stage.role is StageRole.RESPONSE]
@@ -117,7 +122,7 @@ def _tables(steps: Sequence[Step]) -> Tables:
         image = step.method.reference(image, ReferenceContext(step.context, {}, {}))
     curve = np.maximum.accumulate(np.clip(image[0, :, 1].astype(np.float64), 0, 1))
     codes = np.arange(CODES) / (CODES - 1)
-    first = np.searchsorted(curve, codes)  # the least x of each code
+    first = np.searchsorted(curve, codes)  # the smallest x of each code
     at = np.clip(first, 1, len(curve) - 1)
     rise = curve[at] - curve[at - 1]
     part = np.where(rise > 0, (codes - curve[at - 1]) / np.where(rise > 0, rise, 1), 1.0)

@@ -1,4 +1,4 @@
-"""All stages: clpipe's own, those of installed packages, and those of stage files."""
+"""The registry of stages: built-in ones, those of installed packages, and those of stage files."""
 
 import os
 import re
@@ -33,7 +33,7 @@ _loading = RLock()  # so that each file is run once
 
 
 def all_stages() -> dict[str, Stage]:
-    """All stages by name: clpipe's own, the default chain first, then the others."""
+    """Return all stages by name: built-in ones first, in the order of the default chain."""
     return _all_stages(tuple(_from_files.values()))
 
 
@@ -44,10 +44,10 @@ def _all_stages(from_files: tuple[Stage, ...]) -> dict[str, Stage]:
 
 @cache
 def installed_stages() -> dict[str, Stage]:
-    """The stages that installed packages offer as entry points of the group ``clpipe.stages``.
+    """Return the stages that installed packages offer as entry points, group ``clpipe.stages``.
 
     Raises:
-        RequestError: one cannot be loaded, is no stage, or has the name of another stage.
+        RequestError: a stage cannot be loaded, is no stage, or has the name of another stage.
     """
     stages: dict[str, Stage] = {}
     for entry in entry_points(group=ENTRY_POINTS):
@@ -59,23 +59,23 @@ def installed_stages() -> dict[str, Stage]:
 
 
 def stage_in(role: StageRole) -> Stage:
-    """The stage that has a role: clpipe's own, unless that is gone."""
+    """Return the first stage that has a role, normally the built-in one."""
     return next(stage for stage in all_stages().values() if stage.role is role)
 
 
 def load_stage_file(path: Path) -> Stage:
-    """Load a stage from a Python file that defines ``STAGE``; its kernels lie in the same folder.
+    """Load a stage from a Python file that defines ``STAGE``. Kernels are in the same directory.
 
     Raises:
-        RequestError: the file cannot be read or run, defines no stage, or one with the name of
-            another stage.
+        RequestError: the file cannot be read or run, defines no stage, or defines one with the
+            name of another stage.
     """
     with _loading:
         return _loaded_file(path, Path(os.path.realpath(path)))
 
 
 def code_files(stage_files: Iterable[Path]) -> list[Path]:
-    """Stage files with the kernels of their stages: all of the code that they bring.
+    """Return stage files and the kernels of their stages, which is all of their code.
 
     Raises:
         RequestError: as :func:`load_stage_file`.
@@ -92,12 +92,12 @@ def _loaded_file(path: Path, where: Path) -> Stage:
     if where not in _from_files:
         spec = spec_from_file_location(f"clpipe_stage_{path.stem}", where)
         if path.suffix != ".py" or spec is None or spec.loader is None:
-            raise RequestError(f"{path}: a stage file is a Python file, ending in .py")
+            raise RequestError(f"{path}: a stage file is a Python file; use one that ends in .py")
         check_exists(path)
         try:
             check_regular(where)
         except OSError as error:
-            raise RequestError(f"{path}: cannot be read: {error.strerror}") from None
+            raise RequestError(f"{path}: cannot read the stage file: {error.strerror}") from None
         module = module_from_spec(spec)
         stage, _ = _loaded(str(path), module)
         _check_stage_name(str(path), stage.name, all_stages())
@@ -106,14 +106,14 @@ def _loaded_file(path: Path, where: Path) -> Stage:
 
 
 def _loaded(place: str, source: EntryPoint | ModuleType) -> tuple[Stage, Path]:
-    """The stage of an entry point, or of a module that is run here, and its file.
+    """Return the stage of an entry point, or of a module that this function runs, and its file.
 
     Args:
         place: the package or the file, for messages.
         source: the entry point or the module.
 
     Raises:
-        RequestError: it cannot be loaded, or is no valid stage.
+        RequestError: the stage cannot be loaded, or is not valid.
     """
     folder = Path(place).parent.resolve() if isinstance(source, ModuleType) else None
     with user_code_errors(place, folder):
@@ -126,29 +126,35 @@ def _loaded(place: str, source: EntryPoint | ModuleType) -> tuple[Stage, Path]:
             module.__spec__.loader.exec_module(module)
             stage = getattr(module, "STAGE", None)
     if not isinstance(stage, Stage):
-        raise RequestError(f"{place}: STAGE is not there, or is no clpipe.stage.Stage")
+        raise RequestError(
+            f"{place}: STAGE is missing or no clpipe.stage.Stage; define STAGE = Stage(...)"
+        )
     file = Path(str(module.__file__))
     if not isinstance(stage.methods, tuple) or not stage.methods:
         raise RequestError(f"{place}: the methods of {stage.name} must be a tuple: (Method,)")
     for method in stage.methods:
         if not (isinstance(method, type) and issubclass(method, Method)):
-            raise RequestError(f"{place}: {method!r} is no class derived from Method")
+            raise RequestError(
+                f"{place}: {method!r} is not derived from Method; list subclasses of Method only"
+            )
         missing = [n for n in ("method", "kernel", "summary") if not hasattr(method, n)]
         if missing:
-            raise RequestError(f"{place}: {method.__name__} lacks {', '.join(missing)}")
+            raise RequestError(
+                f"{place}: {method.__name__} lacks {', '.join(missing)}; define this in the class"
+            )
         kernel = file.parent / f"{method.kernel}.cl"
         if method.kernel and not kernel.is_file():
-            raise RequestError(f"{place}: its kernel {kernel} is not there")
+            raise RequestError(f"{place}: its kernel {kernel} does not exist; create this file")
     return stage, file
 
 
 @contextmanager
 def user_code_errors(place: str, folder: Path | None) -> Iterator[None]:
-    """Turn any error that a user's stage raises into a message with the line of its code.
+    """Convert any error that a user's stage raises into a message with the line of its code.
 
     Args:
         place: the stage, for the message.
-        folder: of the stage's code; None is clpipe's own.
+        folder: the directory of the stage's code; None for a built-in stage.
 
     Raises:
         RequestError: the stage raised an error.
@@ -169,10 +175,10 @@ def user_code_errors(place: str, folder: Path | None) -> Iterator[None]:
 
 
 def check_passes(name: str, stage: Stage, method: Method, context: Context) -> None:
-    """See that the passes of a user's method fit its arguments and its kernel file.
+    """Check that the passes of a user's method fit its arguments and its kernel file.
 
     Raises:
-        RequestError: they do not.
+        RequestError: they do not fit.
     """
     assert stage.folder
     kernel = stage.folder / f"{method.kernel}.cl"
@@ -183,33 +189,38 @@ def check_passes(name: str, stage: Stage, method: Method, context: Context) -> N
             for argument in pass_.all_arguments:
                 if argument not in names:
                     raise RequestError(
-                        f"stage {name}: pass {pass_.function} needs the argument '{argument}'; "
-                        f"arguments() gives {', '.join(arguments) or 'none'}"
+                        f"stage {name}: pass {pass_.function} needs the argument '{argument}', but "
+                        f"arguments() returns {', '.join(arguments) or 'none'}; add '{argument}'"
                     )
             for function in pass_.functions:
                 if not re.search(rf"\b{re.escape(function)}\s*\(", kernel.read_text("utf-8")):
                     raise RequestError(
-                        f"stage {name}: {kernel} has no function {function}, which a pass names"
+                        f"stage {name}: a pass calls the function {function}, but {kernel} does "
+                        "not define it; add it there"
                     )
         for argument, value in arguments.items():
             if not isinstance(value, ARGUMENT_TYPES):
                 allowed = ", ".join(["float", *(t.__name__ for t in ARGUMENT_TYPES)])
                 raise RequestError(
-                    f"stage {name}: arguments() gives {value!r} as '{argument}'; allowed: {allowed}"
+                    f"stage {name}: arguments() returns {value!r} as '{argument}'; its type must "
+                    f"be one of {allowed}"
                 )
 
 
 def _check_stage_name(place: str, name: str, taken: dict[str, Stage]) -> None:
     if not name.isidentifier() or name[-1].isdecimal():
         raise RequestError(
-            f"{place}: its stage is called '{name}'; "
-            "a name has letters, digits and _, and no digit last"
+            f"{place}: its stage is called '{name}', but a name has only letters, digits and _, "
+            "and does not end in a digit; choose another name"
         )
     if name == NOISE:
-        raise RequestError(f"{place}: its stage is called '{name}', which stands for all noise")
+        raise RequestError(
+            f"{place}: its stage is called '{name}', which stands for all noise under --skip; "
+            "choose another name"
+        )
     if name in taken:
         owner = taken[name].folder or "clpipe itself"
         raise RequestError(
             f"{place}: its stage is called '{name}', but that name is taken ({owner}); "
-            "choose another"
+            "choose another name"
         )

@@ -17,9 +17,9 @@ Pose = Annotated[tuple[Matrix, Vector], Field(strict=False)]
 
 
 class RenderCamera(BaseModel):
-    """The camera of a render: what its pixels are of, as far as it is known.
+    """The camera of a render, as far as it is known: intrinsics, pose and exposure.
 
-    Its optics are a part of :class:`clpipe.camera.optics.Optics`.
+    Its optics are part of :class:`clpipe.camera.optics.Optics`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
@@ -27,41 +27,41 @@ class RenderCamera(BaseModel):
     exposure_time: Annotated[float, Field(gt=0, le=86400, allow_inf_nan=False)] | None = None  # s
     focal_length: Length | None = None  # mm
     sensor_width: Length | None = None  # mm, along the longer side of the image
-    # In px, the first pixel's centre at 0.5; None follows from the lengths in mm and the middle of
-    # the image.
+    # In px; the centre of the first pixel is at 0.5. None is derived from the lengths in mm and the
+    # centre of the image.
     fx: Pixels | None = None
     fy: Pixels | None = None
     cx: Finite | None = None
     cy: Finite | None = None
-    # Radians, across the width of the render, as transforms.json has it.
+    # The horizontal field of view in radians, as in transforms.json.
     camera_angle_x: Annotated[float, Field(gt=0, lt=math.pi)] | None = None
-    # From the world to the camera, in OpenCV's axes: x_cam = rotation x + translation.
+    # From world to camera, in OpenCV's axes: x_cam = rotation x + translation.
     rotation: Matrix | None = None
     translation: Vector | None = None
 
-    # While the shutter is open, from its opening to its end, in equal steps of time: poses alike.
+    # Poses of the same form while the shutter is open, in equal steps from its opening to its end.
     motion: Annotated[tuple[Pose, ...] | None, Field(strict=False, min_length=2)] = None
 
     @model_validator(mode="after")
     def _check_pose(self) -> Self:
         if (self.rotation is None) != (self.translation is None):
-            raise ValueError("rotation and translation belong together; give both, or neither")
+            raise ValueError("only one of rotation and translation is set; set both or neither")
         return self
 
     @property
     def pose(self) -> dict[str, Any] | None:
-        """R and t of x_cam = R X + t; None where they are not known."""
+        """R and t of x_cam = R X + t; None if they are unknown."""
         if self.rotation is None or self.translation is None:
             return None
         return {"R": [list(row) for row in self.rotation], "t": list(self.translation)}
 
     @property
     def optics(self) -> dict[str, float]:
-        """The optics that are set, by the names of the fields."""
+        """The optics that are set, by field name."""
         return self.model_dump(exclude=POSE, exclude_none=True)
 
     def with_defaults(self, shot: Mapping[str, float]) -> "RenderCamera":
-        """A copy in which ``shot``, what a source says of itself, fills the fields that are None.
+        """Return a copy whose fields that are None are filled from ``shot``, an image's own values.
 
         >>> camera = RenderCamera(focal_length=24.0)
         >>> camera.with_defaults({"focal_length": 50.0, "exposure_time": 0.5}).focal_length

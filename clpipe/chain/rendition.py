@@ -1,7 +1,7 @@
-"""Renditions: which of the pictures that are made of one image.
+"""Renditions: the different pictures that are made of one image.
 
-There is the noisy picture or a burst of frames of it, truths and baselines beside it; a bracket has
-all of these at each of its exposures.
+These are the noisy picture or a burst of noisy frames, its ground truth, and its baselines. A
+bracket has all of these at each of its exposures.
 """
 
 import math
@@ -21,8 +21,7 @@ NOISY, *_ = ROLES = get_args(Role)
 DEVELOPMENT, CLEAN, MOSAIC, VARIANCE = TRUTHS = ROLES[1:5]
 IID, INTENSITY = BASELINES = ROLES[5:]
 
-# What is the same picture without noise; the other truths are mosaics in float, whatever the format
-# of pictures is.
+# Truths that are the same picture without noise, and truths that are always float mosaics.
 PICTURES, FLOAT_MOSAICS = TRUTHS[:2], TRUTHS[2:]
 
 
@@ -32,9 +31,9 @@ class Rendition:
 
     Args:
         role: the noisy picture, one of :data:`TRUTHS` or one of :data:`BASELINES`.
-        ev: what its exposure in a bracket adds, in EV; None without a bracket.
-        frame: the number of a noisy picture in its burst; None where it is no frame.
-        frames: how many frames the burst has; None without one.
+        ev: its relative exposure in a bracket, in EV; None without a bracket.
+        frame: the number of the noisy picture in its burst; None if it is no frame.
+        frames: the number of frames of the burst; None without a burst.
     """
 
     role: Role = NOISY
@@ -44,7 +43,7 @@ class Rendition:
 
     @property
     def suffix(self) -> str:
-        """What is put behind the image's name.
+        """The part of the file name after the image's name.
 
         >>> Rendition(frame=3, frames=20).suffix, Rendition("clean", ev=-0.5).suffix
         ('.frame03', '.ev-0.5.truth_clean')
@@ -56,26 +55,26 @@ class Rendition:
 
     @property
     def label(self) -> str:
-        """The role as names of files say it, "" for a noisy picture."""
+        """The role as it appears in file names; "" for a noisy picture."""
         if self.role in TRUTHS:
             return ".truth" if self.role == DEVELOPMENT else f".truth_{self.role}"
         return f".{self.role}" if self.role in BASELINES else ""
 
     @property
     def is_first(self) -> bool:
-        """Whether it is the noisy picture, or the first frame of its burst."""
+        """Whether this is the noisy picture, or the first frame of its burst."""
         return self.role == NOISY and not self.frame
 
     def beside(self, role: Role) -> "Rendition":
-        """The rendition of a role at the same exposure; of a noisy burst, its first frame."""
+        """Return the rendition of a role at the same exposure; for a burst, its first frame."""
         return replace(self, role=role, frame=0 if role == NOISY and self.frames else None)
 
     @classmethod
     def from_record(cls, values: Mapping[str, Any]) -> "Rendition":
-        """The rendition that a sidecar's values are of.
+        """Return the rendition that a sidecar's values describe.
 
         Raises:
-            KeyError, TypeError, ValueError: they are damaged.
+            KeyError, TypeError, ValueError: the values are damaged.
         """
         own = {each.name: values[each.name] for each in fields(cls)}
         try:
@@ -91,23 +90,23 @@ class Rendition:
 
 @cache
 def _adapter() -> TypeAdapter[Rendition]:
-    return TypeAdapter(Rendition)  # which takes 10 ms to make
+    return TypeAdapter(Rendition)  # takes 10 ms
 
 
 FIRST = Rendition()
 
 
 def parse_bracket(evs: str | Sequence[float]) -> tuple[float, ...]:
-    """The exposures of a bracket, from EVs or a text with commas between them.
+    """Return the exposures of a bracket, from EVs or a text of EVs separated by commas.
 
     >>> parse_bracket("-2, 0, +2")
     (-2.0, 0.0, 2.0)
 
     Raises:
-        RequestError: one is not a number, or occurs twice.
+        RequestError: an EV is not a number, or occurs twice.
     """
     try:
-        # As their names say them, so that a replay has the same ones.
+        # Rounded as in file names, so that a replay has the same exposures.
         items = evs.split(",") if isinstance(evs, str) else evs
         bracket = tuple(float(f"{float(item):g}") + 0.0 for item in items)
     except ValueError:

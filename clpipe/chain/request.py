@@ -1,4 +1,4 @@
-"""Requests: plain values from options, a configuration, a manifest, a sidecar."""
+"""Requests: plain values from options, a configuration, a manifest or a sidecar."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -30,14 +30,14 @@ from clpipe.stage import Kind
 
 DEFAULTS = Settings()
 
-MADE = 8  # settings that a request, and those that it is replaced by, keep
+MADE = 8  # settings that a request and its copies cache
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """The part of a request that decides about a picture's bytes, as a sidecar stores it.
+    """The part of a request that determines a picture's bytes, as a sidecar stores it.
 
-    The rest of a request decides which pictures are made, or whether they are.
+    The rest of a request determines which pictures are made.
 
     Args:
         config: the values of a configuration, nested as in its file; None if none is named.
@@ -75,13 +75,12 @@ RECORDED = tuple(each.name for each in fields(Recorded))
 
 @dataclass(frozen=True)
 class Request(Recorded):
-    """A request: plain values for all that is asked for, so that it can be stored and sent.
+    """A request: plain values of all options, which can be stored and sent to other processes.
 
     Args:
         truths: which of :data:`clpipe.chain.rendition.TRUTHS` are written next to each picture.
         baselines: which of :data:`clpipe.chain.rendition.BASELINES` are made next to each picture.
-        made: the settings that were made of ``config`` and ``options``; requests that are replaced
-            by others share them.
+        made: a cache of the settings made of ``config`` and ``options``, which copies share.
 
     The other fields are those of :class:`Recorded`, and options.
     """
@@ -105,7 +104,7 @@ class Request(Recorded):
         truth: Sequence[str] = (),
         **others: Any,
     ) -> "Request":
-        """The request of options. None is an option that is not set.
+        """Return the request of options. None is an option that is not set.
 
         Args:
             config: built-in configurations or TOML files. Each overrides those before it.
@@ -115,7 +114,7 @@ class Request(Recorded):
             **others: further fields of the class.
 
         Raises:
-            RequestError: a name or value that is not allowed.
+            RequestError: a name or value is not allowed.
         """
         for file in stage_files:
             load_stage_file(Path(file))
@@ -130,7 +129,7 @@ class Request(Recorded):
             **{name: value for name, value in others.items() if value is not None},
         )
         if configuration:
-            # They are validated already.
+            # These settings are already validated.
             request.made.get(Identity(request.config), lambda: configuration.settings)
         request.settings()
         request.aov_specs()  # rejects wrong texts
@@ -138,16 +137,16 @@ class Request(Recorded):
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> "Request":
-        """The request that :meth:`record` stored. No stage file is loaded, no name looked up.
+        """Return the request that :meth:`record` stored. It loads no stage files or configurations.
 
         Raises:
-            RequestError: the record is not of that form.
+            RequestError: the record does not have this form.
         """
         damaged = "the request in it is damaged: "
         known = {name: record[name] for name in RECORDED if name in record}
         for name in RECORDED:
-            if name not in known and name != "truth_at":  # which older sidecars lack
-                raise RequestError(f"{damaged}{name}: it is missing")
+            if name not in known and name != "truth_at":  # older sidecars lack it
+                raise RequestError(f"{damaged}{name} is missing")
         try:
             found = _recorded().validate_json(json.dumps(known), strict=True)
         except ValidationError as error:
@@ -156,24 +155,26 @@ class Request(Recorded):
         if (found.patch is None) != (found.patches_per_image == 0):
             raise RequestError(f"{damaged}patch and patches_per_image contradict each other")
         if not set(found.formats) <= set(EVERY_FORMAT):
-            raise RequestError(f"found formats {', '.join(found.formats)}")
+            raise RequestError(
+                f"{damaged}formats: found {', '.join(found.formats)}; expected some of "
+                f"{', '.join(EVERY_FORMAT)}"
+            )
         request = cls(**vars(found))
         request.aov_specs()  # rejects wrong texts
         return request
 
     def for_image(self, name: str, values: Mapping[str, Any]) -> Self:
-        """The request for one image: its name, and values that hold for it alone."""
+        """Return the request for one image: with its name, and values that only it has."""
         return altered(self, {"image_name": name, "image": values})
 
     def with_outputs(self, chain: Chain) -> "ResolvedRequest":
-        """The request with every output named, as a chain has them.
+        """Return the request with every output named, for a chain.
 
-        The format, where none is chosen, is JPEG; where ``until`` ends the chain before it comes to
-        display values, EXR, or of patches ``.npy``. The truth of the mosaic is not kept a second
-        time beside that of the development.
+        The default format is JPEG. If ``until`` ends the chain before display values, it is EXR, or
+        ``.npy`` for patches. The mosaic's ground truth is not kept again for the development's.
 
         Raises:
-            RequestError: the chain has not a step of ``keep``, or no mosaic that is asked for.
+            RequestError: the chain lacks a step of ``keep``, or a mosaic that the truths need.
         """
         is_whole = self.until is None or chain.result is Kind.DISPLAY
         usual = "jpg" if is_whole else "exr" if self.patch is None else NPY
@@ -186,21 +187,21 @@ class Request(Recorded):
         return ResolvedRequest(**known)
 
     def aov_specs(self) -> tuple[AovSpec, ...]:
-        """The layers that go along with each picture.
+        """Return the layers that are warped and written with each picture.
 
         Raises:
-            RequestError: one is wrong.
+            RequestError: a layer is not valid, see :func:`~clpipe.chain.carry.parse_carry`.
         """
         return parse_carry(self.carry)
 
     def settings(self, embedded: Settings | None = None) -> Settings:
-        """The settings that are asked for, drawn for the image where there is one.
+        """Return the settings of the request, with draws replaced by the image's values, if any.
 
         Args:
-            embedded: the settings that an image carries, which hold where nothing else is set.
+            embedded: the settings in the image's file, which all other values override.
 
         Raises:
-            RequestError: a name or value that is not allowed.
+            RequestError: a name or value is not allowed.
         """
         for file in self.stage_files:
             load_stage_file(Path(file))
@@ -214,32 +215,32 @@ class Request(Recorded):
         return settings.drawn(self.image_name) if self.image_name else settings
 
     def chain(self, embedded: Settings | None = None) -> Chain:
-        """The chain that is asked for; ``embedded`` as for :meth:`settings`.
+        """Return the chain of the request; ``embedded`` as for :meth:`settings`.
 
         Raises:
-            RequestError: it cannot be made.
+            RequestError: the chain cannot be built.
         """
         return self.chain_from(self.settings(embedded), self.start_at)
 
     def chain_from(self, settings: Settings, start_at: str | None) -> Chain:
-        """The chain of settings, from a step on.
+        """Return the chain of settings, from a step on.
 
         Raises:
-            RequestError: it cannot be made, or the options name a stage that is not in it.
+            RequestError: the chain cannot be built, or the options name a stage that it lacks.
         """
         chain = make_chain(settings, start_at=start_at, until=self.until)
         known = (*chain.names, *self.image.get("skip", ()), *TABLES)
         for step, value in self.options.items():
-            is_table = isinstance(value, Mapping) and step not in KEYS  # where it is a draw
+            is_table = isinstance(value, Mapping) and step not in KEYS  # there it is a draw
             if is_table and step not in known:
                 raise RequestError(one_of("stage in this chain", step, chain.names))
         return chain
 
     def record(self) -> dict[str, Any]:
-        """The request as a sidecar stores it, in JSON values.
+        """Return the request as a sidecar stores it, in JSON values.
 
-        Equal records make the same bytes of the same image: :data:`RECORDED`, and the SHA-256 of
-        all files that are named, as "files".
+        It contains :data:`RECORDED`, and under "files" the SHA-256 of all files that are named.
+        Equal records of the same image produce the same bytes.
 
         Raises:
             RequestError: as :meth:`settings`.
@@ -249,7 +250,7 @@ class Request(Recorded):
         )
 
     def record_over(self, record: Mapping[str, Any]) -> dict[str, Any]:
-        """The same, from the record of a request that differs in the image alone.
+        """Return :meth:`record`, computed from the record of a request for another image.
 
         Raises:
             RequestError: as :meth:`settings`.
@@ -258,12 +259,12 @@ class Request(Recorded):
         return {**record, **_as_read_back(own)}
 
     def _files(self) -> dict[str, str]:
-        """The SHA-256 of all files that are named."""
+        """Return the SHA-256 of all files that the request names, by name."""
         code = code_files([Path(file) for file in self.stage_files])
         return digests([*self.settings().files(), *map(str, code)])
 
     def _general(self) -> Settings:
-        """The options over the configuration: the settings of all images, nothing drawn."""
+        """Return the settings of all images, without draws: options override the configuration."""
         config, options = Identity(self.config), Identity(self.options)
         configured = (
             self.made.get(config, lambda: overlay(DEFAULTS, self.config or {}))
@@ -285,13 +286,13 @@ class ResolvedRequest(Request):
     """A request with every output named, see :meth:`Request.with_outputs`.
 
     Args:
-        truth_keep: steps whose image is written beside a truth that is a picture.
+        truth_keep: steps whose image is also written for a truth that is a picture.
     """
 
     truth_keep: tuple[str, ...] = ()
 
 
 def _as_read_back(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values as JSON gives them back."""
+    """Return values as they are after a round trip through JSON."""
     read: dict[str, Any] = json.loads(json.dumps(values))
     return read

@@ -1,7 +1,7 @@
-"""Settings: every value that is set, checked by name and range, those left to chance declared.
+"""Settings: every value that is set, checked by name and range, and every draw.
 
-Nothing here depends on the camera's data or on a stage's place in the chain; that is resolved in
-:mod:`clpipe.chain.chain`.
+Nothing here depends on the camera's data or on a stage's place in the chain. These are resolved in
+:mod:`clpipe.chain.making`.
 """
 
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
@@ -53,10 +53,9 @@ from clpipe.stages import DEFAULT_CHAIN
 
 @dataclass(frozen=True)
 class Settings:
-    """Values that can be set, with nothing resolved yet: None and what is missing stay automatic.
+    """Values that can be set. Nothing is resolved yet: None and missing values are automatic.
 
-    Where ``draws`` has a law for a dotted name ("iso", "sensor_noise.a"), the value is drawn for
-    each image, by :meth:`drawn`.
+    The values in ``draws``, by dotted name ("sensor_noise.a"), are drawn by :meth:`drawn`.
     """
 
     camera: str = DEFAULT_CAMERA
@@ -73,21 +72,21 @@ class Settings:
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     output: Encoding = field(default_factory=Encoding)
     render: RenderCamera = field(default_factory=RenderCamera)
-    pushed: bool = False  # the ISO was drawn, and may be beyond the camera's own
+    pushed: bool = False  # the ISO was drawn, and may be outside the camera's range
     draws: Mapping[str, Draw] = field(default_factory=dict)
-    # By step: the table that overlay() validated, and the model that it made of it.
+    # By step: the table that overlay() validated, and the resulting model.
     validated: Mapping[str, tuple[Mapping[str, Any], Method]] = field(
         default_factory=dict, compare=False, repr=False
     )
 
     @property
     def label(self) -> str:
-        """Camera and ISO in a few words, for people."""
+        """The camera and the ISO as text for people."""
         camera = "drawn camera" if "camera" in self.draws else self.camera
         return f"{camera}, {'drawn ISO' if 'iso' in self.draws else f'ISO {self.iso:g}'}"
 
     def record(self) -> dict[str, Any]:
-        """The settings as nested JSON values, which :func:`settings_from` reads back."""
+        """Return the settings as nested JSON values, which :func:`settings_from` reads back."""
         plain: dict[str, Any] = {"camera": self.camera, "iso": self.iso, "seed": self.seed}
         named = *LENS, "noise_key", "dump"
         plain |= {key: value for key in named if (value := getattr(self, key))}
@@ -99,10 +98,10 @@ class Settings:
         return record
 
     def drawn(self, name: str) -> "Settings":
-        """The settings with a value for each draw; the same object where there are none.
+        """Return the settings with a value for each draw; the same object if there are no draws.
 
-        The values depend on the seed and the image's name alone (see :mod:`clpipe.chain.draws`).
-        Frames of a burst share the name, and so the values, of their image.
+        The values depend only on the seed and the image's name (see :mod:`clpipe.chain.draws`).
+        Frames of a burst share the name, and therefore the values, of their image.
 
         Raises:
             RequestError: the values are not allowed together, or a camera cannot be loaded.
@@ -130,29 +129,29 @@ class Settings:
         return altered(drawn, {"pushed": True}) if pushed else drawn
 
     def constants(self) -> dict[str, Any]:
-        """The values that are set and not drawn, by their dotted names."""
+        """Return the values that are set and not drawn, by dotted name."""
         tables = self.tables.items()
         named = {f"{name}.{key}": v for name, table in tables for key, v in table.items()}
         lens = {key: value for key in LENS if (value := getattr(self, key))}
         return {"iso": self.iso, "camera": self.camera, **lens, **named}
 
     def table(self, step: str) -> dict[str, Any]:
-        """The values and draws of a step, or of another table."""
+        """Return the values and draws of a step, or of another table."""
         names = {key: key.removeprefix(f"{step}.") for key in self.draws}
         drawn = {names[key]: draw for key, draw in self.draws.items() if names[key] != key}
         return {**self.tables.get(step, {}), **drawn}
 
     @property
     def tables(self) -> dict[str, Mapping[str, Any]]:
-        """The values that are set, by steps and by the tables that belong to no stage."""
+        """The values that are set, by step, and by the tables that belong to no stage."""
         others = {name: getattr(self, name).model_dump(exclude_defaults=True) for name in TABLES}
         return {**self.parameters, **{name: own for name, own in others.items() if own}}
 
     def method(self, step: str) -> Method:
-        """The method of a step with its parameters, validated.
+        """Return the method of a step with its parameters, validated.
 
         Raises:
-            KeyedError: an unknown stage, method or parameter, or a value that is not allowed.
+            KeyedError: a stage, method or parameter is unknown, or a value is not allowed.
         """
         table = self.parameters.get(step, {})
         validated, model = self.validated.get(step, (None, None))
@@ -162,7 +161,7 @@ class Settings:
 
     @property
     def step_names(self) -> tuple[str, ...]:
-        """The names of the steps that are not skipped; a repeated stage gets a number.
+        """The names of the steps that are not skipped. A repeated stage gets a number.
 
         >>> Settings(stages=("exposure", "mosaic", "exposure"), skip=("mosaic",)).step_names
         ('exposure', 'exposure_2')
@@ -171,11 +170,11 @@ class Settings:
 
     @property
     def dump_format(self) -> Dump | None:
-        """The format of headerless dumps; None where it is not set."""
+        """The format of headerless dumps; None if it is not set."""
         return parse_dump(self.dump) if self.dump else None
 
     def files(self) -> list[str]:
-        """The files that the settings name, whose contents are so a part of them."""
+        """Return the files that the settings name. Their contents are part of the settings."""
         files = [self.camera] if self.camera.endswith(".toml") else []
         for step, table in self.parameters.items():
             for name in sorted(file_parameters(stage_of(step))):
@@ -184,7 +183,7 @@ class Settings:
         return files
 
     def models(self, step: str) -> list[type[BaseModel]]:
-        """The classes that declare a step's parameters: its method, or all that are drawn from.
+        """Return the classes that declare a step's parameters: its method, or all drawn methods.
 
         Raises:
             KeyedError: there is no such method.
@@ -197,7 +196,9 @@ class Settings:
         return [method_named(stage, step, name) for name in names]
 
     def limits(self, key: str, isos: Limits) -> Limits | None:
-        """The limits of a value by its dotted name, None for what is no number; ``isos`` for iso.
+        """Return the limits of a value by its dotted name; None if it is no number.
+
+        ``isos`` are the limits of "iso".
 
         Raises:
             KeyedError: its step has no such method.
@@ -210,12 +211,12 @@ class Settings:
         return limits_of(self.models(step)[0], name)
 
     def names_of(self, key: str) -> list[str]:
-        """Return the camera or the lens, or all that it is drawn from. Without a lens, none."""
+        """Return the names of the camera or lens, or of all that are drawn; [] without a lens."""
         draw, name = self.draws.get(key), getattr(self, key)
         return list(draw.choice) if isinstance(draw, Choice) else [name] * bool(name)
 
     def isos(self) -> Limits:
-        """The ISOs that the camera has, or that all cameras have which it is drawn from.
+        """Return the range of ISOs of the camera; of drawn cameras, the range that all have.
 
         Raises:
             RequestError: a camera cannot be loaded.
@@ -224,33 +225,33 @@ class Settings:
         return Limits(max(low for low, _ in ranges), min(high for _, high in ranges))
 
     def drawn_isos(self, camera: Camera) -> Limits:
-        """The ISOs that are drawn for a camera: it may be pushed where no other has them."""
+        """Return the ISOs that can be drawn for a camera. A set camera may be pushed."""
         return Limits(*(camera.iso_range if "camera" in self.draws else camera.pushed_range))
 
 
 def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Settings:
-    """Settings from nested values as a TOML file holds them, every name and parameter checked.
+    """Return settings from nested values as in a TOML file. Every name and value is checked.
 
     Args:
-        values: a dict of the file's form.
-        folder: what the names of files are relative to; None is the working directory.
+        values: nested values of the form of a configuration file.
+        folder: the directory that file names are relative to; None is the working directory.
 
     Raises:
-        KeyedError: an unknown key, stage, method or parameter, or a value of the wrong type or out
-            of range.
+        KeyedError: a key, stage, method or parameter is unknown, or a value has the wrong type or
+            is out of range.
     """
     return overlay(Settings(), values, folder)
 
 
 def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None = None) -> Settings:
-    """The settings with other values over them. Only steps that ``values`` names are validated.
+    """Return settings that other values override. Only steps that ``values`` names are validated.
 
-    Stages to skip are added to those that were skipped before. Where another method is chosen for a
-    step, the parameters of the method before are dropped. A value replaces a draw, and a draw a
-    value.
+    Stages to skip are added to those that are already skipped. If ``values`` chooses another method
+    for a step, the parameters of the earlier method are dropped. A value replaces a draw, and a
+    draw replaces a value.
 
     Args:
-        settings: what holds where ``values`` has nothing.
+        settings: the settings to override.
         values: as for :func:`settings_from`.
         folder: as for :func:`settings_from`.
 
@@ -283,7 +284,7 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
     return changed
 
 
-# A camera has one name, however it is called, so that requests can be compared.
+# Aliases of a camera become its name, so that requests can be compared.
 CONVERSIONS: dict[str, Callable[[Any], Any]] = {
     "iso": float,
     **dict.fromkeys(LENS[1:], float),
@@ -292,19 +293,19 @@ CONVERSIONS: dict[str, Callable[[Any], Any]] = {
 
 
 def _checked_plain(settings: Settings, plain: Mapping[str, Any]) -> dict[str, Any]:
-    """The values that stand in no table, each checked, as the fields of :class:`Settings`.
+    """Return the values outside tables, each checked, as fields of :class:`Settings`.
 
     Raises:
-        KeyedError: an unknown key, or a value that is not allowed.
+        KeyedError: a key is unknown, or a value is not allowed.
     """
     checked = dict(plain)
     for key, value in plain.items():
         if key in all_stages():
-            raise KeyedError(key, f"{key}: found {value!r}, but a stage is a table: [{key}]")
+            raise KeyedError(key, f"{key}: found {value!r}, but a stage is a table; use [{key}]")
         if key in TABLES:
-            raise KeyedError(key, f"{key}: found {value!r}, but it is a table: [{key}]")
+            raise KeyedError(key, f"{key}: found {value!r}, but this is a table; use [{key}]")
         if key == CODE:
-            raise KeyedError(key, f"{key}: code comes from --stage-file or a configuration file")
+            raise KeyedError(key, f"{key}: set it in a configuration file, or use --stage-file")
         if key not in KEYS:
             having = [each for each in parameter_names() if each.endswith(f".{key}")]
             hint = f"; did you mean {either(having)}?" if having else ""
@@ -314,7 +315,9 @@ def _checked_plain(settings: Settings, plain: Mapping[str, Any]) -> dict[str, An
         if key in plain:
             names = names_in(plain, key, "stage names")
             if key == "stages" and len(names) > MAX_STAGES:
-                raise KeyedError(key, f"{key}: found {len(names)}, but at most {MAX_STAGES} run")
+                raise KeyedError(
+                    key, f"{key}: found {len(names)} stages; list at most {MAX_STAGES}"
+                )
             for name in names:
                 _check_step(key, name)
             checked[key] = (*settings.skip, *names) if key == "skip" else names
@@ -328,10 +331,10 @@ def _checked_plain(settings: Settings, plain: Mapping[str, Any]) -> dict[str, An
 
 
 def _check_step(key: str, name: str) -> None:
-    """See that a name can stand under "stages" or "skip".
+    """Check that a name is allowed under "stages" or "skip".
 
     Raises:
-        KeyedError: it is no stage; to skip, "noise" will do.
+        KeyedError: the name is no stage. "noise" is also allowed under "skip".
     """
     if key == "stages":
         stage_named(key, name)
@@ -340,10 +343,10 @@ def _check_step(key: str, name: str) -> None:
 
 
 def _merged(settings: Settings, step: str, table: Mapping[str, Any]) -> dict[str, Any]:
-    """The values and draws of a step with a table over them.
+    """Return the values and draws of a step, overridden by a table.
 
     Raises:
-        KeyedError: there is no such stage, or a table within the table is no draw.
+        KeyedError: there is no such stage, or a table inside the table is no draw.
     """
     methods = () if step in TABLES else stage_of(step).methods
     own = {k: draw_of(f"{step}.{k}", v) if isinstance(v, Mapping) else v for k, v in table.items()}
@@ -357,15 +360,15 @@ def _merged(settings: Settings, step: str, table: Mapping[str, Any]) -> dict[str
 
 
 def _check_draws(settings: Settings, changed: Container[str]) -> None:
-    """See that all that can be drawn is allowed, by validating each value at its extremes.
+    """Check that every value that can be drawn is allowed, by validating the extremes.
 
     Args:
-        settings: with draws.
-        changed: the keys and steps that are new; others were checked before. A step with a draw
-            that follows another value is checked again.
+        settings: settings with draws.
+        changed: the keys and steps that are new. The others were checked earlier. A step with a
+            draw that follows another value is checked again.
 
     Raises:
-        KeyedError: a draw has no such parameter, or can draw what is not allowed.
+        KeyedError: a draw is for an unknown parameter, or can draw a value that is not allowed.
     """
     followers = {key.partition(".")[0] for key, draw in settings.draws.items() if draw.follows}
     for key in settings.draws:
@@ -389,7 +392,7 @@ def _check_draws(settings: Settings, changed: Container[str]) -> None:
 
 
 def _examples(drawn: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
-    """Each method with each extreme of each parameter, the other parameters at their first."""
+    """Yield each method with each extreme of each parameter, the others at their first extreme."""
     first = {name: values[0] for name, values in drawn.items()}
     methods = [{"method": method} for method in drawn.get("method", ())] or [{}]
     others = [{k: value} for k, values in drawn.items() if k != "method" for value in values]

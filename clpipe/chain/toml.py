@@ -1,4 +1,4 @@
-"""TOML as text: single values in and out, and the line on which a key stands."""
+"""TOML as text: read and write single values, and find the line of a key."""
 
 import json
 import re
@@ -9,7 +9,7 @@ from clpipe.base.reading import parse_toml
 
 
 def line_of(text: str, key: str) -> int | None:
-    """The line of a TOML text (from 1) on which a key such as ``stage.parameter`` is set."""
+    """Return the line (from 1) that sets a key such as ``stage.parameter``; None if none does."""
     table = ""
     within = None
     for number, line in enumerate(text.splitlines(), 1):
@@ -31,16 +31,16 @@ PLAIN_NUMBER = re.compile(r"[+-]?(?:0|[1-9]\d{0,99})(\.\d+)?", re.ASCII)
 
 
 def toml_value(text: str) -> Any:
-    """The value of a text that is valid TOML, such as a number or a list; else the text itself.
+    """Return the value of a text that is valid TOML, such as a number or a list; else the text.
 
-    Numbers may begin or end with the point, as TOML's may not.
+    Unlike in TOML, numbers may begin or end with the point.
 
     >>> toml_value("1e-4"), toml_value("{choice = [100, 400]}"), toml_value("bilinear")
     (0.0001, {'choice': [100, 400]}, 'bilinear')
     >>> toml_value(".5"), toml_value("-2."), toml_value(".")
     (0.5, -2.0, '.')
     """
-    if plain := PLAIN_NUMBER.fullmatch(text):  # which a parser takes thirty times as long for
+    if plain := PLAIN_NUMBER.fullmatch(text):  # thirty times faster than the parser
         return float(text) if plain[1] else int(text)
     try:
         table = parse_toml(f"value = {text}")
@@ -50,7 +50,7 @@ def toml_value(text: str) -> Any:
 
 
 def value_text(value: Any) -> str:
-    """A parameter's value, as TOML has it.
+    """Return a parameter's value as TOML.
 
     >>> value_text((1.0, 2.5)), value_text("bayer"), value_text(False)
     ('[1, 2.5]', '"bayer"', 'false')

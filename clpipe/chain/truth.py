@@ -1,4 +1,4 @@
-"""The truth beside a noisy picture: what it would be without noise, and how large the noise is."""
+"""Ground truth of a noisy picture: the picture without noise, and the variance of its noise."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,12 +15,11 @@ from clpipe.stage import Kind, ReferenceContext
 
 
 def picture_without_noise(truth: str, chain: Chain) -> Chain:
-    """The chain of a truth that is a picture, :data:`~clpipe.chain.rendition.PICTURES`.
+    """Return the chain of a truth that is a picture, see :data:`~clpipe.chain.rendition.PICTURES`.
 
-    "development" is developed exactly as the noisy picture is: denoised as strongly, and sharpened
-    as much. So their difference is the noise that is left. "clean" is the picture that is wanted:
-    its development has nothing to do against noise. Without noise and denoising it is the same
-    picture at every ISO.
+    "development" is developed exactly like the noisy picture, with the same denoising and
+    sharpening. Their difference is therefore the remaining noise. "clean" has neither noise nor
+    denoising, so it is the same picture at every ISO.
 
     Raises:
         RequestError: the chain adds no noise.
@@ -31,38 +30,40 @@ def picture_without_noise(truth: str, chain: Chain) -> Chain:
 
 
 def noisy_mosaic(chain: Chain) -> Chain:
-    """The chain up to its noisy mosaic in signal, whose truth is the same mosaic without noise.
+    """Return the chain up to its noisy mosaic in signal. Its truth is this mosaic without noise.
 
-    It ends with ``normalize``; without a ``quantize`` behind the first noise, with the last stage
-    that adds noise to a mosaic.
+    The chain ends with ``normalize``. If no ``quantize`` follows the first noise, it ends with the
+    last stage that adds noise to a mosaic.
 
     Raises:
         RequestError: the chain has no such mosaic.
     """
-    chain.without_noise()  # refuses a chain without noise
+    chain.without_noise()  # rejects a chain without noise
     first = [step.adds_noise for step in chain.steps].index(True)
     noisy = chain.steps[first:]
     ends = [s for s in noisy if (s.stage.reads, s.stage.writes) == (Kind.RAW, Kind.MOSAIC)][:1]
     if not ends and any(s.stage.writes is Kind.RAW for s in noisy):
         raise RequestError(
-            f"the chain ends in DN, at {noisy[-1].name}, but the truth of a mosaic is in signal; "
-            "end it with normalize or a later stage"
+            f"the chain ends in DN, at {noisy[-1].name}, but the ground truth of a mosaic is in "
+            "signal; end the chain with normalize or a later stage"
         )
     ends = ends or [s for s in noisy if s.adds_noise and s.stage.writes is Kind.MOSAIC][-1:]
     if not ends:
         raise RequestError(
-            f"the first noise of this chain is that of {noisy[0].name}, behind the mosaic; "
-            "there is no noise in the mosaic to know the truth of"
+            f"the first noise of this chain is added by {noisy[0].name}, after the mosaic, so the "
+            "mosaic has no noise; use --truth clean or development"
         )
     return replace(chain, steps=chain.steps[: chain.steps.index(ends[0]) + 1])
 
 
 def signal_and_noise(chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
-    """What :func:`variance_of` needs: the chain to the clean image that the first noise falls on,
-    and the steps from there to the :func:`noisy_mosaic`.
+    """Return the arguments of :func:`variance_of`: a chain and steps.
+
+    The chain makes the clean image to which the first noise is added. The steps lead from there to
+    the :func:`noisy_mosaic`.
 
     Raises:
-        RequestError: the chain has no such mosaic, or a step does not know its variance.
+        RequestError: the chain has no such mosaic, or a step cannot compute its variance.
     """
     steps = noisy_mosaic(chain).steps
     first = [step.adds_noise for step in steps].index(True)
@@ -79,17 +80,15 @@ def variance_of(noise: Sequence[Step], signal: Floats) -> Floats:
     clean mosaic is that of an ideal sensor, so fixed patterns (PRNU, DSNU, columns) are noise too.
 
     Derivation: a stage reads x + n, where x is the clean image and n has the mean 0 and the
-    variance v. It draws its own noise independently of n, so the variance that it writes is the
-    mean variance of its own noise plus the variance of its mean (law of total variance):
+    variance v. It draws its own noise independently of n. By the law of total variance, the
+    variance after it is the mean variance of its own noise plus the variance of its mean:
 
-    ==========================================  ====================
-    what the stage does, k of variance 1        variance it writes
-    ==========================================  ====================
-    adds noise of the variance w(x) = a x + b   v + w(x)
-    multiplies by a gain g                      g^2 v
-    multiplies each pixel by 1 + s k            (1 + s^2) v + s^2 x^2
-    rounds to whole DN                          v + 1/12, in DN^2
-    ==========================================  ====================
+    | operation of the stage, k of variance 1   | variance after it      |
+    | ----------------------------------------- | ---------------------- |
+    | adds noise of the variance w(x) = a x + b | v + w(x)               |
+    | multiplies by a gain g                    | g^2 v                  |
+    | multiplies each pixel by 1 + s k          | (1 + s^2) v + s^2 x^2  |
+    | rounds to whole DN                        | v + 1/12, in DN^2      |
 
     The first row is exact for any n, because w is linear in x and the mean of n is 0. Each stage's
     ``variance`` applies its row. This function starts with v = 0, applies the stages in order, and
@@ -112,7 +111,7 @@ def variance_of(noise: Sequence[Step], signal: Floats) -> Floats:
         float32, (height, width).
 
     Raises:
-        RequestError: a step does not know its variance.
+        RequestError: a step cannot compute its variance.
     """
     before_adc = list(takewhile(lambda step: step.stage.writes is not Kind.RAW, noise))
     keeps_scale = all(step.adds_noise or not step.passes for step in before_adc)
@@ -129,8 +128,8 @@ def variance_of(noise: Sequence[Step], signal: Floats) -> Floats:
                 signal = clean.reference(signal, ReferenceContext(step.context, {}, {}))
         if after is None:
             raise RequestError(
-                f"--truth variance: {step.name} ({step.method.method}) does not say what it makes "
-                "of the variance of noise; skip it, or move it before the noise"
+                f"--truth variance: {step.name} ({step.method.method}) cannot compute the variance "
+                "of the noise after it; skip it, or move it before the noise"
             )
         variance = after
     return np.ascontiguousarray(np.broadcast_to(variance, signal.shape[:2]))

@@ -1,4 +1,4 @@
-"""What a lens shows beside a render, where the picture stays black."""
+"""Black areas of a picture: a lens shows more of the scene than the render contains."""
 
 from functools import lru_cache
 from math import ceil
@@ -10,20 +10,20 @@ from clpipe.chain.chain import Chain
 from clpipe.chain.panorama import projection_of
 from clpipe.reference.geometry import Composition
 
-POINTS = 128, 96  # across and down the picture, at which it is looked for
-LEAST = 5e-4  # share of the picture, below which nothing is said
-MOST_OVERSCAN = 0.5  # of the longer side, beyond which no overscan is proposed
+POINTS = 128, 96  # samples across and down the picture
+LEAST = 5e-4  # the smallest black share of a picture that causes a warning
+MOST_OVERSCAN = 0.5  # the largest overscan that a warning proposes, relative to the longer side
 
 
 def check_void(chain: Chain, width: int, height: int) -> str:
-    """A warning where a part of a picture is black, as its lens shows more than there is; or "".
+    """Return a warning if part of a picture is black because its lens shows too much; else "".
 
     Args:
-        chain: of the picture.
-        width, height: of the image that enters, with its overscan.
+        chain: the chain of the picture.
+        width, height: the size in px of the image that enters, with its overscan.
 
     Raises:
-        ImageError: the lens folds the image over.
+        ImageError: the distortion folds the image over.
     """
     if chain.geometry is None:
         return ""
@@ -33,31 +33,31 @@ def check_void(chain: Chain, width: int, height: int) -> str:
         lens = chain.optics.calibration
         if lens and lens.is_of_smaller_sensor:
             raise ImageError(
-                f"{lens.name} was calibrated on a sensor smaller than that of "
-                f"{chain.camera.name}, whose corners it does not reach; choose a camera with a "
-                "smaller sensor, or a lens for this one"
+                f"{lens.name} was calibrated on a smaller sensor than that of {chain.camera.name}, "
+                "so its distortion is undefined in the corners; choose another lens, or a camera "
+                "with a smaller sensor"
             ) from None
         raise error from None
     if share < LEAST:
         return ""
     if projection_of(chain):
         return (
-            f"{100 * share:.1f} % of the lens's field is black: no view shows what is there; give "
-            "the other faces, or make field_of_view smaller"
+            f"{100 * share:.1f} % of the lens's field of view is black, because no view "
+            "covers it; add the missing faces, or make field_of_view smaller"
         )
     bends = [step.name for step in chain.steps if hasattr(step.method, "fit")]
     fit = f"set {bends[0]}.fit=true" if bends else "make the picture smaller"
     most = MOST_OVERSCAN * max(width, height)
     more = f"render {ceil(beyond)} px more on each side (overscan), or " if beyond < most else ""
     return (
-        f"{100 * share:.1f} % of the picture is black: there the lens shows what lies next to the "
-        f"render; {more}{fit}"
+        f"{100 * share:.1f} % of the picture is black, because the lens shows parts of the scene "
+        f"outside the render; {more}{fit}"
     )
 
 
 @lru_cache(maxsize=64)
 def _void(chain: Chain, width: int, height: int) -> tuple[float, float]:
-    """The share of a picture that has no place in its image, and how far it is beyond it, px."""
+    """Return the share of a picture that lies outside its image, and the largest distance in px."""
     geometry = chain.geometry
     assert geometry
     columns, rows = geometry.size(width, height)

@@ -1,4 +1,4 @@
-"""``clpipe bench``: how fast a chain, a stage's methods or whole batches are on a device."""
+"""``clpipe bench``: time a chain, a stage's methods or whole batches on a device."""
 
 from dataclasses import asdict, replace
 from typing import Any
@@ -27,25 +27,26 @@ BATCH_HEADINGS = ("images", "MP/s", "s", *CPU_STEPS, "ms CPU", "busy", "peak MiB
 @chain_options
 @device_option
 @click.option(
-    "--size", default="6000x4000", show_default=True, metavar="WxH", help="The picture's size."
+    "--size", default="6000x4000", show_default=True, metavar="WxH", help="The image size in px."
 )
 @click.option(
     "--repeat",
     default=7,
     show_default=True,
     type=click.IntRange(1),
-    help="Number of runs; the best counts.",
+    help="The number of runs. The fastest one is reported.",
 )
 @click.option(
     "--methods",
     metavar="STAGE",
     shell_complete=methods_of,
-    help="Time each method of this stage alone, instead of the chain.",
+    help="Time each method of this stage separately, instead of the chain.",
 )
 @click.option(
     "--batch",
     is_flag=True,
-    help="Time batches of files instead, half EXR to JPEG, and the CPU time of their steps.",
+    help="Time batches of files instead, from half-float EXR to JPEG, with the CPU time of each "
+    "step.",
 )
 @json_option
 def bench(
@@ -59,9 +60,9 @@ def bench(
 ) -> None:
     """Time a chain and each of its launches on a device.
 
-    The image is of the kind that the chain starts on: a render, or with --start-at a mosaic or a
-    raw. It is in half floats (a raw: floats) when it enters, and in eight bits when it leaves; both
-    stay on the device.
+    The image is of the kind that the chain reads: a render, or with --start-at a mosaic or a raw.
+    The input is in half floats (a raw in floats) and the output has 8 bits. Both stay on the
+    device.
     """
     width, height = map(whole_number, size.partition("x")[::2])
     if min(width, height) < 1 or width * height > MAX_PIXELS:
@@ -78,7 +79,10 @@ def bench(
     chain = request.chain()
     device = open_device(selector)
     if device is None:
-        raise RequestError("bench: it times the kernels of a device; numpy has none")
+        raise RequestError(
+            "--device: found numpy, which has no kernels to time; choose a device from "
+            "'clpipe devices'"
+        )
     if methods is not None:
         stage = stage_named("--methods", methods)
         speeds = bench_methods(device, stage, chain.settings, width, height, repeat)
@@ -128,7 +132,7 @@ def bench(
 
 
 def batch_row(speed: BatchSpeed) -> tuple[str, ...]:
-    """The row of one load."""
+    """Return the row of one load."""
     return (
         f"{speed.images} of {speed.width}x{speed.height}",
         f"{speed.megapixels_per_second:.1f}",

@@ -1,4 +1,4 @@
-"""``clpipe calibrate``: the noise of a sensor from raw frames, as a camera profile."""
+"""``clpipe calibrate``: measure a sensor's noise from raw frames, for a camera profile."""
 
 from pathlib import Path
 
@@ -23,33 +23,39 @@ CALIBRATION = (
     *("ISO", "frames", "K, DN/e-", "read, DN", "row, DN", "column, DN", "DSNU, e-", "PRNU, %"),
     *("hot", "dead", "pixels used"),
 )
-WITH_EMVA = ("emva", "output", "iso", "as_json")  # what goes with --emva
+WITH_EMVA = ("emva", "output", "iso", "as_json")  # options that are allowed with --emva
 
 
 @click.command("calibrate", cls=Command)
 @click.argument("inputs", nargs=-1, metavar="FRAMES...")
 @output_option(
-    "CAMERA.toml", "The profile to write; CAMERA.png, a picture of the fit, is written beside it."
+    "CAMERA.toml", "The profile to write. A plot of the fit, CAMERA.png, is written next to it."
 )
 @click.option(
     "--dark",
     multiple=True,
     metavar="FILES",
-    help="Frames without light, or a quoted glob; may be repeated.",
+    help="Frames without light: a file or a quoted glob. May be repeated.",
 )
 @click.option(
     "--emva",
     type=EXISTING,
     metavar="EMVA1288_Data.txt",
-    help="Instead of FRAMES: a series of uniform frames, as EMVA 1288 asks for it.",
+    help="A series of uniform frames according to EMVA 1288, instead of FRAMES.",
 )
-@click.option("--black-level", type=float, metavar="DN", help="In place of what the files say.")
-@click.option("--white-level", type=float, metavar="DN", help="In place of what the files say.")
-@click.option("--pattern", type=click.Choice(PATTERNS), help="In place of what the files say.")
+@click.option(
+    "--black-level", type=float, metavar="DN", help="The black level. [default: the files']"
+)
+@click.option(
+    "--white-level", type=float, metavar="DN", help="The white level. [default: the files']"
+)
+@click.option(
+    "--pattern", type=click.Choice(PATTERNS), help="The CFA pattern. [default: the files']"
+)
 @click.option(
     "--iso",
     type=click.FloatRange(0, min_open=True),
-    help="The ISO of all frames, in place of what the files say.",
+    help="The ISO of all frames. [default: the files']",
 )
 @option(KEYS["dump"])
 @json_option
@@ -67,13 +73,13 @@ def calibrate(
 ) -> None:
     """Measure a sensor's noise from raw frames, and write it as a camera profile.
 
-    FRAMES are camera raws, mosaics that clpipe kept, or mosaics from elsewhere (EXR, 16-bit TIFF or
-    PNG, headerless dumps, with options for what they do not say). For each ISO, take two or more of
-    one static scene that has dark and bright places; a single frame gives less exact figures. Dark
-    frames (lens cap on) add column noise, DSNU, hot pixels and a better b.
+    FRAMES are camera raws, kept mosaics, or other mosaics: EXR, 16-bit TIFF or PNG, or headerless
+    dumps. Use options for values that the files lack. For each ISO, take two or more frames of one
+    static scene with dark and bright areas. A single frame gives less accurate figures. Dark frames
+    (lens cap on) add column noise, DSNU, hot pixels and a better b.
 
-    With --emva, a series of uniform light gives the figures of EMVA 1288 (release 3.1), and
-    CAMERA.png has the standard's plots; clpipe emva makes such a series.
+    With --emva, figures according to EMVA 1288 (release 3.1) are measured from a series of frames
+    of uniform light, and CAMERA.png has the standard's plots. clpipe emva makes such a series.
 
     \b
     clpipe calibrate scene/*.CR2 --dark 'dark/*.CR2' -o my_camera.toml
@@ -85,11 +91,13 @@ def calibrate(
         others = [option for name, option in options_set().items() if name not in WITH_EMVA]
         if inputs or others:
             found = "FRAMES" if inputs else others[0]
-            raise RequestError(f"--emva: found {found}, too; the series names its frames itself")
+            raise RequestError(
+                f"--emva: found {found} as well, but the series names its frames; remove {found}"
+            )
         calibrate_emva(emva, output, iso, as_json)
         return
     if not inputs:
-        raise RequestError("calibrate: found no FRAMES; name raw frames, or a series with --emva")
+        raise RequestError("FRAMES: none is named; name raw frames, or a series with --emva")
     dumped = parse_dump(dump) if dump else None
     overrides = FrameOverrides(black_level, white_level, pattern, iso, dumped)
     frames, calibrations = calibrate_files(inputs, dark, overrides)
@@ -112,7 +120,7 @@ def calibrate(
 
 
 def calibrate_emva(series: Path, output: Path, iso: float | None, as_json: bool) -> None:
-    """Measure a series after EMVA 1288, write the profile and say what was found."""
+    """Measure a series according to EMVA 1288, write the profile and print the figures."""
     moments, found = measure_series(series)
     picture = write_emva_profile(output, series, iso, moments, found)
     if as_json:
@@ -124,7 +132,7 @@ def calibrate_emva(series: Path, output: Path, iso: float | None, as_json: bool)
 
 
 def emva_rows(found: Figures) -> list[tuple[str, str, str]]:
-    """The rows of a table of figures, with standard errors."""
+    """Return the rows of a table of figures, with standard errors."""
     errors = found.linearity
     rows: list[tuple[str, Estimate | None, float, str]] = [
         ("system gain K", found.system_gain, 1, "DN/e-"),
@@ -135,10 +143,10 @@ def emva_rows(found: Figures) -> list[tuple[str, str, str]]:
         ("sensitivity threshold", found.threshold, 1, "photons"),
         ("saturation capacity", found.saturation, 1, "photons"),
         ("saturation capacity", found.saturation_electrons, 1, "e-"),
-        ("signal-to-noise ratio, at most", found.snr_max, 1, ""),
+        ("maximum signal-to-noise ratio", found.snr_max, 1, ""),
         ("dynamic range", found.dynamic_range, 1, ""),
-        ("linearity error, least", errors.least, 1, "%"),
-        ("linearity error, most", errors.most, 1, "%"),
+        ("linearity error, minimum", errors.least, 1, "%"),
+        ("linearity error, maximum", errors.most, 1, "%"),
     ]
     for name, figure, factor, unit in (
         ("DSNU1288", found.dsnu, 1, "e-"),
@@ -157,14 +165,14 @@ def emva_rows(found: Figures) -> list[tuple[str, str, str]]:
 
 
 def estimate_text(estimate: Estimate | None, factor: float = 1) -> str:
-    """An estimate with its standard error, a dash where there is none."""
+    """Return an estimate with its standard error; a dash if there is none."""
     if estimate is None:
         return "-"
     return f"{estimate.value * factor:.4g} ± {estimate.error * factor:.1g}"
 
 
 def calibration_row(one: Calibration) -> tuple[str, ...]:
-    """The row of one ISO, figures with their standard errors."""
+    """Return the row of one ISO: figures with their standard errors."""
 
     return (
         f"{one.iso:g}",

@@ -1,4 +1,4 @@
-"""``clpipe cameras``: the built-in cameras, the noise of one, or a profile of a noise model."""
+"""``clpipe cameras``: list cameras, show the noise of one, or import a noise model."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,7 +18,7 @@ from clpipe.commands.completion import cameras_or_import
 from clpipe.commands.options import EXISTING, Command, json_option, output_option
 from clpipe.commands.printing import Rows, short_text, show, show_json
 
-# What a camera has at every ISO, with units.
+# Fields that are the same at every ISO, with units.
 FIXED = {
     "black_level": "DN",
     "white_level": "DN",
@@ -46,23 +46,23 @@ FIXED = {
     "banding_amplitude": "e-",
     "banding_period": "rows",
 }
-DERIVED = ("bits",)  # of FIXED, what follows from others
+DERIVED = ("bits",)  # the fields of FIXED that are computed from others
 UNKNOWN = "unknown"
 
 
 @click.command("import", cls=Command)
 @click.argument("path", metavar="FILE", type=EXISTING)
 @click.option(
-    "--camera", metavar="NAME", help="Which camera of a noiseprofiles.json, by make and model."
+    "--camera", metavar="NAME", help="The make and model of a camera in a noiseprofiles.json."
 )
-@output_option("FILE.toml", "Write the profile there. [default: print it]", required=False)
+@output_option("FILE.toml", "The profile to write. [default: it is printed]", required=False)
 @json_option
 def import_command(path: Path, camera: str | None, output: Path | None, as_json: bool) -> None:
-    """Make a camera profile of a noise model from elsewhere.
+    """Make a camera profile from another program's noise model.
 
     FILE is a DNG with a NoiseProfile, an Android noise model (the text that CameraITS generates and
-    device trees hold), or darktable's noiseprofiles.json. The profile says what of it is the file's
-    and what stands in.
+    that device trees contain), or darktable's noiseprofiles.json. The profile lists which values
+    are from the file and which are assumed.
 
     \b
     clpipe cameras import photo.dng -o my_camera.toml
@@ -84,7 +84,7 @@ def import_command(path: Path, camera: str | None, output: Path | None, as_json:
 
 
 class CamerasCommand(Command):
-    """Takes the name of a camera, or the word "import" and what that command takes."""
+    """Accepts the name of a camera, or the word "import" and the arguments of that command."""
 
     def make_context(self, info_name: str | None, args: list[str], *rest: Any, **more: Any) -> Any:
         if args[:1] == [import_command.name]:
@@ -100,13 +100,13 @@ class CamerasCommand(Command):
 
 @click.command("cameras", cls=CamerasCommand)
 @click.argument("names", nargs=-1, metavar="[NAME|FILE]", shell_complete=cameras_or_import)
-@click.option("--iso", type=float, help="The ISO. [default: all that were measured]")
+@click.option("--iso", type=float, help="The ISO. [default: all measured ISOs]")
 @json_option
 def cameras(names: tuple[str, ...], iso: float | None, as_json: bool) -> None:
-    """List the cameras, show the noise of one, or make one of a noise model (cameras import).
+    """List cameras, show the noise of one, or import a noise model (cameras import).
 
-    NAME is that of the list, or a make and model; a part of it lists all that match. Noise is
-    shown in three forms, with the source of each figure.
+    NAME is a name from the list, or a make and model. A part of a name lists all cameras that
+    match. Noise is shown in three forms, with the source of each figure.
 
     \b
     clpipe cameras "Canon 5D Mark III" --iso 3200
@@ -115,7 +115,10 @@ def cameras(names: tuple[str, ...], iso: float | None, as_json: bool) -> None:
     name = " ".join(names)
     if not name:
         if iso is not None:
-            raise RequestError("--iso: it needs the name of a camera")
+            raise RequestError(
+                f"--iso: found {iso:g}, but no camera is named; name one, as in "
+                f"'clpipe cameras nikon-d850 --iso {iso:g}'"
+            )
         show_cameras(map(load_camera, built_in_cameras()), as_json)
         return
     called = [] if built_in_name(name) else cameras_called(name)
@@ -143,20 +146,20 @@ def show_cameras(cameras: Iterable[Camera], as_json: bool) -> None:
 
 
 def make_and_model(camera: Camera) -> str:
-    """The name of a camera as people know it; some makers begin the model with their name."""
+    """Return the make and model of a camera, without repeating the make if the model has it."""
     model, make = camera.model, camera.make
     return model if model.startswith(make) else f"{make} {model}"
 
 
 def camera_row(camera: Camera) -> tuple[str, ...]:
-    """The row of a camera: name, make and model, other names of the model, ISOs."""
+    """Return the row of a camera: name, make and model, other names of the model, ISOs."""
     low, high = camera.iso_range
     aliases = ", ".join(camera.aliases)
     return camera.name, make_and_model(camera), aliases, f"{low:g} to {high:g}"
 
 
 def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[str, ...], Rows]]:
-    """A camera's noise at an ISO, or at all that were measured, as titles, headings and rows.
+    """Return a camera's noise at an ISO, or at all measured ISOs, as titles, headings and rows.
 
     Raises:
         RequestError: the ISO is outside the camera's range.
@@ -191,7 +194,7 @@ def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[st
             [("", "", "DN", "DN"), *(dark_frames_row(camera, i) for i in isos)],
         ),
         (
-            "The paper's: a = theta/chi, b = theta^2 b' + b'' - theta^2 p0/chi",
+            "The paper's form: a = theta/chi, b = theta^2 b' + b'' - theta^2 p0/chi",
             ("ISO", "chi", "theta", "b'", "b''", "p0"),
             paper,
         ),
@@ -204,7 +207,7 @@ def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[st
 
 
 def known_text(camera: Camera, key: str) -> str:
-    """A figure of a profile that is the same at every ISO, or that it does not say it.
+    """Return a figure of a profile that is the same at every ISO, or "unknown".
 
     >>> known_text(load_camera("sony-a7s2"), "prnu")
     'unknown'
@@ -215,7 +218,7 @@ def known_text(camera: Camera, key: str) -> str:
 
 
 def dark_frames_row(camera: Camera, iso: float) -> tuple[str, ...]:
-    """What is known of dark frames beside their noise at an ISO, as a row."""
+    """Return the row of an ISO with figures of dark frames other than their noise."""
     stage, unit = camera.gain_stage(iso), camera.signal_range
     shape = camera.tukey_lambda_at(iso)
     bias = ", ".join(f"{offset * unit:.3g}" for offset in camera.color_bias(iso))
@@ -228,12 +231,12 @@ def dark_frames_row(camera: Camera, iso: float) -> tuple[str, ...]:
 
 
 def figures(iso: float, *values: float) -> tuple[str, ...]:
-    """An ISO and other numbers, to four digits, as a row."""
+    """Return an ISO and other numbers, to four digits, as a row."""
     return (f"{iso:g}", *(f"{value:.4g}" for value in values))
 
 
 def noise_at(camera: Camera, iso: float) -> dict[str, Any]:
-    """The noise at an ISO in all three forms, and that of dark frames, rows and columns in DN.
+    """Return the noise at an ISO in all three forms, and of dark frames, rows and columns in DN.
 
     Raises:
         RequestError: the ISO is outside the camera's range.
@@ -253,7 +256,7 @@ def noise_at(camera: Camera, iso: float) -> dict[str, Any]:
 
 
 def camera_record(camera: Camera, iso: float | None = None) -> dict[str, Any]:
-    """A camera as JSON values, with its noise at an ISO or at all that were measured.
+    """Return a camera as JSON values, with its noise at an ISO or at all measured ISOs.
 
     Raises:
         RequestError: the ISO is outside the camera's range.

@@ -30,10 +30,10 @@ class FormatName(click.Choice[str]):
 
 
 def patch_count(text: str) -> int | str:
-    """How many patches of an image: a number, or "grid".
+    """Return the number of patches per image, or "grid".
 
     Raises:
-        RequestError: it is neither.
+        RequestError: the text is neither.
     """
     key, count = OPTIONS["patches_per_image"], whole_number(text)
     if text != "grid" and not key.allows(count):
@@ -41,7 +41,7 @@ def patch_count(text: str) -> int | str:
     return text if text == "grid" else count
 
 
-# Keys whose options are not written --name, and those with types of their own.
+# Keys whose options are not --name, and keys whose options have special types.
 FLAGS = {"config": ("-c", "--config"), CODE: ("--stage-file",)}
 TYPES: dict[str, Any] = {
     "stages": lambda text: [name.strip() for name in text.split(",") if name.strip()],
@@ -54,12 +54,12 @@ TYPES: dict[str, Any] = {
 
 
 def option(key: Key, parameter: str = "", **others: Any) -> Callable[[F], F]:
-    """The option of a command that sets a key.
+    """Return the option of a command that sets a key.
 
     Args:
-        key: what it sets; type, range, choices and help follow from it.
-        parameter: the parameter of the command's function, if it is not the name of the key.
-        **others: arguments of :func:`click.option` that replace those of the key.
+        key: the key, from which type, range, choices and help follow.
+        parameter: the parameter of the command's function, if it is not the key's name.
+        **others: arguments of :func:`click.option` that replace those from the key.
     """
     type_: Any = {int: int, float: float}.get(key.type_)
     if key.choices:
@@ -82,7 +82,7 @@ def option(key: Key, parameter: str = "", **others: Any) -> Callable[[F], F]:
 
 
 def options(*keys: Key | str) -> Callable[[F], F]:
-    """The options of a command that set keys; those of a run by their names."""
+    """Return the options of a command that set keys. Name a key of :data:`OPTIONS` by its name."""
 
     def decorated(function: F) -> F:
         for key in reversed(keys):
@@ -98,27 +98,27 @@ set_option = click.option(
     multiple=True,
     metavar="STAGE.PARAM=VALUE",
     shell_complete=parameters,
-    help="Set a parameter. STAGE.method=NAME chooses a method; '{uniform=[1, 2]}' as the value "
-    "draws one for each image. May be repeated.",
+    help="Set a parameter. STAGE.method=NAME chooses a method. A value such as '{uniform=[1, 2]}' "
+    "is drawn for each image. May be repeated.",
 )
 out_option = output_option("OUT", OPTIONS["output"].text)
 device_option = option(DEVICE, "selector")
 
-# Settings that chains have options for, besides the camera and the ISO.
+# The settings that are options of a chain, besides the camera and the ISO.
 SETTINGS = tuple(key for name, key in KEYS.items() if name not in ("camera", "iso", "dump", CODE))
 
 
 def chain_options(function: F) -> F:
-    """The options that say which chain to run; :func:`request_of` makes a request of them."""
+    """Add the options that choose a chain; :func:`request_of` makes a request of them."""
     own = options("config", KEYS["camera"], KEYS["iso"], *SETTINGS, "start_at", "until", CODE)
     return own(set_option(function))
 
 
 def settings_in(options: dict[str, Any]) -> dict[str, Any]:
-    """Take the settings from the options of a command, nested as in a configuration.
+    """Remove the settings from a command's options, and return them nested as in a configuration.
 
     Raises:
-        RequestError: an assignment is wrong, or is about a value that has an option as well.
+        RequestError: an assignment is wrong, or sets a value that an option also sets.
     """
     own = {key: options.pop(key) for key in KEYS if key in options and key != CODE}
     settings = {key: value for key, value in own.items() if value not in (None, ())}
@@ -132,7 +132,7 @@ def settings_in(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def request_of(options: dict[str, Any]) -> Request:
-    """The request that a command's options describe, which are all of them that are left.
+    """Return the request that a command's options describe. Every option must belong to it.
 
     Raises:
         RequestError: a name or value is not allowed.

@@ -1,4 +1,4 @@
-"""``clpipe check``: kernels compared with their NumPy references."""
+"""``clpipe check``: compare kernels with their NumPy references."""
 
 import sys
 from pathlib import Path
@@ -33,15 +33,17 @@ def check(
 ) -> None:
     """Compare kernels with their NumPy references on a device.
 
-    Without STAGE, all stages are compared, then the raw bit for bit, and images in common launches
-    with the same alone.
+    Without STAGE, all stages are compared. The raw is then compared bit for bit, and images that
+    share launches are compared with the same images processed one by one.
     """
     for file in stage_files:
         load_stage_file(file)
     chosen = [stage_named("check", name) for name in names]
     device = open_device(selector)
     if device is None:
-        raise RequestError("check: numpy is the reference; choose a device to compare with it")
+        raise RequestError(
+            "--device: found numpy, which is the reference; choose a device from 'clpipe devices'"
+        )
     checks = list(check_all(device, chosen, SIZES[:5] if small else SIZES))
     failed = sum(not c.passed for c in checks)
     if as_json:
@@ -59,7 +61,7 @@ def check(
 
 
 def check_row(check: Check) -> tuple[str, ...]:
-    """The row of one comparison of a kernel with its reference."""
+    """Return the row of one comparison of a kernel with its reference."""
     return (
         check.stage,
         check.method,

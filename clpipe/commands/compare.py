@@ -1,4 +1,4 @@
-"""``clpipe compare``: crops of pictures side by side, as a figure."""
+"""``clpipe compare``: a figure with crops of pictures side by side."""
 
 from pathlib import Path
 
@@ -15,22 +15,24 @@ from clpipe.commands.printing import number, show, show_json
 @click.command("compare", cls=Command)
 @click.argument("pictures", nargs=-1, required=True, type=EXISTING, metavar="PICTURE...")
 @output_option(
-    "FIGURE", "The figure to write, as .png, .pdf or .svg; may be repeated.", multiple=True
+    "FIGURE", "The figure to write, a .png, .pdf or .svg. May be repeated.", multiple=True
 )
 @click.option(
     "--crop",
     "crops",
     multiple=True,
     metavar="PLACE",
-    help="A row: [NAME=]X,Y,WxH in pixels, or a place that is found, "
-    f"{WIDTH}x{HEIGHT}: {', '.join(FOUND)}; may be repeated. [default: those that are found]",
+    help="The crop of a row: [NAME=]X,Y,WxH in pixels, or an area of "
+    f"{WIDTH}x{HEIGHT} pixels that clpipe chooses: {', '.join(FOUND)}. May be repeated. "
+    "[default: all areas that clpipe chooses]",
 )
 @click.option(
     "--label",
     "labels",
     multiple=True,
     metavar="TEXT",
-    help="Of each PICTURE, in the same order. [default: what tells their names apart]",
+    help="The label of each PICTURE, in the same order. May be repeated. [default: the parts in "
+    "which their names differ]",
 )
 @click.option(
     "--truth",
@@ -38,19 +40,21 @@ from clpipe.commands.printing import number, show, show_json
     multiple=True,
     type=EXISTING,
     metavar="FILE",
-    help="The same without noise: one for all PICTUREs, or one for each in the same order.",
+    help="The picture without noise: one for all PICTUREs, or one for each in the same order. May "
+    "be repeated.",
 )
 @click.option(
     "--difference",
     is_flag=True,
-    help="Below each row, its difference from the truth, or else from the first PICTURE.",
+    help="Show the difference from the truth below each row; without --truth, from the first "
+    "PICTURE.",
 )
 @click.option(
     "--zoom",
     default=4,
     show_default=True,
     type=click.IntRange(1, 32),
-    help="The side of a picture's pixel, in pixels of 300 dpi.",
+    help="The side of a picture's pixel, in pixels at 300 dpi.",
 )
 @json_option
 def compare(
@@ -63,16 +67,21 @@ def compare(
     zoom: int,
     as_json: bool,
 ) -> None:
-    """Compare pictures: labelled crops side by side, as papers print them.
+    """Compare pictures in a figure with labelled crops side by side, like those in papers.
 
-    PICTUREs are of one size: finished ones (JPEG, PNG, TIFF), images that clpipe kept, renders. A
-    row shows one place of all of them. Places are found in the mean of the truths or, without, of
-    the PICTUREs, averaged over 5x5 pixels: where R, G and B vary least at a middle brightness
-    (flat), where luma has most gradient (textured), where the channels are furthest apart
-    (saturated), and where it is darkest without being black (dark).
+    PICTUREs have one size. They are finished pictures (JPEG, PNG, TIFF), kept images or renders. A
+    row shows the same area of all of them. clpipe chooses areas in the mean of the truths, or of
+    the PICTUREs without --truth, averaged over 5x5 pixels:
 
-    The noise is written below: with --truth as 'clpipe measure' finds it, and the rms of the whole
-    picture; without, that of the flat place.
+    \b
+    flat        R, G and B vary least, at a medium brightness
+    textured    the gradient of luma is largest
+    saturated   the channels differ most
+    dark        darkest, but not black
+
+    The noise of each picture is printed below its crops. With --truth it is measured like in
+    'clpipe measure', with the rms of the whole picture. Without --truth it is that of the flat
+    area.
 
     \b
     clpipe run render.exr -o shots --iso 100,3200
@@ -99,7 +108,7 @@ def compare(
 
 
 def show_noise(found: Comparison) -> None:
-    """Print the noise of each picture."""
+    """Print a table with the noise of each picture."""
     rows = [
         (label, number(one.rms, ".2f"), number(one.sigma, ".2f"), number(one.left, ".2f"))
         for label, one in zip(found.labels, found.noise, strict=True)

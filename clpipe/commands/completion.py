@@ -1,7 +1,7 @@
-"""Names that the shell completes: cameras, configurations, stages and their parameters.
+"""Shell completion of the names of cameras, configurations, stages and parameters.
 
-Each function has the signature of click's ``shell_complete``. Rooms are imported where they are
-needed, because these functions are named by options of commands that do not use them.
+Each function has the signature of click's ``shell_complete``. It imports the packages that it
+needs, because commands that do not use it have options that name it.
 """
 
 from collections.abc import Iterable
@@ -14,7 +14,7 @@ from clpipe.base.errors import ClpipeError
 
 
 def cameras(context: click.Context, option: click.Parameter, text: str) -> list[CompletionItem]:
-    """Built-in cameras, by their names or by what else they are called, and files."""
+    """Complete built-in cameras, by name or alias, and files."""
     from clpipe.camera.profile import built_in_cameras, camera_names, comparable
 
     names = [name for name in built_in_cameras() if name.startswith(text)]
@@ -26,37 +26,37 @@ def cameras(context: click.Context, option: click.Parameter, text: str) -> list[
 def cameras_or_import(
     context: click.Context, option: click.Parameter, text: str
 ) -> list[CompletionItem]:
-    """Built-in cameras, files, and the command that makes a profile."""
+    """Complete built-in cameras, files, and the command that imports a profile."""
     return [*_names(["import"] if text else [], text), *cameras(context, option, text)]
 
 
 def configs(context: click.Context, option: click.Parameter, text: str) -> list[CompletionItem]:
-    """Built-in configurations, and files."""
+    """Complete built-in configurations, and files."""
     from clpipe.chain.files import built_in_configs
 
     return _names(built_in_configs(), text) or _file(text)
 
 
 def steps(context: click.Context, option: click.Parameter, text: str) -> list[CompletionItem]:
-    """Stages, in the order of the default chain."""
+    """Complete stages, in the order of the default chain."""
     return _names(_stages(context), text)
 
 
 def steps_or_all(
     context: click.Context, option: click.Parameter, text: str
 ) -> list[CompletionItem]:
-    """Stages, and "all"."""
+    """Complete stages, and "all"."""
     return _names(["all", *_stages(context)], text)
 
 
 def stage_lists(context: click.Context, option: click.Parameter, text: str) -> list[CompletionItem]:
-    """Stages behind the last comma."""
+    """Complete the stage after the last comma."""
     before, comma, last = text.rpartition(",")
     return [CompletionItem(before + comma + item.value) for item in _names(_stages(context), last)]
 
 
 def methods_of(context: click.Context, option: click.Parameter, text: str) -> list[CompletionItem]:
-    """Stages that have more than one method."""
+    """Complete stages that have more than one method."""
     from clpipe.chain.registry import all_stages
 
     names = _stages(context)
@@ -64,7 +64,7 @@ def methods_of(context: click.Context, option: click.Parameter, text: str) -> li
 
 
 def parameters(context: click.Context, option: click.Parameter, text: str) -> list[CompletionItem]:
-    """``stage.``, then ``stage.parameter=``, then the methods of ``stage.method=``."""
+    """Complete ``stage.``, then ``stage.parameter=``, then the methods of ``stage.method=``."""
     from clpipe.chain.methods import base_name
     from clpipe.chain.registry import all_stages
 
@@ -82,7 +82,7 @@ def parameters(context: click.Context, option: click.Parameter, text: str) -> li
 
 
 def _stages(context: click.Context) -> list[str]:
-    """The names of all stages, with those of ``--stage-file`` where they can be loaded."""
+    """Return the names of all stages, including those of ``--stage-file`` if they can be loaded."""
     from clpipe.chain.registry import all_stages, load_stage_file
 
     try:
@@ -98,11 +98,11 @@ def _names(names: Iterable[str], text: str) -> list[CompletionItem]:
 
 
 def _file(text: str) -> list[CompletionItem]:
-    """The item that lets the shell complete names of files."""
+    """Return the item that lets the shell complete file names."""
     return [CompletionItem(text, type="file")]
 
 
-# By the names of options.
+# Completion functions by option.
 COMPLETIONS = {
     "camera": cameras,
     "config": configs,

@@ -1,4 +1,4 @@
-"""``clpipe dataset``: a scene or a folder of renders becomes a dataset."""
+"""``clpipe dataset``: make a dataset of a scene or of a directory of renders."""
 
 import sys
 from collections.abc import Callable, Mapping
@@ -49,68 +49,68 @@ from clpipe.scenes.source import NOTE, RENDERS, UNIT, Source, from_folder, from_
 from clpipe.scenes.view_request import PATHS, asked_views, parse_box, parse_frames, parse_resolution
 from clpipe.stage import StageRole
 
-# Options that are for a scene alone.
+# Options that apply only to a scene.
 VIEW_OPTIONS = ("views", "path", "box", "frames")
 RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit", "blender")
 
 
 @click.command("dataset", cls=GroupedCommand)
 @click.argument("source", type=EXISTING, metavar="SCENE.blend|FOLDER")
-@output_option("DS", "The folder of the dataset; it is made where it is missing.")
+@output_option("DS", "The directory of the dataset. It is created if it does not exist.")
 @click.option(
     "--views",
     type=click.IntRange(1, 100_000),
     metavar="N",
-    help="Render N views on a path about what the scene's camera looks at. [default: 24]",
+    help="Render N views around the point that the scene's camera looks at. [default: 24]",
 )
 @click.option(
     "--path",
     type=click.Choice(PATHS),
-    help="Where views are: once around (orbit), 60 degrees about the scene's camera (arc), or "
-    "anywhere in a box about it (random). [default: orbit]",
+    help="The positions of views: a full circle (orbit), 60 degrees around the scene's camera "
+    "(arc), or random positions in a box around it (random). [default: orbit]",
 )
 @click.option(
     "--box",
     metavar="X,Y,Z,X,Y,Z",
     type=parse_box,
-    help="Two corners of the box of --path random. [default: half as wide as the way to what the "
-    "camera looks at]",
+    help="Two corners of the box of --path random. [default: half as wide as the distance from the "
+    "camera to the point that it looks at]",
 )
 @click.option(
     "--frames",
     metavar="A-B",
     type=parse_frames,
-    help="Render these frames of the scene, by its own camera: 1-24, or 1,5,9.",
+    help="Render these frames of the scene, with the scene's camera, such as 1-24 or 1,5,9.",
 )
 @click.option(
     "--resolution",
     metavar="WxH",
     type=parse_resolution,
-    help="Of the renders. [default: the scene's]",
+    help="The resolution of the renders in px. [default: the scene's]",
 )
 @click.option(
     "--samples",
     default=128,
     show_default=True,
     type=click.IntRange(1, 2**24),
-    help="Light paths for each pixel.",
+    help="The number of light paths per pixel.",
 )
 @click.option(
     "--denoise/--no-denoise",
     default=True,
     show_default=True,
-    help="Have Blender remove the noise of its light paths, which is no camera's.",
+    help="Have Blender remove the noise of its light paths, which is not camera noise.",
 )
 @click.option(
     "--time-limit",
     type=click.FloatRange(0, min_open=True),
     metavar="SECONDS",
-    help="Stop a view's rendering after that time; other machines then make other pictures.",
+    help="Stop rendering a view after this time. The result then depends on the machine.",
 )
 @click.option(
     "--blender",
     metavar="PATH",
-    help="An installed Blender, 4.2 or newer, or a Python that has the package bpy. [default: this "
+    help="An installed Blender, 4.2 or newer, or a Python with the package bpy. [default: this "
     "Python]",
 )
 @options("config", "camera", "iso", *SETTINGS, "start_at", "until", CODE, "carry", "poses")
@@ -120,14 +120,14 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
 @click.option(
     "--licence",
     metavar="TEXT",
-    help="Under which the dataset is published, for its README: CC-BY-4.0, or a sentence.",
+    help="The licence of the dataset, for its README, such as CC-BY-4.0 or a sentence.",
 )
-@click.option("--author", metavar="TEXT", help="Whose the dataset is, for its README.")
+@click.option("--author", metavar="TEXT", help="The author of the dataset, for its README.")
 @click.option(
     "--lens-model",
     type=click.Choice(sorted(MODELS)),
-    help="Render faces of a cube, and look at them through a wide lens of that model, whose "
-    "coefficients are those of --set projection.fx=300 and so on.",
+    help="Render the faces of a cube, and combine them into the picture of a wide lens of this "
+    "model. Set its coefficients with --set projection.fx=300 and so on.",
 )
 @device_option
 @quiet_option
@@ -142,15 +142,17 @@ def dataset(
     json_lines: bool,
     **chosen: Any,
 ) -> None:
-    """Make a dataset of a Blender scene, or of a folder of renders that exist.
+    """Make a dataset of a Blender scene, or of a directory of existing renders.
 
-    Renders a scene's views to DS/renders, linear EXRs with depth, normals, object numbers and, for
-    frames, flow; develops them as clpipe run does, for each camera and ISO, while the next ones are
-    rendered; and writes the cameras of the pictures (cameras.json, transforms.json, COLMAP's
-    sparse/0), manifest.csv, train.txt and val.txt, a contact sheet and a README.
+    The views of a scene are rendered to DS/renders, as linear EXRs with depth, normals, object
+    numbers and, for frames, flow. Each is developed like in clpipe run, for each camera and ISO,
+    while the next one is rendered. The dataset also has the cameras of the pictures (cameras.json,
+    transforms.json, COLMAP's sparse/0), manifest.csv, train.txt and val.txt, a contact sheet and a
+    README.
 
-    A folder of renders is taken as it is, with the cameras.json or transforms.json in it. The same
-    command goes on where it was interrupted, and renders no view twice for other ISOs and cameras.
+    A directory of renders is used unchanged, with the cameras.json or transforms.json in it. To
+    resume an interrupted run, repeat the command. For other ISOs and cameras, views are not
+    rendered again.
 
     \b
     clpipe dataset scene.blend -o set --iso 100,800,3200 --views 24
@@ -174,7 +176,7 @@ def dataset(
     request = Request.from_options(values=values, **chosen)
     if not series.isos and "iso" not in request.settings().draws:
         series = replace(series, isos=(request.settings().iso,))
-    series.jobs((), request.settings())  # refuses what is wrong before anything is rendered
+    series.jobs((), request.settings())  # rejects errors before anything is rendered
     with ExitStack() as stack:
         if source.suffix.lower() == ".blend":
             check_chain(request)
@@ -198,7 +200,7 @@ def dataset(
 def rendering_of(
     scene: Path, output: Path, poses: Path | None, seed: int, options: Mapping[str, Any]
 ) -> Rendering:
-    """What Blender is asked.
+    """Return the job for Blender.
 
     Raises:
         RequestError: the options contradict each other.
@@ -206,20 +208,20 @@ def rendering_of(
     own = dict(options)
     named = {name: own.pop(name) for name in VIEW_OPTIONS}
     views = asked_views(**named, poses=poses, seed=seed)
-    # Blender has a working directory of its own.
+    # Blender has another working directory.
     return Rendering(scene.absolute(), (output / RENDERS).absolute(), views, **own, seed=seed)
 
 
 def faces_of(request: Request, resolution: tuple[int, int] | None) -> dict[str, Any] | None:
-    """The faces of a cube that a wide lens sees; None without such a lens.
+    """Return the faces of a cube that a wide lens sees; None without such a lens.
 
     Args:
-        request: with the lens.
-        resolution: of a face; None is as fine as the picture where that is finest.
+        request: a request with the lens.
+        resolution: the size of a face in px; None matches the finest part of the picture.
 
     Raises:
-        RequestError: a face is no square.
-        ImageError: the lens cannot be.
+        RequestError: a face is not square.
+        ImageError: the lens is impossible.
     """
     projection = projection_of(request.chain()) if wide_of(request.settings()) else None
     if projection is None:
@@ -227,39 +229,41 @@ def faces_of(request: Request, resolution: tuple[int, int] | None) -> dict[str, 
     side, names = seen_faces(projection.lens)
     if resolution and resolution[0] != resolution[1]:
         raise RequestError(
-            f"--resolution: found {resolution[0]}x{resolution[1]}; a wide lens looks at the faces "
-            f"of a cube, which are squares, here of {side}x{side} px"
+            f"--resolution: found {resolution[0]}x{resolution[1]}, but a wide lens needs the faces "
+            f"of a cube, which are square; use {side}x{side}, for example"
         )
     side = resolution[0] if resolution else side
     return {"side": side, "turns": {name: CUBE[name] for name in names}}
 
 
 def check_chain(request: Request) -> None:
-    """See that a chain can be made for renders whose cameras are not known yet.
+    """Check that a chain can be built for renders whose cameras are not known yet.
 
     Raises:
-        RequestError: it cannot.
+        RequestError: the chain cannot be built.
     """
     try:
         request.chain()
     except RequestError:
         try:
             request.for_image("", {"render": {"fx": 1000.0}}).chain()
-            return  # it lacked nothing but a focal length, which the scene's cameras have
+            return  # only a focal length was missing, which the scene's cameras have
         except RequestError:
             pass
         raise
 
 
 def refuse_rendering() -> None:
-    """See that no option is set that is for a scene alone.
+    """Check that no option is set that applies only to a scene.
 
     Raises:
-        RequestError: one is.
+        RequestError: such an option is set.
     """
     for name, flag in options_set().items():
         if name in RENDER_OPTIONS:
-            raise RequestError(f"{flag}: it is for a .blend, not for renders that exist")
+            raise RequestError(
+                f"{flag}: this option applies only to a .blend, not to existing renders; remove it"
+            )
 
 
 def develop(
@@ -272,10 +276,10 @@ def develop(
     said: Mapping[str, str],
     echo: Callable[[bytes], None] | None,
 ) -> Summary:
-    """Develop the renders as they come, and write the dataset's card behind them.
+    """Develop each render when it is finished, then write the dataset's README and lists.
 
     Raises:
-        ClpipeError: the run cannot go on.
+        ClpipeError: the run cannot continue.
     """
     found = renders.jobs() or ()
     images = Images(renders.inputs, poses=renders.poses, series=series, found=found)
@@ -294,7 +298,7 @@ def develop(
     outcomes = made.outcomes(renders.as_rendered(made.jobs, tell))
     follow(made, outcomes, quiet, reporter, stop)
     if not made.summary.interrupted:
-        unit = renders.about.get(UNIT, "as the renders have it")
+        unit = renders.about.get(UNIT, "as in the renders")
         about = About(renders.about, said["licence"], said["author"], unit, sys.argv[1:])
         written = write_card(output, RENDERS, about)
         tell(f"wrote {', '.join(map(str, written))}")

@@ -1,4 +1,4 @@
-"""``clpipe devices``: the OpenCL devices of this machine, and which one is used."""
+"""``clpipe devices``: list the OpenCL devices of this machine, and which one is used."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from clpipe.engine.discovery import DeviceInfo, choose, find_devices
 @click.command("devices", cls=Command)
 @json_option
 def devices(as_json: bool) -> None:
-    """List the OpenCL devices, and say which one is used and why others are not."""
+    """List the OpenCL devices, which one is used by default, and why the others are not."""
     rows = device_rows(find_devices(again=True))
     if as_json:
         show_json(rows)
@@ -28,7 +28,7 @@ def devices(as_json: bool) -> None:
 
 
 def device_rows(devices: Sequence[DeviceInfo]) -> list[dict[str, Any]]:
-    """A row for each device, with its status: used, or why it is passed over. NumPy is the last."""
+    """Return a row for each device, with its status: used, or why not. NumPy is the last row."""
     try:
         used: DeviceInfo | None = choose(None, list(devices))
     except DeviceError:
@@ -38,13 +38,13 @@ def device_rows(devices: Sequence[DeviceInfo]) -> list[dict[str, Any]]:
         if device is used:
             status = "used by default"
         elif device.problem:
-            status = f"passed over: {device.problem}"
+            status = f"not used: {device.problem}"
         elif device.type == "emulator":
-            status = f"passed over: an emulator, slow; --device {device.index}"
+            status = f"not used: an emulator is slow; use it with --device {device.index}"
         elif used and used.type == "GPU" and device.type != "GPU":
-            status = f"passed over: there is a GPU; --device {device.index}"
+            status = f"not used: there is a GPU; use it with --device {device.index}"
         else:
-            status = f"passed over: another one comes first; --device {device.index}"
+            status = f"not used: another device is first; use it with --device {device.index}"
         rows.append(
             {
                 "index": device.index,
@@ -60,7 +60,7 @@ def device_rows(devices: Sequence[DeviceInfo]) -> list[dict[str, Any]]:
                 "status": status,
             }
         )
-    numpy = "slow; --device numpy"
+    numpy = "slow; use it with --device numpy"
     blank = dict.fromkeys(
         ("driver", "compute_units", "memory", "lanes", "target", "target_reason"), ""
     )

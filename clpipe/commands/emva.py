@@ -1,4 +1,4 @@
-"""``clpipe emva``: a series of uniform frames of a camera, as EMVA 1288 asks for it."""
+"""``clpipe emva``: make a series of uniform frames of a camera according to EMVA 1288."""
 
 from pathlib import Path
 
@@ -22,27 +22,28 @@ USUAL = SeriesSize()
 @click.command("emva", cls=Command)
 @option(KEYS["camera"]._replace(usual=""), required=True)
 @option(KEYS["iso"]._replace(text="The ISO.", usual="the camera's lowest"))
-@output_option("DIR", "The folder of the series; it is made where it is missing.")
+@output_option("DIR", "The directory of the series. It is created if it does not exist.")
 @click.option(
     "--size",
     default=f"{USUAL.width}x{USUAL.height}",
     show_default=True,
     metavar="WxH",
-    help="Of a frame.",
+    help="The size of a frame in px.",
 )
 @click.option(
     "--exposures",
     default=USUAL.exposures,
     show_default=True,
     type=click.IntRange(LEAST_EXPOSURES, 10_000),
-    help="From dark to the saturation, evenly; a tenth as many follow.",
+    help="The number of exposures, evenly from dark to saturation. A tenth as many follow above "
+    "saturation.",
 )
 @click.option(
     "--stack",
     default=USUAL.stack,
     show_default=True,
     type=click.IntRange(3, 10_000),
-    help="Frames at half the saturation, and as many dark ones, for DSNU and PRNU.",
+    help="The number of frames at half saturation, and of dark frames, for DSNU and PRNU.",
 )
 @option(KEYS["seed"], default=0)
 @device_option
@@ -58,13 +59,14 @@ def emva(
     selector: str | None,
     as_json: bool,
 ) -> None:
-    """Make a series of uniform frames of a camera, as EMVA 1288 asks for it.
+    """Make a series of uniform frames of a camera according to EMVA 1288.
 
-    DIR/EMVA1288_Data.txt describes the frames, PNGs of the camera's bits, as programs for the
-    standard read it, clpipe calibrate --emva among them: pairs from dark to past the saturation,
-    dark pairs of the same times, and a stack each. Light falls on all pixels alike, behind the
-    colour filters, and goes through the raw's stages as a render does. Where a profile does not
-    know the quantum efficiency, photons are electrons.
+    Frames are PNGs with the camera's bits. The series has pairs from dark to above saturation, dark
+    pairs with the same exposure times, and a stack of each. DIR/EMVA1288_Data.txt describes them in
+    the standard's format, for clpipe calibrate --emva and other programs.
+
+    All pixels receive the same light after the colour filters. The light goes through the raw's
+    stages like a render. If the profile has no quantum efficiency, photons count as electrons.
 
     \b
     clpipe emva --camera nikon-d850 --iso 400 -o series
@@ -76,7 +78,7 @@ def emva(
     if not least <= min(columns, rows) <= max(columns, rows) <= most:
         raise RequestError(
             f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 640x480, "
-            f"each {least} to {most}"
+            f"with each side from {least} to {most} px"
         )
     of = SeriesSize(columns, rows, exposures, stack)
     with told() as tell:

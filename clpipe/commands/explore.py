@@ -1,4 +1,4 @@
-"""``clpipe explore``: a page on which a camera is tried on renders."""
+"""``clpipe explore``: try a camera on renders, on a page in the browser."""
 
 import os
 from pathlib import Path
@@ -28,7 +28,8 @@ from clpipe.inputs.loader import ImageLoader
     "--port",
     type=click.IntRange(1, 65535),
     metavar="N",
-    help="The port of the page, to be forwarded from another machine. [default: a free one]",
+    help="The port of the page, for example to forward it to another machine. [default: a free "
+    "port]",
 )
 def explore(
     inputs: tuple[str, ...],
@@ -37,12 +38,13 @@ def explore(
     port: int | None,
     **chosen: Any,
 ) -> None:
-    """Try a camera on renders: a page on this machine, developed live as settings change.
+    """Try a camera on renders: a page in the browser, developed live as settings change.
 
-    It has a control for every parameter of every stage, and shows any stage, pixel values, the
-    histogram, the noise of a part, the time of each launch, and another setting or the clean
-    picture beside. What is found is saved as a configuration, or copied as a command; both give the
-    same picture. Only this machine can open the page, and only by the address that is printed.
+    The page has a control for every parameter of every stage. It shows the image of any stage,
+    pixel values, the histogram, the noise of a region and the time of each launch. Next to the
+    picture it shows other settings or the clean picture. Save the settings as a configuration, or
+    copy them as a command; both give the same picture. Only this machine can open the page, at the
+    printed address.
 
     \b
     clpipe explore render.exr
@@ -55,7 +57,7 @@ def explore(
     request = request_of(chosen)
     loader = ImageLoader(request)
     jobs = loader.exposures(find_jobs(inputs, Path(os.devnull), loader.endings()))
-    loader.first_chain(jobs)  # a wrong request is refused here
+    loader.first_chain(jobs)  # rejects a wrong request
     explorer = Explorer(jobs, request, open_device(selector))
     for note in lens_notes(loader.settings, jobs):
         click.echo(f"clpipe: {note}", err=True)
@@ -63,12 +65,12 @@ def explore(
         explorer.check()
     except ImageError as error:
         raise RequestError(
-            f"{error}. clpipe explore takes what clpipe run takes: linear renders, camera raws, "
-            "and photographs with -c unprocess"
+            f"{error}. clpipe explore reads the same inputs as clpipe run: linear renders, camera "
+            "raws, and photographs with -c unprocess"
         ) from None
     server = Server(explorer, port or 0)
     if as_json:
         show_json({"address": server.address, "images": len(jobs)})
     else:
-        click.echo(f"{explorer.label}: open {server.address} in a browser; Ctrl-C ends")
+        click.echo(f"{explorer.label}: open {server.address} in a browser; press Ctrl-C to stop")
     server.run()

@@ -1,4 +1,4 @@
-"""What was measured on: the machine, in a form that tells its owner's paths to nobody."""
+"""The machine of a measurement, as a record that contains no paths of its owner."""
 
 import platform
 from typing import Any
@@ -11,7 +11,7 @@ from clpipe.outputs.program import all_versions, device_record
 
 
 def machine_record(device: Device) -> dict[str, Any]:
-    """A device and the versions of all that runs on it, as JSON values."""
+    """Return a device and the versions of the software that it runs, as JSON values."""
     info = device.info
     return {
         "clpipe": full_version(),
@@ -22,10 +22,10 @@ def machine_record(device: Device) -> dict[str, Any]:
 
 
 def ask_for_report(device: Device) -> None:
-    """Say what to report from a device that is no CPU, since only CPUs are at hand here."""
+    """Print how to report results from a device that is no CPU, as few are tested."""
     if device.info.type != "CPU":
         click.echo(
-            f"clpipe is developed on CPUs. To report how it does on this {device.info.type}, send "
-            "its developers what the same command prints with --json: the device, its driver, "
-            "versions and these results, and none of your paths."
+            f"clpipe is developed on CPUs. To report results for this {device.info.type}, run the "
+            "same command with --json and send the output to the developers. It contains the "
+            "device, its driver, versions and these results, but none of your paths."
         )

@@ -1,4 +1,4 @@
-"""The program: a group of commands, each imported when it is used."""
+"""The program: a group of commands, each imported on first use."""
 
 import ast
 import gc
@@ -22,7 +22,7 @@ from clpipe.base.system import address_space, processors, save_addresses
 from clpipe.base.text import alike, either, one_line
 from clpipe.commands.notices import NOTICES
 
-# By the headings of the help. Each is a module of this folder that defines a function of its name.
+# Commands by the headings of the help. Each is a module here that defines a function of its name.
 GROUPS = {
     "Make pictures": ("run", "replay", "dataset", "meter"),
     "Look at them": ("report", "explore", "compare", "measure", "poses"),
@@ -32,13 +32,13 @@ GROUPS = {
 COMMANDS = tuple(name for names in GROUPS.values() for name in names)
 
 
-# Bytes of addresses: what loading libraries takes, and a thread of theirs, one on each processor.
+# Bytes of address space that libraries need, and each of their threads, one per processor.
 LIBRARIES = 240 << 20
 OF_THREAD = 10 << 20
 
 
 class LazyGroup(click.Group):
-    """Commands that are imported on use. An error becomes one message and an exit status."""
+    """Commands that are imported on first use. An error becomes one message and an exit status."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         if args[:1] == ["help"]:
@@ -63,7 +63,7 @@ class LazyGroup(click.Group):
         if cmd_name not in COMMANDS:
             return None
         prepare_memory()
-        gc.disable()  # what is imported stays: looking through it again and again takes a tenth
+        gc.disable()  # imported objects stay; collecting garbage takes a tenth of the time
         command = getattr(import_module(f"clpipe.commands.{cmd_name}"), cmd_name)
         gc.enable()
         assert isinstance(command, click.Command)
@@ -75,7 +75,7 @@ class LazyGroup(click.Group):
                 formatter.write_dl([(name, summary(name)) for name in names])
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        # The base imports every command for this.
+        # The method of the base class imports every command.
         names = [name for name in COMMANDS if name.startswith(incomplete)]
         items = [CompletionItem(name, help=summary(name)) for name in names]
         return [*items, *click.Command.shell_complete(self, ctx, incomplete)]
@@ -97,11 +97,16 @@ class LazyGroup(click.Group):
         except OSError as error:
             fail(refused(error))
         except MemoryError:
-            fail(DeviceError("there is no memory left to go on; what was made is whole"))
+            fail(
+                DeviceError(
+                    "there is not enough memory to continue; finished pictures are complete, so "
+                    "repeat the command to resume"
+                )
+            )
 
 
 def meant(text: str) -> str:
-    """What was probably meant by a text in the place of a command, as the end of a message."""
+    """Return what an unknown command probably means, as the end of a message."""
     from clpipe.camera.profile import built_in_name
     from clpipe.chain.registry import all_stages
 
@@ -119,7 +124,7 @@ def meant(text: str) -> str:
 
 
 def prepare_memory() -> None:
-    """Have a small address space last, and see that there is one for the libraries."""
+    """Save address space if it is limited, and check that the libraries fit into it."""
     if address_space() is None:
         return
     save_addresses()
@@ -130,22 +135,22 @@ def prepare_memory() -> None:
 
 
 def refused(error: OSError) -> ClpipeError:
-    """What the system refused: a file, to print, or something that it does not name."""
+    """Return the error for a failure of the operating system, with the file if there is one."""
     if error.filename is not None:
         return OutputError(f"{error.filename}: {error.strerror or error}")
     if isinstance(error, FileNotFoundError):  # only the working directory has no name
-        return RequestError("the working directory has gone; change to one that exists")
+        return RequestError("the working directory no longer exists; change to another one")
     *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
     room, _, _ = innermost.f_globals["__name__"].partition(".")
     if room in ("click", "rich"):
         return RequestError(f"cannot print: {error.strerror}")
-    return OutputError(f"the system refused something: {error.strerror or error}")
+    return OutputError(f"the operating system reported an error: {error.strerror or error}")
 
 
 def summary(name: str) -> str:
-    """The first sentence of a command's help, up to a colon, read from its source.
+    """Return the first sentence of a command's help, up to a colon, from its source.
 
-    Importing all commands takes ten times as long as listing them in this way.
+    Importing all commands would take ten times as long.
     """
     module = ast.parse(Path(__file__).with_name(f"{name}.py").read_text("utf-8"))
     functions = (node for node in module.body if isinstance(node, ast.FunctionDef))
@@ -161,7 +166,7 @@ def fail(error: ClpipeError) -> NoReturn:
 
 
 def say_version(context: click.Context, _: click.Parameter, is_asked: bool) -> None:
-    """Print the version with the commit, which takes some time to find, and exit."""
+    """Print the version with the commit, which is slow to look up, and exit."""
     if is_asked and not context.resilient_parsing:
         click.echo(f"clpipe, version {full_version()}")
         context.exit()
@@ -180,7 +185,7 @@ def say_version(context: click.Context, _: click.Parameter, is_asked: bool) -> N
     help="Show the version and exit.",
 )
 def main() -> None:
-    """Put clean, linear renders through a camera: mosaic, sensor noise, development.
+    """Simulate a camera on clean, linear renders: mosaic, sensor noise, development.
 
     \b
     clpipe run render.exr -o out --iso 3200

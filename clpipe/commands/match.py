@@ -1,4 +1,4 @@
-"""``clpipe match``: from pictures of a camera to a development with the same noise."""
+"""``clpipe match``: find a development whose noise matches a camera's pictures."""
 
 import contextlib
 import time
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 
 
 class Follower(Watch):
-    """Says how far a search is, and writes the best configuration so far, each time it is better.
+    """Shows the progress of a search, and writes the best configuration whenever it improves.
 
     Args:
-        output: the configuration.
-        console: where to print; a terminal gets a bar while this is a context.
+        output: the path of the configuration.
+        console: the console to print on; a terminal shows a bar inside the context.
     """
 
     def __init__(self, output: Path, console: Console) -> None:
@@ -44,7 +44,7 @@ class Follower(Watch):
         self._written: Settings | None = None
         self._bar: Progress | None = None
         self._live = contextlib.ExitStack()
-        self.state = "nothing was found yet, and nothing is written"
+        self.state = "the search has no result yet, so nothing was written"
 
     def __enter__(self) -> Self:
         if self._console.is_terminal:
@@ -64,15 +64,18 @@ class Follower(Watch):
         self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def stop(self) -> None:
-        """Have the search end."""
+        """Stop the search."""
         self.is_stopping = True
 
     def advanced(self, share: float, best: Candidate, scenes: Scenes) -> None:
-        """Write the best if it is new, and say how it goes, without a terminal now and then."""
+        """Write the best settings if they are new, and show the progress.
+
+        Without a terminal, a line is printed now and then.
+        """
         residuals = f"residuals of {best.residual:.2g}"
         if best.settings is not self._written:
             self._written = best.settings
-            remark = f"the best after {share:.0%} of the search, with {residuals}"
+            remark = f"the best result after {share:.0%} of the search, with {residuals}"
             write_configuration(self._output, best.settings, scenes, [remark])
             self.state = f"wrote {self._output}, {remark}"
         now = time.perf_counter()
@@ -94,13 +97,13 @@ class Follower(Watch):
     "means",
     multiple=True,
     metavar="FILES",
-    help="The mean of many pictures of each FRAME's scene, in the same order; a file or a quoted "
-    "glob; may be repeated. [default: the FRAMEs are a burst of one scene]",
+    help="The mean of many pictures of each FRAME's scene, in the same order: a file or a quoted "
+    "glob. May be repeated. [default: the FRAMEs are a burst of one scene]",
 )
 @option(KEYS["camera"])
 @option(
     KEYS["iso"]._replace(
-        text="The ISO at which the raw noise is the camera's.",
+        text="The ISO, which sets the noise of the raw.",
         usual="the search finds the strength",
     )
 )
@@ -122,12 +125,12 @@ def match(
     selector: str | None,
     as_json: bool,
 ) -> None:
-    """Find the development whose noise is that of a camera's finished pictures.
+    """Find a development whose noise matches a camera's finished pictures.
 
-    FRAMEs are JPEGs, PNGs or TIFFs as the camera made them, or crops of them that are not scaled: a
-    burst of a scene in which nothing moves, or single pictures, each with the mean of many of its
-    scene (--mean). The methods and numbers of demosaicing, denoising and what follows are searched
-    until the noise of the developed means has the same signature.
+    FRAMEs are JPEGs, PNGs or TIFFs from the camera, or unscaled crops of them. They are a burst of
+    a static scene, or single pictures, each with the mean of many pictures of its scene (--mean).
+    The search varies the methods and parameters of demosaicing, denoising and later stages, until
+    the noise of the developed means has the same statistics.
 
     \b
     clpipe match burst/*.jpg -o camera-jpeg.toml
@@ -162,7 +165,7 @@ def match(
 
 
 def columns_table(found: Match) -> Rows:
-    """A row for each column; residuals with their standard errors."""
+    """Return a row for each column, with residuals and their standard errors."""
     rows: Rows = [("column", "theirs", "ours", "residual", "in places not searched")]
     for seen, unseen in zip(found.seen, found.unseen, strict=True):
         text = COLUMNS[seen.name].text
@@ -172,7 +175,7 @@ def columns_table(found: Match) -> Rows:
 
 
 def residual_text(row: Row) -> str:
-    """A residual and its error; in percent where it is relative."""
+    """Return a residual and its error; in percent if it is relative."""
     if row.residual != row.residual:
         return "-"
     factor, form, unit = (100, ".1f", " %") if row.relative else (1, ".3f", "")
@@ -180,7 +183,7 @@ def residual_text(row: Row) -> str:
 
 
 def summary(found: Match) -> str:
-    """What was found, in two lines."""
+    """Return the result of the search in two lines."""
     tables = found.settings.parameters.items()
     methods = [f"{name} {table['method']}" for name, table in tables if "method" in table]
     numbers = [f"{name} = {value_text(value)}" for name, value in found.numbers.items()]

@@ -1,4 +1,4 @@
-"""``clpipe measure``: the noise of images, as tables, JSON or a plot."""
+"""``clpipe measure``: measure the noise of images, as tables, JSON or a plot."""
 
 import math
 from collections.abc import Sequence
@@ -26,24 +26,24 @@ from clpipe.stages.picture_noise import UNKNOWN
 
 @click.command("measure", cls=Command)
 @click.argument("images", nargs=-1, required=True, type=EXISTING, metavar="IMAGE...")
-@click.option("--truth", type=EXISTING, metavar="FILE", help="The same image without noise.")
+@click.option("--truth", type=EXISTING, metavar="FILE", help="The image without noise.")
 @click.option(
     "--pattern",
     default="RGGB",
     show_default=True,
     type=click.Choice(PATTERNS),
-    help="The pattern of mosaics that do not say theirs.",
+    help="The CFA pattern of mosaics whose files do not contain it.",
 )
 @click.option(
     "--plot",
     type=click.Path(path_type=Path),
     metavar="FILE.png",
-    help="Draw noise by intensity, autocorrelation and tails.",
+    help="Plot noise by intensity, autocorrelation and tails.",
 )
 @click.option(
     "--snr",
     is_flag=True,
-    help="The signal-to-noise ratio instead, in steps of half a stop, as a sensor's data sheet.",
+    help="Print the signal-to-noise ratio in steps of half a stop instead, like a data sheet.",
 )
 @json_option
 def measure(
@@ -54,11 +54,11 @@ def measure(
     snr: bool,
     as_json: bool,
 ) -> None:
-    """Measure the noise of images: its size, correlation and distribution.
+    """Measure the noise of images: its strength, correlation and distribution.
 
     IMAGE is a kept EXR of any stage, a mosaic, or a finished picture (JPEG, PNG, TIFF). Noise is
-    the difference from --truth, or, of two or more frames of one scene, from their mean. Several
-    bursts, NAME.frame0.png and so on, or folders with one or more each, make one report per ISO.
+    the difference from --truth, or from the mean of two or more frames of one scene. Name several
+    bursts (NAME.frame0.png and so on), or directories of bursts, to get one report per ISO.
 
     \b
     clpipe run render.exr -o noisy --iso 3200 --until quantize
@@ -71,18 +71,25 @@ def measure(
         require("--plot", "matplotlib")
     bursts = bursts_in(images)
     if truth is not None and len(bursts) > 1:
-        raise RequestError(f"--truth: one scene has it, but there are {len(bursts)} bursts")
+        raise RequestError(
+            f"--truth: found {len(bursts)} bursts, but one truth; name the images of one scene"
+        )
     clean = load_picture(truth, pattern) if truth else None
     if snr:
         if plot is not None or len(bursts) > 1:
-            raise RequestError("--snr: it makes a table of one scene, without --plot")
+            raise RequestError(
+                "--snr: the result is a table of one scene; name the images of one scene, without "
+                "--plot"
+            )
         show_snr(snr_curve([load_picture(p, pattern) for p in bursts[0]], clean), as_json)
         return
     reports = pool_by_iso(
         [measure_images([load_picture(p, pattern) for p in burst], clean) for burst in bursts]
     )
     if plot is not None and len(reports) > 1:
-        raise RequestError("--plot: it draws one ISO; name the images of one")
+        raise RequestError(
+            f"--plot: found {len(reports)} ISOs, but a plot shows one; name the images of one ISO"
+        )
     if plot is not None:
         from clpipe.analysis.plot import draw
 
@@ -102,10 +109,12 @@ def show_snr(curve: Sequence[SnrStep], as_json: bool) -> None:
     """Print a curve of signal-to-noise ratios.
 
     Raises:
-        RequestError: it has no step.
+        RequestError: the curve is empty.
     """
     if not curve:
-        raise RequestError(f"--snr: no step of half a stop has {FEWEST} samples that count")
+        raise RequestError(
+            f"--snr: no step of half a stop has {FEWEST} usable samples; name more or larger images"
+        )
     if as_json:
         show_json({"snr": record_of(curve)})
         return
@@ -116,19 +125,19 @@ def show_snr(curve: Sequence[SnrStep], as_json: bool) -> None:
 
 
 def iso_text(report: NoiseReport) -> str:
-    """The ISO of a report."""
+    """Return the ISO of a report as text."""
     return UNKNOWN if report.iso is None else f"{report.iso:g}"
 
 
 def line_text(lines: LineNoise) -> str:
-    """The noise that rows or columns share, or its limit, where chance alone may explain it."""
+    """Return the noise that rows or columns share; its upper limit if it is not significant."""
     if lines.sigma > lines.limit:
         return number(lines.sigma)
     return "-" if math.isnan(lines.limit) else f"< {number(lines.limit)}"
 
 
 def measure_heading(report: NoiseReport) -> str:
-    """What was measured, in which unit, and over which pixels."""
+    """Return what was measured, in which unit, and in which pixels."""
     against = report.truth or ("their mean" if report.bursts == 1 else "the mean of their burst")
     of = f" in {report.bursts} bursts" if report.bursts > 1 else ""
     at = f", ISO {report.iso:g}" if report.iso else ""
@@ -137,7 +146,7 @@ def measure_heading(report: NoiseReport) -> str:
         f"{len(report.images)} x {report.kind}{of}, {report.width}x{report.height}{at}, "
         f"against {against}; "
         f"unit: {UNITS[report.kind]}",
-        f"{report.share:.1%} of the {what} count; sigma (all) is that of every one",
+        f"{report.share:.1%} of the {what} are used; sigma (all) uses every one",
         *edges_text(report),
         *(f"note: {note}" for note in report.notes),
     ]
@@ -145,7 +154,7 @@ def measure_heading(report: NoiseReport) -> str:
 
 
 def edges_text(report: NoiseReport) -> list[str]:
-    """How much stronger noise is at edges, of pictures."""
+    """Return how much stronger the noise of pictures is at edges; [] for other images."""
     if math.isnan(report.at_edges):
         return []
     ratio = f"{report.at_edges:.2f} times"
@@ -153,7 +162,7 @@ def edges_text(report: NoiseReport) -> list[str]:
 
 
 def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
-    """The tables of a report, each a title and rows of text; the first row is the headings."""
+    """Return the tables of a report: titles and rows of text. The first row has the headings."""
     names = [one.name for one in report.channels]
     laws = ["a", "b"] if any(one.law for one in report.channels) else []
     which = "not clipped" if report.kind in ("mosaic", "values") else "flat"
@@ -196,11 +205,11 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
     ]
 
 
-WHERE = {FLAT: "flat places", PICTURE: "all", HALVED: "all, after 2x2"}
+WHERE = {FLAT: "flat areas", PICTURE: "all", HALVED: "all, after 2x2"}
 
 
 def covariance_rows(report: NoiseReport) -> Rows:
-    """The covariances of red, green and blue, a line for each place that they are measured in."""
+    """Return the covariances of red, green and blue, one row for each set of pixels."""
     first, *_ = report.covariances.values()
     places = [(i, j) for i in range(len(first)) for j in range(i, len(first))]
     names = Kind.RGB.channels

@@ -1,4 +1,4 @@
-"""``clpipe meter``: the auto exposure of a sequence, smoothed over time, as a manifest."""
+"""``clpipe meter``: meter a sequence's auto exposure, smoothed over time, for a manifest."""
 
 import os
 from pathlib import Path
@@ -27,8 +27,8 @@ from clpipe.inputs.loader import ImageLoader
     show_default=True,
     type=click.FloatRange(0, 1e6),
     metavar="FRAMES",
-    help="The time constant of the smoothing, after which 1/e of a change of light is left to make "
-    "up for; 0 is none.",
+    help="The time constant of the smoothing, after which the exposure still lacks 1/e of a change "
+    "of light. 0 disables smoothing.",
 )
 @options("config", CODE, "transfer", "layer", "max_pixels", "exclude")
 @set_option
@@ -46,9 +46,10 @@ def meter(
 ) -> None:
     """Meter the frames of a sequence, and write their exposures as a manifest for clpipe run.
 
-    FRAMES are renders in order of time: files, folders, globs or manifests. Each is metered as
-    exposure.method=auto does it, with what --set exposure.NAME=VALUE says; then the EVs are
-    smoothed, each folder by itself. So a run needs no order, and any frame can be made again alone.
+    FRAMES are renders in order of time: files, directories, globs or manifests. Each is metered
+    like with exposure.method=auto. Set its parameters with --set exposure.NAME=VALUE. The EVs are
+    then smoothed, separately for each directory. A run of the manifest may process frames in any
+    order, or recompute a single frame.
 
     \b
     clpipe meter renders/ -o exposures.csv --set exposure.metering=centre_weighted
@@ -57,7 +58,7 @@ def meter(
     if output.suffix.lower() != ".csv":
         raise RequestError(f"--output: found {output}; expected a name that ends in .csv")
     if any(os.path.realpath(each) == os.path.realpath(output) for each in frames):
-        raise RequestError(f"--output: {output} is an input; choose another name")
+        raise RequestError(f"--output: found {output}, which is an input; choose another name")
     metering = ("exposure.method=auto", *assignments)
     request = request_of({"assignments": metering, "until": "exposure", **chosen})
     loader = ImageLoader(request)

@@ -1,4 +1,4 @@
-"""What the package logs, such as that kernels are being compiled, on the terminal."""
+"""Print the package's log, such as that kernels are being compiled, on the terminal."""
 
 import logging
 from collections.abc import Callable, Iterator
@@ -10,7 +10,7 @@ from clpipe.base.text import one_line
 
 
 class Notices(logging.Handler):
-    """Prints each line on stderr, or where a live display says."""
+    """A log handler that prints each line on stderr, or above a live display."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -25,7 +25,7 @@ class Notices(logging.Handler):
 
     @contextmanager
     def printed_by(self, printer: Callable[[str], None]) -> Iterator[None]:
-        """Have a function print them, which keeps a live display below them."""
+        """Inside the context, print lines with a function that keeps a live display below them."""
         self._printers.append(printer)
         try:
             yield

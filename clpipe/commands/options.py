@@ -1,6 +1,6 @@
-"""The class of all commands, and options that several share.
+"""The base class of commands, and options that several commands share.
 
-The options that set keys are in chain_options.
+The options that set keys are in :mod:`clpipe.commands.chain_options`.
 """
 
 import logging
@@ -20,8 +20,8 @@ from clpipe.base.urls import is_url
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# The options of commands that have many, by the heading that they stand under. "+" is before those
-# that --help shows, briefly; --help-all shows all in full.
+# The options of commands with many options, by heading. --help shows those marked "+" briefly;
+# --help-all shows all in full.
 GROUPS = {
     "Camera": "+config +camera +iso +lens lens_model focal_length aperture focus_distance +seed "
     "noise_key",
@@ -37,10 +37,10 @@ GROUPS = {
 
 
 class Command(click.Command):
-    """Rejects an option that is given twice and can hold but one value.
+    """Rejects an option that occurs twice but holds only one value.
 
-    If an input that does not exist follows the value of an option, the message says how that
-    option takes several values.
+    If a missing input follows the value of an option, the message explains how to pass several
+    values to that option.
     """
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -68,8 +68,8 @@ class Command(click.Command):
                 holds_one = not (option.multiple or option.is_flag)
                 if holds_one and given.count(option) > 1:
                     raise RequestError(
-                        f"{option.opts[-1]}: it is given {given.count(option)} times, but holds "
-                        "one value; give it once"
+                        f"{option.opts[-1]}: found {given.count(option)} times, but it holds only "
+                        "one value; use it once"
                     )
         return super().parse_args(ctx, args)
 
@@ -77,7 +77,7 @@ class Command(click.Command):
 def several_values(
     options: Sequence[click.Parameter], arguments: Sequence[str], missing: str
 ) -> str:
-    """How to write the values of the option that a missing input follows; "" if it follows none.
+    """Return how to pass several values to the option before a missing input; "" without one.
 
     >>> several_values([click.Option(["--skip"], multiple=True)], ["--skip", "a", "b"], "b")
     ". To give --skip several values, use --skip a --skip b; for one with spaces, --skip 'a b'"
@@ -104,7 +104,7 @@ def several_values(
 
 
 class GroupedCommand(Command):
-    """A command whose help has its options in groups: --help the usual ones, --help-all all."""
+    """A command with options in groups: --help shows the usual ones, --help-all all of them."""
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         everything = click.Option(
@@ -129,7 +129,7 @@ class GroupedCommand(Command):
                 formatter.write_dl(rows)
 
     def _groups(self, ctx: click.Context) -> Iterator[tuple[str, list[tuple[str, str]]]]:
-        """The headings with the rows below them."""
+        """Yield the headings and their rows."""
         is_whole = ctx.meta.get(ALL, False)
         records = {
             option.opts[-1].lstrip("-").replace("-", "_"): record
@@ -143,7 +143,7 @@ class GroupedCommand(Command):
 
 
 def brief(text: str) -> str:
-    """The first part of a help text, with its default, or that the option is required.
+    """Return the first part of a help text, with the default, or "required".
 
     >>> brief("A stage, whole; may be repeated. Others follow. [default: a; else b]")
     'A stage, whole. [default: a]'
@@ -155,20 +155,20 @@ def brief(text: str) -> str:
     return f"{first}.{f' [{end[1]}]' if end else ''}"
 
 
-ALL = "clpipe.help_all"  # of a context: every option is shown
-ARGUMENTS = "clpipe.arguments"  # of a context: as they were written
+ALL = "clpipe.help_all"  # in a context's meta: show every option
+ARGUMENTS = "clpipe.arguments"  # in a context's meta: the arguments of the command line
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 json_lines_option = click.option(
     "--json-lines",
     is_flag=True,
-    help="Print the lines of the log on stdout, for programs: the start, each image, the end.",
+    help="Print the log on stdout for programs, one line for the start, each image and the end.",
 )
 
 
 class ExistingPath(click.Path):
-    """A file or directory that is read."""
+    """A file or directory to read. It must exist."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if not (ctx and ctx.resilient_parsing):
@@ -187,18 +187,21 @@ class OutputPath(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if not value:
-            raise RequestError("--output: it is empty; name what to write to")
+            raise RequestError("--output: found an empty name; name a file or directory")
         if is_url(value) and ctx:
             if ctx.info_name == "run":
                 return value
-            raise RequestError(f"--output: found {value}; only clpipe run writes behind URLs")
+            raise RequestError(
+                f"--output: found the URL {value}, but only clpipe run writes to URLs; name a "
+                "local path"
+            )
         return super().convert(value, param, ctx)
 
 
 def output_option(
     metavar: str, text: str, required: bool = True, multiple: bool = False
 ) -> Callable[[F], F]:
-    """The option -o; ``text`` is its help."""
+    """Return the option -o; ``text`` is its help."""
     return click.option(
         "-o",
         "--output",
@@ -221,7 +224,7 @@ quiet_option = click.option("--quiet", is_flag=True, callback=_hush, help="Print
 
 
 def options_set() -> dict[str, str]:
-    """The options that are set on the command line, by the names of their parameters."""
+    """Return the options that are set on the command line, by parameter name."""
     context = click.get_current_context()
     return {
         str(parameter.name): parameter.opts[0]

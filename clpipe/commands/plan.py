@@ -1,4 +1,4 @@
-"""``clpipe plan``: the launches and buffers of a chain, as a table or JSON; their source."""
+"""``clpipe plan``: show the launches and buffers of a chain, or the source of a launch."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -18,7 +18,7 @@ from clpipe.engine.plan import make_plan
 from clpipe.engine.traffic import bytes_per_pixel, launch_bytes
 from clpipe.outputs.recipes import results_of
 
-LANES = 8  # of a CPU, for which sources and bytes are given
+LANES = 8  # vector lanes of the CPU for which sources and bytes are printed
 
 
 @click.command("plan", cls=Command)
@@ -31,18 +31,17 @@ LANES = 8  # of a CPU, for which sources and bytes are given
 def plan(as_json: bool, as_toml: bool, source: str | None, **options: Any) -> None:
     """Show the launches and buffer slots of a chain, without running it.
 
-    A launch is one kernel call over the image. Stages that read only the pixel itself join the
-    launch before them; a stencil, a reduction and a kept image open a new one. A slot is a buffer
-    of one plane. --source takes a launch's number or name, and prints what a CPU of 8 lanes runs.
+    A launch is one kernel call over the image. A stage that reads only the pixel itself joins the
+    previous launch. A stencil, a reduction or a kept image starts a new one. A slot is a buffer of
+    one plane. For --source, name a launch or its number; the source is for a CPU with 8 lanes.
     """
     if (as_json, as_toml, source is not None).count(True) > 1:
-        raise RequestError("plan: --json, --toml and --source each print something else; give one")
+        raise RequestError("--json, --toml and --source exclude each other; use only one of them")
     request = request_of(options)
     if as_toml:
         if request.start_at or request.until:
             raise RequestError(
-                "plan: --toml prints a whole chain as a configuration; leave out --start-at and "
-                "--until"
+                "--toml: it prints a whole chain as a configuration; remove --start-at and --until"
             )
         click.echo(toml_text(request.chain()), nl=False)
         return
@@ -65,10 +64,10 @@ def plan(as_json: bool, as_toml: bool, source: str | None, **options: Any) -> No
 
 
 def launch_named(plan: Plan, wanted: str) -> AnyLaunch:
-    """The launch of a plan with that number, from 1 on, or that name.
+    """Return the launch of a plan with a number, from 1, or a name.
 
     Raises:
-        RequestError: there is none.
+        RequestError: there is no such launch.
     """
     for number, launch in enumerate(plan.launches, 1):
         if wanted in (str(number), launch.name):
@@ -78,7 +77,7 @@ def launch_named(plan: Plan, wanted: str) -> AnyLaunch:
 
 
 def plan_rows(plan: Plan) -> list[tuple[str, ...]]:
-    """A row for each launch: name, cause, stages, images read and written, bytes a pixel."""
+    """Return a row for each launch: name, cause, stages, images read and written, bytes a pixel."""
     kept = {image.number: name for name, image in plan.kept}
     return [
         (
@@ -94,7 +93,7 @@ def plan_rows(plan: Plan) -> list[tuple[str, ...]]:
 
 
 def opener(launch: AnyLaunch, kept: Mapping[int, str]) -> str:
-    """Why a launch does not join the one before it: the stage and its reason."""
+    """Return why a launch does not join the previous one: the stage and its reason."""
     if isinstance(launch, Lines):
         return "tables of rows and columns"
     if not isinstance(launch, Launch):
@@ -110,7 +109,7 @@ def opener(launch: AnyLaunch, kept: Mapping[int, str]) -> str:
 
 
 def stages_of(launch: AnyLaunch) -> list[str]:
-    """The steps in a launch, in order, each once; those repeated at each tap are in brackets."""
+    """Return the steps in a launch, in order. Steps repeated at each tap are in brackets."""
     if isinstance(launch, Lines):
         return [op.step for op in launch.ops]
     if not isinstance(launch, Launch):
@@ -123,12 +122,12 @@ def stages_of(launch: AnyLaunch) -> list[str]:
 
 
 def slots_text(plan: Plan, number: int) -> str:
-    """The slots of an image."""
+    """Return the slots of an image as text."""
     return ",".join(str(slot) for slot in plan.slots[number])
 
 
 def reads_text(plan: Plan, launch: AnyLaunch) -> str:
-    """The images that a launch reads, as text."""
+    """Return the images that a launch reads, as text."""
     if isinstance(launch, Launch) and not launch.reads:
         return f"source {plan.source.label}, {'half' if plan.half else 'float'}"
     return "; ".join(
@@ -137,7 +136,7 @@ def reads_text(plan: Plan, launch: AnyLaunch) -> str:
 
 
 def writes_text(plan: Plan, launch: AnyLaunch) -> str:
-    """The images that a launch writes, as text."""
+    """Return the images that a launch writes, as text."""
     if not isinstance(launch, Launch):
         return ""
     kept = {image.number: name for name, image in plan.kept}
@@ -151,7 +150,7 @@ def writes_text(plan: Plan, launch: AnyLaunch) -> str:
 
 
 def plan_record(plan: Plan) -> dict[str, Any]:
-    """A plan as JSON values."""
+    """Return a plan as JSON values."""
     keys = ("launch", "opened_by", "stages", "reads", "writes", "bytes_per_pixel")
     return {
         "launches": [dict(zip(keys, row, strict=True)) for row in plan_rows(plan)],

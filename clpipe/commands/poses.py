@@ -1,4 +1,4 @@
-"""``clpipe poses``: the cameras of the pictures of a folder, for COLMAP, nerfstudio and others."""
+"""``clpipe poses``: write the cameras of a run's pictures for COLMAP, nerfstudio and others."""
 
 from pathlib import Path
 
@@ -16,10 +16,10 @@ from clpipe.outputs.camera_files import write_camera_files
 def poses(folder: Path, as_json: bool) -> None:
     """Write the cameras and poses of a run's pictures, for COLMAP, nerfstudio and other programs.
 
-    OUT is the output folder of clpipe run, finished or not. From its sidecars alone this writes
-    OUT/cameras.json, OUT/transforms.json (NeRF's and nerfstudio's) and OUT/sparse/0 (COLMAP's text
-    model): the cameras as they are after distortion and resizing. clpipe run --poses does so by
-    itself, but for tars, and for the parts of a run (--shard).
+    OUT is the output directory of clpipe run, finished or not. Only its sidecars are read. The
+    cameras after distortion and resizing are written to OUT/cameras.json, OUT/transforms.json (for
+    NeRF and nerfstudio) and OUT/sparse/0 (COLMAP's text model). clpipe run --poses also writes
+    these files, except for tars and for the parts of a run (--shard).
 
     \b
     clpipe run renders/ -o out --poses renders/cameras.json --shard 1/2
@@ -27,13 +27,15 @@ def poses(folder: Path, as_json: bool) -> None:
     clpipe poses out
     """
     if not folder.is_dir():
-        raise RequestError(f"{folder}: it is no folder; name the output folder of a run")
+        raise RequestError(
+            f"{folder}: this is a file, not a directory; name the output directory of a run"
+        )
     written = write_camera_files(folder)
     if not written.files:
-        reasons = "; ".join(written.left_out) or "found no sidecar of one"
+        reasons = "; ".join(written.left_out) or "there is no sidecar of a picture"
         raise RequestError(
-            f"{folder}: has no picture whose intrinsics are known: {reasons}; run with --poses "
-            "FILE, or set render.focal_length and render.sensor_width, or render.fx"
+            f"{folder}: the intrinsics of no picture are known: {reasons}; run with --poses FILE, "
+            "or set render.focal_length and render.sensor_width, or render.fx"
         )
     if as_json:
         named = {"files": written.files, "pictures": written.pictures, "warnings": written.left_out}

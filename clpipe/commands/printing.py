@@ -1,4 +1,4 @@
-"""Tables, numbers and JSON on stdout."""
+"""Print tables, numbers and JSON on stdout."""
 
 import json
 import math
@@ -14,7 +14,7 @@ Rows = list[tuple[str, ...]]
 
 
 def short_text(value: Any) -> str:
-    """A value, with numbers to four digits.
+    """Return a value as text, with numbers to four digits.
 
     >>> short_text(((1.0, 0.123456), (0.0, 2.0)))
     '[[1, 0.1235], [0, 2]]'
@@ -28,7 +28,7 @@ def short_text(value: Any) -> str:
 
 
 def number(value: float, form: str = ".3g") -> str:
-    """A measured number; a dash where it is NaN.
+    """Return a measured number as text; a dash for NaN.
 
     >>> number(0.01234), number(math.nan)
     ('0.0123', '-')
@@ -40,9 +40,10 @@ def show(headings: Sequence[str], rows: Iterable[Sequence[str]], left: int | Non
     """Print a table.
 
     Args:
-        headings: of the columns.
-        rows: with a text for each column.
-        left: how many columns are aligned left, the others right; None is all.
+        headings: the headings of the columns.
+        rows: the rows, with a text for each column.
+        left: the number of columns that are aligned left; the others are aligned right. None
+            aligns all left.
     """
     # Imported here, because --json needs none of it.
     from rich.console import Console
@@ -53,8 +54,7 @@ def show(headings: Sequence[str], rows: Iterable[Sequence[str]], left: int | Non
         table.add_column(heading, justify="left" if left is None or number < left else "right")
     for row in rows:
         table.add_row(*row)
-    # A pipe gets room for whole lines.
-    # Names of files go in here, and are no markup.
+    # In a pipe, lines may be long. Markup is off, because cells may contain file names.
     width = None if sys.stdout.isatty() else 140
     Console(width=width, highlight=False, markup=False, emoji=False).print(table)
 

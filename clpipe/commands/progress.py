@@ -1,5 +1,7 @@
-"""What a run prints on stderr: a bar on a terminal, otherwise a line for each image, or of many
-images one every so often."""
+"""The progress of a run on stderr: a bar on a terminal, otherwise lines.
+
+There is a line for each image, or if there are many images, one every 10 s.
+"""
 
 import contextlib
 import shlex
@@ -25,14 +27,17 @@ from clpipe.outputs.existing import Redo
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-FEW = 50  # images that have a line each, where there is no terminal
-SOON = 0.5  # s, after which compiling is worth a word
-EVERY = 10.0  # s, from line to line of more images
+FEW = 50  # the most images that have a line each, without a terminal
+SOON = 0.5  # s; compiling that takes longer is shown
+EVERY = 10.0  # s between lines if there are more images
 
 
 def bar_on(console: Console) -> "Progress":
-    """A bar of images with what is described and the time that remains; removed when it stops."""
-    from rich import progress  # takes a while, and a single image needs none
+    """Return a bar that counts images, with a description and the remaining time.
+
+    The bar is removed when it stops.
+    """
+    from rich import progress  # slow to import, and a single image needs no bar
 
     return progress.Progress(
         progress.BarColumn(bar_width=None),
@@ -46,7 +51,10 @@ def bar_on(console: Console) -> "Progress":
 
 @contextlib.contextmanager
 def told() -> Generator[Callable[[str], None]]:
-    """What shows on stderr what is done: one line on a terminal, else a line now and then."""
+    """Yield a function that shows progress on stderr.
+
+    A terminal shows one line that changes. Otherwise a line is printed every 10 s.
+    """
     console = Console(stderr=True)
     last = time.perf_counter()
 
@@ -64,11 +72,11 @@ def told() -> Generator[Callable[[str], None]]:
 
 
 class Reporter:
-    """Prints outcomes as they come, and a summary when it is left as a context.
+    """Prints the outcome of each image, and a summary at the end of its context.
 
     Args:
-        run: what is printed of.
-        console: where to print; a terminal gets a bar where there are several images.
+        run: the run.
+        console: the console to print on; a terminal shows a bar if there are several images.
         quiet: print failures only.
     """
 
@@ -83,7 +91,7 @@ class Reporter:
         self._bar: Progress | None = None
         self._shows = console.is_terminal and not quiet
         self._live = contextlib.ExitStack()
-        self._warned: Counter[str] = Counter()  # printed once, and counted
+        self._warned: Counter[str] = Counter()  # each is printed once, and counted
 
     def __enter__(self) -> Self:
         self._live.enter_context(NOTICES.printed_by(self.print))
@@ -97,7 +105,7 @@ class Reporter:
         self.end()
 
     def _show(self, description: str) -> None:
-        """Show the bar, with what is described beside it."""
+        """Show the bar with a description."""
         if self._bar is None:
             self._bar = bar_on(self._console)
             self._task = self._bar.add_task("", total=self._summary.total)
@@ -105,18 +113,18 @@ class Reporter:
         self._bar.update(self._task, completed=self._summary.finished, description=description)
 
     def _compiling(self, compiled: int, of: int) -> None:
-        """Show how many kernels are compiled, where that takes time."""
+        """Show how many kernels are compiled, if that takes long."""
         if self._shows and time.perf_counter() - self._began > SOON:
             left = f"compiling {compiled + 1} of {of}" if compiled < of else "first launches"
             self._show(left)
 
     def print(self, text: str) -> None:
-        """Print a line. One that cannot be printed, on a full disk, ends no run."""
+        """Print a line. A failure to print, such as on a full disk, does not stop the run."""
         with contextlib.suppress(OSError):
             self._console.print(one_line(text), markup=False, highlight=False, soft_wrap=True)
 
     def report(self, outcome: Outcome) -> None:
-        """Print what became of one image, after it was added to the summary."""
+        """Print the outcome of one image, which is already in the summary."""
         if outcome.error:
             self.print(f"clpipe: {outcome.error}")
         if self._quiet:
@@ -144,7 +152,7 @@ class Reporter:
         return f"{text}  {outcome.megapixels:.2g} MP  {seconds:.2f} s"
 
     def _state(self, with_count: bool = False) -> str:
-        """How it goes, as the bar and, with the count of images, a line of its own says it."""
+        """Return the progress as text for the bar; with the count of images, as text for a line."""
         summary = self._summary
         failed = summary.counts[FAILED]
         speed = summary.megapixels / max(summary.elapsed, 1e-9)
@@ -158,7 +166,7 @@ class Reporter:
         return "; ".join([count, *parts, f"about {remaining} left"])
 
     def _clipping(self) -> str:
-        """What is said of images that are clipped much."""
+        """Return a warning about images with much clipping."""
         share, path = self._summary.most_clipped
         text = clipping_text(share)
         if not self._several:
@@ -167,27 +175,27 @@ class Reporter:
         return f"{count} image{'s are' if count > 1 else ' is'} clipped much, most {path}: {text}"
 
     def _old(self) -> str:
-        """What is said of pictures that another program has made."""
+        """Return a note about pictures of other versions of clpipe or of image libraries."""
         count = self._summary.old
         text = (
-            f"{count} picture{'s were' if count > 1 else ' was'} made by another clpipe, or with "
+            f"{count} picture{'s were' if count > 1 else ' was'} made by another version of clpipe "
         )
-        text += "other libraries for pictures, "
+        text += "or of image libraries, "
         if self._keeps_old:
             return f"{text}and {'stay' if count > 1 else 'stays'} (--redo missing)"
-        return f"{text}and {'are' if count > 1 else 'is'} made again; --redo missing keeps them"
+        return f"{text}and {'are' if count > 1 else 'is'} recomputed; --redo missing keeps them"
 
     def _print_passed_over(self) -> None:
-        """Print what is said of pictures that are old, and of images that were left out."""
+        """Print notes about old pictures, and about images that were left out."""
         if self._summary.old:
             self.print(self._old())
         without = self._summary.without_picture
         if without:
-            hold = "images in folders hold" if len(without) > 1 else "image in a folder holds"
+            hold = "images in directories have" if len(without) > 1 else "image in a directory has"
             self.print(f"left out: {len(without)} {hold} no picture, such as {without[0]}")
         if (kept := self._summary.counts[LEFT_OUT] - len(without)) > 0:
-            were = "image in a folder was" if kept == 1 else "images in folders were"
-            self.print(f"{kept} {were} kept after other stages and left out")
+            were = "image in a directory was" if kept == 1 else "images in directories were"
+            self.print(f"left out: {kept} {were} kept after other stages")
 
     def end(self) -> None:
         """Remove the bar and print the summary."""
@@ -220,7 +228,7 @@ class Reporter:
             text += f"; {summary.elapsed:.1f} s, {speed:.3g} MP/s; {summary.shares()}"
         self.print(text)
         if self._bar and self._several and counts[DONE] and not url_of(self._writer.folder):
-            self.print(f"look at it: clpipe report {shlex.quote(str(self._writer.folder))}")
+            self.print(f"for a report: clpipe report {shlex.quote(str(self._writer.folder))}")
 
 
 def follow(
@@ -230,17 +238,17 @@ def follow(
     reporter: Reporter | None = None,
     stop: Callable[[], None] | None = None,
 ) -> None:
-    """Print what becomes of a run's images, and what there is to say behind it.
+    """Print the outcomes of a run's images, and its notes at the end.
 
     Args:
         run: the run.
-        outcomes: its outcomes.
+        outcomes: the outcomes of its images.
         quiet: print failures only.
-        reporter: what prints; None is one on stderr.
-        stop: is called at Ctrl-C in place of the run's.
+        reporter: the reporter to use; None is a new one on stderr.
+        stop: the function to call at Ctrl-C instead of the run's.
 
     Raises:
-        ClpipeError: the run cannot go on.
+        ClpipeError: the run cannot continue.
     """
     shown = reporter or Reporter(run, Console(stderr=True), quiet)
     with contextlib.closing(outcomes), interruptible(stop or run.stop), shown:
@@ -251,6 +259,6 @@ def follow(
 
 
 def print_line(line: bytes) -> None:
-    """Print a line on stdout. One that cannot be printed ends no run."""
+    """Print a line on stdout. A failure to print does not stop the run."""
     with contextlib.suppress(OSError):
         click.echo(line, nl=False)

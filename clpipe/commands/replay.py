@@ -1,4 +1,4 @@
-"""``clpipe replay``: a picture again, from its sidecar."""
+"""``clpipe replay``: recompute a picture from its sidecar, and compare it."""
 
 import sys
 from pathlib import Path
@@ -35,13 +35,13 @@ def replay(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Make a sidecar's picture again, byte for byte, or say what has changed.
+    """Recompute a sidecar's picture and compare it byte for byte, or say what has changed.
 
-    INPUT is its input, where that has moved. Files that the picture was made with, a camera profile
-    or a curve, must be as they were. A sidecar is data: code that it names is run only where
-    --stage-file names it, too.
+    INPUT is the picture's input, if it has moved. Files that the picture was made with, such as a
+    camera profile or a curve, must be unchanged. Code that the sidecar names runs only if
+    --stage-file also names it.
 
-    The exit status is 0 where the bytes are the same.
+    The exit status is 0 if the bytes are the same.
 
     \b
     clpipe replay out/render.json -o again

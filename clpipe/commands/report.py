@@ -1,4 +1,4 @@
-"""``clpipe report``: what a run made, as one HTML file to look at."""
+"""``clpipe report``: write a report of a run as one HTML file."""
 
 import os
 from pathlib import Path
@@ -16,28 +16,32 @@ from clpipe.outputs.existing import is_marked
 
 @click.command("report", cls=Command)
 @click.argument("folders", metavar="OUT [OUT2]", nargs=-1, required=True, type=EXISTING)
-@output_option("FILE.html", "The file. [default: OUT/report.html]", required=False)
+@output_option("FILE.html", "The report to write. [default: OUT/report.html]", required=False)
 @json_option
 def report(folders: tuple[Path, ...], output: Path | None, as_json: bool) -> None:
-    """Look at a run: its figures, pictures, noise and settings, in one HTML file.
+    """Report on a run: its figures, pictures, noise and settings, in one HTML file.
 
-    OUT is the output folder of clpipe run, finished or not, with tars or without. The file opens
-    from the disk in any browser, without a network: a contact sheet that filters, a slider between
-    pictures and their truths with enlarged crops, noise against what was asked, the chain with its
-    parameters, what was drawn, failures and warnings. Of two folders, the report compares the runs.
+    OUT is the output directory of clpipe run, finished or not, with or without tars. The file opens
+    in any browser, without a network. It has a contact sheet with filters, a slider between
+    pictures and their ground truth with enlarged crops, and measured and requested noise. It also
+    has the chain with its parameters, drawn values, failures and warnings. To compare two runs,
+    name both directories.
 
     \b
     clpipe report out
     clpipe report out other -o both.html
     """
     if len(folders) > 2:
-        raise RequestError(f"found {len(folders)} folders; one is reported on, or two are compared")
+        raise RequestError(
+            f"found {len(folders)} directories; name one for a report, or two to compare them"
+        )
     path = output or folders[0] / "report.html"
     if path.suffix != ".html":
         raise RequestError(f"-o: found {path}; expected a name that ends in .html")
     if os.path.lexists(path) and not is_marked(path):
         raise RequestError(
-            f"{path}: clpipe did not write this file; move it, or name another with -o"
+            f"{path}: clpipe did not write this file, so it is not overwritten; move it, or name "
+            "another file with -o"
         )
     require("clpipe report", "jinja2", "matplotlib", "scipy")
     from clpipe.reports.page import html

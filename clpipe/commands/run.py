@@ -1,4 +1,4 @@
-"""``clpipe run``: images through the chain, on this machine or on a cluster."""
+"""``clpipe run``: run images through the chain, on this machine or on a cluster."""
 
 import sys
 from pathlib import Path
@@ -33,7 +33,7 @@ OWN = [name for name in OPTIONS if name not in ("inputs", "output")]
     "--annotations",
     type=EXISTING,
     metavar="PATH",
-    help="Annotations of renders in the format of COCO, BOP or KITTI: a JSON file of COCO, a "
+    help="Annotations of renders in the format of COCO, BOP or KITTI: COCO's JSON file, a "
     "scene_gt.json, or a directory of labels. They are warped like the pixels, by distortion, "
     "resizing and patches, and written to OUT.",
 )
@@ -42,10 +42,11 @@ OWN = [name for name in OPTIONS if name not in ("inputs", "output")]
 def run(annotations: Path | None, quiet: bool, json_lines: bool, **chosen: Any) -> None:
     """Run images through the chain: files, folders, globs or manifests (.csv, .jsonl).
 
-    Renders are linear float images (EXR). Camera raws enter behind the stages that add noise.
+    Renders are linear float images (EXR). Camera raws skip the stages that add noise.
 
-    Each image makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used. A
-    second run makes only what is missing or has changed. OUT/run.jsonl is the log.
+    For each image, OUT/NAME.jpg and OUT/NAME.json are written. The latter, the sidecar, contains
+    all settings. A second run makes only pictures that are missing or have changed. OUT/run.jsonl
+    is the log.
 
     \b
     clpipe run render.exr -o out --camera sony-a7r2 --iso 3200
@@ -67,7 +68,7 @@ def run(annotations: Path | None, quiet: bool, json_lines: bool, **chosen: Any) 
 
 
 def read_annotations(path: Path, images: Images) -> Annotations:
-    """The annotations of a run's renders.
+    """Return the annotations of a run's renders.
 
     Raises:
         RequestError: they cannot be read, or the run does not write all pictures as files.
@@ -75,8 +76,8 @@ def read_annotations(path: Path, images: Images) -> Annotations:
     require("--annotations", "pycocotools", "shapely")
     if not images.is_whole:
         raise RequestError(
-            "--annotations: they are written for all pictures of a directory; run without "
-            "--webdataset and --shard, after all parts are done"
+            "--annotations: they can only be written for all pictures of a directory; run again "
+            "without --webdataset and --shard after all parts are done"
         )
     if path.is_dir():
         return read_kitti(path)

@@ -1,4 +1,4 @@
-"""``clpipe stages``: the stages, or the methods and parameters of one."""
+"""``clpipe stages``: list the stages, or explain the methods and parameters of one."""
 
 import types
 from pathlib import Path
@@ -36,7 +36,7 @@ def stages(
 ) -> None:
     """List the stages, or explain the methods and parameters of one.
 
-    Automatic parameters are shown with the values that they have for a camera and an ISO.
+    Automatic parameters are shown with their values for the camera and the ISO.
     """
     for file in stage_files:
         load_stage_file(file)
@@ -55,7 +55,7 @@ def stages(
 
 
 def type_text(annotation: Any) -> str:
-    """The type of a parameter, in words."""
+    """Return the type of a parameter in words."""
     if get_origin(annotation) is Literal:
         return " | ".join(map(str, get_args(annotation)))
     if get_origin(annotation) is Annotated:
@@ -71,7 +71,7 @@ def type_text(annotation: Any) -> str:
 
 
 def resolved(method: type[Method], context: Context) -> dict[str, str]:
-    """The values that automatic parameters of a method have in a context, as text."""
+    """Return the values of a method's automatic parameters in a context, as text."""
     automatic = [name for name, field in method.model_fields.items() if field.default is None]
     try:
         values = method().resolve(context)
@@ -85,7 +85,7 @@ def resolved(method: type[Method], context: Context) -> dict[str, str]:
 
 
 def context_for(stage: Stage, settings: Settings) -> Context:
-    """The context of a stage where it stands in the default chain, or could stand."""
+    """Return the context of a stage at its place, or a possible place, in the default chain."""
     steps = make_chain(settings).steps
     own = [step.context for step in steps if step.stage is stage]
     alike = [step.context for step in steps if step.stage.reads is stage.reads]
@@ -93,7 +93,7 @@ def context_for(stage: Stage, settings: Settings) -> Context:
 
 
 def parameter_rows(method: type[Method]) -> list[tuple[str, ...]]:
-    """A row for each parameter: name, default, unit, what is allowed, one sentence."""
+    """Return a row for each parameter: name, default, unit, allowed values, one sentence."""
     rows: list[tuple[str, ...]] = []
     for name, field in method.model_fields.items():
         extra: Any = field.json_schema_extra
@@ -108,7 +108,7 @@ def parameter_rows(method: type[Method]) -> list[tuple[str, ...]]:
 
 
 def stage_record(stage: Stage, context: Context) -> dict[str, Any]:
-    """A stage as JSON values, with the values of automatic parameters in a context."""
+    """Return a stage as JSON values, with the values of automatic parameters in a context."""
     keys = ("name", "default", "unit", "allowed", "text")
     return {
         "name": stage.name,
@@ -128,14 +128,14 @@ def stage_record(stage: Stage, context: Context) -> dict[str, Any]:
 
 
 def stage_row(stage: Stage) -> tuple[str, ...]:
-    """The row of a stage: name, what it reads and writes, what it does, its methods."""
+    """Return the row of a stage: name, kinds read and written, summary, methods."""
     methods = ", ".join(stage.by_name)
     kinds = (kinds_text(kind, stage) for kind in (stage.reads, stage.writes))
     return stage.name, *kinds, stage.summary, methods
 
 
 def kinds_text(kind: Kind, stage: Stage) -> str:
-    """The kind that a stage reads or writes, and those that it may have in its place."""
+    """Return the kind that a stage reads or writes, and the kinds allowed instead."""
     return " or ".join(each.label for each in (kind, *stage.also))
 
 
