@@ -87,10 +87,9 @@ def texts_of(path: Path) -> Iterator[Text]:
             yield from paragraphs(str(ast.get_docstring(node, clean=False)), first.lineno)
         elif isinstance(node, ast.Constant | ast.JoinedStr) and node not in docstrings:
             text = node.value if isinstance(node, ast.Constant) else message_of(node)
-            if isinstance(text, str) and len(text.split()) > 3:
+            is_code = isinstance(text, str) and "__global " in text  # of OpenCL
+            if isinstance(text, str) and len(text.split()) > 3 and not is_code:
                 yield from paragraphs(text, node.lineno)
-            if isinstance(text, str) and len(text.split()) > 3 and "__global " not in text:
-                yield node.lineno, text
     comments: list[Text] = []  # lines, of which those on lines of their own belong together
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:

@@ -95,9 +95,9 @@ def refuse_other_scenes(images: Sequence[Picture], noise: Floats) -> None:
     if remaining[worst] > SCENE_SHARE * energy:
         others = "the others" if frames > 2 else images[1 - worst].path
         raise RequestError(
-            f"{images[worst].path} does not show the same scene as {others}: averaged over "
-            f"{BLOCK}x{BLOCK} pixels, {remaining[worst] / energy:.0%} of the difference remains, "
-            f"but of noise less than {SCENE_SHARE:.0%} would; give repeats of one scene, or --truth"
+            f"{images[worst].path} does not show the same scene as {others}. Averaged over "
+            f"{BLOCK}x{BLOCK} pixels, {remaining[worst] / energy:.0%} of the difference remains; "
+            f"noise leaves less than {SCENE_SHARE:.0%}. Give repeats of one scene, or --truth."
         )
 
 
