@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from clpipe.base.errors import RequestError
-from clpipe.camera.profile import built_in_cameras, built_in_name, comparable, load_camera
+from clpipe.camera.profile import built_in_cameras, built_in_name, load_camera
+from clpipe.camera.text import comparable
 from clpipe.chain.isos import check_cameras
 
 NAMES = tuple(built_in_cameras())

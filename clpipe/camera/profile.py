@@ -1,7 +1,6 @@
 """Camera profiles: a sensor's properties at each ISO, from a TOML file that cites every number."""
 
 import os
-import re
 from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
@@ -17,6 +16,7 @@ from clpipe.base.types import Doubles
 from clpipe.base.validation import first_fault
 from clpipe.camera.gain_stage import GainStage, NotNegative, Offsets, Positive, TukeyLambda
 from clpipe.camera.noise import NoiseModel
+from clpipe.camera.text import comparable
 
 DEFAULT_CAMERA = "sony-a7r2"
 MOST_NAMED = 5  # cameras in a message
@@ -25,7 +25,6 @@ Coefficient = Annotated[float, Field(ge=-100, le=100)]
 Row = tuple[Coefficient, Coefficient, Coefficient]
 Matrix = tuple[Row, Row, Row]
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
 # Linear sRGB to CIE XYZ, white D65 at Y = 1 (IEC 61966-2-1, 1999).
 SRGB_TO_XYZ = np.array(
     [
@@ -270,16 +269,6 @@ def built_in_cameras() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.toml"), key=lambda path: path.stem)}
 
 
-def comparable(name: str) -> str:
-    """Return the name of a camera in a form that makers, people and files share.
-
-    >>> comparable("NIKON CORPORATION NIKON D850") == comparable("nikon-d850") == "nikond850"
-    True
-    """
-    words = re.findall(r"[^\W_]+", name.casefold())
-    return "".join(word for word in dict.fromkeys(words) if word != "corporation")
-
-
 @cache
 def camera_names() -> dict[str, str]:
     """Return the built-in cameras by all their names, in the form of :func:`comparable`."""
@@ -305,10 +294,8 @@ def built_in_name(name: str) -> str | None:
 def cameras_called(name: str) -> list[str]:
     """Return the built-in cameras that have all words of a text in one of their names.
 
-    >>> cameras_called("nikon d8")
-    []
-    >>> cameras_called("canon 5d mark")
-    ['canon-5d2', 'canon-5d3', 'canon-5d4']
+    >>> cameras_called("nikon d8"), cameras_called("canon 5d mark")
+    ([], ['canon-5d2', 'canon-5d3', 'canon-5d4'])
     """
     names = _full_names()
     return list(dict.fromkeys(names[each] for each in with_words(name, names)))

@@ -1,6 +1,7 @@
-"""A camera profile as the text of its TOML file."""
+"""The text of a camera profile, and names of cameras in a form that can be compared."""
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -54,3 +55,13 @@ def check_profile_name(path: Path) -> None:
         raise RequestError(
             f"{path}: the name of a camera profile must end in .toml, for example camera.toml"
         )
+
+
+def comparable(name: str) -> str:
+    """Return the name of a camera in a form that makers, people and files share.
+
+    >>> comparable("NIKON CORPORATION NIKON D850") == comparable("nikon-d850") == "nikond850"
+    True
+    """
+    words = re.findall(r"[^\W_]+", name.casefold())
+    return "".join(word for word in dict.fromkeys(words) if word != "corporation")

@@ -15,7 +15,8 @@ from clpipe.base.errors import ClpipeError
 
 def cameras(context: click.Context, option: click.Parameter, text: str) -> list[CompletionItem]:
     """Complete built-in cameras, by name or alias, and files."""
-    from clpipe.camera.profile import built_in_cameras, camera_names, comparable
+    from clpipe.camera.profile import built_in_cameras, camera_names
+    from clpipe.camera.text import comparable
 
     names = [name for name in built_in_cameras() if name.startswith(text)]
     if not names and (start := comparable(text)):

@@ -19,7 +19,8 @@ from clpipe.analysis.noise_models.model import FOURTEEN_BITS, Law, SensorModel
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_line
 from clpipe.base.validation import first_fault
-from clpipe.camera.profile import built_in_name, comparable, load_camera
+from clpipe.camera.profile import built_in_name, load_camera
+from clpipe.camera.text import comparable
 
 MARK = "noiseprofiles"
 RAW_OVER_DEMOSAICED = 12.8
