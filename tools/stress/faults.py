@@ -284,7 +284,7 @@ def by_another_program(trial: Trial, seconds: float, whole: int) -> None:
         shutil.copytree(ROOT / folder, other / folder)
     for name, was, now in (
         ("kernels/quantize.cl", "+ black_level)", "+ black_level + 9.0f)"),
-        ("clpipe/stages/quantize.py", "(self.black_level))\n", "(self.black_level + 9))\n"),
+        ("clpipe/stages/quantize.py", '+ n["black_level"])', '+ n["black_level"] + 9)'),
     ):
         text = (other / name).read_text("utf-8")
         assert text.count(was) == 1, name
