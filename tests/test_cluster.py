@@ -311,7 +311,7 @@ def test_a_worker_sees_the_same_files(tmp_path):
     where, first = Where(Path("out"), ("numpy",)), Job(Path("a.exr"), "a.exr")
     spec = DaskSpec(ResolvedRequest(formats=("jpg",)), where, first, tmp_path).anchored()
     spec = replace(spec, first=spec.anchored_job(first))
-    assert probe_worker(spec, "probe", None).startswith("does not see the output folder")
+    assert probe_worker(spec, "probe", None).startswith("does not see the output directory")
     (tmp_path / "probe").rename(tmp_path / "out" / "probe")
     assert probe_worker(spec, "probe", 3) == f"does not see the input {tmp_path / 'a.exr'}"
     (tmp_path / "a.exr").write_text("abcd")

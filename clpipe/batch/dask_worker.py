@@ -165,7 +165,7 @@ def probe_worker(spec: DaskSpec, probe: str, size: int | None) -> WorkerEnvironm
         return str(error)
     path, output = spec.first.path, spec.where.output
     if not (output / probe).exists():
-        return f"does not see the output folder {output}"
+        return f"does not see the output directory {output}"
     if reason := write_problem(output):
         return f"{output}: {reason}"
     if size is not None and (not path.exists() or path.stat().st_size != size):

@@ -1,6 +1,6 @@
 """Processes on this machine that share a run, each with its part of the processors and devices.
 
-One Python process does not exceed about 500 small images a second, however many processors there
+One Python process makes a few hundred small images a second at most, however many processors there
 are, because its threads share the interpreter's lock. So a run has several processes if that pays.
 This process holds the output directory and the log, distributes jobs, and collects outcomes. Each
 of the others runs a :class:`clpipe.batch.threads.Batch`. If one dies, its jobs go to the others,

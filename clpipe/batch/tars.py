@@ -104,13 +104,13 @@ def prepare(tars: Sequence[Tar], overwrite: bool) -> None:
         else:
             raise RequestError(
                 f"{path}: is of another run, as this one makes {total} tar{'s' * (total > 1)}, and "
-                "would be read with them; remove it, or choose another output folder"
+                "would be read with them; remove it, or choose another output directory"
             )
     for tar in tars:
         if not overwrite and os.path.lexists(tar.path) and not is_own(tar.path):
             raise RequestError(
                 f"{tar.path}: clpipe did not write this tar, or it is damaged, and would be "
-                "overwritten; move it, choose another output folder, or say --redo all"
+                "overwritten; move it, choose another output directory, or say --redo all"
             )
 
 
