@@ -4,6 +4,7 @@ Such a method overrides :meth:`SignalMethod.apply` instead of ``reference``. Num
 image, as the reference of the kernel. :mod:`clpipe.torch` runs it on a batch.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias
@@ -43,7 +44,7 @@ def nothing(method: Any, context: Context) -> tuple[Any, ...]:
     return ()
 
 
-class Backend:
+class Backend(ABC):
     """Functions and random numbers that :meth:`SignalMethod.apply` uses besides operators.
 
     Random numbers are new in each image, except those of :meth:`fixed`.
@@ -59,30 +60,31 @@ class Backend:
     in_upper_half: ClassVar[Callable[..., Any]]  # whether a word's top bit is 0
     tap: ClassVar[Callable[..., Any]]  # of a signal, the value dx to the right and dy below
 
+    @abstractmethod
     def normals(self, draw: int = 0) -> Signal:
         """Return a standard normal for each pixel."""
-        raise NotImplementedError
 
+    @abstractmethod
     def words(self, draw: int = 0) -> Any:
         """Return a random word of 32 bits for each pixel."""
-        raise NotImplementedError
 
+    @abstractmethod
     def lines(self, count: int) -> Signal:
         """Return ``count`` standard normals, (..., count)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def uniform(self) -> Signal:
         """Return one number from 0 to 1, (..., 1, 1)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def rows(self) -> Signal:
         """Return the numbers of the rows, from 0, (..., height, 1)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def tiled(self, cell: list[list[Signal]]) -> Signal:
         """Repeat a cell of 2x2 numbers, (..., 1, 1) each, over the image."""
-        raise NotImplementedError
 
+    @abstractmethod
     def fixed(self, make: Callable[..., Floats], own: Own = nothing) -> Signal:
         """Return values that are fixed to a sensor.
 
@@ -91,7 +93,6 @@ class Backend:
                 Returns (height or 1, width).
             own: further arguments, from the method and its context.
         """
-        raise NotImplementedError
 
 
 class SignalMethod(Method):
