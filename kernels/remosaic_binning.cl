@@ -1,4 +1,4 @@
-// Binning: each row, then each column, is the mean of those of a cell in the larger mosaic.
+// Binning: averages the rows, then the columns, of each cell of the larger mosaic.
 #include "resize.cl"
 
 INLINE vf bin_rows(site at, __global const float *r, __global const float *g, __global const float *b,

@@ -1,5 +1,5 @@
-// Smaller images: each row, then each column, is a weighted mean of those of the larger image. The
-// host computes which, and their weights: line i is made of `count` lines from first[i] on.
+// Makes an image smaller: averages its rows, then its columns, with weights. The host computes the
+// weights. Line i of the result is the weighted mean of `count` lines, starting at first[i].
 //
 // `r`, `g`, `b` point to where the larger image's first pixel would be in each plane. Rows and
 // lanes outside an image or a tile are computed as well; their reads are clamped to it.

@@ -88,8 +88,7 @@ def hold(file: int, first: int, length: int) -> bool:
 def use(file: int, alone: bool = False, wait: bool = True) -> bool:
     """Lock a whole file, shared or exclusively, until the file is closed.
 
-    The system also releases the lock when the process ends. This lock is independent of those of
-    :func:`hold`.
+    The system also releases the lock when the process ends. Locks of :func:`hold` do not affect it.
 
     Args:
         file: a descriptor.

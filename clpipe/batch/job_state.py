@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class JobState:
-    """What is known about a job so far."""
+    """The state of a job, from the start of its decoding to its outcome."""
 
     job: Job
     loader: ImageLoader

@@ -8,7 +8,7 @@ batches (16 patches of 64x64) and content; what differs is the noise:
     clpipe     pictures that clpipe develops, and their development without noise
     awgn       Gaussian noise with a sigma of 0 to 55 levels on that development
     iid        Gaussian noise, for each picture as strong as clpipe's
-    intensity  the same, as strong at each intensity
+    intensity  Gaussian noise, as strong as that of clpipe at each intensity
     test       Gaussian noise with a sigma of the test pictures' own: no one can know it
     real       the pictures of --pairs: another camera's real noise
 
