@@ -33,6 +33,8 @@ def _suggestion(text: str) -> str:
 
     >>> _suggestion("iso=800"), _suggestion("denoise=mean")
     ('; use --iso 800', "; did you mean 'denoise.method=mean'?")
+    >>> _suggestion("iso={choice=[100,800]}")
+    '; to draw it, write iso = {choice=[100,800]} in a configuration and use -c'
     >>> _suggestion("luma_strenght=2")
     "; did you mean 'denoise.luma_strength=2'?"
     """
@@ -40,6 +42,8 @@ def _suggestion(text: str) -> str:
     stage, _, parameter = name.partition(".")
     name = parameter if stage in KEYS and parameter in KEYS else name
     if name in KEYS and name != CODE:
+        if value.startswith("{"):
+            return f"; to draw it, write {name} = {value} in a configuration and use -c"
         return f"; use --{name.replace('_', '-')} {value or 'VALUE'}"
     if name in all_stages():
         meant = [f"{name}.method"]
