@@ -142,7 +142,7 @@ def test_an_android_noise_model_as_json_with_one_plane(imported, tmp_path):
     path.write_text(json.dumps({**values, "noise_model_D": [1e-7]}))
     camera = imported(path)
     assert camera.noise(1600).a == pytest.approx(1.6e-3)
-    assert "100 to 1600 stand in" in camera.sources["system_gain"]
+    assert "assumed: 100 to 1600" in camera.sources["system_gain"]
 
 
 @pytest.mark.parametrize(

@@ -71,8 +71,8 @@ class Wide(Method):
     )
     source: Literal["auto", "map"] = parameter(
         "auto",
-        "Layout of the render: map of longitude and latitude, cube or perspective view. auto "
-        "uses the file's metadata and the file names, else a view.",
+        "Layout of the render. map is a map of longitude and latitude. auto uses the file's "
+        "metadata or the names of the files, and otherwise assumes a perspective view.",
     )
     face_angle: float | None = parameter(
         None,
@@ -84,8 +84,8 @@ class Wide(Method):
     )
     views: str | None = parameter(
         None,
-        "Cameras of overlapping renders, in a format of --poses. The world's axes are the "
-        "image's, and file names end with the names of the views.",
+        "File with the cameras of overlapping renders, as for --poses. Its world axes are those "
+        "of the image, and the names of the renders end with the names of the views.",
         "",
         "the faces of a cube",
         file=True,

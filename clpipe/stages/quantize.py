@@ -135,7 +135,7 @@ class Pwl(Linear):
 
     method: ClassVar = "pwl"
     kernel: ClassVar = "companding"
-    summary: ClassVar = "the same, then fewer bits by a piecewise linear curve"
+    summary: ClassVar = "round and clip, then reduce the bits by a piecewise linear curve"
     example: ClassVar = {"result_bits": 10}
 
     result_bits: int = parameter(12, "Bit depth after the curve.", ge=8, le=16)

@@ -84,7 +84,7 @@ class Unsharp(Method):
     )
     threshold: float | None = parameter(
         None,
-        "Threshold: smaller differences are not sharpened.",
+        "Smallest difference that is sharpened.",
         "root of signal",
         "a fifth of the noise",
         ge=0,

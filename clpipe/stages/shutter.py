@@ -65,8 +65,8 @@ class Rows(Method):
 
     subframes: int = parameter(
         1,
-        "Number of consecutive files that make one exposure, their mean. With a rolling "
-        "shutter, each row averages the frames within its own exposure.",
+        "Number of consecutive files whose mean is one exposure. With a rolling shutter, each "
+        "row averages the files within its own exposure.",
         ge=1,
         le=10_000,
     )

@@ -330,24 +330,24 @@ def main() -> int:
 PAGE = """# Validation
 
 This page compares simulated noise with its model and with real cameras. `tools/run pages validate` measures the figures and makes the page. For
-comparisons with other programs, see [Quality](quality.md). To measure your own images, see [Measuring and calibrating](measuring.md).
+other programs, see [Quality](quality.md). To measure your own images, see [Measuring and calibrating](measuring.md).
 """
 
 LOOP = """## Calibration of known noise
 
-The tool simulates {frames} frames of a scene and {frames} dark frames, {width}x{height}, with a camera's noise at an ISO. This noise consists of Poisson
-photo-electrons, read, row and column noise, PRNU, DSNU, hot pixels and rounding to whole DN. Then `clpipe calibrate` receives the levels and the
-pattern, and estimates everything else.
+The tool simulates {frames} frames of a scene and {frames} dark frames, {width}x{height}, with a camera's noise at an ISO. The noise
+consists of Poisson photo-electrons, read, row and column noise, PRNU, DSNU, hot pixels and rounding to whole DN. `clpipe calibrate`
+receives only the levels and the pattern, and estimates everything else.
 
-Each row lists the worst of the four Bayer patterns. Errors are relative, in %. Errors of a and b are also listed in their standard errors; by chance,
-one row in three has one above 2. Column noise is compared with the drawn values. The last column counts hot pixels that were missed or invented.
-The targets are 1 % and 3 standard errors for a and b, 3 % for rows and columns, and no wrong hot pixel.
+Each row lists the worst of the four Bayer patterns. Errors are relative, in %. Errors of a and b are also listed in standard errors; by chance, one
+row in three has an error above 2. The last column counts hot pixels that were missed or invented. The targets
+are 1 % and 3 standard errors for a and b, 3 % for rows and columns, and no wrong hot pixel.
 """
 
 POISSON = """
 ## Photo-electrons
 
-Chi-square test of {draws} Poisson numbers against the exact distribution, in cells of 10 and more. The target is p above 0.001. The test suite
+A chi-square test compares {draws} Poisson numbers with the exact distribution, in cells of 10 and more. The target is p above 0.001. The test suite
 also compares the tails, to 1e-6, with the exact probabilities.
 """
 
@@ -355,19 +355,21 @@ CANON = """
 ## A real camera's finished pictures
 
 This table compares the correlation of noise in small JPEGs of a Canon EOS 5D Mark II with `clpipe run -c canon-5d2-jpeg` on the project's render.
-The JPEGs have 2784x1856 pixels, half of 5616x3744. There are 11 pairs at ISO 3200 and 6400; noise is one frame minus the mean of many, in flat areas.
+The JPEGs have 2784x1856 pixels, half the size of 5616x3744. There are 11 pairs at ISO 3200 and 6400. Noise is one frame minus the mean of many, in flat
+areas.
 
-The camera's processing is unknown. The configuration has its colour matrix, the noise of its sensor and the half size. The strengths of denoising and
-sharpening were fitted to these figures on this render. The target is a difference below 0.1 at ISO 3200. Independent noise has 0 everywhere, and
+The camera's processing is unknown. The configuration has its colour matrix, its sensor's noise and the half size. Denoising and sharpening were fitted
+to these figures on this render. The target is a difference below 0.1 at ISO 3200. Independent noise has 0 everywhere, and
 0.25 after averaging 2x2.
 """
 
 BESIDE = """
-## Real cameras beside ours
+## Real cameras and the default chain { #real-cameras-beside-ours }
 
-This section compares cameras' own JPEGs in their native size with pictures of the default chain ({renders}). Noise is one picture minus the mean of many
+This section compares cameras' JPEGs at native size with pictures of the default chain ({renders}). Noise is one picture minus the mean of many
 of the same scene. For the default chain, it is the picture minus its development without noise. Drifting light is removed (a Gaussian of 12 px).
-Only areas that are flat in the mean count: below the 60th percentile of the gradient, with luma of 30 to 225. All figures are medians over pictures.
+Only areas that are flat in the mean are measured: below the 60th percentile of the gradient, with luma of 30 to 225. Figures are medians over
+pictures.
 
 | column | meaning |
 |---|---|

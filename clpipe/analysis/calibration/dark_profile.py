@@ -72,7 +72,7 @@ def _current(calibrations: Sequence[Calibration]) -> Sourced:
     source = f"noise and pattern of dark frames of {times} s: "
     spreads = [each.spread for each in own if each.spread]
     spread = weighted(spreads) if spreads and current.significant else None
-    where = "; at the temperature of the frames, for which 20 deg C stands in"
+    where = "; at the temperature of the frames, assumed to be 20 deg C"
     return {
         keys[0]: (
             current.value if current.significant else None,

@@ -51,7 +51,7 @@ def calibrated_profile(
     sources = {
         "gain_stages": _gain_source(calibrations),
         "levels": "as stated by the frames or the options",
-        "white_balance_gains": "as stated by the frames" if gains else "not known; 1 stands in",
+        "white_balance_gains": "as stated by the frames" if gains else "not known; assumed to be 1",
         "xyz_to_camera": "as stated by the frames" if xyz_to_camera else "not known",
         "full_well": f"not known; {_white_in_electrons(calibrations[0])}",
     }
@@ -117,7 +117,7 @@ def _line_source(calibrations: Sequence[Calibration], key: str) -> str:
     estimates = [(c.iso, e) for c in calibrations if (e := getattr(c, key)) is not None]
     if not estimates:
         needs = "two frames" if key == "row_noise" else "dark frames"
-        return f"not known, for want of {needs}; zero stands in"
+        return f"not known without {needs}; assumed to be zero"
     values = "; ".join(f"ISO {iso:g} {plus_minus(e, 'DN')}" for iso, e in estimates)
     what = "means of rows" if key == "row_noise" else "means of columns of the mean dark frame"
     return f"{what}, corrected for pixel noise: {values}"
@@ -138,7 +138,7 @@ def _fixed_pattern(calibrations: Sequence[Calibration]) -> dict[str, tuple[float
         mean = weighted(prnu)
         result["prnu"] = mean.value, f"flat places of the mean frame: {plus_minus(mean)}"
     dsnu = {c.iso: c.dsnu.scaled(1 / c.pooled.gain.value) for c in calibrations if c.dsnu}
-    result["dsnu"] = (None, "not known, for want of dark frames")
+    result["dsnu"] = (None, "not known without dark frames")
     if dsnu:
         each = "; ".join(f"ISO {iso:g} {plus_minus(e, 'e-')}" for iso, e in dsnu.items())
         source = f"pixels of the mean dark frame, temporal noise subtracted: {each}"
@@ -161,7 +161,7 @@ def _hot(calibrations: Sequence[Calibration]) -> dict[str, tuple[float | None, s
     judged = [c for c in calibrations if c.hot and c.dark_frames]
     if not judged:
         candidates = max((len(c.hot.rows) for c in calibrations if c.hot), default=0)
-        source = "not known, for want of dark frames"
+        source = "not known without dark frames"
         if candidates:
             source += f"; {candidates} pixels of a scene look hot, but so does a glint of one pixel"
         return {"hot_pixel_share": (None, source), "hot_pixel_level": (None, source)}

@@ -70,30 +70,30 @@ def emva_profile(name: str, iso: float, source: str, moments: Moments, figures: 
     sources = {
         "gain_stages": f"EMVA 1288 (release 3.1), {source}: K "
         f"{plus_minus(figures.system_gain, 'DN/e-')}, dark noise "
-        f"{plus_minus(figures.dark_noise, 'e-')}; ISO {iso:g} stands for the setting of the "
+        f"{plus_minus(figures.dark_noise, 'e-')}; ISO {iso:g} denotes the setting of the "
         "series",
         "levels": "black: the mean of the frames without light, before they were rounded; white: "
         "the largest value of a frame",
-        "white_balance_gains": "not known; 1 stands in",
-        "filter_array": "not said by a series; a sensor without filters stands in",
+        "white_balance_gains": "not known; assumed to be 1",
+        "filter_array": "not stated in a series; assumed to have no filters",
         "xyz_to_camera": "not known: a series has no colours",
         "quantum_efficiency": "at the light of the series: "
         f"{plus_minus(figures.quantum_efficiency)}"
-        + ("; there is none above 1, which stands in" if efficiency > 1 else ""),
+        + ("; it cannot exceed 1, so the profile has 1" if efficiency > 1 else ""),
         "full_well": well,
         "prnu": f"PRNU1288: {_parts(figures.prnu, '')}; all of it drawn for each pixel",
-        "dsnu": f"DSNU1288: {_parts(figures.dsnu, 'e-')}; what is no "
-        "column noise is drawn for each pixel",
+        "dsnu": f"DSNU1288: {_parts(figures.dsnu, 'e-')}; the part that "
+        "is not column noise is drawn for each pixel",
         "column_noise": "differences of neighbouring columns without light: "
         f"{plus_minus(stripes.root(), 'DN')}, with rounding",
         "dark_current": f"slope of the means without light: {plus_minus(current, 'e-/s')}; at the "
-        "temperature of the series, for which 20 deg C stands in"
+        "temperature of the series, assumed to be 20 deg C"
         if current
         else "not known: it takes three or more exposure times",
         "linearity": "the sensor is off a line by "
         f"{figures.linearity.least.value:+.2f} to {figures.linearity.most.value:+.2f} %; the "
         "profile is linear",
-        "fixed_pattern": "hot and dead pixels, row noise: not known; zero stands in",
+        "fixed_pattern": "hot and dead pixels, row noise: not known; assumed to be zero",
     }
     return profile_text(values, [stage], sources)
 

@@ -98,6 +98,6 @@ def _isos(text: str, highest: float) -> tuple[list[float], str]:
         source = ""
     else:
         low, high = 100.0, max(1600.0, highest if math.isfinite(highest) else 0.0)
-        source = f"; its ISOs are not stated, {low:g} to {high:g} stand in"
+        source = f"; its ISOs are not stated; assumed: {low:g} to {high:g}"
     stops = (100 * 2.0**n for n in range(-7, 24))
     return sorted({low, *(stop for stop in stops if low < stop < high), high}), source

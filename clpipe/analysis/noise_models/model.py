@@ -20,7 +20,7 @@ STAND_IN_GAINS = (2.15, 1.70)
 READ_NOISE_SLOPE, READ_NOISE_OFFSET = 0.600, 1.521
 READ_NOISE_RANGE = 15871.0  # DN of signal 1 in that source: 14 bits, black level 512
 
-NOT_IN_FILE = "not in the file, and not known; zero stands in"
+NOT_IN_FILE = "not in the file, and not known; assumed to be zero"
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Levels:
     source: str
 
 
-TEN_BITS = Levels(64, 1023, "not in the file; those of 10 bits with black 64 stand in")
-FOURTEEN_BITS = Levels(512, 16383, "not in the file; those of 14 bits with black 512 stand in")
+TEN_BITS = Levels(64, 1023, "not in the file; assumed: 10 bits, black 64")
+FOURTEEN_BITS = Levels(512, 16383, "not in the file; assumed: 14 bits, black 512")
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class SensorModel:
             gains, matrix = self.gains or STAND_IN_GAINS, None
             source = "as the file has it, as shot"
             if not self.gains:
-                source = "not in the file; stands in: the middle of the range of Brooks et al. 2019"
+                source = "not in the file; assumed: the middle of the range of Brooks et al. 2019"
             matrix_source = "not in the file, so colours stay as they are"
         colours: dict[str, Any] = {"white_balance_gains": gains}
         if matrix:

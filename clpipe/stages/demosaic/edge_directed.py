@@ -80,7 +80,7 @@ class EdgeDirected(Method):
 
     classifier: Classifier = parameter(
         "hamilton_adams",
-        "Gradient that decides the direction of an edge; see the patents of these authors.",
+        "Gradient that decides the direction of an edge, named after the authors of its patent.",
         structural=True,
     )
 

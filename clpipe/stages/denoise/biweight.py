@@ -96,7 +96,7 @@ class Biweight(Denoiser):
 
     method: ClassVar = "biweight"
     kernel: ClassVar = "denoise_biweight"
-    summary: ClassVar = "weighted mean of near pixels, as mild as a camera's; keeps grain"
+    summary: ClassVar = "weighted mean of near pixels, as light as in cameras; keeps grain"
     tolerance: ClassVar = 5e-5  # the kernel's root is a short iteration
 
     luma_strength: float = parameter(

@@ -66,7 +66,7 @@ class Mean(BlendedFilter):
 
     method: ClassVar = "mean"
     kernel: ClassVar = "denoise_mean"
-    summary: ClassVar = "mean of a window, with more weight if there is more noise"
+    summary: ClassVar = "mean of a window, mixed in more strongly if there is more noise"
     tolerance: ClassVar = 2e-6  # sums in another order
     function: ClassVar = "mean_filter"
     vectors_per_row: ClassVar = 1
@@ -98,7 +98,7 @@ class Median(BlendedFilter):
 
     method: ClassVar = "median"
     kernel: ClassVar = "denoise_median"
-    summary: ClassVar = "median of a window, with more weight if there is more noise"
+    summary: ClassVar = "median of a window, mixed in more strongly if there is more noise"
     tolerance: ClassVar = 1e-6  # luma and chroma are not exact
     function: ClassVar = "median_filter"
     largest_size: ClassVar = 5

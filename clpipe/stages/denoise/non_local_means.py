@@ -37,7 +37,7 @@ class NonLocalMeans(WindowDenoiser):
 
     method: ClassVar = "non_local_means"
     kernel: ClassVar = "denoise_non_local_means"
-    summary: ClassVar = "mean of pixels with similar surroundings; the best, and slow"
+    summary: ClassVar = "mean of pixels with similar surroundings: the best method, but slow"
     tolerance: ClassVar = 2e-4  # the kernel's exp is a short polynomial
     function: ClassVar = "non_local_means"
     names: ClassVar = (

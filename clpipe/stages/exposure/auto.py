@@ -86,15 +86,15 @@ class Auto(Gain):
     method: ClassVar = "auto"
     kernel: ClassVar = "exposure_auto"
     overscan: ClassVar = False  # it meters the finished image
-    summary: ClassVar = "meter the image, and bring its luminance to a target"
+    summary: ClassVar = "meter the image and scale its luminance to a target"
     example: ClassVar = {"metering": "centre_weighted"}
 
     rule: Literal["log_average", "percentile"] = parameter(
-        "log_average", "Luminance that is brought to the target.", structural=True
+        "log_average", "How the metered luminance is computed.", structural=True
     )
     target: float | None = parameter(
         None,
-        "Level that this luminance gets, before ev and headroom.",
+        "Level to which the metered luminance is scaled, before ev and headroom.",
         "1 = white",
         "0.18 for log_average, 1 for percentile",
         ge=1e-6,

@@ -29,8 +29,8 @@ class Gain(Method):
     ev: float = parameter(0.0, "Exposure compensation; +1 doubles the light.", "EV", ge=-20, le=20)
     headroom: float = parameter(
         1.0,
-        "Distance of the sensor's white above a render's 1.0, for highlights. The tone curve "
-        "neutral gives one stop of it back, and linear all of it.",
+        "Range for highlights between a render's 1.0 and the sensor's white. The tone curves "
+        "standard and neutral restore one stop of brightness, and linear restores all of it.",
         "EV",
         ge=0,
         le=10,

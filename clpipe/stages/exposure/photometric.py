@@ -38,8 +38,8 @@ class Photometric(Gain):
 
     headroom: float = parameter(
         0.0,
-        "Distance of the sensor's full scale above that of ISO 12232, 78 lx s / ISO. The tone "
-        "curve linear gives it back.",
+        "Range of the sensor above the saturation of ISO 12232, 78 lx s / ISO. The tone curve "
+        "linear restores the brightness.",
         "EV",
         ge=0,
         le=10,

@@ -254,7 +254,7 @@ class DualGain(Readouts):
     """
 
     method: ClassVar = "dual_gain"
-    summary: ClassVar = "one charge read at two gains, and merged"
+    summary: ClassVar = "one charge, read at two gains and merged"
     other_examples: ClassVar = ({"part": 1},)
 
     @property

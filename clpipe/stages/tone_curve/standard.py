@@ -85,22 +85,20 @@ class Standard(Method):
     )
     toe: float = parameter(
         0.85,
-        "Darkening of shadows: how much the slope at black is below that of the line from black "
-        "to grey. 1 starts level.",
+        "Darkening of shadows. 0 starts with the slope of the line from black to grey, and 1 "
+        "starts flat.",
         ge=0,
         le=1,
     )
     shoulder: float = parameter(
         0.95,
-        "Softness of highlights: how much the slope at white is below that of the line from "
-        "grey to white. 1 ends level.",
+        "Softness of highlights. 0 ends with the slope of the line from grey to white, and 1 "
+        "ends flat.",
         ge=0,
         le=1,
     )
 
-    saturation: float = parameter(
-        1.0, "Distance of colours from grey, relative to the scene's.", ge=0.5, le=3
-    )
+    saturation: float = parameter(1.0, "Saturation relative to the scene's.", ge=0.5, le=3)
 
     @property
     def pieces(self) -> tuple[Piece, Piece]:
