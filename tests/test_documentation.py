@@ -249,9 +249,9 @@ def anchors(text):
     return found
 
 
-@pytest.mark.parametrize("name", architecture.PAGES)
+@pytest.mark.parametrize("name", architecture.PICTURES)
 def test_the_pictures_of_the_architecture_are_those_of_the_code(name):
-    drawn = architecture.PAGES[name]()
+    drawn = architecture.PICTURES[name]()
     assert (DOCS / name).read_text("utf-8") == drawn, "run tools/run pages architecture"
 
 
@@ -261,9 +261,9 @@ def test_screenshots_show_the_present_pages(name):
         assert picture.info["xmp"].decode() == screens.pages_digest(), "run tools/run pages screens"
 
 
-def test_the_architecture_counts_its_rooms():
-    count = sum(map(len, architecture.floors()))
-    assert f"clpipe is {count} rooms" in (DOCS / "architecture.md").read_text("utf-8")
+def test_the_architecture_counts_its_packages():
+    count = sum(map(len, architecture.layers()))
+    assert f"clpipe has {count} packages" in (DOCS / "architecture.md").read_text("utf-8")
 
 
 @pytest.mark.slow

@@ -193,10 +193,10 @@ def strings_of(path):
     ]
 
 
-@pytest.mark.parametrize("room", ["chain", "inputs", "outputs", "explorer"])
-def test_no_stage_is_known_by_its_name(room):
+@pytest.mark.parametrize("package", ["chain", "inputs", "outputs", "explorer"])
+def test_no_stage_is_known_by_its_name(package):
     """Clpipe's own stages are found by what they declare, as those of others are."""
-    folder = ROOT / "clpipe" / room
+    folder = ROOT / "clpipe" / package
     names = [name for name, stage in all_stages().items() if stage.folder is None]
     parameter = re.compile(rf"\b({'|'.join(names)})\.[a-z_]+")
     found = [

@@ -32,8 +32,8 @@ SIZE = {"width": 1366, "height": 768}
 def pages_digest() -> str:
     """Return a digest of the pages' files. Pictures store it, so a test finds old ones."""
     digest = hashlib.sha256()
-    for room in ("analysis", "explorer", "reports"):
-        for path in sorted((ROOT / "clpipe" / room / "page").iterdir()):
+    for package in ("analysis", "explorer", "reports"):
+        for path in sorted((ROOT / "clpipe" / package / "page").iterdir()):
             digest.update(path.read_bytes())
     return digest.hexdigest()
 
