@@ -263,7 +263,7 @@ def test_timer_shows_what_a_window_renders(blender, tmp_path):
     render()
     module.development.add(module.save_linear(scene))
     while len(module.development):
-        assert module.look_after() > 0
+        assert module.check_progress() > 0
         time.sleep(0.05)
     shown = module.bpy.data.images["clpipe"].filepath
     assert shown == str(tmp_path / "shots/clpipe/shot_0001.jpg")
