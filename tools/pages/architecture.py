@@ -1,6 +1,6 @@
-"""Draw the pictures of docs/architecture.md from the code: clpipe's packages and a chain's launches.
+"""Draw the pictures of docs/architecture.md from the code: packages and a chain's launches.
 
-Run this again after packages or launches have changed; a test compares the pictures with the code.
+Run this again after packages or launches have changed. A test compares the pictures with the code.
 """
 
 import ast
