@@ -1,4 +1,4 @@
-"""An EXR writer for tests, which also writes what no program should: sizes that are not there."""
+"""An EXR writer for tests, which can also write invalid sizes."""
 
 import struct
 

@@ -67,15 +67,15 @@ def settings():
 def test_manifest_says_what_is_packed(extension):
     with zipfile.ZipFile(extension) as packed:
         names = packed.namelist()
-        said = tomllib.loads(packed.read("blender_manifest.toml").decode())
+        record = tomllib.loads(packed.read("blender_manifest.toml").decode())
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert said["schema_version"] == "1.0.0" and said["type"] == "add-on"
-    assert said["id"] == "clpipe" and said["version"] == package.__version__
-    assert said["license"] == [f"SPDX:{project['license']}"] and "LICENSE" in names
-    assert (said["blender_version_min"], said["blender_version_max"]) == ("4.2.0", "5.1.0")
-    assert len(said["tagline"]) <= 64 and said["tagline"][-1].isalnum()
+    assert record["schema_version"] == "1.0.0" and record["type"] == "add-on"
+    assert record["id"] == "clpipe" and record["version"] == package.__version__
+    assert record["license"] == [f"SPDX:{project['license']}"] and "LICENSE" in names
+    assert (record["blender_version_min"], record["blender_version_max"]) == ("4.2.0", "5.1.0")
+    assert len(record["tagline"]) <= 64 and record["tagline"][-1].isalnum()
     wheels = [name for name in names if name.endswith(".whl")]
-    assert said["wheels"] == [f"./{name}" for name in wheels] == ["./wheels/" + min(WHEELS)]
+    assert record["wheels"] == [f"./{name}" for name in wheels] == ["./wheels/" + min(WHEELS)]
     assert len(names) == len(set(names))
 
 
@@ -87,9 +87,9 @@ def test_what_blender_has_itself_is_not_put_in_its_place(extension):
 
 def test_panel_offers_cameras_and_configurations(extension):
     with zipfile.ZipFile(extension) as packed:
-        said = json.loads(packed.read("choices.json"))
-    assert said["cameras"].keys() == built_in_cameras().keys()
-    assert said["looks"] == list(built_in_configs()) and said["look"] in said["looks"]
+        record = json.loads(packed.read("choices.json"))
+    assert record["cameras"].keys() == built_in_cameras().keys()
+    assert record["looks"] == list(built_in_configs()) and record["look"] in record["looks"]
 
 
 def test_command_is_one_of_the_command_line(settings, tmp_path):
@@ -98,8 +98,8 @@ def test_command_is_one_of_the_command_line(settings, tmp_path):
     arguments = development.command(renders)
     run = main.get_command(click.Context(main), "run")
     context = run.make_context("run", arguments[arguments.index("run") + 1 :])
-    told = ParameterSource.COMMANDLINE
-    given = {n for n in context.params if context.get_parameter_source(n) is told}
+    explicit = ParameterSource.COMMANDLINE
+    given = {n for n in context.params if context.get_parameter_source(n) is explicit}
     assert given == {"inputs", "output", "config", "camera", "iso", "seed", "format", "quiet"}
     assert context.params["inputs"] == tuple(str(render.path) for render in renders)
 

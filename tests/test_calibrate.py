@@ -1,4 +1,4 @@
-"""Calibration: what is put into frames comes back out, and frames that cannot tell are refused."""
+"""Calibration: it recovers known parameters, and rejects unsuitable frames."""
 
 import numpy as np
 import pytest

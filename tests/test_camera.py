@@ -1,4 +1,4 @@
-"""Camera profiles: sources, interpolation, what is refused."""
+"""Camera profiles: sources, interpolation, rejected values."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Layers that go along with a picture: found, moved as its pixels are, written beside it."""
+"""Carried layers: found, warped like the pixels, and written next to the picture."""
 
 import json
 import tarfile

@@ -1,4 +1,4 @@
-"""clpipe compare: what its figures show, the places and the noise that it finds, refusals."""
+"""clpipe compare: labels, crops, noise figures and rejected inputs."""
 
 import base64
 import io

@@ -73,9 +73,9 @@ def test_methods_run_on_one_image_and_a_missing_package_is_named(monkeypatch, ca
     assert row.work == "demosaic bilinear: json"
     assert len(row.ours) == len(row.theirs["other"]) == 3
     assert set(seen) == {("json", (8, 16))}
-    said = capsys.readouterr().err
+    stderr = capsys.readouterr().err
     assert (
-        said == "demosaic bilinear: no_such_module is skipped: No module named 'no_such_module'\n"
+        stderr == "demosaic bilinear: no_such_module is skipped: No module named 'no_such_module'\n"
     )
 
 

@@ -1,4 +1,4 @@
-"""What a sensor adds in the dark beside read noise: each law, statistically, on dark frames."""
+"""Dark noise besides read noise: each distribution, statistically, on dark frames."""
 
 import numpy as np
 import pytest

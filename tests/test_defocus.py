@@ -1,4 +1,4 @@
-"""defocus: depth of field from a depth channel, found, checked and seen in what comes out."""
+"""defocus: depth of field from a depth channel, checked against geometry."""
 
 import json
 from pathlib import Path

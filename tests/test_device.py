@@ -1,4 +1,4 @@
-"""The choice of a device, and what one cannot do."""
+"""The choice of a device, and the limits of devices."""
 
 import struct
 import time
@@ -156,14 +156,14 @@ def test_buffers_are_used_again_and_go_when_memory_is_short():
 
 
 def test_what_drivers_say_of_hardware(device, monkeypatch):
-    told = {}
-    monkeypatch.setattr(hardware, "queried", lambda _, name: told.get(name))
+    properties = {}
+    monkeypatch.setattr(hardware, "queried", lambda _, name: properties.get(name))
     nvidia = FakeDevice(pci_domain_id_nv=1, pci_bus_id_nv=65, pci_slot_id_nv=3 << 3 | 1)
     assert hardware_of(nvidia) == Hardware(7, (1, 65, 3, 1))
     amd = FakeDevice(topology_amd=SimpleNamespace(bus=65, device=3, function=1))
     assert hardware_of(amd) == Hardware(7, (0, 65, 3, 1))
     assert hardware_of(FakeDevice()) == Hardware(7)
-    told.update({0x410F: struct.pack("4I", 1, 65, 3, 1), 0x106A: b"u" * 16})
+    properties.update({0x410F: struct.pack("4I", 1, 65, 3, 1), 0x106A: b"u" * 16})
     assert hardware_of(FakeDevice()) == Hardware(7, (1, 65, 3, 1), b"u" * 16)
     monkeypatch.undo()
     version = hardware.queried(device.info.handle, cl.device_info.VENDOR_ID, 4)

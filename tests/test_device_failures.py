@@ -1,4 +1,4 @@
-"""Devices that fail: with the errors, and in the state, in which drivers leave them."""
+"""Device failures: errors and states as drivers report them."""
 
 import threading
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""DNGs, as programs read them that no one here wrote: LibRaw, Pillow, ExifRead."""
+"""DNGs, read by independent programs: LibRaw, Pillow, ExifRead."""
 
 import io
 import json
@@ -389,6 +389,6 @@ def test_of_a_raw_alone_the_clipped_pixels_are_counted(tmp_path, write_exr):
     pixels[:2] = 100
     path = write_exr("bright.exr", pixels)
     sharp = ("--skip", "optical_blur")
-    told = clpipe("run", path, "-o", tmp_path, "--format", "dng", "--device", "numpy", *sharp)
+    result = clpipe("run", path, "-o", tmp_path, "--format", "dng", "--device", "numpy", *sharp)
     assert json.loads((tmp_path / "bright.json").read_text())["clipped"] == 0.25
-    assert "25 % of its pixels are clipped" in told
+    assert "25 % of its pixels are clipped" in result

@@ -1,4 +1,4 @@
-"""The pages of the documentation: every example is run as it stands, every link leads somewhere."""
+"""The documentation: every example runs as written, and every link has a target."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""EMVA 1288: known sensors found again, what is refused, and series of cameras."""
+"""EMVA 1288: known sensors are recovered, invalid series rejected, camera series read."""
 
 import os
 from pathlib import Path

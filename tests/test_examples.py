@@ -1,4 +1,4 @@
-"""tools/examples, as they are, on a few small renders."""
+"""tools/examples, unchanged, on a few small renders."""
 
 import os
 import re
@@ -55,7 +55,7 @@ def test_slurm_makes_what_one_machine_makes(start, clpipe, tmp_path):
     whole = pictures(tmp_path / "whole")
     assert len(whole) == 10
     for task in "12":
-        told = start(
+        result = start(
             "sh",
             EXAMPLES / "slurm_array.sh",
             *("in", "-o", "slurm"),
@@ -63,7 +63,7 @@ def test_slurm_makes_what_one_machine_makes(start, clpipe, tmp_path):
             SLURM_ARRAY_TASK_ID=task,
             SLURM_CPUS_PER_TASK="2",
         )
-    assert "2 of 2 images done" in told  # of five; the recipe's test runs dask_local.py
+    assert "2 of 2 images done" in result  # of five; the recipe's test runs dask_local.py
     assert pictures(tmp_path / "slurm") == whole
     logs = {p.name for p in (tmp_path / "slurm").glob("*.jsonl")}
     assert logs == {f"run.{i}-of-2.jsonl" for i in "12"}

@@ -1,4 +1,4 @@
-"""``clpipe explore``: an image developed again and again, and the settings that are saved."""
+"""``clpipe explore``: repeated development of an image, and saved settings."""
 
 import json
 import os
@@ -140,13 +140,15 @@ def test_noise_of_all_of_a_picture_is_that_of_measure(clpipe, explorer, two_rend
     for step, (picture, truth) in pairs.items():
         box = (0, 0, 96, 63)
         report = explorer.noise(0, {"iso": 6400}, View(step), box)
-        said = json.loads(clpipe("measure", out / picture, "--truth", out / truth, "--json").output)
+        record = json.loads(
+            clpipe("measure", out / picture, "--truth", out / truth, "--json").output
+        )
         own = report.record()
-        assert own["channels"].keys() == said["channels"].keys()
+        assert own["channels"].keys() == record["channels"].keys()
         for name, channel in own["channels"].items():
             if step == "":  # a mosaic of an odd height is cut to whole cells
-                assert channel == said["channels"][name]
-            assert channel["sigma"] == pytest.approx(said["channels"][name]["sigma"], rel=0.05)
+                assert channel == record["channels"][name]
+            assert channel["sigma"] == pytest.approx(record["channels"][name]["sigma"], rel=0.05)
 
 
 def test_views_are_stages_and_truths_and_their_values(explorer):

@@ -1,4 +1,4 @@
-"""``clpipe explore``: what its server answers, and what its page does in a browser."""
+"""``clpipe explore``: the server's responses, and the page in a browser."""
 
 import asyncio
 import http.client
@@ -212,8 +212,8 @@ def test_a_port_in_use_is_said(two_renders):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = str(taken.getsockname()[1])
-        said = clpipe("explore", two_renders, "--device", "numpy", "--port", port, status=2)
-    assert f"--port {port}: cannot be used: Address already in use" in said
+        result = clpipe("explore", two_renders, "--device", "numpy", "--port", port, status=2)
+    assert f"--port {port}: cannot be used: Address already in use" in result
 
 
 @pytest.mark.slow

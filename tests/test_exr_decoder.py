@@ -1,4 +1,4 @@
-"""The two decoders of OpenEXR files: the same pixels, the same refusals."""
+"""The two decoders of OpenEXR files return the same pixels and the same errors."""
 
 import struct
 import sys

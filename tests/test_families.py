@@ -1,4 +1,4 @@
-"""Chains that differ in numbers: those that are computed are those that are made."""
+"""Traced chains equal resolved chains when only numbers differ."""
 
 import math
 import operator

@@ -1,4 +1,4 @@
-"""Files are written whole or not at all, and what is read is a regular file."""
+"""Files are written completely or not at all, and only regular files are read."""
 
 import json
 import os

@@ -611,10 +611,10 @@ def test_a_remosaiced_picture_is_as_the_array_saw_it(develop):
 
 
 def test_the_array_of_a_raw_is_that_of_its_pixels():
-    quad, wanted = "RRGG/RRGG/GGBB/GGBB", {"method": "linear_mmse", "pattern": "GBRG"}
+    quad, remosaic = "RRGG/RRGG/GGBB/GGBB", {"method": "linear_mmse", "pattern": "GBRG"}
     assert remosaiced("quad-RGGB", "binning").filters.pattern == quad
     assert remosaiced("quad-RGGB", "linear_mmse").filters.pattern == quad
-    assert on("RGGB", stages=WITH_REMOSAIC, remosaic=wanted).filters.pattern == "RGGB"
+    assert on("RGGB", stages=WITH_REMOSAIC, remosaic=remosaic).filters.pattern == "RGGB"
     charge = [*DEFAULT_CHAIN]
     charge.insert(charge.index("mosaic") + 1, "remosaic")
     assert on("quad-RGGB", stages=charge, remosaic={"method": "binning"}).filters.pattern == "RGGB"

@@ -1,4 +1,4 @@
-"""Which files of a folder a run is about, and what its outputs are called."""
+"""The input files of a folder, and the names of their outputs."""
 
 import json
 import logging

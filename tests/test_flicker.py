@@ -1,4 +1,4 @@
-"""Pulsed light: rows, layers of light and staggered exposures against the square wave itself."""
+"""Pulsed light: rows, light layers and staggered exposures against the square wave."""
 
 from pathlib import Path
 
@@ -131,7 +131,7 @@ def test_a_short_exposure_misses_the_pulse(lit):
 
 
 def test_what_is_refused(lit):
-    told = lit(
+    stderr = lit(
         "run",
         "in/f0.exr",
         "-o",
@@ -142,11 +142,11 @@ def test_what_is_refused(lit):
         "shutter.flicker_layer=Sun",
         status=1,
     ).stderr
-    assert "no layer 'Sun' with a picture; its layers: " in told and "Lamp" in told
+    assert "no layer 'Sun' with a picture; its layers: " in stderr and "Lamp" in stderr
     pipeline = Pipeline(device="numpy", shutter={"flicker_duty": 0.5, "flicker_layer": "Lamp"})
     with pytest.raises(RequestError, match="which an array does not have"):
         pipeline.process(np.ones((4, 4, 3), np.float32), "a")
     wide = ("--set", "projection.method=kannala_brandt", "--set", "shutter.flicker_layer=Lamp")
     wide += ("--set", "shutter.flicker_duty=0.2", "--set", "projection.fx=10")
-    told = lit("run", "in", "-o", "x", *wide, status=2).stderr
-    assert "panoramas have no light layers" in told
+    stderr = lit("run", "in", "-o", "x", *wide, status=2).stderr
+    assert "panoramas have no light layers" in stderr

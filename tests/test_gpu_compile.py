@@ -1,4 +1,4 @@
-"""tools/stress/gpu_compile.py, on a few kernels, for each target whose compilers are here."""
+"""tools/stress/gpu_compile.py on a few kernels, for targets with an installed compiler."""
 
 import re
 import subprocess

@@ -1,4 +1,4 @@
-"""Intrinsics in sidecars: points of a scene are where COLMAP's models say, in the picture."""
+"""Intrinsics in sidecars: scene points project as COLMAP's models state."""
 
 import json
 from pathlib import Path
@@ -96,5 +96,5 @@ def test_the_sidecar_has_them(clpipe, write_exr, tmp_path, monkeypatch):
     }
     contradictory = [f"distortion.{k}={v}" for k, v in (BROWN | {"fx": 45.0, "cx": 15.0}).items()]
     sets = [x for each in contradictory for x in ("--set", each)]
-    told = clpipe("run", "list.csv", "-o", "p", "--device", "numpy", *sets, status=2).stderr
-    assert "distortion.cx: 15 contradicts render.cx: 14; set one" in told
+    stderr = clpipe("run", "list.csv", "-o", "p", "--device", "numpy", *sets, status=2).stderr
+    assert "distortion.cx: 15 contradicts render.cx: 14; set one" in stderr

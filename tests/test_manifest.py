@@ -1,4 +1,4 @@
-"""Manifests: what their rows say, and what is said of a row that is wrong."""
+"""Manifests: the values of rows, and the messages about wrong rows."""
 
 import json
 import ntpath

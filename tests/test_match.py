@@ -1,4 +1,4 @@
-"""clpipe match: its columns, known developments that come back, the pictures that it refuses."""
+"""clpipe match: its figures, known developments that it recovers, rejected pictures."""
 
 import io
 import json
@@ -211,7 +211,7 @@ def test_the_table(burst, clpipe, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("numbers", "told"),
+    ("numbers", "reason"),
     [
         ({"iso": 6390.0}, "iso stopped at 6400, .* may have more noise"),
         ({"iso": 100.0}, "iso stopped at 100, .* may have less noise"),
@@ -219,8 +219,8 @@ def test_the_table(burst, clpipe, monkeypatch, tmp_path):
         ({"denoise.luma_strength": 1.0}, "$"),
     ],
 )
-def test_an_iso_that_stops_where_the_profile_ends_is_told_of(numbers, told):
-    assert re.match(told, ended_by(Settings(camera="nikon-d800", iso=6400), numbers))
+def test_an_iso_that_stops_where_the_profile_ends_is_told_of(numbers, reason):
+    assert re.match(reason, ended_by(Settings(camera="nikon-d800", iso=6400), numbers))
 
 
 def test_numbers_that_make_up_for_each_other_are_told_of():

@@ -1,4 +1,4 @@
-"""clpipe measure, from the outside: real runs, other people's files, refusals."""
+"""clpipe measure as a command: real runs, foreign files, rejected inputs."""
 
 import json
 import re
@@ -251,15 +251,17 @@ def test_bursts_of_several_scenes_are_one_figure_for_each_iso(tmp_path, measured
         ("100", 2, 6),
         ("800", 1, 3),
     ]
-    for iso, wanted in (("100", (3**2 + 2 * 6**2) / 3), ("800", 9**2)):
+    for iso, variance_expected in (("100", (3**2 + 2 * 6**2) / 3), ("800", 9**2)):
         report = by_iso[iso]
         one = report["channels"]["G"]
         for found in (one["sigma_picture"] ** 2, report["covariance"]["picture"][1][1]):
-            assert found * 255**2 == pytest.approx(wanted, rel=0.05)
-        assert report["covariance"]["halved"][2][2] * 255**2 == pytest.approx(wanted / 4, rel=0.06)
+            assert found * 255**2 == pytest.approx(variance_expected, rel=0.05)
+        assert report["covariance"]["halved"][2][2] * 255**2 == pytest.approx(
+            variance_expected / 4, rel=0.06
+        )
         curve = one["intensity_picture"]
         variance = np.average(np.square(curve["sigma"]), weights=curve["samples"])
-        assert variance * 255**2 == pytest.approx(wanted, rel=0.05)
+        assert variance * 255**2 == pytest.approx(variance_expected, rel=0.05)
         assert one["energy_left_2x2"] == pytest.approx(0.25, abs=0.02)
         assert sum(one["histogram"]["samples"]) == one["samples"]
     low = measured(*sorted((out / "low").glob("*.frame?.png")))

@@ -1,4 +1,4 @@
-"""How much memory images may take: what files claim, which image waits, and which is refused."""
+"""The memory budget of images: estimates, waiting images and rejected images."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""The formats that results are written in, and what [output] says of them."""
+"""Output formats and the table [output]."""
 
 import hashlib
 import json

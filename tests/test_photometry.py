@@ -1,4 +1,4 @@
-"""What is said of a picture's light, in EXIF and sidecars, is what happened to it."""
+"""Photometry in EXIF and sidecars matches the processing."""
 
 import json
 import math

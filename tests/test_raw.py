@@ -1,4 +1,4 @@
-"""Camera raws and headerless dumps: the right picture, or the right refusal."""
+"""Camera raws and dumps: the correct picture, or the correct error."""
 
 import json
 

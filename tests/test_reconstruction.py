@@ -1,4 +1,4 @@
-"""tools/reconstruction, its data and what it measures; the run itself only where OpenCV is."""
+"""tools/reconstruction: its data and figures; the whole run only with OpenCV."""
 
 import json
 

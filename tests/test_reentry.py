@@ -1,4 +1,4 @@
-"""Going on from a kept image, from one that was edited, and from a mosaic of somebody else's."""
+"""Resuming from a kept image, an edited image, and a foreign mosaic."""
 
 import itertools
 import json

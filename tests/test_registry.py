@@ -1,4 +1,4 @@
-"""Stages of other people: from a file, and from an installed package."""
+"""Users' own stages: from a file, and from an installed package."""
 
 import ast
 import re

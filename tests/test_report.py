@@ -1,4 +1,4 @@
-"""``clpipe report``: what its page says of runs, and what it does in a browser."""
+"""``clpipe report``: the text of its page, and the page in a browser."""
 
 import base64
 import io
@@ -255,9 +255,9 @@ def test_what_was_drawn_is_drawn_and_what_follows_is_folded(renders, tmp_path):
 
 def test_a_report_that_takes_long_says_where_it_is(out, monkeypatch):
     monkeypatch.setattr("clpipe.commands.progress.EVERY", 0)
-    said = clpipe("report", out)
+    result = clpipe("report", out)
     for text in ("sidecars", "noise of raw mosaics", "thumbnail 2 of 3", "comparison 1 of 3"):
-        assert f"{text}\n" in said
+        assert f"{text}\n" in result
 
 
 def test_tars_and_series_are_read(renders, tmp_path):

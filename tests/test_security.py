@@ -1,4 +1,4 @@
-"""The promises of SECURITY.md, by their numbers; what has tests of its own elsewhere is named."""
+"""The promises of SECURITY.md, by number, or the names of their tests."""
 
 import json
 import os

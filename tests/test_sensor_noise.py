@@ -1,4 +1,4 @@
-"""Photo-electrons, read noise and what is fixed to a sensor: laws, parametrisations, bounds."""
+"""Photo-electrons, read noise and fixed patterns: distributions, parameters, bounds."""
 
 from math import sqrt
 

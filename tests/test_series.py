@@ -1,4 +1,4 @@
-"""Series: the same images with several cameras and ISOs, each in a folder of its own."""
+"""Series: the same images with several cameras and ISOs, each in its own folder."""
 
 import json
 import tarfile
@@ -73,5 +73,5 @@ def test_what_is_refused(clpipe, renders, options, message):
 
 def test_a_manifest_that_says_it_too_is_refused(clpipe, renders, tmp_path):
     (tmp_path / "rows.csv").write_text("path,iso\nrenders/a.exr,400\n")
-    said = clpipe("run", "rows.csv", "-o", "out", *NUMPY, "--iso", "100,200", status=2).stderr
-    assert "rows.csv, row 2): this row sets iso, but --iso lists several; remove one" in said
+    stderr = clpipe("run", "rows.csv", "-o", "out", *NUMPY, "--iso", "100,200", status=2).stderr
+    assert "rows.csv, row 2): this row sets iso, but --iso lists several; remove one" in stderr

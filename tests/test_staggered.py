@@ -1,4 +1,4 @@
-"""Staggered exposures between which the light changes: sub-frames, rows, flicker."""
+"""Staggered exposures in changing light: sub-frames, rows, flicker."""
 
 import json
 from pathlib import Path
@@ -185,5 +185,5 @@ def test_what_is_refused(settings, message):
 
 
 def test_a_variance_is_not_known(frames, clpipe):
-    told = clpipe(*RUN, "-o", "o", "--truth", "variance", status=2).stderr
-    assert "sensor_noise (staggered) cannot compute the variance" in told
+    stderr = clpipe(*RUN, "-o", "o", "--truth", "variance", status=2).stderr
+    assert "sensor_noise (staggered) cannot compute the variance" in stderr

@@ -1,4 +1,4 @@
-"""What a picture's file states about its samples is applied, or named in a warning."""
+"""Metadata about a picture's samples is applied, or named in a warning."""
 
 import json
 import struct

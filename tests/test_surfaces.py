@@ -1,4 +1,4 @@
-"""Layers are interpolated within a surface alone, without a shift; what is unknown is invalid."""
+"""Layers are interpolated within a surface only, without a shift; unknown pixels are invalid."""
 
 import numpy as np
 import pytest

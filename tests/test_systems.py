@@ -1,4 +1,4 @@
-"""What Linux has and macOS or Windows lacks is taken away; clpipe goes on, and makes the same."""
+"""Without features that macOS or Windows lack, clpipe works and returns the same results."""
 
 import errno
 import os

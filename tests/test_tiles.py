@@ -1,4 +1,4 @@
-"""Images in tiles: the same bits as whole, in whatever memory there is."""
+"""Tiled images: the same bits as whole images, in any amount of memory."""
 
 from contextlib import contextmanager
 

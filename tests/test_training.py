@@ -1,4 +1,4 @@
-"""tools/training: denoisers that are trained on what clpipe makes, and how they are judged."""
+"""tools/training: denoisers trained on clpipe's pictures, and their scores."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Pixels on their way to a device and back: where they lie, or through staging buffers."""
+"""Transfers to and from a device: zero-copy, or through staging buffers."""
 
 from dataclasses import replace
 from typing import Any
@@ -146,8 +146,8 @@ def test_transfers_of_an_image_run_beside_the_kernels_of_its_neighbours(gpu_runn
     cl._enqueue_marker_with_wait_list(device.flow.queue, [gate])
     timings: list[list[Timing]] = [[], []]
     begun = [gpu_runner.submit(IMAGES[i], "k", RunOptions(timings[i])) for i in range(2)]
-    wanted = ["enqueue_copy", "enqueue_nd_range_kernel", "enqueue_copy"] * 2
-    assert [name for name, _ in seen] == wanted  # and the host did not wait
+    target = ["enqueue_copy", "enqueue_nd_range_kernel", "enqueue_copy"] * 2
+    assert [name for name, _ in seen] == target  # and the host did not wait
     up, run, down = (queue for _, queue in seen[:3])
     assert len({up, run, down}) == 3
     assert [queue for _, queue in seen[3:]] == [up, run, down]

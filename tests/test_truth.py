@@ -1,4 +1,4 @@
-"""The truth beside noisy pictures: the development, the mosaic, and the variance of the noise."""
+"""Ground truth of noisy pictures: the development, the mosaic, the noise variance."""
 
 import json
 import os
@@ -265,9 +265,9 @@ def test_the_clean_picture_is_written_kept_and_entered_again(clpipe, write_exr):
     assert all(np.array_equal(clean, each) for each in cleans)
     assert np.array_equal(other, again)
     assert not np.array_equal(clean, other)
-    said = json.loads(Path("o/a.truth_clean.json").read_text())
-    assert said["noise"] is None
-    assert {s["name"]: s["method"] for s in said["stages"]}["denoise"] == "none"
+    record = json.loads(Path("o/a.truth_clean.json").read_text())
+    assert record["noise"] is None
+    assert {s["name"]: s["method"] for s in record["stages"]}["denoise"] == "none"
 
 
 def stamps():

@@ -1,4 +1,4 @@
-"""tools/pages/validate.py: known noise comes back; finished pictures are like a real camera's."""
+"""tools/pages/validate.py: known noise is recovered; pictures resemble a real camera's."""
 
 import doctest
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""OpenCL's runtimes are tried before they are trusted, in a process that they may end."""
+"""OpenCL runtimes are tested in a separate process before use, because they may crash."""
 
 import json
 import sys
@@ -187,22 +187,22 @@ def test_what_fails_is_passed_over_and_what_helps_is_said(device, monkeypatch):
     gone = Verdicts(platforms={platform_id(platform): "it crashes the process (SIGABRT)"})
     monkeypatch.setattr(discovery, "verdicts", lambda *_, **__: gone)
     monkeypatch.setattr(cl.Platform, "get_devices", lambda _: pytest.fail("it would end here"))
-    assert "when asked for its devices, it crashes" in find_devices()[0].problem
+    assert "when queried for its devices, it crashes" in find_devices()[0].problem
     monkeypatch.setattr(discovery, "verdicts", lambda *_, **__: Verdicts(listing="it ends"))
     with pytest.raises(DeviceError, match=r"listed: it ends. On this machine, try"):
         find_devices()
 
 
 def test_a_device_that_was_not_there_is_tried(device, monkeypatch):
-    asked = []
+    queried = []
 
     def answer(again=False, missing=()):
-        asked.extend(missing)
+        queried.extend(missing)
         return Verdicts(attempts=dict.fromkeys(missing, ""))
 
     monkeypatch.setattr(discovery, "verdicts", answer)
     found = next(d for d in find_devices() if d.handle == device.info.handle)
-    assert not found.problem and any(found.name in name for name in asked)
+    assert not found.problem and any(found.name in name for name in queried)
 
 
 def test_what_another_process_does_not_see_is_trusted(program):
