@@ -30,7 +30,7 @@ SHAPES = {
 
 
 def mask_of(points, beyond=0):
-    """The share of each pixel that an outline covers, by 8x8 places in it."""
+    """Return the share of each pixel inside an outline, by 8x8 samples per pixel."""
     height, width = HEIGHT + 2 * beyond, WIDTH + 2 * beyond
     y, x = (np.mgrid[: height * 8, : width * 8] + 0.5) / 8 - beyond
     inside = np.zeros(x.shape, bool)
@@ -43,7 +43,7 @@ def mask_of(points, beyond=0):
 
 @pytest.fixture
 def coco(write_exr):
-    """A render of each shape in a channel of its own, and annotations of all kinds."""
+    """A render with a channel for each shape, and annotations of all kinds."""
     masks = np.stack([mask_of(points) for points in SHAPES.values()], -1).astype(np.float32)
     write_exr("in/a.exr", masks, half=False)
     annotations = [
@@ -75,7 +75,7 @@ def read_back(folder="o"):
 
 
 def seen(path):
-    """What the picture shows of each shape, linear."""
+    """Return the linear picture of each shape."""
     with Image.open(path) as image:
         codes = np.asarray(image, np.float64) / 255
     return np.where(codes > 0.04045, ((codes + 0.055) / 1.055) ** 2.4, codes / 12.92)
@@ -261,7 +261,7 @@ AS_BOP += ("--annotations", "bop/scene_gt.json", *PLAIN, *BARREL, "--set", "resi
 
 @pytest.fixture
 def bop(write_exr):
-    """A scene of three objects, the last beside the picture; its files by name, its masks."""
+    """A scene of three objects, the last outside the picture: files by name, and masks."""
     masks = np.stack([mask_of(points) for points in SHAPES.values()], -1).astype(np.float32)
     write_exr("in/000003.exr", masks, half=False)
     visible = masks[..., 0] * (np.arange(WIDTH) < 50)

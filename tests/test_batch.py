@@ -737,7 +737,7 @@ def test_a_replay_with_other_bytes_says_what_was_different(clpipe, renders):
 
 
 class Panic(BaseException):
-    """As extensions written in Rust raise it."""
+    """An exception like those of Rust extensions."""
 
 
 # Where an image is decoded, developed and encoded.
@@ -838,7 +838,7 @@ def test_what_a_device_leaves_another_does(renders, tmp_path, monkeypatch, caplo
 
 @pytest.mark.parametrize(("budget", "together"), [(1, 1), (2, 2), (100, 4)])
 def test_images_wait_for_memory(renders, tmp_path, monkeypatch, budget, together):
-    """As many images as fit are in memory at a time: they wait for each other, and no more come."""
+    """Only as many images as fit are in memory at a time; the others wait."""
     renders(12)
     (tmp_path / "out").mkdir()
     worker, jobs = worker_of(tmp_path)

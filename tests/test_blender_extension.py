@@ -48,7 +48,7 @@ SETTINGS = {"camera": "", "look": "default", "iso": 1600, "seed": 3, "keep_raw":
 
 @pytest.fixture(scope="module")
 def extension(tmp_path_factory):
-    """The extension with wheels that hold nothing."""
+    """The extension with empty wheels."""
     folder = tmp_path_factory.mktemp("extension")
     for name, file in WHEELS.items():
         with zipfile.ZipFile(folder / name, "w") as wheel:
@@ -60,7 +60,7 @@ def extension(tmp_path_factory):
 
 @pytest.fixture
 def settings():
-    """Settings as the panel's, with some changed."""
+    """Return the panel's settings with some changes."""
     return lambda **changed: development.Settings(**SETTINGS | changed)
 
 
@@ -130,7 +130,7 @@ def test_missing_wheels_are_said(settings, tmp_path, monkeypatch):
 
 @pytest.fixture
 def blender(extension, tmp_path, monkeypatch):
-    """Blender with the extension and a small scene; the extension's module, and the scene."""
+    """Blender with the extension and a small scene: the extension's module, and the scene."""
     bpy = pytest.importorskip("bpy", reason="needs bpy, in the extra blender")
     folder = tmp_path / "clpipe_extension"
     with zipfile.ZipFile(extension) as packed:

@@ -14,7 +14,7 @@ from clpipe.stages.optical_blur import along, diffracted, lens_taps
 
 
 def blurred(image, device=None, **stages):
-    """An image through these stages, with their parameters."""
+    """Process an image with stages and parameters."""
     chain = make_chain(settings_from({"stages": list(stages), **stages}))
     return Runner(chain, device, encode=False, final=True).run(image, "k").final
 

@@ -55,7 +55,7 @@ def frames(
 
 
 def off(estimate: Estimate | None, truth: float) -> tuple[float, float]:
-    """How far an estimate is from the truth: relative, and in standard errors."""
+    """Return the error of an estimate, relative and in standard errors."""
     assert estimate is not None
     return abs(estimate.value / truth - 1), abs(estimate.value - truth) / estimate.error
 

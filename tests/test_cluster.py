@@ -43,7 +43,7 @@ IMAGES = 16
 
 @pytest.fixture(scope="module")
 def workers():
-    """A client of two workers, processes of their own, which are started again where they die.
+    """A client of two worker processes, which restart if they die.
 
     Dask gives up one that is not back after 15 s, which a busy machine may need.
     """
@@ -71,7 +71,7 @@ def renders(write_exr):
 
 
 def contents(folder):
-    """All files but the logs, with their bytes."""
+    """Return the bytes of all files except logs."""
     found = {p.relative_to(folder): p.read_bytes() for p in Path(folder).rglob("*") if p.is_file()}
     return {path: data for path, data in found.items() if path.suffix != ".jsonl"}
 
@@ -81,7 +81,7 @@ def log(folder):
 
 
 def die_at_sidecar(number):
-    """On a worker: be killed in the midst of writing the sidecar of that number."""
+    """On a worker: kill the process while it writes the sidecar of that number."""
     write, numbers = work.write_sidecar, itertools.count(1)
 
     def planted(path, record):
@@ -94,7 +94,7 @@ def die_at_sidecar(number):
 
 
 def note_folders():
-    """On a worker: note the working directory at each image from now on."""
+    """On a worker: record the working directory at each following image."""
     decode, work.folders = work.ImageWorker.decode, set()
 
     def noting(this, job, begin):
@@ -105,7 +105,7 @@ def note_folders():
 
 
 class DieOf(WorkerPlugin):
-    """Workers, those that are started again too, are killed by an image of this name."""
+    """An image of this name kills each worker, also restarted ones."""
 
     def __init__(self, name):
         self.name = name
@@ -251,7 +251,7 @@ def hold(name, reached, go):
 def test_a_log_that_cannot_be_written_ends_the_run(
     clpipe, renders, workers, address, monkeypatch, tmp_path
 ):
-    """What another worker has begun by then is finished before the run ends."""
+    """The run ends after other workers have finished their images."""
     reached, go = tmp_path / "reached", tmp_path / "go"
     workers.run(hold, "f04.exr", str(reached), str(go))  # the first one of the second chunk
     halt = cluster.Cluster._halt

@@ -27,7 +27,7 @@ THIN = ("--set", "defocus.method=thin_lens", *SETS)
 
 
 def at_radius(radius):
-    """The distance behind the focus at which discs have a radius in px."""
+    """Return the distance beyond the focus at which discs have a radius in px."""
     return 2.0 / (1 - 2 * radius / FAR)
 
 

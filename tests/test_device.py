@@ -131,7 +131,7 @@ def test_a_gpu_that_two_drivers_offer_is_one(devices):
 
 
 class FakeDevice:
-    """What hardware_of() asks of a pyopencl.Device."""
+    """The attributes of pyopencl.Device that hardware_of() reads."""
 
     def __init__(self, **values):
         self.platform = SimpleNamespace(int_ptr=7)

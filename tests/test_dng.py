@@ -205,7 +205,7 @@ def test_the_preview_is_our_neutral_picture(tmp_path):
 
 
 def test_adobes_software_is_told_of_our_tone_curve(tmp_path, scene):
-    """The curve stands for all: there is no BaselineExposure on top, and nothing near black."""
+    """The tone curve includes all gains: there is no BaselineExposure."""
     render = scene(8, 8)
     clpipe("run", render, "-o", tmp_path, "--format", "dng", "--device", "numpy")
     first, raw = directories(tmp_path / "scene.dng")

@@ -391,7 +391,7 @@ def test_each_camera_draws_in_its_own_part_of_a_law(law, share):
 
 
 def test_one_camera_is_pushed_where_a_law_goes_on(clpipe, write_exr):
-    """From its highest ISO on gain and variance go on in proportion, and this is said."""
+    """Above the highest ISO, gain and variance are extrapolated in proportion, with a note."""
     settings = settings_from({"iso": {"log_uniform": [1600, 25600]}, "camera": "nikon-d800"})
     isos = np.array([settings.drawn(f"{n}.exr").iso for n in range(400)])
     assert abs(np.mean(isos > 6400) - 0.5) < 0.08 and isos.max() > 20000

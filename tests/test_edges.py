@@ -18,7 +18,7 @@ def stripes():
 
 
 def noise(at_edges):
-    """Noise of sigma 2, and of another at the borders of the stripes."""
+    """Return noise of sigma 2, with another sigma at the borders of the stripes."""
     normals = np.random.default_rng(1).normal(size=(SIZE, SIZE))
     steep = slopes_of(stripes(), np.ones((SIZE, SIZE), bool)).steep
     return normals * np.where(steep, at_edges, 2.0)

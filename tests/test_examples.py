@@ -21,7 +21,7 @@ EXAMPLES = ROOT / "tools" / "examples"
 
 @pytest.fixture
 def start(write_exr, tmp_path):
-    """Start an example in a folder with renders, the command clpipe on the PATH; what it told."""
+    """Return a function that runs an example in a folder with renders, and returns its output."""
     for i in range(5):
         pixels = np.random.default_rng(i).random((64, 64, 3)).astype(np.float32)
         write_exr(f"in/f{i}.exr", pixels)

@@ -22,7 +22,7 @@ MADE = ("a.jpg", "a.normalize.exr", "a.truth_mosaic.exr")
 
 @pytest.fixture
 def again(clpipe, write_exr):
-    """Run an image; the files that the run wrote."""
+    """Run an image, and return the files that the run wrote."""
     write_exr("in/a.exr", np.full((8, 8, 3), 0.25, np.float32))
 
     def run(*options, status=0):
@@ -248,7 +248,7 @@ def test_pictures_of_inputs_that_are_gone_are_counted(clpipe, write_exr):
 
 @pytest.fixture
 def program(monkeypatch):
-    """Be another program from now on."""
+    """Change the digest of the program."""
 
     def be(digest):
         for module in ("existing", "record"):

@@ -105,7 +105,7 @@ def test_nobody_without_the_token_gets_an_answer(served):
 
 
 def test_another_host_name_is_refused(served):
-    """So no page elsewhere can have its own name lead here."""
+    """This prevents DNS rebinding by other sites."""
     assert answer(served, "", host="evil.example")[0] == 400
 
 
@@ -254,7 +254,7 @@ def put(page, key, value):
 
 
 def on_screen(page):
-    """The whole picture as the page has it."""
+    """Return the whole picture of the page."""
     text = page.evaluate("Array.from(picture.pixels).join()")
     shape = page.evaluate("[picture.facts.height, picture.facts.width, 3]")
     return np.array(text.split(","), np.uint8).reshape(shape)

@@ -50,7 +50,7 @@ def outcome(path, **options):
 
 @pytest.fixture
 def decoded(monkeypatch):
-    """Read a file with both decoders, which must agree; whether the OpenEXR package did."""
+    """Read a file with both decoders, which must agree; return whether OpenEXR read it."""
 
     def both(path, **options):
         used = []

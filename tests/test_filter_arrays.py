@@ -231,7 +231,7 @@ def test_filters_of_several_colours_add_up_what_the_light_gives_each(device, lig
     ],
 )
 def test_flat_colours_stay_under_any_white_balance(stages, settings):
-    """As on a Bayer pattern, but for a factor by which clear filters make a camera expose less."""
+    """Like on a Bayer pattern, except that clear filters reduce the exposure by a factor."""
     flat = np.full((24, 24, 3), 1, np.float32) * np.float32([0.2, 0.3, 0.4])
     light = {"red_gain": 1.2, "blue_gain": 3.0}
     if "inverse" in stages:
@@ -510,7 +510,7 @@ def test_cells_are_binned_to_a_bayer_pattern(device):
     [("quad-RGGB", 2, (101, 67)), ("nona-RGGB", 3, (101, 67)), ("nona-RGGB", 3, (100, 2))],
 )
 def test_places_follow_the_cells_that_are_binned(array, factor, size):
-    """Of sizes that are no multiple of a cell: brightness tells where each pixel comes from."""
+    """Test sizes that are no multiple of a cell; brightness encodes the position of each pixel."""
     width, height = size
     chain = on(array, stages=["mosaic", "remosaic"], remosaic={"method": "binning"})
     runner = Runner(chain, None, encode=False, final=True)

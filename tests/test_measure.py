@@ -30,7 +30,7 @@ def measured(clpipe):
 
 @pytest.fixture(scope="module")
 def developed(tmp_path_factory):
-    """Develop the still life with some options, once; what the names of its pictures begin with.
+    """Develop the still life once with some options, and return the start of its file names.
 
     It is the middle of the still life, of 640x480 px.
     """
@@ -192,7 +192,7 @@ def test_finished_pictures_of_others(tmp_path, measured):
 
 
 def test_the_whole_picture_and_the_covariance_of_channels(tmp_path, measured, clpipe):
-    """Noise is twice as large beside edges, so flat places have less; channels share a part."""
+    """Noise is twice as large next to edges; channels share a part of it."""
     random = np.random.default_rng(5)
     clean = np.full((256, 257, 3), 128.0)
     clean[:128, ::2] -= 40  # stripes: nowhere flat

@@ -38,7 +38,7 @@ class SharingDevice:
 
 
 def budget_of(free, *devices, size=None, drop=lambda: None):
-    """A budget in which so many bytes are free, less what devices hold."""
+    """Return a budget with so many free bytes, minus the memory of devices."""
     budget = MemoryBudget(
         size, devices, drop, lambda: Left(free - sum(d.bytes_held for d in devices), "x")
     )
@@ -62,7 +62,7 @@ def clock(monkeypatch):
 
 
 class Entering:
-    """A thread that takes budget, and whether it has to wait for it."""
+    """Take budget in a thread, and return whether it waits."""
 
     def __init__(self, budget, *arguments):
         self._budget, self._arguments = budget, arguments
@@ -225,7 +225,7 @@ def test_no_runtime_is_loaded_where_addresses_are_too_few(monkeypatch):
 
 
 def limited(text, megabytes):
-    """Run Python in a process with so much address space."""
+    """Run Python in a process with limited address space."""
     import resource
 
     return subprocess.run(

@@ -85,7 +85,7 @@ def stated(*places, **others):
 
 
 def others_for(fact):
-    """What else must be known: a focal length in px or mm."""
+    """Return the focal length that is also needed, in px or mm."""
     lengths = {"render": {"focal_length": 35.0, "sensor_width": 36.0}}
     return {
         "fx": {"render": {"sensor_width": 36.0}},

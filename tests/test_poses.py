@@ -70,7 +70,7 @@ def renders(write_exr):
 
 
 def changed(**changes):
-    """A cameras.json in which the view of a.exr, or what holds for all, is different."""
+    """Write a cameras.json with changes to the view of a.exr or to all views."""
     values = json.loads(Path("cameras.json").read_text())
     common = {"width", "height"} & changes.keys()
     values |= {name: changes[name] for name in common}
@@ -80,13 +80,13 @@ def changed(**changes):
 
 
 def rotated(w, x, y, z):
-    """The rotation of a unit quaternion, as the Rodrigues formula has it."""
+    """Return the rotation of a unit quaternion by the Rodrigues formula."""
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
 
 
 def bent(x, y, k):
-    """Brown and Conrady's formula, as OpenCV's documentation has it."""
+    """Brown and Conrady's formula from OpenCV's documentation."""
     r2 = x * x + y * y
     grown = 1 + k.get("k1", 0) * r2 + k.get("k2", 0) * r2**2 + k.get("k3", 0) * r2**3
     p1, p2 = k.get("p1", 0), k.get("p2", 0)
@@ -101,7 +101,7 @@ def places(r, t, fx, fy, cx, cy, k):
 
 
 def written_poses(folder):
-    """Where each file of a folder says that the points are, by the name of the picture."""
+    """Return the points that each file of a folder predicts, by the name of the picture."""
     by_form = {"cameras": {}, "nerf": {}, "colmap": {}}
     for view in json.loads((folder / "cameras.json").read_text())["views"]:
         (fx, _, cx), (_, fy, cy), _ = view["K"]

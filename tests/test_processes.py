@@ -37,7 +37,7 @@ ImageWorker.decode = planted
 
 
 def is_running(pid):
-    """Whether a process exists and is no zombie, which has no command any more."""
+    """Return whether a process exists and is not a zombie."""
     try:
         return bool(Path(f"/proc/{pid}/cmdline").read_bytes())
     except OSError:
@@ -49,14 +49,14 @@ def pictures():
 
 
 def held_run():
-    """A run by two processes that have both come to a held image, and the numbers of these two."""
+    """A run by two processes that both wait at a held image, and their process IDs."""
     process = start("in", *TWO, planted=HOLDING_PROCESSES)
     wait_until(lambda: len(held()) == 2, "two processes that hold", process)
     return process, held()
 
 
 def held():
-    """The numbers of the processes that have come to a held image."""
+    """Return the IDs of processes that wait at a held image."""
     return sorted(int(path.suffix[1:]) for path in Path().glob("held.*"))
 
 
@@ -176,7 +176,7 @@ ImageWorker.runners = broken
 
 @pytest.mark.parametrize("side", [24, 1700])
 def test_a_kernel_that_does_not_compile_ends_the_run(write_exr, clpipe, monkeypatch, side):
-    """Also where all images are handed out already, and whoever decodes waits for more."""
+    """The run also ends if all images are distributed and decoders wait."""
     for i in range(2):
         write_exr(f"in/r{i}.exr", np.zeros((side, side, 3), np.float32))
     monkeypatch.setattr(processes, "START", f"exec({BROKEN!r}); {processes.START}")

@@ -97,7 +97,7 @@ def mirrored(image: np.ndarray, dx: int, dy: int) -> np.ndarray:
 
 
 def around(src: np.ndarray, reach: int) -> np.ndarray:
-    """The kernel's function of that name, in NumPy."""
+    """The kernel function of that name in NumPy."""
     across = mirrored(src, -reach, 0) + mirrored(src, reach, 0)
     return (across + (mirrored(src, 0, -reach) + mirrored(src, 0, reach))) * np.float32(0.25)
 
@@ -202,7 +202,7 @@ class Symbols:
 
 
 def results_of_passes(chain: Chain, symbols: Symbols) -> dict[str, int]:
-    """What each step of a chain makes, by its passes alone."""
+    """Return the result of each step of a chain from its passes only."""
     image, found = symbols.of("source"), {}
     for step in chain.steps:
         known = {"src": image, "dst": image}
@@ -221,7 +221,7 @@ def results_of_passes(chain: Chain, symbols: Symbols) -> dict[str, int]:
 
 
 class Execution:
-    """A plan, executed with symbols."""
+    """Execute a plan with symbols."""
 
     def __init__(self, plan: Plan, symbols: Symbols):
         self.plan, self.symbols = plan, symbols
@@ -309,7 +309,7 @@ def test_what_a_plan_makes_is_what_the_passes_say(seed):
 
 
 def check_sizes(plan: Plan, chain: Chain) -> None:
-    """See that images are of the size of their level, and the border wide enough for all taps."""
+    """Check the size of each image, and that the border covers all taps."""
     passes = [each for step in chain.steps for each in step.method.passes()]
     resamplers = [p.access.resampler for p in passes if isinstance(p.access, Resample)]
     assert list(plan.resamplings) == resamplers[: len(plan.resamplings)]

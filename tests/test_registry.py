@@ -181,7 +181,7 @@ NO_STAGES = {
 
 
 def strings_of(path):
-    """The strings in code, docstrings apart."""
+    """Return the strings in code except docstrings."""
     if path.suffix != ".py":
         return re.findall(r'"([^"\n]*)"|`([^`]*)`', path.read_text())
     tree = ast.parse(path.read_text())
@@ -195,7 +195,7 @@ def strings_of(path):
 
 @pytest.mark.parametrize("package", ["chain", "inputs", "outputs", "explorer"])
 def test_no_stage_is_known_by_its_name(package):
-    """Clpipe's own stages are found by what they declare, as those of others are."""
+    """clpipe finds its own stages by their declarations, like users' stages."""
     folder = ROOT / "clpipe" / package
     names = [name for name, stage in all_stages().items() if stage.folder is None]
     parameter = re.compile(rf"\b({'|'.join(names)})\.[a-z_]+")

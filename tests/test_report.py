@@ -93,7 +93,7 @@ def made(renders):
 
 @pytest.fixture(autouse=True)
 def few_drawings(monkeypatch):
-    """The noise of one picture is drawn: that is what takes long."""
+    """Draw the noise of one picture only, because this is slow."""
     monkeypatch.setattr("clpipe.reports.page.DRAWN", 1)
 
 

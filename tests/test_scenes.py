@@ -311,7 +311,7 @@ def seen_again(folder, one, two):
 
 
 def test_views_of_a_room_see_what_the_camera_looks_at(clpipe, tmp_path):
-    """An orbit leads behind the walls; no view is from there, and each sees most objects."""
+    """An orbit passes outside the walls, but no view is there, and each view sees most objects."""
     pytest.importorskip("bpy", reason="needs bpy, in the extra blender")
     example(tmp_path, "room_scene.py", "room.blend")
     small = ("--resolution", "48x32", "--samples", 1, "--device", "numpy", "--no-denoise")
@@ -328,7 +328,7 @@ def test_views_of_a_room_see_what_the_camera_looks_at(clpipe, tmp_path):
 
 
 def test_blender_itself_renders_a_scene(clpipe, tmp_path):
-    """Its depth, cameras and object numbers agree with each other, and it makes the same again."""
+    """Depth, cameras and object numbers of the example agree, and it is reproducible."""
     pytest.importorskip("bpy", reason="needs bpy, in the extra blender")
     example(tmp_path, "room_scene.py", "room.blend")
     small = ("--resolution", "48x32", "--samples", 4, "--device", "numpy", "--path", "arc")

@@ -23,7 +23,7 @@ CAMERA = ("--set", "render.fx=30", "--set", "render.fy=30")
 
 @pytest.fixture
 def made(clpipe, write_exr):
-    """Run two renders; running it again gives the status of each by its name."""
+    """Run two renders, and return a function that runs again and returns their status by name."""
     for name, value in (("a", 0.25), ("b", 0.5)):
         write_exr(f"in/{name}.exr", np.full((8, 8, 3), value, np.float32))
 
@@ -128,7 +128,7 @@ ODD = [7, -1.5, [], ["x"], None, "", "\0", {}, {"a": {"b": [1]}}, True, 10**400,
 
 
 def places(values, at=()):
-    """The keys on the way to each value of a sidecar; of a list, to its first."""
+    """Return the path of keys to each value of a sidecar; for a list, to its first item."""
     if at:
         yield at
     if isinstance(values, dict):

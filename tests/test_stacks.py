@@ -48,12 +48,12 @@ def equal(one: Result, two: Result) -> None:
 
 @pytest.fixture(params=["CPU", pytest.param("GPU", marks=pytest.mark.slow)])
 def on(device, request):
-    """The device, also as if its memory were its own."""
+    """The device, and the same device as if it had its own memory."""
     return Device(replace(device.info, type=request.param))
 
 
 class Asked(NamedTuple):
-    """An image that is to go through a runner."""
+    """An image to submit to a runner."""
 
     runner: Runner
     image: np.ndarray

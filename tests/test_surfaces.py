@@ -26,7 +26,7 @@ GEOMETRIES = {
 
 
 def room(x, y):
-    """A floor, a wall behind it, and a pillar before both: depth, normals, label."""
+    """Return a floor, a wall and a pillar in front of them: depth, normals, label."""
     u, v = (x - WIDTH / 2) / 90, (y - HEIGHT / 2) / 90
     with np.errstate(divide="ignore"):
         floor = np.where(v > 0, 1.5 / v, np.inf)

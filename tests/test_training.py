@@ -27,7 +27,7 @@ def tool(tmp_path):
 
 @pytest.fixture
 def real(clpipe, tmp_path):
-    """A folder with pairs that stand for a camera's: a development, and that without noise."""
+    """A folder of simulated camera pairs: a development, and the same without noise."""
     made = tmp_path / "made"
     clpipe(
         "run", STILL_LIFE, "-o", made, "--iso", 3200, "--truth", "development", "--format", "png"
@@ -62,7 +62,7 @@ def test_denoisers_are_compared_on_real_pictures(tool, real, tmp_path):
 
 
 def _other(real):
-    """A folder with the first pair under another name, so that it is not the one that is tested."""
+    """A folder with the first pair under another name, so training does not use the test pair."""
     other = real.parent / "other"
     other.mkdir()
     for kind in ("real", "mean"):

@@ -23,13 +23,13 @@ IMAGES = [example(Kind.RGB, (40, 48), half=True, seed=seed) for seed in range(5)
 
 
 def planes_of(image: np.ndarray) -> np.ndarray:
-    """The channels of an image one behind the other, (3, height, width)."""
+    """Return the channels of an image as planes, (3, height, width)."""
     return np.ascontiguousarray(image.transpose(2, 0, 1))
 
 
 @pytest.fixture
 def runner(device: Device) -> Runner:
-    """A single launch, on a device of its own."""
+    """A single launch on its own device."""
     return Runner(make_chain(settings_from({"stages": ["exposure", "gamma"]})), Device(device.info))
 
 
@@ -113,7 +113,7 @@ def test_both_ways_give_the_same(device, type_, memory):
 
 
 def queued(device: Device, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
-    """What is enqueued from now on, and in which queue."""
+    """Record the following enqueued operations and their queues."""
     seen = []
 
     def watched(name: str) -> None:

@@ -37,7 +37,7 @@ PATCHES = np.repeat(
 
 
 def tall(rows=1600):
-    """The patches again and again, as 400 frames of four rows one below the other."""
+    """Return the patches as 400 frames of four rows, one below another."""
     return np.ascontiguousarray(np.broadcast_to(PATCHES, (rows, 64, 3)))
 
 
@@ -55,7 +55,7 @@ def known(image, device=None, **settings):
 
 
 def agree(noisy, clean, variance, axis=1):
-    """See that the noise of each patch and colour is as large as is said, within 4 standard errors.
+    """Check the predicted noise of each patch and colour within 4 standard errors.
 
     Rows (axis 1), or columns (axis 0), may share noise; among each other they do not. Means differ
     by up to half a DN, to which the clean mosaic is rounded.

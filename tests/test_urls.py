@@ -24,7 +24,7 @@ RUN = ("--iso", 3200, "--device", "numpy", "--skip", "noise")
 
 
 class Flaky(MemoryFileSystem):
-    """A bucket in memory: requests fail, or bring half a file, by chance."""
+    """A bucket in memory, where requests randomly fail or return half a file."""
 
     protocol = "flaky"
     store: ClassVar = {}
@@ -75,7 +75,7 @@ class Flaky(MemoryFileSystem):
 
 @pytest.fixture
 def bucket(write_exr, clpipe, monkeypatch):
-    """Seven renders in a bucket, and here."""
+    """Seven renders, in a bucket and in the working directory."""
     monkeypatch.setattr(urls, "FIRST_WAIT", 0.0)
     monkeypatch.setattr(urls, "TRIES", 30)
     fsspec.register_implementation("flaky", Flaky, clobber=True)

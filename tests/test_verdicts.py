@@ -19,7 +19,7 @@ from clpipe.engine.verdicts import Verdicts, tried
 
 @pytest.fixture
 def program(tmp_path, monkeypatch):
-    """A shell script in place of the trial; it is given what is known on its standard input."""
+    """Replace the test of runtimes by a shell script, which reads known results from stdin."""
 
     def be(script):
         path = tmp_path / "python"

@@ -54,7 +54,7 @@ def unit(rays):
 
 
 def light(rays):
-    """What is seen in a direction: waves about 2 px long at the narrowest."""
+    """Return the light from a direction: waves, at least about 2 px long."""
     x, y, z = unit(rays)
     waves = np.cos(9 * x + 3 * y + 5 * z), np.sin(8 * y - 4 * z), np.cos(7 * z + 6 * x - 2 * y)
     return np.stack([0.5 + 0.4 * wave for wave in waves], -1)
@@ -104,7 +104,7 @@ def places_of(lens):
 
 
 def off_by(picture, lens, scene=light):
-    """How far, in px at least, a picture is from the scene where the lens sees it."""
+    """Return a lower bound of the error of a picture's positions, in px."""
     x, y, rays = places_of(lens)
     step = 1e-3
     slopes = [
@@ -356,7 +356,7 @@ def plane_and_sky(rays):
 
 
 def moved(rays, distance, by):
-    """Directions of what is seen there once the camera has moved."""
+    """Return the directions of the same points after the camera has moved."""
     return unit(rays) * distance - np.array(by).reshape(3, *[1] * (rays.ndim - 1))
 
 
