@@ -66,8 +66,8 @@ def main():
     objects = {"1": ["floor"], "2": ["ball", "ball.001"]}
     layers = ["Depth", "Normal", "IndexOB"]
     notes = ["3 of 9 places see too little"] if scene == "a maze" else []
-    said = {"objects": objects, "layers": layers, "unit_metres": 0.1, "notes": notes}
-    tell("scene", blender="4.9.9", views=cameras, **said)
+    facts = {"objects": objects, "layers": layers, "unit_metres": 0.1, "notes": notes}
+    tell("scene", blender="4.9.9", views=cameras, **facts)
     for number, each in enumerate(cameras):
         if scene == f"die after {number}":
             print("Segmentation fault (not really)")

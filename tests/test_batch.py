@@ -802,7 +802,7 @@ def test_a_thread_that_dies_ends_the_run(renders, tmp_path, monkeypatch):
                 caught.append(str(error))
 
         with monkeypatch.context() as patch:
-            patch.setattr(JobState, "outcome", die)  # of what is done behind an image's back
+            patch.setattr(JobState, "outcome", die)  # an error in the scheduling of images
             thread = threading.Thread(target=run, args=(Batch(worker, [None], 1),), daemon=True)
             thread.start()
             thread.join(GUARD)

@@ -93,8 +93,8 @@ def test_panel_offers_cameras_and_configurations(extension):
 
 
 def test_command_is_one_of_the_command_line(settings, tmp_path):
-    said = settings(camera=DEFAULT_CAMERA, look="paper", keep_raw=True)
-    renders = [development.Render(tmp_path / f"-{n}.exr", tmp_path, said) for n in range(2)]
+    chosen = settings(camera=DEFAULT_CAMERA, look="paper", keep_raw=True)
+    renders = [development.Render(tmp_path / f"-{n}.exr", tmp_path, chosen) for n in range(2)]
     arguments = development.command(renders)
     run = main.get_command(click.Context(main), "run")
     context = run.make_context("run", arguments[arguments.index("run") + 1 :])
@@ -214,8 +214,8 @@ def test_output_settings_are_the_users_again(blender, kind):
 
 def test_settings_are_in_the_blend(blender, tmp_path):
     module, scene = blender
-    said = {**SETTINGS, "camera": "canon-5d3", "look": "paper", "keep_raw": True, "enabled": True}
-    for name, value in said.items():
+    chosen = {**SETTINGS, "camera": "canon-5d3", "look": "paper", "keep_raw": True, "enabled": True}
+    for name, value in chosen.items():
         setattr(scene.clpipe, name, value)
     path = str(tmp_path / "scene.blend")
     module.bpy.ops.wm.save_as_mainfile(filepath=path)
@@ -223,7 +223,7 @@ def test_settings_are_in_the_blend(blender, tmp_path):
     assert not module.bpy.context.scene.clpipe.enabled
     module.bpy.ops.wm.open_mainfile(filepath=path)
     again = module.bpy.context.scene.clpipe
-    assert {name: getattr(again, name) for name in said} == said
+    assert {name: getattr(again, name) for name in chosen} == chosen
 
 
 def test_rendering_goes_on_without_clpipe(blender, tmp_path, monkeypatch):

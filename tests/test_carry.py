@@ -303,7 +303,7 @@ def test_a_pipeline_moves_arrays():
     moved, valid = half.carry(depth, "depth")
     row, column = np.mgrid[:2, :3]
     nearest = depth[2 * row + column % 2, 2 * column + row % 2]
-    np.testing.assert_array_equal(moved[0], nearest[0])  # beside a depth of 0 there is no surface
+    np.testing.assert_array_equal(moved[0], nearest[0])  # a depth of 0 is no surface
     assert valid.tolist() == [[0, 1, 1], [1, 1, 1]]
     np.testing.assert_allclose(half.carry(flow, "flow")[0], np.full((2, 3, 2), 2.0), atol=1e-6)
     whole, _ = half.carry(depth, "depth", resize={"scale": 1.0})

@@ -347,7 +347,7 @@ def test_a_worker_has_a_folder_of_its_own(clpipe, renders, workers, address, tmp
     assert len(pictures) == 2 and all(dask[path] == whole[path] for path in pictures)
     again = clpipe("run", *inputs, *chosen, "-o", "out", status=1)  # the request is the same
     assert "(2 of them were there already)" in again.stderr
-    # What a kept image carries names files, too.
+    # The settings in a kept image also name files.
     go_on = ("--start-at", "inverse_white_balance", "--device", "numpy", "--format", "png")
     clpipe("run", "out/f00.mosaic.exr", *go_on, "-o", "next", "--dask", address)
     clpipe("run", "whole/f00.mosaic.exr", *go_on, "-o", "after")

@@ -103,9 +103,9 @@ def test_bounded_invents_no_extremes(pattern):
         green = roots[..., 1]
         for channel, sites in enumerate((red, ~red & ~blue, blue)):
             own = roots[..., channel]
-            low, high = around(own, sites)
+            low, high = range_around(own, sites)
             if channel != 1:  # as far beyond as green is beyond what it is there, for fine lines
-                green_low, green_high = around(green, sites)
+                green_low, green_high = range_around(green, sites)
                 low += np.minimum(green - green_low, 0)
                 high += np.maximum(green - green_high, 0)
             assert np.all(own >= low - 2e-6)
@@ -114,7 +114,7 @@ def test_bounded_invents_no_extremes(pattern):
             assert abs(moved).max() <= 2**-21 + 2e-6  # half a step
 
 
-def around(values, sites):
+def range_around(values, sites):
     """Return the minimum and maximum at sites of the 3x3 around each pixel."""
     return (
         minimum_filter(np.where(sites, values, np.inf), 3, mode="mirror"),

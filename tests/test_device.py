@@ -268,9 +268,9 @@ def test_what_memory_held_before_does_not_matter(device, monkeypatch, byte):
 def test_pixels_into_an_array_that_is_there(device):
     runner = Runner(make_chain(settings_from({})), device)
     image = np.full((20, 30, 3), 0.5, np.float16)
-    room = np.empty((20, 30, 3), np.uint8)
-    result = runner.run(image, "k", RunOptions(into=room))
-    assert result.encoded is room
-    assert np.array_equal(room, runner.run(image, "k").encoded)
+    buffer = np.empty((20, 30, 3), np.uint8)
+    result = runner.run(image, "k", RunOptions(into=buffer))
+    assert result.encoded is buffer
+    assert np.array_equal(buffer, runner.run(image, "k").encoded)
     with pytest.raises(ValueError, match=r"into has shape \(20, 30\)"):
-        runner.run(image, "k", RunOptions(into=room[..., 0]))
+        runner.run(image, "k", RunOptions(into=buffer[..., 0]))

@@ -433,11 +433,11 @@ def test_sliders_have_the_limits_of_their_texts(page):
     )
     assert len(sliders) > 20
     for low, high, text in sliders:
-        said = re.search(r"The slider covers (\S+) to (\S+)\.(?= |$)", text)
-        said = said or re.search(r"(?:From|Above) (\S+) (?:to|below) (\S+)\.(?= |$)", text)
-        assert said, text
+        match = re.search(r"The slider covers (\S+) to (\S+)\.(?= |$)", text)
+        match = match or re.search(r"(?:From|Above) (\S+) (?:to|below) (\S+)\.(?= |$)", text)
+        assert match, text
         near = pytest.approx((low, high), abs=(high - low) / 300)
-        assert (float(said[1]), float(said[2])) == near, text
+        assert (float(match[1]), float(match[2])) == near, text
 
 
 def test_keys_move_zoom_swap_and_undo(page):

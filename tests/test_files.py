@@ -163,9 +163,9 @@ def test_the_log_has_whole_lines_only(tmp_path):
     log = RunLog(path, {})
     log.add(outcome(0))
     before = path.read_bytes()
-    for room in (0, 1, 100):
+    for free_bytes in (0, 1, 100):
         with (
-            file_limit(len(before) + room),
+            file_limit(len(before) + free_bytes),
             pytest.raises(OutputError, match=r"run\.jsonl: cannot"),
         ):
             log.add(outcome(1))

@@ -474,7 +474,7 @@ def test_settings_that_draw_an_array(clpipe):
     options = ("--set", "mosaic.method=array", "--set", f"mosaic.array={choices}")
     clpipe("run", STILL_LIFE, "-o", "out", *options, "--device", "numpy", "--until", "mosaic")
     assert Path("out/still_life.exr").exists()
-    assert ARRAYS  # what clpipe check goes through
+    assert ARRAYS  # the arrays of clpipe check
     with pytest.raises(KeyedError):
         settings_from({"mosaic": {"method": "array", "pattern": "RGGB"}})
 

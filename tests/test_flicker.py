@@ -114,7 +114,7 @@ def test_each_frame_has_the_light_of_its_time(lit):
 
 @pytest.mark.slow
 def test_a_short_exposure_misses_the_pulse(lit):
-    # On for 2 of each 10 ms; exposed for 8, 2 and 0.5 ms, one behind the other.
+    # The lamp is on for 2 of each 10 ms. Exposures of 8, 2 and 0.5 ms follow each other.
     lamp = {"flicker_frequency": 100.0, "flicker_duty": 0.2, "exposure_time": 8e-3}
     noise = {"method": "staggered", "ratio": 4.0, "a": 0.0, "b": 0.0}
     given = {f"sensor_noise.{name}": value for name, value in noise.items()}

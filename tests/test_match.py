@@ -118,7 +118,7 @@ def test_noise_against_the_mean_of_a_burst_is_that_of_a_frame(burst):
     against_truth = figures_of(noise_of_frames(frames, truth), places)
     against_mean = figures_of(noise_of_frames(frames[:4], None), places)
     for name, column in COLUMNS.items():
-        # What is left of a frame beside the mean of few is skewed less, in both that are compared.
+        # A frame minus the mean of few frames is less skewed, so skew is excluded.
         if name not in TAILS and "skew" not in name and not np.isnan(against_truth[name]):
             assert abs(column.residual(against_mean[name], against_truth[name])) < 0.06, name
 

@@ -181,7 +181,7 @@ def test_what_files_claim(write_exr, tmp_path):
     four = np.zeros((4, 10, 4), np.float32)
     assert bytes_of(four, "R,G,B,A") == (6, 14)  # of all four, and of the three together
     assert bytes_of(pixels[..., :1], "Raw", half=False, mosaic=True) == (4, 4)
-    (tmp_path / "a.pfm").write_bytes(b"PF\n6000 4000\n-1.0\n")  # nothing behind it is looked at
+    (tmp_path / "a.pfm").write_bytes(b"PF\n6000 4000\n-1.0\n")  # only the header is read
     claim = claim_of(tmp_path / "a.pfm")
     assert (claim.width, claim.image, claim.reading) == (6000, 288_000_000, 576_000_000)
     assert claim_of(tmp_path / "missing.exr") is None

@@ -161,8 +161,8 @@ def test_px_and_mm_that_contradict_each_other_are_named(clpipe, write_exr):
 def test_what_counts_in_the_renders_pixels_comes_before_a_smaller_picture(later, parameter):
     (name,) = later
     settings = {"render": {"fx": 300.0, "cx": 90.0}, "resize": {"scale": 0.5}, **later}
-    said = f"{name}.{parameter}: found .*; list {name} before resize$"
-    with pytest.raises(RequestError, match=said):
+    message = f"{name}.{parameter}: found .*; list {name} before resize$"
+    with pytest.raises(RequestError, match=message):
         make_chain(settings_from({**settings, "stages": ["resize", name]}))
     make_chain(settings_from({**settings, "stages": [name, "resize"]}))
     make_chain(settings_from({**settings, "stages": ["resize", name], "resize": {"scale": 1.0}}))
@@ -240,8 +240,11 @@ def test_exif_has_it_wherever_it_is_stated(clpipe, point, stated):
 @pytest.mark.slow
 def test_what_an_exr_says_of_its_camera_is_taken_where_nothing_else_is_said(clpipe, point):
     with OpenEXR.File("in/a.exr", separate_channels=True) as file:
-        said = {"effectiveFocalLength": 35.0, "sensorOverallDimensions": np.float32([36, 24])}
-        header, channels = file.header() | said, {n: c.pixels for n, c in file.channels().items()}
+        attributes = {"effectiveFocalLength": 35.0, "sensorOverallDimensions": np.float32([36, 24])}
+        header, channels = (
+            file.header() | attributes,
+            {n: c.pixels for n, c in file.channels().items()},
+        )
     OpenEXR.File(header, channels).write("in/a.exr")
     clpipe(*RUN, *DEFOCUS, "-o", "o")
     assert spread_of(Path("o/a.exr")) == pytest.approx(disc(35, 0.5, 0.1), abs=0.3)

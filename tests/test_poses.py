@@ -275,7 +275,7 @@ def test_a_lens_that_is_fitted_for_nerfstudio(clpipe, renders):
     record = json.loads(Path("o/transforms.json").read_text())
     exact = json.loads(Path("o/a.json").read_text())["intrinsics"]
     width, height, d = record["w"], record["h"], exact["distortion"]
-    # Of points that the picture shows: nerfstudio's model, and OpenCV's.
+    # Compare nerfstudio's and OpenCV's models for points in the picture.
     x, y = np.mgrid[-1:1:41j, -1:1:41j] * np.array([width, height])[:, None, None] / exact["fx"]
     r2 = x * x + y * y
     k = sum(record[f"k{i}"] * r2**i for i in (1, 2, 3, 4))

@@ -1,8 +1,8 @@
-"""Random chains of random passes: what their plans make is what their passes say.
+"""Random chains of random passes: their plans produce the results of their passes.
 
-A plan is executed with symbols for images: each slot has the one that was written there last. So a
-slot that is reused too soon, a launch that reads what is not written yet, a pass that is left out,
-repeated or moved, all show as another symbol in a result. Some of the chains run on the device.
+The tests execute a plan with symbols for images. Each slot holds the symbol that was last written.
+A wrong plan gives another symbol in a result: a slot reused too early, a read before the write, or
+a pass that is skipped, repeated or moved. Some of the chains also run on the device.
 """
 
 from collections.abc import Callable
@@ -89,7 +89,7 @@ def pointwise(is_inlined: bool) -> dict[str, tuple[Pass, ...]]:
 
 
 def mirrored(image: np.ndarray, dx: int, dy: int) -> np.ndarray:
-    """What each pixel has so far from it."""
+    """Shift an image, mirrored at its borders."""
     reach = max(abs(dx), abs(dy))
     wide = np.pad(image, ((reach, reach), (reach, reach), (0, 0))[: image.ndim], "reflect")
     height, width = image.shape[:2]

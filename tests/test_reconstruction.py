@@ -204,8 +204,8 @@ def test_what_is_missing_or_wrong_is_named(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(tool, "NEEDED", ("numpy", "no_such_module"))
     monkeypatch.setattr("sys.argv", ["reconstruction", "-o", str(tmp_path)])
     assert tool.main() == 1
-    said = "no_such_module: missing; .venv/bin/pip install -e '.[compare]'\n"
-    assert capsys.readouterr().err == said
+    message = "no_such_module: missing; .venv/bin/pip install -e '.[compare]'\n"
+    assert capsys.readouterr().err == message
     monkeypatch.setattr(tool, "NEEDED", ())
     monkeypatch.setattr(
         "sys.argv", ["reconstruction", "-o", str(tmp_path), "--data", str(tmp_path)]

@@ -170,7 +170,7 @@ def test_a_package_whose_stage_cannot_be_loaded(tmp_path):
     assert "Traceback" not in done.stderr
 
 
-# What these name is no stage: a truth, an attribute of kept images, a kind, a key of cameras.json.
+# These names are not stages: a truth, an attribute of kept images, a kind, a key of cameras.json.
 NO_STAGES = {
     ("chain/rendition.py", "mosaic"),
     ("inputs/kept.py", "sensor_noise"),

@@ -30,7 +30,7 @@ def test_each_member_is_as_if_it_were_made_alone(clpipe, renders, tmp_path):
     for name in ("a.jpg", "b/c.jpg"):
         member = tmp_path / "all/canon-5d2/iso1600" / name
         assert member.read_bytes() == (tmp_path / "one" / name).read_bytes()
-    # A second run has nothing to do; another ISO is made beside those that are there.
+    # A second run only makes the pictures of the additional ISO.
     clpipe("run", "renders", "-o", "all", *NUMPY, *TWO[:4], "--iso", "100,1600,400")
     end = json.loads((tmp_path / "all/run.jsonl").read_text().splitlines()[-1])
     assert (end["done"], end["skipped"]) == (4, 8)

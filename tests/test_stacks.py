@@ -19,7 +19,7 @@ from clpipe.engine.runner import Result, Runner, cut_out, submit_together
 from clpipe.stage import Kind
 from tests.conftest import worker_of
 
-# Of each kind of launch: lines and stencils; a resampling, sums, a mosaic with a period.
+# These chains have each kind of launch: stencils, resampling, sums, a mosaic with a period.
 CHAINS = {
     "default": {"row_noise": {"sigma": 0.002}},
     "others": {

@@ -55,7 +55,7 @@ def test_each_layer_is_that_of_one_surface(geometry):
     same = (valid == 1) & (own[..., 0] == true_label)
     assert same.sum() > 0.95 * valid.sum() > 0.8 * valid.size
     relative = abs(z[..., 0] / true_z - 1)[same]
-    # On an edge between two surfaces it is a pixel's own, beside it.
+    # On an edge, each pixel has the depth of one surface.
     assert np.median(relative) < 1e-6 and (relative < 1e-4).mean() > 0.93
     assert relative.max() < 0.05  # never between two
     assert abs(n - true_n)[same].max() < 1e-6 or (abs(n - true_n)[same] < 1e-6).mean() > 0.99

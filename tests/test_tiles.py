@@ -312,7 +312,7 @@ def test_memory_that_is_not_there_all_the_same(device, monkeypatch, call):
             patch.setattr(cl, call, scarce)
             yield
 
-    # Room for the image alone, but not beside what the larger one has left behind.
+    # The memory suffices for the image, but not together with the larger image's buffers.
     enough = sum(buffer_sizes(plan, whole_image(plan, 203, 150, 8)).values())
     for size, tries in ((enough, 1), (enough // 3, 3), (enough // 9, 5)):
         with left(size):

@@ -57,11 +57,11 @@ def test_a_cpu_uses_an_image_where_it_is(runner, copied):
     expected = Runner(runner.chain, None).run(image, "k").encoded
     assert np.abs(into.astype(int) - expected).max() <= 1
     assert not copied
-    room = np.zeros((60, 40, 3), np.float16)  # rows behind the image, for whole blocks
-    room[:37] = image[:37, :40]
-    whole = runner.run(room[:37].copy(), "k").encoded
+    padded = np.zeros((60, 40, 3), np.float16)  # with rows after the image, for whole blocks
+    padded[:37] = image[:37, :40]
+    whole = runner.run(padded[:37].copy(), "k").encoded
     assert len(copied) == 1
-    assert np.array_equal(runner.run(room[:37], "k").encoded, whole)
+    assert np.array_equal(runner.run(padded[:37], "k").encoded, whole)
     assert len(copied) == 1
 
 

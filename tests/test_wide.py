@@ -261,7 +261,7 @@ def test_overlapping_views_and_what_no_view_shows(write, clpipe):
     assert shown[np.isfinite(rays[0]) & band].all()
     off = np.abs(seen - light(rays))[shown]
     assert np.percentile(off, 99) < 0.004
-    assert off.max() < 0.02  # beside the outermost half pixels of a view
+    assert off.max() < 0.02  # next to the outermost half pixels of a view
     views[1]["t"] = [0, 0, 1]
     Path("rig.json").write_text(json.dumps({"views": views}))
     output = clpipe("run", "in", "-o", "q", *RUN, *options, status=2).output
