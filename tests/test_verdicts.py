@@ -187,7 +187,7 @@ def test_what_fails_is_passed_over_and_what_helps_is_said(device, monkeypatch):
     gone = Verdicts(platforms={platform_id(platform): "it crashes the process (SIGABRT)"})
     monkeypatch.setattr(discovery, "verdicts", lambda *_, **__: gone)
     monkeypatch.setattr(cl.Platform, "get_devices", lambda _: pytest.fail("it would end here"))
-    assert "when queried for its devices, it crashes" in find_devices()[0].problem
+    assert "when asked for its devices, it crashes" in find_devices()[0].problem
     monkeypatch.setattr(discovery, "verdicts", lambda *_, **__: Verdicts(listing="it ends"))
     with pytest.raises(DeviceError, match=r"listed: it ends. On this machine, try"):
         find_devices()
