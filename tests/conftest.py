@@ -52,31 +52,31 @@ WRITTEN = "2026:01:01 00:00:00"  # the time in a file is a part of what its nois
 
 
 def written(folder: Path) -> list[str]:
-    """The files in a folder at any depth, sorted, but for the run's log."""
+    """Return the files below a folder, sorted, without the run's log."""
     files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
     return sorted(files - {"run.jsonl"})
 
 
 def contents(folder: str | Path) -> dict[str, bytes]:
-    """Each file's bytes, by its name, but for the run's log."""
+    """Return the bytes of each file by its name, without the run's log."""
     return {name: (Path(folder) / name).read_bytes() for name in written(Path(folder))}
 
 
 def statuses(folder: str | Path) -> dict[str, str]:
-    """What the last run in a folder made of each image, by its log."""
+    """Return the log's outcome of each image in the last run."""
     lines = read_log(Path(folder) / "run.jsonl")
     last = max(i for i, line in enumerate(lines) if line["event"] == "start")
     return {line["name"]: line["status"] for line in lines[last:] if line["event"] == "image"}
 
 
 def same_samples(one: Mapping[str, Any], two: Mapping[str, Any]) -> None:
-    """See that two samples of a dataset are equal."""
+    """Check that two samples of a dataset are equal."""
     assert one.keys() == two.keys()
     assert all(np.array_equal(one[name], two[name]) for name in one)
 
 
 def run_cli(*arguments: object, status: int | tuple[int, ...] = 0) -> ClickResult:
-    """The command line: arguments in, the result out, its status checked."""
+    """Run the command line, check its status, and return the result."""
     result = CliRunner().invoke(main, [str(a) for a in arguments])
     if result.exception and not isinstance(result.exception, SystemExit):
         raise result.exception
@@ -86,14 +86,14 @@ def run_cli(*arguments: object, status: int | tuple[int, ...] = 0) -> ClickResul
 
 
 def cli_output(*arguments: object, status: int = 0) -> str:
-    """What the command line prints."""
+    """Return the output of the command line."""
     return run_cli(*arguments, status=status).output
 
 
 def run_python(
     *words: object, cwd: str | Path | None = None, status: int | None = 0, **environment: object
 ) -> "subprocess.CompletedProcess[str]":
-    """Run Python in a process of its own that finds this clpipe, and check its status.
+    """Run Python in a process that finds this clpipe, and check its status.
 
     Args:
         words: what stands behind ``python`` on its command line.
@@ -140,12 +140,12 @@ def noise_report(*sigmas: float, **changes: Any) -> dict[str, Any]:
 
 
 def reseal(path: Path, values: Mapping[str, Any]) -> None:
-    """Write a sidecar with values of one's own and the digest that fits them, as a forger can."""
+    """Write a sidecar with forged values and a valid digest."""
     path.write_bytes(sealed({key: value for key, value in values.items() if key != SEAL}))
 
 
 def worker_of(folder: Path, out: str = "out", **options: Any) -> tuple[ImageWorker, list[Job]]:
-    """A worker that makes PNGs of the renders in "in" of a folder, and its jobs."""
+    """Return a worker that develops the renders in "in" to PNGs, and its jobs."""
     request, made = Request.from_options(formats=("png",), **options), folder / out
     made.mkdir(exist_ok=True)
     loader, jobs = ImageLoader(request), find_jobs([str(folder / "in")], made)
@@ -155,7 +155,7 @@ def worker_of(folder: Path, out: str = "out", **options: Any) -> tuple[ImageWork
 
 @contextmanager
 def file_limit(size: int) -> Iterator[None]:
-    """Let no file grow beyond a size in bytes, as a full disk does."""
+    """Limit the size of files in bytes, like a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -165,7 +165,7 @@ def file_limit(size: int) -> Iterator[None]:
 
 
 def fail_launches(monkeypatch: pytest.MonkeyPatch, error: BaseException, *numbers: int) -> None:
-    """Have launches of kernels fail, by their numbers from now on."""
+    """Make kernel launches fail by their numbers, counted from now."""
     launch, count = cl.enqueue_nd_range_kernel, itertools.count()
 
     def launched(*arguments: Any, **options: Any) -> cl.Event:
@@ -178,7 +178,7 @@ def fail_launches(monkeypatch: pytest.MonkeyPatch, error: BaseException, *number
 
 @pytest.fixture
 def launches(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
-    """The global sizes of the launches from now on."""
+    """Record the global sizes of the following launches."""
     seen, launch = [], cl.enqueue_nd_range_kernel
 
     def launched(queue: Any, kernel: Any, size: Any, *rest: Any, **options: Any) -> cl.Event:
@@ -207,13 +207,13 @@ def device() -> Iterator[Device]:
 
 @pytest.fixture(scope="session")
 def scalar_device(device: Device) -> Device:
-    """The same device as if it were a GPU: one lane, so the kernels are plain scalar code."""
+    """Return the device with one lane, like a GPU, so kernels are scalar code."""
     return Device(replace(device.info, lanes=1))
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of additional files whose licences do not let clpipe ship them."""
+    """The folder of additional files whose licences do not allow redistribution."""
     if not SHARED.is_dir():
         pytest.skip("needs the files in ../shared/data that tests/data/README.md lists")
     return SHARED
@@ -287,7 +287,7 @@ def renders(
 
 @pytest.fixture(scope="session")
 def two_renders(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two small renders, one of them in a folder of the folder."""
+    """Two small renders, one of them in a subfolder."""
     folder = tmp_path_factory.mktemp("explore") / "renders"
     (folder / "left").mkdir(parents=True)
     y, x = np.mgrid[0:63, 0:96] / 96
@@ -306,7 +306,7 @@ def clpipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Cli
 
 @pytest.fixture
 def browser_page() -> Iterator[Any]:
-    """A page of Chromium, which says nothing on its console.
+    """A Chromium page whose console must stay empty.
 
     But for a line of Chromium's own for each answer with status 400, which is a refusal that the
     page shows.
@@ -318,9 +318,9 @@ def browser_page() -> Iterator[Any]:
     with playwright.sync_playwright() as play:
         browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1400, "height": 900})
-        said: list[str] = []
-        page.on("console", lambda message: said.append(message.text))
-        page.on("pageerror", lambda error: said.append(str(error)))
+        console: list[str] = []
+        page.on("console", lambda message: console.append(message.text))
+        page.on("pageerror", lambda error: console.append(str(error)))
         yield page
-        assert [text for text in said if "status of 400" not in text] == []
+        assert [text for text in console if "status of 400" not in text] == []
         browser.close()

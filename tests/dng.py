@@ -1,4 +1,4 @@
-"""A DNG writer for tests, which also writes what no camera should."""
+"""A DNG writer for tests, which can also write invalid values."""
 
 import struct
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""An EXR writer for tests, which also writes what no program should: sizes that are not there."""
+"""An EXR writer for tests, which can also write invalid sizes."""
 
 import struct
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def exr(channels, width, height, display=None, attributes=()):
-    """An uncompressed EXR of half channels, {name: (plane, sampling)}, sizes as claimed."""
+    """Return an EXR of half channels, {name: (plane, sampling)}, with a claimed size."""
 
     def attribute(name, kind, data):
         return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(data)) + data

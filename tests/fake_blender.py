@@ -54,25 +54,25 @@ def render(path, name, width, height):
 
 def main():
     with open(sys.argv[-1], encoding="utf-8") as file:
-        asked = json.load(file)
-    with open(asked["scene"], encoding="utf-8") as file:
+        request = json.load(file)
+    with open(request["scene"], encoding="utf-8") as file:
         scene = file.read().strip()
     print("Blender 4.9.9 (fake)")
     if scene.startswith("refuse: "):
         tell("refused", message=scene.removeprefix("refuse: "))
         sys.exit(1)
-    width, height = asked["resolution"] or (24, 16)
-    cameras = [camera(name, width, height) for name in names(asked["views"])]
+    width, height = request["resolution"] or (24, 16)
+    cameras = [camera(name, width, height) for name in names(request["views"])]
     objects = {"1": ["floor"], "2": ["ball", "ball.001"]}
     layers = ["Depth", "Normal", "IndexOB"]
     notes = ["3 of 9 places see too little"] if scene == "a maze" else []
-    said = {"objects": objects, "layers": layers, "unit_metres": 0.1, "notes": notes}
-    tell("scene", blender="4.9.9", views=cameras, **said)
+    facts = {"objects": objects, "layers": layers, "unit_metres": 0.1, "notes": notes}
+    tell("scene", blender="4.9.9", views=cameras, **facts)
     for number, each in enumerate(cameras):
         if scene == f"die after {number}":
             print("Segmentation fault (not really)")
             sys.exit(11)
-        path = os.path.join(asked["folder"], each["file"])
+        path = os.path.join(request["folder"], each["file"])
         began = time.perf_counter()
         if is_new := not os.path.exists(path):
             render(path, each["file"].removesuffix(".exr"), width, height)

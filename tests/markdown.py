@@ -37,7 +37,7 @@ SHELL = re.compile(r"[$|;&<`(){}\n]")  # outside of quotes: what only a shell un
 
 @dataclass(frozen=True)
 class Block:
-    """A code block, where it stands, and what a comment before it says."""
+    """A code block with its position and the comment before it."""
 
     page: Path
     line: int
@@ -49,17 +49,17 @@ class Block:
 
     @property
     def place(self) -> str:
-        """Where it stands, for messages."""
+        """The position for messages."""
         return f"{self.page.relative_to(ROOT)}, line {self.line}"
 
     @property
     def missing(self) -> list[str]:
-        """The modules that it needs and that are not installed."""
+        """The required modules that are not installed."""
         return [name for name in self.needs if find_spec(name) is None]
 
 
 def blocks(page: Path) -> list[Block]:
-    """The code blocks of a page, in order."""
+    """Return the code blocks of a page in order."""
     text = page.read_text()
     found = []
     for match in BLOCK.finditer(text):
@@ -79,7 +79,7 @@ def blocks(page: Path) -> list[Block]:
 
 
 def commands(script: str) -> Iterator[str]:
-    """The lines of a script without comments, continued ones as one."""
+    """Return the lines of a script without comments, with continued lines joined."""
     for line in script.replace("\\\n", " ").splitlines():
         if text := re.sub(r"(^|\s)#.*", "", line).strip():
             yield text
@@ -124,7 +124,7 @@ class PageRunner:
             self._script(block)
 
     def _validate(self, block: Block) -> None:
-        """See that it is a configuration or a profile; other TOML must be TOML."""
+        """Check that a TOML block is a configuration or a profile, or at least valid TOML."""
         values = tomllib.loads(block.text)
         if "project" in values:
             return
@@ -144,7 +144,7 @@ class PageRunner:
                 self._shell(block, line)
 
     def _command(self, line: str) -> None:
-        """Run a line that needs no shell but for globs and ``> FILE``."""
+        """Run a line that uses no shell features except globs and ``> FILE``."""
         words: list[str] = []
         for word in shlex.split(line, posix=False)[1:]:
             found = [] if word[0] in "'\"" else sorted(glob(word, root_dir=self._folder))

@@ -1,7 +1,7 @@
-"""Every method of every stage, for tests that go over all of them or over some of each kind.
+"""Every method of every stage, for tests of all methods or of one method of each kind.
 
-Methods whose passes touch pixels in the same ways differ in arithmetic alone. Where a test is about
-the ways, one method for each is enough; the others are marked slow.
+Methods with the same access pattern differ only in arithmetic. Tests of access patterns need one
+method of each kind; the others are marked slow.
 """
 
 import pytest
@@ -12,7 +12,7 @@ from clpipe.engine.check import chain_for
 METHODS = [(stage, method) for stage in all_stages().values() for method in stage.methods]
 
 
-def ways(stage, method):
+def access_pattern(stage, method):
     """Return how the passes of a method touch pixels, and whether it is for any filter array."""
     accesses = [pass_.access for pass_ in chain_for(stage, method, {}, "GRBG").steps[0].passes]
     shapes = ("bins", "vectors_per_row")
@@ -21,7 +21,7 @@ def ways(stage, method):
 
 
 # The first of each way.
-REPRESENTATIVES = [*{ways(*each): each for each in reversed(METHODS)}.values()]
+REPRESENTATIVES = [*{access_pattern(*each): each for each in reversed(METHODS)}.values()]
 
 ALL = [
     pytest.param(

@@ -1,4 +1,4 @@
-"""--annotations: those of COCO, KITTI and BOP go where the pixels go."""
+"""--annotations: COCO, KITTI and BOP annotations are warped with the pixels."""
 
 import json
 import shutil
@@ -30,7 +30,7 @@ SHAPES = {
 
 
 def mask_of(points, beyond=0):
-    """The share of each pixel that an outline covers, by 8x8 places in it."""
+    """Return the share of each pixel inside an outline, by 8x8 samples per pixel."""
     height, width = HEIGHT + 2 * beyond, WIDTH + 2 * beyond
     y, x = (np.mgrid[: height * 8, : width * 8] + 0.5) / 8 - beyond
     inside = np.zeros(x.shape, bool)
@@ -43,7 +43,7 @@ def mask_of(points, beyond=0):
 
 @pytest.fixture
 def coco(write_exr):
-    """A render of each shape in a channel of its own, and annotations of all kinds."""
+    """A render with a channel for each shape, and annotations of all kinds."""
     masks = np.stack([mask_of(points) for points in SHAPES.values()], -1).astype(np.float32)
     write_exr("in/a.exr", masks, half=False)
     annotations = [
@@ -70,12 +70,12 @@ def coco(write_exr):
 
 def read_back(folder="o"):
     path = Path(folder) / "annotations.json"
-    told = COCO(str(path))
-    return told, [told.anns[number] for number in sorted(told.anns)]
+    coco = COCO(str(path))
+    return coco, [coco.anns[number] for number in sorted(coco.anns)]
 
 
 def seen(path):
-    """What the picture shows of each shape, linear."""
+    """Return the linear picture of each shape."""
     with Image.open(path) as image:
         codes = np.asarray(image, np.float64) / 255
     return np.where(codes > 0.04045, ((codes + 0.055) / 1.055) ** 2.4, codes / 12.92)
@@ -85,14 +85,14 @@ def seen(path):
 def test_outlines_lie_where_the_picture_has_the_shapes(clpipe, coco, way):
     options = {"barrel": BARREL, "smaller": ("--set", "resize.scale=0.6")}.get(way, ())
     clpipe("run", "in/a.exr", "-o", "o", *RUN, *PLAIN, *options)
-    told, found = read_back()
+    coco, found = read_back()
     picture = seen("o/a.png")
     height, width = picture.shape[:2]
-    (image,) = told.imgs.values()
+    (image,) = coco.imgs.values()
     assert (image["file_name"], image["width"], image["height"]) == ("a.png", width, height)
     assert image["license"] == 3
     for channel, each in enumerate(found[:3]):
-        own = told.annToMask(each).astype(float)
+        own = coco.annToMask(each).astype(float)
         shown = picture[..., channel]
         perimeter = 2 * sum(each["bbox"][2:])
         # COCO's masks are of whole pixels: half a pixel along the outline, at most.
@@ -102,7 +102,7 @@ def test_outlines_lie_where_the_picture_has_the_shapes(clpipe, coco, way):
         x, y, w, h = each["bbox"]
         assert abs(np.array([x, y]) - [columns.min(), rows.min()]).max() < 1
         assert abs(np.array([x + w, y + h]) - [columns.max() + 1, rows.max() + 1]).max() < 1
-    of_mask = told.annToMask(found[3])
+    of_mask = coco.annToMask(found[3])
     assert np.mean(of_mask != (picture[..., 0] > 0.5)) < 0.01
     assert found[3]["area"] == of_mask.sum() and found[3]["iscrowd"] == 1
     assert found[0]["truncated"] == 0 and 0.01 < found[1]["truncated"] < 0.3
@@ -117,38 +117,38 @@ def test_what_overscan_shows_is_annotated(clpipe, coco, write_exr):
     window = {"x": -24, "y": -24, "full_width": WIDTH, "full_height": HEIGHT}
     write_exr("in/a.exr", masks, half=False, **window)
     clpipe("run", "in/a.exr", "-o", "o", *RUN, *PLAIN, *BARREL, "--set", "distortion.k1=-0.18")
-    told, found = read_back()
+    coco, found = read_back()
     picture = seen("o/a.png")
     assert picture.shape[:2] == (HEIGHT, WIDTH)
     for channel, each in enumerate(found[:3]):
         shown = picture[..., channel]
-        assert abs(told.annToMask(each) - shown).sum() < sum(each["bbox"][2:])
+        assert abs(coco.annToMask(each) - shown).sum() < sum(each["bbox"][2:])
         assert each["area"] == pytest.approx(shown.sum(), rel=0.02)
     assert found[1]["truncated"] < 0.02  # what was cut off lies in the picture now
-    assert np.mean(told.annToMask(found[3]) != (picture[..., 0] > 0.5)) < 0.01
+    assert np.mean(coco.annToMask(found[3]) != (picture[..., 0] > 0.5)) < 0.01
 
 
 @pytest.mark.slow
 def test_patches_have_their_own(clpipe, coco):
     patches = ("--patch", 48, "--patches-per-image", 12, "--augment", "--seed", 3)
     clpipe("run", "in/a.exr", "-o", "o", *RUN, *PLAIN, *BARREL, *patches)
-    told, found = read_back()
-    assert len(told.imgs) == 12 and {i["width"] for i in told.imgs.values()} == {48}
+    coco, found = read_back()
+    assert len(coco.imgs) == 12 and {i["width"] for i in coco.imgs.values()} == {48}
     checked = 0
     for each in found:
-        picture = seen(Path("o") / told.imgs[each["image_id"]]["file_name"])
+        picture = seen(Path("o") / coco.imgs[each["image_id"]]["file_name"])
         if isinstance(each.get("segmentation"), list):
             shown = max((picture[..., c].sum(), c) for c in range(3))
-            overlap = [abs(told.annToMask(each) - picture[..., c]).sum() for c in range(3)]
+            overlap = [abs(coco.annToMask(each) - picture[..., c]).sum() for c in range(3)]
             assert min(overlap) < 0.6 * 2 * sum(each["bbox"][2:]), shown
             checked += 1
         if isinstance(each.get("segmentation"), dict):
-            assert abs(told.annToMask(each) - picture[..., 0]).sum() < 60
+            assert abs(coco.annToMask(each) - picture[..., 0]).sum() < 60
     assert checked >= 8
     named = {each["image_id"] for each in found}
-    empty = [number for number in told.imgs if number not in named]
+    empty = [number for number in coco.imgs if number not in named]
     for number in empty:
-        assert seen(Path("o") / told.imgs[number]["file_name"]).max() < 0.5
+        assert seen(Path("o") / coco.imgs[number]["file_name"]).max() < 0.5
 
 
 def test_patches_of_a_burst_are_named_as_their_files(clpipe, coco):
@@ -164,8 +164,11 @@ def test_each_series_and_a_resumed_run_have_theirs(clpipe, coco):
     clpipe(*run, *BARREL)
     one, other = (Path(f"o/iso{n}/annotations.json").read_bytes() for n in (100, 800))
     assert one == other
-    said = clpipe(*run, *BARREL).stderr
-    assert "there already" in said and "wrote o/iso800/annotations.json: 5 annotations of 1" in said
+    stderr = clpipe(*run, *BARREL).stderr
+    assert (
+        "there already" in stderr
+        and "wrote o/iso800/annotations.json: 5 annotations of 1" in stderr
+    )
     assert Path("o/iso800/annotations.json").read_bytes() == other
 
 
@@ -204,8 +207,8 @@ AS_KITTI += ("--annotations", "kitti/label_2")
 
 def test_kittis_labels_and_calibration(clpipe, kitti):
     smaller = ("--set", "resize.scale=0.5")
-    said = clpipe("run", "in/a.exr", "-o", "o", *AS_KITTI, *PLAIN, *smaller).stderr
-    assert "wrote o/label_2, o/calib: 4 annotations of 1 pictures" in said
+    stderr = clpipe("run", "in/a.exr", "-o", "o", *AS_KITTI, *PLAIN, *smaller).stderr
+    assert "wrote o/label_2, o/calib: 4 annotations of 1 pictures" in stderr
     for line, now in zip(kitti, labels("o/label_2/a.txt"), strict=True):
         before = line.split()
         box = (np.array(before[4:8], float) + 0.5) / 2 - 0.5
@@ -248,8 +251,8 @@ def test_kittis_boxes_go_through_a_lens_and_into_patches(clpipe, kitti):
     ]
     assert len(boxes) > 4
     assert all((box >= 0).all() and (box <= 48).all() for box in boxes)
-    said = clpipe("run", "in/a.exr", "-o", "q", *AS_KITTI, *PLAIN, *patches, "--augment").stderr
-    assert "flipped and rotated patches have no poses" in said
+    stderr = clpipe("run", "in/a.exr", "-o", "q", *AS_KITTI, *PLAIN, *patches, "--augment").stderr
+    assert "flipped and rotated patches have no poses" in stderr
 
 
 AS_BOP = ("--device", "numpy", "--skip", "noise", "--format", "png")
@@ -258,7 +261,7 @@ AS_BOP += ("--annotations", "bop/scene_gt.json", *PLAIN, *BARREL, "--set", "resi
 
 @pytest.fixture
 def bop(write_exr):
-    """A scene of three objects, the last beside the picture; its files by name, its masks."""
+    """A scene of three objects, the last outside the picture: files by name, and masks."""
     masks = np.stack([mask_of(points) for points in SHAPES.values()], -1).astype(np.float32)
     write_exr("in/000003.exr", masks, half=False)
     visible = masks[..., 0] * (np.arange(WIDTH) < 50)
@@ -287,8 +290,8 @@ def bop(write_exr):
 
 def test_bops_scene(clpipe, coco, bop):
     write, _ = bop
-    said = clpipe("run", "in/000003.exr", "-o", "o", *AS_BOP).stderr
-    assert "2 annotations of 1 pictures" in said
+    stderr = clpipe("run", "in/000003.exr", "-o", "o", *AS_BOP).stderr
+    assert "2 annotations of 1 pictures" in stderr
     read = {name: json.loads(Path(f"o/{name}.json").read_text())["3"] for name in write}
     assert read["scene_gt"] == write["scene_gt"][:2]
     shown = seen("o/000003.png")[..., 0] > 0.5
@@ -316,8 +319,8 @@ def test_bops_masks_are_of_all_or_of_none(clpipe, coco, bop):
     clpipe("run", "in/000003.exr", "-o", "o", *AS_BOP)
     with_mask = json.loads(Path("o/scene_gt_info.json").read_text())["3"][1]
     Path("bop/mask/000003_000001.png").unlink()
-    said = clpipe("run", "in/000003.exr", "-o", "p", *AS_BOP, status=2).stderr
-    assert "3[1]: found no bop/mask/000003_000001.png; expected masks for all objects" in said
+    stderr = clpipe("run", "in/000003.exr", "-o", "p", *AS_BOP, status=2).stderr
+    assert "3[1]: found no bop/mask/000003_000001.png; expected masks for all objects" in stderr
     for kind in bop[1]:
         shutil.rmtree(Path("bop", kind))
     clpipe("run", "in/000003.exr", "-o", "p", *AS_BOP)
@@ -330,12 +333,12 @@ def test_annotations_of_another_size_are_told(clpipe, coco):
     coco["images"][0]["width"] = 100
     del coco["annotations"][3]  # a mask, which is refused
     Path("coco.json").write_text(json.dumps(coco))
-    said = clpipe("run", "in", "-o", "o", *RUN).stderr
-    assert "the annotations are for a render of 100x120 pixels" in said
+    stderr = clpipe("run", "in", "-o", "o", *RUN).stderr
+    assert "the annotations are for a render of 100x120 pixels" in stderr
     coco["images"][0]["file_name"] = "b.jpg"
     Path("coco.json").write_text(json.dumps(coco))
-    said = clpipe("run", "in", "-o", "o", *RUN).stderr
-    assert "1 picture is not annotated, because coco.json does not list" in said
+    stderr = clpipe("run", "in", "-o", "o", *RUN).stderr
+    assert "1 picture is not annotated, because coco.json does not list" in stderr
 
 
 def first(coco, **values):
@@ -381,8 +384,8 @@ def mask_with(counts, size=(HEIGHT, WIDTH)):
 def test_coco_files_that_are_none(clpipe, coco, damage, message):
     damage(coco)
     Path("coco.json").write_text(json.dumps(coco))
-    said = clpipe("run", "in", "-o", "o", *RUN, status=2).stderr
-    assert message in said
+    stderr = clpipe("run", "in", "-o", "o", *RUN, status=2).stderr
+    assert message in stderr
     assert not Path("o").exists()
 
 
@@ -410,7 +413,7 @@ def test_files_that_are_of_no_format(clpipe, write_exr, name, text, message):
     path.write_text(text)
     path.with_name("scene_camera.json").write_text('{"3": {"cam_K": [1, 2]}}')
     path.with_name("scene_gt_info.json").write_text(f'{{"4": [{{"px_count_all": {10**400}}}]}}')
-    asked = path if path.suffix == ".json" else path.parent
-    said = clpipe("run", "in", "-o", "o", "--annotations", asked, status=2).stderr
-    assert message in said
+    target = path if path.suffix == ".json" else path.parent
+    stderr = clpipe("run", "in", "-o", "o", "--annotations", target, status=2).stderr
+    assert message in stderr
     assert not Path("o").exists()

@@ -1,4 +1,4 @@
-"""The Python API, as somebody who imports clpipe sees it."""
+"""The Python API, as a user imports it."""
 
 from concurrent.futures import ThreadPoolExecutor
 

@@ -1,4 +1,4 @@
-"""Arrays of all kinds for the Python API: taken where they are plain, else told what helps."""
+"""Arrays for the Python API: plain ones are accepted, others rejected with a hint."""
 
 import numpy as np
 import pytest

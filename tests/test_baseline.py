@@ -1,4 +1,4 @@
-"""Baselines: independent noise on the clean picture, as strong as what the noisy picture has."""
+"""Baselines: independent noise of the noisy picture's strength on the clean picture."""
 
 import json
 
@@ -35,11 +35,11 @@ def test_it_is_as_strong_as_the_pictures_noise_and_independent(clpipe, render, t
         name: picture(tmp_path / f"out/view{name}.png")
         for name in ("", ".truth", ".truth_clean", ".iid", ".intensity")
     }
-    wanted = (out[""] - out[".truth"]).var((0, 1))
-    assert (wanted > 1).all()
+    expected = (out[""] - out[".truth"]).var((0, 1))
+    assert (expected > 1).all()
     for baseline in (".iid", ".intensity"):
         noise = out[baseline] - out[".truth_clean"]
-        assert noise.var((0, 1)) == pytest.approx(wanted, rel=0.04)
+        assert noise.var((0, 1)) == pytest.approx(expected, rel=0.04)
         flat = noise[2:38, 40:80]
         assert abs(np.corrcoef(flat[:, 1:].ravel(), flat[:, :-1].ravel())[0, 1]) < 0.05
     # The one is the same everywhere, the other as large at each intensity as the picture's own.

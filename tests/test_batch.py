@@ -1,4 +1,4 @@
-"""Many images: resuming, failing alone, being stopped, being looked at."""
+"""Batches: resuming, failing images, interruption, progress."""
 
 import contextlib
 import errno
@@ -186,9 +186,9 @@ def test_devices_develop_at_the_same_time(renders, tmp_path, monkeypatch):
     (tmp_path / "out").mkdir()
     start, both = ImageWorker.start, threading.Barrier(2)
 
-    def together(self, asked):
+    def together(self, submitted):
         both.wait(GUARD)  # for the other device's image
-        return start(self, asked)
+        return start(self, submitted)
 
     monkeypatch.setattr(ImageWorker, "start", together)
     worker, jobs = worker_of(tmp_path)
@@ -348,8 +348,8 @@ def test_a_trace_that_cannot_be_written_stops_no_image(clpipe, renders, monkeypa
 
     monkeypatch.setattr(Trace, "_events", full)
     run = ("run", renders(3), "-o", "out", "--device", "numpy", "--stages", "exposure,gamma")
-    told = clpipe(*run, "--trace", "t.json", status=1).stderr
-    assert "t.json: cannot be written: No space left on device" in told
+    stderr = clpipe(*run, "--trace", "t.json", status=1).stderr
+    assert "t.json: cannot be written: No space left on device" in stderr
     assert len(written(Path("out"))) == 6
     assert not list(Path().glob("*t.json"))
 
@@ -364,10 +364,10 @@ def test_a_disk_without_room_is_no_problem_where_all_is_done(clpipe, renders, mo
 
     monkeypatch.setattr(os, "posix_fallocate", full)
     assert "2 of them were there already" in clpipe("run", "in", *RUN, *options).stderr
-    told = clpipe("run", "in", *RUN, *options, "--seed", 7, status=1).stderr
+    stderr = clpipe("run", "in", *RUN, *options, "--seed", 7, status=1).stderr
     assert (
         "out: cannot write to this directory: No space left on device (8.0 MiB are needed); "
-        in told
+        in stderr
     )
     assert {name: data for name, data in contents("out").items() if name in before} == before
 
@@ -737,7 +737,7 @@ def test_a_replay_with_other_bytes_says_what_was_different(clpipe, renders):
 
 
 class Panic(BaseException):
-    """As extensions written in Rust raise it."""
+    """An exception like those of Rust extensions."""
 
 
 # Where an image is decoded, developed and encoded.
@@ -773,10 +773,10 @@ def test_what_nobody_expected_fails_its_image_alone(
     run = ("run", "in", "-o", "out", "--device", "numpy", "--stages", "exposure,gamma")
     with monkeypatch.context() as patch, caplog.at_level(logging.DEBUG, "clpipe.batch.job_state"):
         patch.setattr(owner, name, planted)
-        told = clpipe(*run, status=1).stderr
+        stderr = clpipe(*run, status=1).stderr
     (failed,) = [key for key, status in statuses("out").items() if status == "failed"]
-    assert f"clpipe: in/{failed}: {text}" in told
-    assert "5 of 6 images done, 1 failed" in told
+    assert f"clpipe: in/{failed}: {text}" in stderr
+    assert "5 of 6 images done, 1 failed" in stderr
     assert not [name for name in written(Path("out")) if name.startswith(failed[:4])]
     records = [r for r in caplog.records if r.name == "clpipe.batch.job_state"]
     assert [r.levelname for r in records] == ["DEBUG"] * (not isinstance(error, MemoryError))
@@ -802,7 +802,7 @@ def test_a_thread_that_dies_ends_the_run(renders, tmp_path, monkeypatch):
                 caught.append(str(error))
 
         with monkeypatch.context() as patch:
-            patch.setattr(JobState, "outcome", die)  # of what is done behind an image's back
+            patch.setattr(JobState, "outcome", die)  # an error in the scheduling of images
             thread = threading.Thread(target=run, args=(Batch(worker, [None], 1),), daemon=True)
             thread.start()
             thread.join(GUARD)
@@ -816,13 +816,13 @@ def test_what_a_device_leaves_another_does(renders, tmp_path, monkeypatch, caplo
     worker, jobs = worker_of(tmp_path)
     broken, is_broken = [], threading.Event()
 
-    def start(self, asked):
+    def start(self, submitted):
         if threading.current_thread().name == "device 0":
-            broken.append(asked[0][0].job)
+            broken.append(submitted[0][0].job)
             is_broken.set()
             raise DeviceError("it is given up")
         assert is_broken.wait(GUARD)
-        return right(self, asked)
+        return right(self, submitted)
 
     right = ImageWorker.start
     monkeypatch.setattr(ImageWorker, "start", start)
@@ -838,7 +838,7 @@ def test_what_a_device_leaves_another_does(renders, tmp_path, monkeypatch, caplo
 
 @pytest.mark.parametrize(("budget", "together"), [(1, 1), (2, 2), (100, 4)])
 def test_images_wait_for_memory(renders, tmp_path, monkeypatch, budget, together):
-    """As many images as fit are in memory at a time: they wait for each other, and no more come."""
+    """Only as many images as fit are in memory at a time; the others wait."""
     renders(12)
     (tmp_path / "out").mkdir()
     worker, jobs = worker_of(tmp_path)

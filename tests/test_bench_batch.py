@@ -40,9 +40,9 @@ def test_the_table(clpipe, short):
     assert "6 of 32x24" in text and "5 of 40x17" in text and "hash" in text and "busy" in text
 
 
-@pytest.mark.parametrize("asked", ["--start-at normalize", "-c unprocess"])
-def test_images_are_of_the_kind_that_the_chain_starts_on(clpipe, short, asked):
-    result = json.loads(clpipe("bench", "--batch", "--json", *asked.split()).stdout)
+@pytest.mark.parametrize("options", ["--start-at normalize", "-c unprocess"])
+def test_images_are_of_the_kind_that_the_chain_starts_on(clpipe, short, options):
+    result = json.loads(clpipe("bench", "--batch", "--json", *options.split()).stdout)
     assert [b["images"] for b in result["batches"]] == [6, 5]
 
 

@@ -48,7 +48,7 @@ SETTINGS = {"camera": "", "look": "default", "iso": 1600, "seed": 3, "keep_raw":
 
 @pytest.fixture(scope="module")
 def extension(tmp_path_factory):
-    """The extension with wheels that hold nothing."""
+    """The extension with empty wheels."""
     folder = tmp_path_factory.mktemp("extension")
     for name, file in WHEELS.items():
         with zipfile.ZipFile(folder / name, "w") as wheel:
@@ -60,22 +60,22 @@ def extension(tmp_path_factory):
 
 @pytest.fixture
 def settings():
-    """Settings as the panel's, with some changed."""
+    """Return the panel's settings with some changes."""
     return lambda **changed: development.Settings(**SETTINGS | changed)
 
 
 def test_manifest_says_what_is_packed(extension):
     with zipfile.ZipFile(extension) as packed:
         names = packed.namelist()
-        said = tomllib.loads(packed.read("blender_manifest.toml").decode())
+        record = tomllib.loads(packed.read("blender_manifest.toml").decode())
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert said["schema_version"] == "1.0.0" and said["type"] == "add-on"
-    assert said["id"] == "clpipe" and said["version"] == package.__version__
-    assert said["license"] == [f"SPDX:{project['license']}"] and "LICENSE" in names
-    assert (said["blender_version_min"], said["blender_version_max"]) == ("4.2.0", "5.1.0")
-    assert len(said["tagline"]) <= 64 and said["tagline"][-1].isalnum()
+    assert record["schema_version"] == "1.0.0" and record["type"] == "add-on"
+    assert record["id"] == "clpipe" and record["version"] == package.__version__
+    assert record["license"] == [f"SPDX:{project['license']}"] and "LICENSE" in names
+    assert (record["blender_version_min"], record["blender_version_max"]) == ("4.2.0", "5.1.0")
+    assert len(record["tagline"]) <= 64 and record["tagline"][-1].isalnum()
     wheels = [name for name in names if name.endswith(".whl")]
-    assert said["wheels"] == [f"./{name}" for name in wheels] == ["./wheels/" + min(WHEELS)]
+    assert record["wheels"] == [f"./{name}" for name in wheels] == ["./wheels/" + min(WHEELS)]
     assert len(names) == len(set(names))
 
 
@@ -87,19 +87,19 @@ def test_what_blender_has_itself_is_not_put_in_its_place(extension):
 
 def test_panel_offers_cameras_and_configurations(extension):
     with zipfile.ZipFile(extension) as packed:
-        said = json.loads(packed.read("choices.json"))
-    assert said["cameras"].keys() == built_in_cameras().keys()
-    assert said["looks"] == list(built_in_configs()) and said["look"] in said["looks"]
+        record = json.loads(packed.read("choices.json"))
+    assert record["cameras"].keys() == built_in_cameras().keys()
+    assert record["looks"] == list(built_in_configs()) and record["look"] in record["looks"]
 
 
 def test_command_is_one_of_the_command_line(settings, tmp_path):
-    said = settings(camera=DEFAULT_CAMERA, look="paper", keep_raw=True)
-    renders = [development.Render(tmp_path / f"-{n}.exr", tmp_path, said) for n in range(2)]
+    chosen = settings(camera=DEFAULT_CAMERA, look="paper", keep_raw=True)
+    renders = [development.Render(tmp_path / f"-{n}.exr", tmp_path, chosen) for n in range(2)]
     arguments = development.command(renders)
     run = main.get_command(click.Context(main), "run")
     context = run.make_context("run", arguments[arguments.index("run") + 1 :])
-    told = ParameterSource.COMMANDLINE
-    given = {n for n in context.params if context.get_parameter_source(n) is told}
+    explicit = ParameterSource.COMMANDLINE
+    given = {n for n in context.params if context.get_parameter_source(n) is explicit}
     assert given == {"inputs", "output", "config", "camera", "iso", "seed", "format", "quiet"}
     assert context.params["inputs"] == tuple(str(render.path) for render in renders)
 
@@ -130,7 +130,7 @@ def test_missing_wheels_are_said(settings, tmp_path, monkeypatch):
 
 @pytest.fixture
 def blender(extension, tmp_path, monkeypatch):
-    """Blender with the extension and a small scene; the extension's module, and the scene."""
+    """Blender with the extension and a small scene: the extension's module, and the scene."""
     bpy = pytest.importorskip("bpy", reason="needs bpy, in the extra blender")
     folder = tmp_path / "clpipe_extension"
     with zipfile.ZipFile(extension) as packed:
@@ -214,8 +214,8 @@ def test_output_settings_are_the_users_again(blender, kind):
 
 def test_settings_are_in_the_blend(blender, tmp_path):
     module, scene = blender
-    said = {**SETTINGS, "camera": "canon-5d3", "look": "paper", "keep_raw": True, "enabled": True}
-    for name, value in said.items():
+    chosen = {**SETTINGS, "camera": "canon-5d3", "look": "paper", "keep_raw": True, "enabled": True}
+    for name, value in chosen.items():
         setattr(scene.clpipe, name, value)
     path = str(tmp_path / "scene.blend")
     module.bpy.ops.wm.save_as_mainfile(filepath=path)
@@ -223,7 +223,7 @@ def test_settings_are_in_the_blend(blender, tmp_path):
     assert not module.bpy.context.scene.clpipe.enabled
     module.bpy.ops.wm.open_mainfile(filepath=path)
     again = module.bpy.context.scene.clpipe
-    assert {name: getattr(again, name) for name in said} == said
+    assert {name: getattr(again, name) for name in chosen} == chosen
 
 
 def test_rendering_goes_on_without_clpipe(blender, tmp_path, monkeypatch):
@@ -263,7 +263,7 @@ def test_timer_shows_what_a_window_renders(blender, tmp_path):
     render()
     module.development.add(module.save_linear(scene))
     while len(module.development):
-        assert module.look_after() > 0
+        assert module.check_progress() > 0
         time.sleep(0.05)
     shown = module.bpy.data.images["clpipe"].filepath
     assert shown == str(tmp_path / "shots/clpipe/shot_0001.jpg")

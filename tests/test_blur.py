@@ -14,7 +14,7 @@ from clpipe.stages.optical_blur import along, diffracted, lens_taps
 
 
 def blurred(image, device=None, **stages):
-    """An image through these stages, with their parameters."""
+    """Process an image with stages and parameters."""
     chain = make_chain(settings_from({"stages": list(stages), **stages}))
     return Runner(chain, device, encode=False, final=True).run(image, "k").final
 
@@ -58,8 +58,8 @@ def test_a_slanted_edge_is_as_sharp_as_the_lens_says(lens):
     _, found = edge_mtf(blurred(edge, None, optical_blur=lens)[..., 1], slope)
     light = along(lens.get("sigma", 0.4), lens.get("low_pass", 0), lens.get("pixel_area", 0))
     places = np.arange(len(light)) - len(light) // 2
-    said = np.cos(2 * np.pi * frequency[:, None] * places) @ light
-    assert found / sharp == pytest.approx(said, abs=0.02)
+    expected = np.cos(2 * np.pi * frequency[:, None] * places) @ light
+    assert found / sharp == pytest.approx(expected, abs=0.02)
 
 
 @pytest.mark.slow
@@ -84,8 +84,8 @@ def test_diffraction_is_widest_in_red_and_has_the_transfer_of_an_aperture():
     line = spread[..., 1].sum(0)
     places = np.arange(len(line)) - len(line) // 2
     v = 0.2 * 0.54 * 16 / 4.5
-    said = 2 / np.pi * (np.arccos(v) - v * np.sqrt(1 - v**2)) * np.sinc(0.2)
-    assert np.cos(2 * np.pi * 0.2 * places) @ line == pytest.approx(said, abs=0.02)
+    expected = 2 / np.pi * (np.arccos(v) - v * np.sqrt(1 - v**2)) * np.sinc(0.2)
+    assert np.cos(2 * np.pi * 0.2 * places) @ line == pytest.approx(expected, abs=0.02)
 
 
 def test_a_measured_function_is_seen_around_a_point_of_light(device, write_exr):
@@ -134,8 +134,8 @@ def test_streaks_in_perspective_follow_the_turned_camera(device):
         mean = [np.average(each, weights=near) for each in (dx, dy)]
         assert mean == pytest.approx(np.average(path, 0, area), abs=0.05)
         seconds = [np.average(each, weights=near) for each in (dx**2, dy**2, dx * dy)]
-        said = [(path[:, 0] ** 2), (path[:, 1] ** 2), path[:, 0] * path[:, 1]]
-        expected = np.average(said, 1, area) + np.array([1 / 6, 1 / 6, 0])  # between pixels
+        moments = [(path[:, 0] ** 2), (path[:, 1] ** 2), path[:, 0] * path[:, 1]]
+        expected = np.average(moments, 1, area) + np.array([1 / 6, 1 / 6, 0])  # between pixels
         assert seconds == pytest.approx(expected, rel=0.02, abs=0.05)
     straight = {"length": 90 * np.tan(np.deg2rad(8.0)), "angle": 25.0}
     near = np.s_[45:76, 65:96]

@@ -1,4 +1,4 @@
-"""Calibration: what is put into frames comes back out, and frames that cannot tell are refused."""
+"""Calibration: it recovers known parameters, and rejects unsuitable frames."""
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def frames(
 
 
 def off(estimate: Estimate | None, truth: float) -> tuple[float, float]:
-    """How far an estimate is from the truth: relative, and in standard errors."""
+    """Return the error of an estimate, relative and in standard errors."""
     assert estimate is not None
     return abs(estimate.value / truth - 1), abs(estimate.value - truth) / estimate.error
 

@@ -1,4 +1,4 @@
-"""Calibration from files: which frames, what is refused, and a profile that runs."""
+"""Calibration from files: choice of frames, rejected inputs, and a usable profile."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Camera profiles: sources, interpolation, what is refused."""
+"""Camera profiles: sources, interpolation, rejected values."""
 
 import numpy as np
 import pytest
@@ -47,8 +47,8 @@ def own(tmp_path):
     return write
 
 
-# Figures as they are published, by camera and ISO: a and b where those are, else the system gain
-# in DN/e- and the noise of a pixel without light in DN.
+# Published figures by camera and ISO. AB has a and b. The others have the system gain in DN/e- and
+# the noise of a dark pixel in DN.
 AB = {
     ("apple-iphone-7", 800): (7.2e-4, 3e-6),
     ("google-pixel", 800): (1.76e-3, 1.2e-5),

@@ -1,4 +1,4 @@
-"""Layers that go along with a picture: found, moved as its pixels are, written beside it."""
+"""Carried layers: found, warped like the pixels, and written next to the picture."""
 
 import json
 import tarfile
@@ -40,7 +40,7 @@ class Barrel:
 
 
 class Shift:
-    """The result shows what lies at another place."""
+    """A stage whose result shows another place."""
 
     def __init__(self, x, y):
         self.by = x, y
@@ -149,7 +149,7 @@ def test_orientation_is_that_of_the_picture(number):
 
 
 def test_flow_ends_where_the_picture_has_its_ends():
-    """A point and where it goes, through a lens, against the closed form of the lens."""
+    """A point moves through a lens as the closed form states."""
     lens, width, height = Barrel(), 41, 31
     y, x = np.mgrid[0:height, 0:width] + 0.5
     flow = np.stack([np.full(x.shape, 3.0), np.full(x.shape, -2.0)], -1)
@@ -303,7 +303,7 @@ def test_a_pipeline_moves_arrays():
     moved, valid = half.carry(depth, "depth")
     row, column = np.mgrid[:2, :3]
     nearest = depth[2 * row + column % 2, 2 * column + row % 2]
-    np.testing.assert_array_equal(moved[0], nearest[0])  # beside a depth of 0 there is no surface
+    np.testing.assert_array_equal(moved[0], nearest[0])  # a depth of 0 is no surface
     assert valid.tolist() == [[0, 1, 1], [1, 1, 1]]
     np.testing.assert_allclose(half.carry(flow, "flow")[0], np.full((2, 3, 2), 2.0), atol=1e-6)
     whole, _ = half.carry(depth, "depth", resize={"scale": 1.0})
@@ -378,7 +378,7 @@ def test_names_that_say_what_they_belong_to():
 
 @pytest.mark.parametrize("turned", [(), ("--augment",)])
 def test_patches_have_their_layers(clpipe, render, turned):
-    """Each patch's are those of the picture, at its place, turned as it is."""
+    """Layers of a patch are the picture's layers at its position and rotation."""
     render(height=40, width=56, only=("R", "G", "B", "View.Depth.Z", "View.IndexOB.X"))
     given = (*RUN, "in", *HALF, *carrying("Depth:png", "IndexOB"))
     clpipe(*given)

@@ -375,9 +375,10 @@ def test_a_plan_prints_the_source_of_a_launch(clpipe):
     assert by_number == by_name and "#define LANES 8" in by_number
     assert re.search(r"__kernel .*\nvoid launch_[0-9a-f]{16}\(", by_number)
     for unknown in ("0", "8", "denoise"):
-        said = clpipe("plan", "--source", unknown, status=2).stderr
+        stderr = clpipe("plan", "--source", unknown, status=2).stderr
         assert (
-            f"unknown launch '{unknown}'" in said and "1 lines, 2 inverse_color_matrix, 3" in said
+            f"unknown launch '{unknown}'" in stderr
+            and "1 lines, 2 inverse_color_matrix, 3" in stderr
         )
     assert "use only one" in clpipe("plan", "--source", 4, "--json", status=2).stderr
 
@@ -474,12 +475,12 @@ def test_many_images_have_a_line_every_so_often(small, clpipe, monkeypatch):
     monkeypatch.setattr("clpipe.commands.progress.FEW", 1)
     monkeypatch.setattr("clpipe.commands.progress.EVERY", 0)
     more = "--iso", "100,200,400"
-    said = clpipe("run", small, "-o", "out", "--device", "numpy", *more).stderr
-    assert re.search(r"^1 of 3 images; [\d.]+ MP/s; decode .*; about [\d.]+ s left$", said, re.M)
-    assert "3 of 3 images done" in said and "->" not in said
+    stderr = clpipe("run", small, "-o", "out", "--device", "numpy", *more).stderr
+    assert re.search(r"^1 of 3 images; [\d.]+ MP/s; decode .*; about [\d.]+ s left$", stderr, re.M)
+    assert "3 of 3 images done" in stderr and "->" not in stderr
     monkeypatch.setattr("clpipe.commands.progress.EVERY", 60)
-    said = clpipe("run", small, "-o", "again", "--device", "numpy", *more).stderr
-    assert "of 3 images;" not in said
+    stderr = clpipe("run", small, "-o", "again", "--device", "numpy", *more).stderr
+    assert "of 3 images;" not in stderr
 
 
 @pytest.mark.parametrize("name", ["run", "dataset"])

@@ -43,7 +43,7 @@ IMAGES = 16
 
 @pytest.fixture(scope="module")
 def workers():
-    """A client of two workers, processes of their own, which are started again where they die.
+    """A client of two worker processes, which restart if they die.
 
     Dask gives up one that is not back after 15 s, which a busy machine may need.
     """
@@ -71,7 +71,7 @@ def renders(write_exr):
 
 
 def contents(folder):
-    """All files but the logs, with their bytes."""
+    """Return the bytes of all files except logs."""
     found = {p.relative_to(folder): p.read_bytes() for p in Path(folder).rglob("*") if p.is_file()}
     return {path: data for path, data in found.items() if path.suffix != ".jsonl"}
 
@@ -81,7 +81,7 @@ def log(folder):
 
 
 def die_at_sidecar(number):
-    """On a worker: be killed in the midst of writing the sidecar of that number."""
+    """On a worker: kill the process while it writes the sidecar of that number."""
     write, numbers = work.write_sidecar, itertools.count(1)
 
     def planted(path, record):
@@ -94,7 +94,7 @@ def die_at_sidecar(number):
 
 
 def note_folders():
-    """On a worker: note the working directory at each image from now on."""
+    """On a worker: record the working directory at each following image."""
     decode, work.folders = work.ImageWorker.decode, set()
 
     def noting(this, job, begin):
@@ -105,7 +105,7 @@ def note_folders():
 
 
 class DieOf(WorkerPlugin):
-    """Workers, those that are started again too, are killed by an image of this name."""
+    """An image of this name kills each worker, also restarted ones."""
 
     def __init__(self, name):
         self.name = name
@@ -145,8 +145,8 @@ def test_one_machine_three_shards_and_a_cluster_that_loses_a_worker(
     assert {i["status"] for i in images} <= {"done", "skipped"}
     assert end["done"] + end["skipped"] == IMAGES and end["skipped"] <= 2 * 4
 
-    told = clpipe("run", "in", "-o", "dask", "--dask", address)
-    assert f"({IMAGES} of them were there already)" in told.stderr
+    result = clpipe("run", "in", "-o", "dask", "--dask", address)
+    assert f"({IMAGES} of them were there already)" in result.stderr
     assert contents("dask") == whole
 
 
@@ -163,14 +163,14 @@ def test_an_image_that_kills_workers_fails_alone(clpipe, renders, workers, addre
     allow(0)
     workers.register_plugin(DieOf("deadly.exr"), name="die")
     try:
-        told = clpipe("run", "in", "-o", "out", "--dask", address, status=1)
+        result = clpipe("run", "in", "-o", "out", "--dask", address, status=1)
     finally:
         workers.unregister_worker_plugin("die")
         allow(3)
     failed = {i["name"]: i["error"] for i in log("out")[1:-1] if i["status"] == "failed"}
     assert sorted(failed) == ["damaged.exr", "deadly.exr"]
     assert "killed the worker that took it, 1 in all, the last one tcp" in failed["deadly.exr"]
-    assert f"{IMAGES - 1} of {IMAGES + 1} images done" in told.stderr
+    assert f"{IMAGES - 1} of {IMAGES + 1} images done" in result.stderr
     assert len(contents("out")) == 2 * (IMAGES - 1)
 
 
@@ -189,8 +189,8 @@ def test_interrupted_it_finishes_what_is_in_flight(clpipe, renders, address, mon
 
     monkeypatch.setattr("clpipe.commands.progress.interruptible", interruptible)
     monkeypatch.setattr(Reporter, "report", interrupting)
-    told = clpipe("run", "in", "-o", "out", "--dask", address, status=130)
-    assert "not begun" in told.stderr
+    result = clpipe("run", "in", "-o", "out", "--dask", address, status=130)
+    assert "not begun" in result.stderr
     images = log("out")[1:-1]
     assert 0 < len(images) < IMAGES
     made = contents("out")
@@ -206,8 +206,8 @@ def test_a_wrong_request(clpipe, renders, address):
     wrong = ("run", "in", "-o", "out", "--dask", address)
     clpipe(*wrong, "--set", "no=1", status=2)
     assert not Path("out").exists()
-    told = clpipe(*wrong, "--device", "no such device", status=2).stderr
-    assert "worker tcp://" in told and "'no such device'" in told
+    stderr = clpipe(*wrong, "--device", "no such device", status=2).stderr
+    assert "worker tcp://" in stderr and "'no such device'" in stderr
 
 
 @pytest.mark.parametrize(
@@ -227,8 +227,8 @@ def test_workers_of_another_make(clpipe, renders, workers, address, name, value,
     worker = next(iter(workers.nthreads()))
     workers.run(pretend, **{name: value}, workers=[worker])
     try:
-        told = clpipe("run", "in", "-o", "out", "--dask", address, status=2).stderr
-        assert message in told and worker in told
+        stderr = clpipe("run", "in", "-o", "out", "--dask", address, status=2).stderr
+        assert message in stderr and worker in stderr
         assert not contents("out")
     finally:
         workers.run(pretend, workers=[worker])
@@ -251,7 +251,7 @@ def hold(name, reached, go):
 def test_a_log_that_cannot_be_written_ends_the_run(
     clpipe, renders, workers, address, monkeypatch, tmp_path
 ):
-    """What another worker has begun by then is finished before the run ends."""
+    """The run ends after other workers have finished their images."""
     reached, go = tmp_path / "reached", tmp_path / "go"
     workers.run(hold, "f04.exr", str(reached), str(go))  # the first one of the second chunk
     halt = cluster.Cluster._halt
@@ -268,8 +268,8 @@ def test_a_log_that_cannot_be_written_ends_the_run(
     monkeypatch.setattr(cluster.Cluster, "_halt", halted)
     try:
         options = ("--device", "numpy", "--dask", address)  # compiles nothing
-        told = clpipe("run", "in", "-o", "out", *options, status=1)
-        assert "the disk is full" in told.stderr
+        result = clpipe("run", "in", "-o", "out", *options, status=1)
+        assert "the disk is full" in result.stderr
         made = contents("out")
         assert Path("f04.json") in made
         assert len(made) <= 2 * 8  # of two chunks, one on each worker
@@ -287,8 +287,8 @@ def test_a_worker_of_another_make_that_comes_later(clpipe, renders, address, mon
         )
 
     monkeypatch.setattr(cluster.Cluster, "_probe", earlier)
-    told = clpipe("run", "in", "-o", "out", "--dask", address, status=2)
-    assert "workers differ in their device" in told.stderr
+    result = clpipe("run", "in", "-o", "out", "--dask", address, status=2)
+    assert "workers differ in their device" in result.stderr
     assert not contents("out")
 
 
@@ -328,12 +328,12 @@ def test_a_worker_has_a_folder_of_its_own(clpipe, renders, workers, address, tmp
     Path("own/c.toml").write_text('camera = "mine.toml"\n')
     Path("own/list.csv").write_text("path,name\n../in/f01.exr,a\n../in/no.exr,b\n")
     workers.run(note_folders)
-    asked = ("--device", "numpy", "--keep", "mosaic", "--format", "png")
-    chosen = (*asked, "-c", "own/c.toml", "--set", "tone_curve.method=file")
+    shared_options = ("--device", "numpy", "--keep", "mosaic", "--format", "png")
+    chosen = (*shared_options, "-c", "own/c.toml", "--set", "tone_curve.method=file")
     chosen += ("--set", "tone_curve.path=curve.csv")
     inputs = ("in/f00.exr", "own/list.csv")
-    told = clpipe("run", *inputs, *chosen, "-o", "out", "--dask", address, status=1)
-    assert "clpipe: own/../in/no.exr: no such file" in told.stderr
+    result = clpipe("run", *inputs, *chosen, "-o", "out", "--dask", address, status=1)
+    assert "clpipe: own/../in/no.exr: no such file" in result.stderr
     seen = workers.run(lambda: work.folders).values()
     assert set().union(*seen) == set(workers.run(os.getcwd).values()) != {str(tmp_path)}
     clpipe("run", *inputs, *chosen, "-o", "whole", status=1)
@@ -347,7 +347,7 @@ def test_a_worker_has_a_folder_of_its_own(clpipe, renders, workers, address, tmp
     assert len(pictures) == 2 and all(dask[path] == whole[path] for path in pictures)
     again = clpipe("run", *inputs, *chosen, "-o", "out", status=1)  # the request is the same
     assert "(2 of them were there already)" in again.stderr
-    # What a kept image carries names files, too.
+    # The settings in a kept image also name files.
     go_on = ("--start-at", "inverse_white_balance", "--device", "numpy", "--format", "png")
     clpipe("run", "out/f00.mosaic.exr", *go_on, "-o", "next", "--dask", address)
     clpipe("run", "whole/f00.mosaic.exr", *go_on, "-o", "after")
@@ -389,8 +389,8 @@ def test_a_scheduler_that_cannot_be_reached(clpipe, renders, monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
         for address in (f"tcp://127.0.0.1:{port}", "tcp://127.0.0.1:1", "nonsense", ""):
-            told = clpipe("run", "in", "-o", "out", "--dask", address, status=2).stderr
-            assert f"no Dask scheduler answers at '{address}'" in told
+            stderr = clpipe("run", "in", "-o", "out", "--dask", address, status=2).stderr
+            assert f"no Dask scheduler answers at '{address}'" in stderr
     assert not Path("out").exists()
 
 
@@ -403,6 +403,6 @@ def test_a_scheduler_without_workers(clpipe, renders, monkeypatch):
     monkeypatch.setattr(Client, "wait_for_workers", too_late)
     with LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0", processes=False) as empty:
         address = empty.scheduler_address
-        told = clpipe("run", "in", "-o", "out", "--dask", address, status=2).stderr
-        assert f"the scheduler at {address} has no workers" in told
+        stderr = clpipe("run", "in", "-o", "out", "--dask", address, status=2).stderr
+        assert f"the scheduler at {address} has no workers" in stderr
     assert not Path("out").exists()

@@ -1,4 +1,4 @@
-"""clpipe compare: what its figures show, the places and the noise that it finds, refusals."""
+"""clpipe compare: labels, crops, noise figures and rejected inputs."""
 
 import base64
 import io
@@ -31,7 +31,7 @@ def write_png(tmp_path):
 
 @pytest.fixture
 def scene():
-    """A picture with a place of each kind, of 320x320, without noise."""
+    """Return a noise-free picture of 320x320 with a place of each kind."""
     picture = np.full((320, 320, 3), 0.5)
     picture += np.linspace(-0.1, 0.1, 320)[:, None]  # nowhere flat but there
     picture[20:100, 20:130] = 0.6
@@ -43,7 +43,7 @@ def scene():
 
 
 def crops_of(figure, crop, zoom):
-    """Where in a figure, (height, width, 3), a crop stands, each of its pixels a square."""
+    """Find the position of an enlarged crop in a figure, (height, width, 3)."""
     large = crop.repeat(zoom, 0).repeat(zoom, 1)
     height, width = large.shape[:2]
     starts = np.argwhere((figure == large[0, 0]).all(-1))

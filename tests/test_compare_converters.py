@@ -1,4 +1,4 @@
-"""tools/compare/converters.py and side_by_side.py; converters that are missing are left out."""
+"""tools/compare/converters.py and tools/pages/comparison_page.py, without missing converters."""
 
 import doctest
 import shutil
@@ -13,7 +13,7 @@ from tools.compare import charts, fidelity
 from tools.compare import converters as tool
 from tools.compare.charts import chart_image, chart_patches, patch_means, saturated_image
 from tools.compare.fidelity import colour_errors
-from tools.pages import side_by_side
+from tools.pages import comparison_page
 
 pytestmark = pytest.mark.slow
 
@@ -47,10 +47,10 @@ def test_a_converter_that_fails_is_named_with_its_reason(tmp_path):
         comparison(tmp_path, FAIL).convert(FAIL, tmp_path / "a.dng", tmp_path / "a.png")
 
 
-def test_a_converter_that_makes_nothing_is_no_success(tmp_path):
+def test_a_converter_that_writes_nothing_is_an_error(tmp_path):
     silent = tool.Converter("silent", "none", "true DNG PICTURE")
     stale = save(tmp_path, "silent", 100, "a.png", np.zeros((4, 4, 3), np.uint8))
-    with pytest.raises(tool.ComparisonError, match="silent made nothing"):
+    with pytest.raises(tool.ComparisonError, match="silent wrote no picture"):
         comparison(tmp_path, silent).convert(silent, tmp_path / "a.dng", stale)
 
 
@@ -66,16 +66,16 @@ def test_a_border_that_a_converter_cuts_off_does_not_shift_the_picture(tmp_path)
         comparison(tmp_path, COPY).picture("copy", 100, "a")
 
 
-def test_the_middle_of_what_was_enlarged_is_the_image():
+def test_reducing_an_enlarged_image_restores_it():
     image = np.random.default_rng(0).random((6, 4, 3)).astype(np.float32)
     assert np.array_equal(tool.reduced(tool.enlarged(image)), image)
 
 
 def test_a_sheet_holds_the_crops_at_400_percent():
     crop = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-    page = np.asarray(side_by_side.sheet(["one", "two"], {"a, b": [crop, 255 - crop]}))
+    page = np.asarray(comparison_page.sheet(["one", "two"], {"a, b": [crop, 255 - crop]}))
     high, wide = (side * 4 for side in (HEIGHT, WIDTH))
-    top, left = side_by_side.HEAD, side_by_side.SIDE
+    top, left = comparison_page.HEAD, comparison_page.SIDE
     assert np.array_equal(page[top : top + high : 4, left : left + wide : 4], crop)
 
 
@@ -90,7 +90,7 @@ def test_the_charts_fit_the_sensor():
         assert image.shape[0] % 2 == image.shape[1] % 2 == 0
 
 
-def test_errors_of_colour_are_told_apart():
+def test_errors_of_grey_hue_and_chroma_are_independent():
     true = chart_patches()
     brighter = colour_errors(true * 1.05, true)
     assert brighter.grey == pytest.approx(128.1)
@@ -105,17 +105,17 @@ def test_errors_of_colour_are_told_apart():
     assert turned.chroma == 1
 
 
-def test_what_is_missing_is_named_and_left_out(monkeypatch, capsys, tmp_path):
+def test_missing_converters_are_named_and_skipped(monkeypatch, capsys, tmp_path):
     seen = []
     monkeypatch.setattr(tool, "compare", lambda comparison, *_: seen.append(comparison))
     monkeypatch.setattr(tool.shutil, "which", lambda name: name if name == "dcraw" else None)
     monkeypatch.setattr("sys.argv", ["compare_converters", "-c", "paper", "-o", str(tmp_path)])
     assert tool.main() == 0
-    assert list(seen[0].makers) == ["clpipe, default", "clpipe, paper", "dcraw", "dcraw -W"]
+    assert list(seen[0].developers) == ["clpipe, default", "clpipe, paper", "dcraw", "dcraw -W"]
     assert seen[0].steady == ["clpipe, default", "clpipe, paper", "dcraw -W"]
-    said = capsys.readouterr().err
-    assert "darktable is left out: apt-get install darktable" in said
-    assert "RawTherapee is left out: apt-get install rawtherapee" in said
+    printed = capsys.readouterr().err
+    assert "darktable is skipped: apt-get install darktable" in printed
+    assert "RawTherapee is skipped: apt-get install rawtherapee" in printed
 
 
 @pytest.mark.parametrize("iso", [100, 6400])
@@ -127,12 +127,14 @@ def test_what_is_missing_is_named_and_left_out(monkeypatch, capsys, tmp_path):
 def test_our_dng_is_as_bright_as_our_picture_in_other_converters(
     tmp_path, write_exr, converter, iso
 ):
-    """18 % grey is within 100 to 140 of 255, and what is brighter than white is not clipped."""
+    """18 % grey is at 100 to 140 of 255, and light above white is not clipped."""
     program = converter.command.split()[0]
     if shutil.which(program) is None:
         pytest.skip(f"needs {program}")
     noisy = iso > 100
-    has_ramp = not noisy and converter.name != "dcraw"  # which is darker with brighter light
+    has_ramp = (
+        not noisy and converter.name != "dcraw"
+    )  # dcraw darkens the picture for brighter light
     chart = chart_image()
     if has_ramp:
         ramp = np.linspace(0, 1.9, chart.shape[1], dtype=np.float32)

@@ -10,12 +10,12 @@ from clpipe.chain.request import Request
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding
 from tools.compare import methods as other_methods
 from tools.compare import opencv as tool
-from tools.compare import turns
+from tools.compare import timing
 
 pytestmark = pytest.mark.slow
 
 
-def test_works_take_turns_and_what_comes_before_is_not_counted(monkeypatch):
+def test_works_are_interleaved_and_preparation_is_not_timed(monkeypatch):
     calls, now = [], [0]
 
     def lasting(name, seconds):
@@ -25,15 +25,15 @@ def test_works_take_turns_and_what_comes_before_is_not_counted(monkeypatch):
 
         return work
 
-    monkeypatch.setattr(turns.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
     works = {"a": lasting("a", 1), "b": lasting("b", 2)}
-    assert turns.in_turns(works, 2, lasting("before", 10)) == {"a": [1, 1], "b": [2, 2]}
+    assert timing.interleaved(works, 2, lasting("before", 10)) == {"a": [1, 1], "b": [2, 2]}
     assert calls == ["before", "a", "before", "b"] * 2
 
 
-def test_a_ratio_is_of_one_turn():
-    # The second turn was disturbed: both took ten times as long.
-    row = turns.Comparison("w", 12.0, (1.0, 10.0, 1.0), {"x": (4.0, 40.0, 2.0)})
+def test_ratios_are_computed_within_a_round():
+    # Other load disturbed the second round: both works took ten times as long.
+    row = timing.Comparison("w", 12.0, (1.0, 10.0, 1.0), {"x": (4.0, 40.0, 2.0)})
     assert row.ratios("x") == (3, 4, 4)
     assert row.cells() == ["w", "12", "3", "4.00", "3.00 4.00"]
     assert row.record()["x"] == {"mp_per_s": 3.0, "ratio_quartiles": (3, 4, 4)}
@@ -73,9 +73,9 @@ def test_methods_run_on_one_image_and_a_missing_package_is_named(monkeypatch, ca
     assert row.work == "demosaic bilinear: json"
     assert len(row.ours) == len(row.theirs["other"]) == 3
     assert set(seen) == {("json", (8, 16))}
-    said = capsys.readouterr().err
+    stderr = capsys.readouterr().err
     assert (
-        said == "demosaic bilinear: no_such_module is left out: No module named 'no_such_module'\n"
+        stderr == "demosaic bilinear: no_such_module is skipped: No module named 'no_such_module'\n"
     )
 
 

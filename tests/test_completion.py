@@ -100,8 +100,8 @@ IMPORTS = {
 
 
 def test_what_is_not_needed_is_not_imported():
-    told = f"print('found', [m for m in {HEAVY} if m in sys.modules])"
-    program = "\n".join(["import sys", *(line for code in IMPORTS for line in (code, told))])
+    print_heavy = f"print('found', [m for m in {HEAVY} if m in sys.modules])"
+    program = "\n".join(["import sys", *(line for code in IMPORTS for line in (code, print_heavy))])
     lines = run_python("-c", program).stdout.splitlines()
     found = [line[6:] for line in lines if line.startswith("found ")]
     for (code, allowed), modules in zip(IMPORTS.items(), found, strict=True):

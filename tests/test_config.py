@@ -1,4 +1,4 @@
-"""Requests: what is wrong with one is said in one message that names it."""
+"""Requests: each error is one message that names its cause."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -118,9 +118,9 @@ def test_the_tools_that_are_named_are_those_that_are_there():
         assert set(re.findall(r"tools/run ([a-z]\w+ \w+)", path.read_text())) <= rows, path
 
 
-def test_the_map_names_every_room():
+def test_the_map_names_every_package():
     package = ROOT / "clpipe"
-    rooms = {p.name for p in package.iterdir() if p.is_dir() and p.name != "__pycache__"}
+    packages = {p.name for p in package.iterdir() if p.is_dir() and p.name != "__pycache__"}
     modules = {p.name for p in package.glob("[a-z]*.py")}
-    for name in (*(f"  {room}/" for room in rooms), *modules):
+    for name in (*(f"  {name}/" for name in packages), *modules):
         assert name in TEXT, name

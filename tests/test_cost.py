@@ -28,7 +28,7 @@ SLACK = 1.05  # for other versions of Python and of libraries
 
 
 class Counter:
-    """Counts Python calls, in this thread and those that begin later, and launches."""
+    """Counts launches, and Python calls in this thread and later ones."""
 
     def __init__(self) -> None:
         self._calls, self._launches, self._counting = itertools.count(), itertools.count(), False

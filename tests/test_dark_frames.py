@@ -1,4 +1,4 @@
-"""What a sensor adds in the dark beside read noise: each law, statistically, on dark frames."""
+"""Dark noise besides read noise: each distribution, statistically, on dark frames."""
 
 import numpy as np
 import pytest
@@ -137,8 +137,8 @@ def test_dark_current_takes_the_exposure_time_that_is_known():
     method = make_chain(settings_from({"exposure": metered})).step_named("dark_current").method
     assert method.exposure_time == 4.0 and not method.passes()  # the camera's current is unknown
     assert make_chain(settings_from({})).step_named("dark_current").method.exposure_time == 0
-    said = {"render": {"exposure_time": 2.5}}
-    assert make_chain(settings_from(said)).step_named("dark_current").method.exposure_time == 2.5
+    values = {"render": {"exposure_time": 2.5}}
+    assert make_chain(settings_from(values)).step_named("dark_current").method.exposure_time == 2.5
 
 
 def test_banding_is_a_wave_of_its_period_with_another_phase_in_each_frame(develop):

@@ -1,4 +1,4 @@
-"""Samples for training, developed on the way: the same as a run's, whoever asks for them when."""
+"""Training samples: the same as a run's, independent of order and worker."""
 
 import gc
 import itertools

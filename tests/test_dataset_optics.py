@@ -1,4 +1,4 @@
-"""Samples of chains that need more than the picture: depth, overscan, and margins of both."""
+"""Training samples of chains with depth and overscan, and the margins of both."""
 
 import json
 from pathlib import Path

@@ -1,6 +1,6 @@
 """The default development: as bright as the render, true in hue, without dots; and the paper's.
 
-All in NumPy, which test_kernels.py and test_pipeline.py hold the kernels to.
+These tests use NumPy; test_kernels.py and test_pipeline.py compare the kernels with it.
 """
 
 import numpy as np
@@ -43,7 +43,7 @@ def finished(image, **settings):
 
 
 def grey(level, **settings):
-    """What a flat grey comes out as; it may lie between two levels."""
+    """Return the level of a developed flat grey; it may lie between two levels."""
     levels = finished(np.full((24, 26, 3), level, np.float32), **settings)
     assert np.ptp(levels) <= 1
     return int(np.median(levels))
@@ -103,9 +103,9 @@ def test_bounded_invents_no_extremes(pattern):
         green = roots[..., 1]
         for channel, sites in enumerate((red, ~red & ~blue, blue)):
             own = roots[..., channel]
-            low, high = around(own, sites)
+            low, high = range_around(own, sites)
             if channel != 1:  # as far beyond as green is beyond what it is there, for fine lines
-                green_low, green_high = around(green, sites)
+                green_low, green_high = range_around(green, sites)
                 low += np.minimum(green - green_low, 0)
                 high += np.maximum(green - green_high, 0)
             assert np.all(own >= low - 2e-6)
@@ -114,8 +114,8 @@ def test_bounded_invents_no_extremes(pattern):
             assert abs(moved).max() <= 2**-21 + 2e-6  # half a step
 
 
-def around(values, sites):
-    """The least and the greatest value at sites of the 3x3 around each pixel."""
+def range_around(values, sites):
+    """Return the minimum and maximum at sites of the 3x3 around each pixel."""
     return (
         minimum_filter(np.where(sites, values, np.inf), 3, mode="mirror"),
         maximum_filter(np.where(sites, values, -np.inf), 3, mode="mirror"),

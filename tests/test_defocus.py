@@ -1,4 +1,4 @@
-"""defocus: depth of field from a depth channel, found, checked and seen in what comes out."""
+"""defocus: depth of field from a depth channel, checked against geometry."""
 
 import json
 from pathlib import Path
@@ -27,7 +27,7 @@ THIN = ("--set", "defocus.method=thin_lens", *SETS)
 
 
 def at_radius(radius):
-    """The distance behind the focus at which discs have a radius in px."""
+    """Return the distance beyond the focus at which discs have a radius in px."""
     return 2.0 / (1 - 2 * radius / FAR)
 
 
@@ -54,10 +54,10 @@ def scene(height, width, seed=0):
 @pytest.mark.parametrize("blades", [0, 7])
 def test_the_kernel_is_the_reference(device, scalar_device, size, blades):
     image, depth = scene(*size)
-    said = blurred(image, depth, None, max_radius=5, blades=blades)
+    expected = blurred(image, depth, None, max_radius=5, blades=blades)
     for on in (device, scalar_device):
         assert blurred(image, depth, on, max_radius=5, blades=blades) == pytest.approx(
-            said, abs=1e-5
+            expected, abs=1e-5
         )
 
 
@@ -96,7 +96,7 @@ def test_a_sharp_foreground_keeps_its_edge_and_gives_no_light_away(device):
     depth = np.full((48, 80), at_radius(8))
     depth[:, :40] = 2.0
     assert blurred(image, depth, device) == pytest.approx(image, abs=1e-6)
-    # A foreground that is out of focus does spread over what is sharp behind it.
+    # A foreground out of focus spreads over the sharp background.
     depth[:, :40], depth[:, 40:] = at_radius(-8), 2.0
     seen = blurred(image, depth, device)[24, :, 0]
     assert seen[42] > 0.2
@@ -167,9 +167,9 @@ def test_depth_of_the_file_or_a_companion(render, clpipe):
     depth[0, :2] = 0, 1e10  # nothing there, to Mitsuba and to Blender
     depth[1, :2] = np.inf
     render("a.exr", **colours(image), **{"View.Depth.Z": depth})
-    said = blurred(image, depth, None)
+    expected = blurred(image, depth, None)
     made = clpipe("run", "a.exr", "-o", "o", *RUN, *THIN)
-    assert read_image(Path("o/a.exr")).pixels == pytest.approx(said, abs=1e-3)
+    assert read_image(Path("o/a.exr")).pixels == pytest.approx(expected, abs=1e-3)
     assert "pixels have discs with radii up to 65.8 px" in made.output
     record = json.loads(Path("o/a.json").read_text())
     assert record["depth"][0].items() >= {"layer": "Depth", "file": "a.exr"}.items()

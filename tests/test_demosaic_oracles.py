@@ -1,4 +1,4 @@
-"""Linear demosaicing against what others say it is: published filters, and OpenCV."""
+"""Linear demosaicing against independent references: published filters, and OpenCV."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The choice of a device, and what one cannot do."""
+"""The choice of a device, and the limits of devices."""
 
 import struct
 import time
@@ -131,7 +131,7 @@ def test_a_gpu_that_two_drivers_offer_is_one(devices):
 
 
 class FakeDevice:
-    """What hardware_of() asks of a pyopencl.Device."""
+    """The attributes of pyopencl.Device that hardware_of() reads."""
 
     def __init__(self, **values):
         self.platform = SimpleNamespace(int_ptr=7)
@@ -156,14 +156,14 @@ def test_buffers_are_used_again_and_go_when_memory_is_short():
 
 
 def test_what_drivers_say_of_hardware(device, monkeypatch):
-    told = {}
-    monkeypatch.setattr(hardware, "queried", lambda _, name: told.get(name))
+    properties = {}
+    monkeypatch.setattr(hardware, "queried", lambda _, name: properties.get(name))
     nvidia = FakeDevice(pci_domain_id_nv=1, pci_bus_id_nv=65, pci_slot_id_nv=3 << 3 | 1)
     assert hardware_of(nvidia) == Hardware(7, (1, 65, 3, 1))
     amd = FakeDevice(topology_amd=SimpleNamespace(bus=65, device=3, function=1))
     assert hardware_of(amd) == Hardware(7, (0, 65, 3, 1))
     assert hardware_of(FakeDevice()) == Hardware(7)
-    told.update({0x410F: struct.pack("4I", 1, 65, 3, 1), 0x106A: b"u" * 16})
+    properties.update({0x410F: struct.pack("4I", 1, 65, 3, 1), 0x106A: b"u" * 16})
     assert hardware_of(FakeDevice()) == Hardware(7, (1, 65, 3, 1), b"u" * 16)
     monkeypatch.undo()
     version = hardware.queried(device.info.handle, cl.device_info.VENDOR_ID, 4)
@@ -268,9 +268,9 @@ def test_what_memory_held_before_does_not_matter(device, monkeypatch, byte):
 def test_pixels_into_an_array_that_is_there(device):
     runner = Runner(make_chain(settings_from({})), device)
     image = np.full((20, 30, 3), 0.5, np.float16)
-    room = np.empty((20, 30, 3), np.uint8)
-    result = runner.run(image, "k", RunOptions(into=room))
-    assert result.encoded is room
-    assert np.array_equal(room, runner.run(image, "k").encoded)
+    buffer = np.empty((20, 30, 3), np.uint8)
+    result = runner.run(image, "k", RunOptions(into=buffer))
+    assert result.encoded is buffer
+    assert np.array_equal(buffer, runner.run(image, "k").encoded)
     with pytest.raises(ValueError, match=r"into has shape \(20, 30\)"):
-        runner.run(image, "k", RunOptions(into=room[..., 0]))
+        runner.run(image, "k", RunOptions(into=buffer[..., 0]))

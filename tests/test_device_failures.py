@@ -1,4 +1,4 @@
-"""Devices that fail: with the errors, and in the state, in which drivers leave them."""
+"""Device failures: errors and states as drivers report them."""
 
 import threading
 from dataclasses import replace
@@ -22,7 +22,7 @@ IMAGE = np.full((20, 30, 3), 0.5, np.float16)
 
 
 class Fault:
-    """Makes launches fail as NVIDIA's driver does where a kernel reads astray.
+    """Makes launches fail like NVIDIA's driver after an invalid read.
 
     The launch, and from then on everything in its context, raises CL_OUT_OF_RESOURCES, which
     pyopencl raises as a MemoryError. There is no GPU here, so this stands in for one.
@@ -65,7 +65,7 @@ def _contexts_of_their_own(monkeypatch):
 
 @pytest.fixture(params=["CPU", "GPU"])
 def device(device, request):
-    """The device, also as if its memory were its own."""
+    """The device, and the same device as if it had its own memory."""
     return Device(replace(device.info, type=request.param))
 
 

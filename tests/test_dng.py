@@ -1,4 +1,4 @@
-"""DNGs, as programs read them that no one here wrote: LibRaw, Pillow, ExifRead."""
+"""DNGs, read by independent programs: LibRaw, Pillow, ExifRead."""
 
 import io
 import json
@@ -205,7 +205,7 @@ def test_the_preview_is_our_neutral_picture(tmp_path):
 
 
 def test_adobes_software_is_told_of_our_tone_curve(tmp_path, scene):
-    """The curve stands for all: there is no BaselineExposure on top, and nothing near black."""
+    """The tone curve includes all gains: there is no BaselineExposure."""
     render = scene(8, 8)
     clpipe("run", render, "-o", tmp_path, "--format", "dng", "--device", "numpy")
     first, raw = directories(tmp_path / "scene.dng")
@@ -389,6 +389,6 @@ def test_of_a_raw_alone_the_clipped_pixels_are_counted(tmp_path, write_exr):
     pixels[:2] = 100
     path = write_exr("bright.exr", pixels)
     sharp = ("--skip", "optical_blur")
-    told = clpipe("run", path, "-o", tmp_path, "--format", "dng", "--device", "numpy", *sharp)
+    result = clpipe("run", path, "-o", tmp_path, "--format", "dng", "--device", "numpy", *sharp)
     assert json.loads((tmp_path / "bright.json").read_text())["clipped"] == 0.25
-    assert "25 % of its pixels are clipped" in told
+    assert "25 % of its pixels are clipped" in result

@@ -1,4 +1,4 @@
-"""The pages of the documentation: every example is run as it stands, every link leads somewhere."""
+"""The documentation: every example runs as written, and every link has a target."""
 
 import json
 import os
@@ -47,7 +47,7 @@ def write(path, pixels, type_, channels=()):
 
 @pytest.fixture(scope="session")
 def material(tmp_path_factory):
-    """What the examples take for granted, as small as will do."""
+    """The files that examples need, as small as possible."""
     folder = tmp_path_factory.mktemp("material")
     file = oiio.ImageInput.open(str(STILL_LIFE))
     still_life = file.read_image("float")[..., :3]
@@ -81,7 +81,7 @@ def material(tmp_path_factory):
 
 @pytest.fixture
 def run_page(material, tmp_path, clpipe, monkeypatch):
-    """Run every block of a page in a folder of its own; the folder."""
+    """Run every block of a page in a new folder, and return the folder."""
     shutil.copytree(material, tmp_path, dirs_exist_ok=True)
     monkeypatch.syspath_prepend(tmp_path)
     modules = set(sys.modules)
@@ -239,7 +239,7 @@ def test_every_link_leads_somewhere(page, generated):
 
 
 def anchors(text):
-    """The anchors of a page: headings behind an empty line, as MkDocs calls them, and objects."""
+    """Return the anchors of a page by MkDocs: headings after an empty line, and objects."""
     text = re.sub(r"^```.*?^```$", "", text, flags=re.DOTALL | re.MULTILINE)
     found = re.findall(r"^::: (\S+)$", text, re.MULTILINE)
     for heading in re.findall(r"(?:^|\n\n)#+ (.+)", text):
@@ -249,9 +249,9 @@ def anchors(text):
     return found
 
 
-@pytest.mark.parametrize("name", architecture.PAGES)
+@pytest.mark.parametrize("name", architecture.PICTURES)
 def test_the_pictures_of_the_architecture_are_those_of_the_code(name):
-    drawn = architecture.PAGES[name]()
+    drawn = architecture.PICTURES[name]()
     assert (DOCS / name).read_text("utf-8") == drawn, "run tools/run pages architecture"
 
 
@@ -261,14 +261,14 @@ def test_screenshots_show_the_present_pages(name):
         assert picture.info["xmp"].decode() == screens.pages_digest(), "run tools/run pages screens"
 
 
-def test_the_architecture_counts_its_rooms():
-    count = sum(map(len, architecture.floors()))
-    assert f"clpipe is {count} rooms" in (DOCS / "architecture.md").read_text("utf-8")
+def test_the_architecture_counts_its_packages():
+    count = sum(map(len, architecture.layers()))
+    assert f"clpipe has {count} packages" in (DOCS / "architecture.md").read_text("utf-8")
 
 
 @pytest.mark.slow
 def test_the_site_builds(tmp_path):
-    """As tools/docs does it: a link, an anchor or a name that leads nowhere is an error."""
+    """The site builds like with tools/docs; a dead link, anchor or name is an error."""
     pytest.importorskip("mkdocs", reason="needs MkDocs, in the extra docs")
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "-d", tmp_path]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
@@ -279,7 +279,7 @@ def test_the_site_builds(tmp_path):
 
 @pytest.mark.slow
 def test_the_notebook_runs(tmp_path, material):
-    """Its code cells, one after the other in one process."""
+    """Run the code cells in order in one process."""
     path = DOCS / "first_steps.ipynb"
     assert path.stat().st_size < 300_000
     cells = json.loads(path.read_text())["cells"]

@@ -1,4 +1,4 @@
-"""Values that a configuration leaves to chance: their laws, and what cannot be drawn."""
+"""Random values of configurations: their distributions, and invalid draws."""
 
 import json
 from pathlib import Path
@@ -391,7 +391,7 @@ def test_each_camera_draws_in_its_own_part_of_a_law(law, share):
 
 
 def test_one_camera_is_pushed_where_a_law_goes_on(clpipe, write_exr):
-    """From its highest ISO on gain and variance go on in proportion, and this is said."""
+    """Above the highest ISO, gain and variance are extrapolated in proportion, with a note."""
     settings = settings_from({"iso": {"log_uniform": [1600, 25600]}, "camera": "nikon-d800"})
     isos = np.array([settings.drawn(f"{n}.exr").iso for n in range(400)])
     assert abs(np.mean(isos > 6400) - 0.5) < 0.08 and isos.max() > 20000
@@ -404,8 +404,8 @@ def test_one_camera_is_pushed_where_a_law_goes_on(clpipe, write_exr):
     assert draw_note(settings).startswith(note)
     write_exr("a.exr", np.full((4, 6, 3), 0.25))
     Path("c.toml").write_text("camera = 'nikon-d800'\niso = { log_uniform = [12800, 25600] }\n")
-    said = clpipe("run", "a.exr", "-o", "out", "--device", "numpy", "-c", "c.toml").stderr
-    assert said.count(note) == 1
+    stderr = clpipe("run", "a.exr", "-o", "out", "--device", "numpy", "-c", "c.toml").stderr
+    assert stderr.count(note) == 1
     sidecar = json.loads(Path("out/a.json").read_text())
     assert 12800 <= sidecar["iso"] <= 25600
     clpipe("replay", "out/a.json", "-o", "again", "--device", "numpy")
@@ -426,5 +426,5 @@ def test_what_no_camera_has_is_refused_before_a_run(clpipe, write_exr):
     Path("c.toml").write_text(
         "camera = { choice = ['sony-a7r2', 'canon-6d'] }\niso = { log_uniform = [800, 12800] }\n"
     )
-    said = clpipe(*run, "-c", "c.toml").stderr
-    assert said.count("iso: drawn within each camera's range: canon-6d from 100 to 6400") == 1
+    stderr = clpipe(*run, "-c", "c.toml").stderr
+    assert stderr.count("iso: drawn within each camera's range: canon-6d from 100 to 6400") == 1

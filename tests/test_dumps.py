@@ -1,4 +1,4 @@
-"""Dumps: bytes of a sensor without a header, with the geometry that somebody says."""
+"""Dumps: raw bytes of a sensor without a header, with a given geometry."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Noise at edges: which pixels they are, and how much stronger it is there."""
+"""Noise at edges: the choice of pixels, and the strength of noise there."""
 
 import json
 
@@ -18,7 +18,7 @@ def stripes():
 
 
 def noise(at_edges):
-    """Noise of sigma 2, and of another at the borders of the stripes."""
+    """Return noise of sigma 2, with another sigma at the borders of the stripes."""
     normals = np.random.default_rng(1).normal(size=(SIZE, SIZE))
     steep = slopes_of(stripes(), np.ones((SIZE, SIZE), bool)).steep
     return normals * np.where(steep, at_edges, 2.0)
@@ -51,5 +51,5 @@ def test_measure_says_it(clpipe, tmp_path):
     words = "measure", tmp_path / "noisy.png", "--truth", tmp_path / "clean.png"
     found = json.loads(clpipe(*words, "--json").stdout)
     assert found["edges_over_flat"] == pytest.approx(2.5, rel=0.1)
-    told = clpipe(*words).stdout
-    assert f"{found['edges_over_flat']:.2f} times as strong at edges" in told
+    stdout = clpipe(*words).stdout
+    assert f"{found['edges_over_flat']:.2f} times as strong at edges" in stdout

@@ -1,4 +1,4 @@
-"""EMVA 1288: known sensors found again, what is refused, and series of cameras."""
+"""EMVA 1288: known sensors are recovered, invalid series rejected, camera series read."""
 
 import os
 from pathlib import Path
@@ -41,7 +41,7 @@ column_noise = [0.5]
 
 
 class Sensor:
-    """A sensor of known figures, in NumPy alone."""
+    """A sensor with known figures, only in NumPy."""
 
     def __init__(self, seed=0, full=1e9, quiet=1e9):
         self.random = np.random.default_rng(seed)
@@ -92,7 +92,7 @@ def series(tmp_path_factory):
 
 
 def near(estimate, value, share):
-    """Whether an estimate is within a share of a value, and within four of its errors."""
+    """Return whether an estimate is within a share of a value, and within four standard errors."""
     own = abs(estimate.value - value)
     assert own < share * value, estimate
     assert own < 4 * estimate.error + 1e-3 * value, estimate
@@ -167,7 +167,7 @@ def test_a_wrong_line_is_named(series, clpipe, case):
 
 
 def only(text, *letters):
-    """A text without the exposures of some letters."""
+    """Remove the exposures with some letters from a text."""
     kept, keep = [], True
     for line in text.splitlines():
         keep = line[0] not in letters if line[0] in "bdnv#" else keep

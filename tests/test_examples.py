@@ -1,4 +1,4 @@
-"""tools/examples, as they are, on a few small renders."""
+"""tools/examples, unchanged, on a few small renders."""
 
 import os
 import re
@@ -21,7 +21,7 @@ EXAMPLES = ROOT / "tools" / "examples"
 
 @pytest.fixture
 def start(write_exr, tmp_path):
-    """Start an example in a folder with renders, the command clpipe on the PATH; what it told."""
+    """Return a function that runs an example in a folder with renders, and returns its output."""
     for i in range(5):
         pixels = np.random.default_rng(i).random((64, 64, 3)).astype(np.float32)
         write_exr(f"in/f{i}.exr", pixels)
@@ -55,7 +55,7 @@ def test_slurm_makes_what_one_machine_makes(start, clpipe, tmp_path):
     whole = pictures(tmp_path / "whole")
     assert len(whole) == 10
     for task in "12":
-        told = start(
+        result = start(
             "sh",
             EXAMPLES / "slurm_array.sh",
             *("in", "-o", "slurm"),
@@ -63,7 +63,7 @@ def test_slurm_makes_what_one_machine_makes(start, clpipe, tmp_path):
             SLURM_ARRAY_TASK_ID=task,
             SLURM_CPUS_PER_TASK="2",
         )
-    assert "2 of 2 images done" in told  # of five; the recipe's test runs dask_local.py
+    assert "2 of 2 images done" in result  # of five; the recipe's test runs dask_local.py
     assert pictures(tmp_path / "slurm") == whole
     logs = {p.name for p in (tmp_path / "slurm").glob("*.jsonl")}
     assert logs == {f"run.{i}-of-2.jsonl" for i in "12"}

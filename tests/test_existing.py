@@ -1,4 +1,4 @@
-"""What lies in the output folder: done, to be made again, or not ours to touch."""
+"""Existing files in the output directory: skipped, recomputed, or left untouched."""
 
 import json
 import os
@@ -22,7 +22,7 @@ MADE = ("a.jpg", "a.normalize.exr", "a.truth_mosaic.exr")
 
 @pytest.fixture
 def again(clpipe, write_exr):
-    """Run an image; the files that the run wrote."""
+    """Run an image, and return the files that the run wrote."""
     write_exr("in/a.exr", np.full((8, 8, 3), 0.25, np.float32))
 
     def run(*options, status=0):
@@ -80,13 +80,13 @@ def test_what_is_whole_and_was_changed_is_somebodys(again, clpipe, name, how):
         ),
         ("--set", "sharpen.amount=0.3"),
     ):
-        said = clpipe("run", "in", *RUN, *option, status=1).stderr
+        stderr = clpipe("run", "in", *RUN, *option, status=1).stderr
         sidecar = "a.truth_mosaic.json" if "truth" in name else "a.json"
         assert (
             f"{path}: this file was changed after clpipe wrote it (its SHA-256 differs from "
-            in said
+            in stderr
         )
-        assert f"{sidecar})" in said and "move it, " in said and "use --redo all" in said
+        assert f"{sidecar})" in stderr and "move it, " in stderr and "use --redo all" in stderr
         assert path.read_bytes() == changed
     assert name in again("--redo", "all")
     assert path.read_bytes() == before
@@ -107,8 +107,8 @@ def test_a_picture_that_somebody_edited_is_kept(clpipe, write_exr, format_):
         path.write_bytes(path.read_bytes() + b"and more")
     changed = path.read_bytes()
     assert is_marked(path)
-    said = clpipe(*run, status=1).stderr
-    assert f"{path}: this file was changed after clpipe wrote it" in said
+    stderr = clpipe(*run, status=1).stderr
+    assert f"{path}: this file was changed after clpipe wrote it" in stderr
     assert path.read_bytes() == changed
     clpipe(*run, "--redo", "all")
 
@@ -235,20 +235,20 @@ def test_pictures_of_inputs_that_are_gone_are_counted(clpipe, write_exr):
     Path("other/d.exr").unlink()
     assert there not in clpipe("run", "in", *run).stderr  # that is not looked at
     Path("in/b.exr").unlink()
-    said = clpipe("run", "in", *run, "--truth", "clean").stderr
-    assert said.endswith("\n2 pictures in out are of inputs that are not there any more\n")
+    stderr = clpipe("run", "in", *run, "--truth", "clean").stderr
+    assert stderr.endswith("\n2 pictures in out are of inputs that are not there any more\n")
     Path("in/sub/c.exr").unlink()
     for given in ("in", "./in/", "in/*.exr", "in/a.exr"):
         count = 4 if given in ("in", "./in/") else 2  # b and its truth; so with c
-        told = clpipe("run", given, *run).stderr
-        assert f"\n{count} pictures in out are of inputs that are {there}" in told
+        messages = clpipe("run", given, *run).stderr
+        assert f"\n{count} pictures in out are of inputs that are {there}" in messages
     for option in (("--quiet",), ("--shard", "1/2"), ("--json-lines",)):
         assert there not in clpipe("run", "in", *run, *option).output
 
 
 @pytest.fixture
 def program(monkeypatch):
-    """Be another program from now on."""
+    """Change the digest of the program."""
 
     def be(digest):
         for module in ("existing", "record"):

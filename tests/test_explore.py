@@ -1,4 +1,4 @@
-"""``clpipe explore``: an image developed again and again, and the settings that are saved."""
+"""``clpipe explore``: repeated development of an image, and saved settings."""
 
 import json
 import os
@@ -140,21 +140,23 @@ def test_noise_of_all_of_a_picture_is_that_of_measure(clpipe, explorer, two_rend
     for step, (picture, truth) in pairs.items():
         box = (0, 0, 96, 63)
         report = explorer.noise(0, {"iso": 6400}, View(step), box)
-        said = json.loads(clpipe("measure", out / picture, "--truth", out / truth, "--json").output)
+        record = json.loads(
+            clpipe("measure", out / picture, "--truth", out / truth, "--json").output
+        )
         own = report.record()
-        assert own["channels"].keys() == said["channels"].keys()
+        assert own["channels"].keys() == record["channels"].keys()
         for name, channel in own["channels"].items():
             if step == "":  # a mosaic of an odd height is cut to whole cells
-                assert channel == said["channels"][name]
-            assert channel["sigma"] == pytest.approx(said["channels"][name]["sigma"], rel=0.05)
+                assert channel == record["channels"][name]
+            assert channel["sigma"] == pytest.approx(record["channels"][name]["sigma"], rel=0.05)
 
 
 def test_views_are_stages_and_truths_and_their_values(explorer):
     raw = explorer.develop(0, {"iso": 6400}, View("quantize"))
     assert raw.facts["kind"] == "raw"
-    said = explorer.values_at(raw.facts["number"], 5, 7)
-    assert said["unit"] == "DN"
-    assert said["values"] == [round(said["values"][0])]
+    sample = explorer.values_at(raw.facts["number"], 5, 7)
+    assert sample["unit"] == "DN"
+    assert sample["values"] == [round(sample["values"][0])]
     clean = explorer.develop(0, {"iso": 6400}, View(truth="clean"))
     other = explorer.develop(0, {"iso": 6400, "seed": 9}, View(truth="clean"))
     np.testing.assert_array_equal(clean.shown, other.shown)
@@ -187,9 +189,9 @@ def test_a_render_that_is_replaced_is_read_again(two_renders, tmp_path, device):
         after = explorer.develop(0, NOISY, View())
         alone = explorer_of(path, device=device).develop(0, NOISY, View())
         np.testing.assert_array_equal(after.shown, alone.shown)
-    # What was shown stays what it was, whatever the file has become.
-    said = explorer.values_at(before.facts["number"], 5, 7)
-    assert said["values"] == before.shown[7, 5].tolist()
+    # Values of a shown picture do not change if its file changes.
+    sample = explorer.values_at(before.facts["number"], 5, 7)
+    assert sample["values"] == before.shown[7, 5].tolist()
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(ImageError, match=r"a\.exr"):
         explorer.develop(0, NOISY, View())
@@ -289,5 +291,5 @@ def test_a_rectangle_that_is_not_in_the_picture_is_refused(explorer, box, says):
 def test_a_manifest_is_refused(two_renders, tmp_path):
     manifest = tmp_path / "list.csv"
     manifest.write_text(f"path,iso\n{two_renders / 'a.exr'},800\n")
-    said = cli_output("explore", manifest, "--device", "numpy", status=2)
-    assert "rows of a manifest may have their own settings" in said
+    output = cli_output("explore", manifest, "--device", "numpy", status=2)
+    assert "rows of a manifest may have their own settings" in output

@@ -1,4 +1,4 @@
-"""``clpipe explore``: what its server answers, and what its page does in a browser."""
+"""``clpipe explore``: the server's responses, and the page in a browser."""
 
 import asyncio
 import http.client
@@ -105,7 +105,7 @@ def test_nobody_without_the_token_gets_an_answer(served):
 
 
 def test_another_host_name_is_refused(served):
-    """So no page elsewhere can have its own name lead here."""
+    """This prevents DNS rebinding by other sites."""
     assert answer(served, "", host="evil.example")[0] == 400
 
 
@@ -212,8 +212,8 @@ def test_a_port_in_use_is_said(two_renders):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = str(taken.getsockname()[1])
-        said = clpipe("explore", two_renders, "--device", "numpy", "--port", port, status=2)
-    assert f"--port {port}: cannot be used: Address already in use" in said
+        result = clpipe("explore", two_renders, "--device", "numpy", "--port", port, status=2)
+    assert f"--port {port}: cannot be used: Address already in use" in result
 
 
 @pytest.mark.slow
@@ -254,7 +254,7 @@ def put(page, key, value):
 
 
 def on_screen(page):
-    """The whole picture as the page has it."""
+    """Return the whole picture of the page."""
     text = page.evaluate("Array.from(picture.pixels).join()")
     shape = page.evaluate("[picture.facts.height, picture.facts.width, 3]")
     return np.array(text.split(","), np.uint8).reshape(shape)
@@ -433,11 +433,11 @@ def test_sliders_have_the_limits_of_their_texts(page):
     )
     assert len(sliders) > 20
     for low, high, text in sliders:
-        said = re.search(r"The slider covers (\S+) to (\S+)\.(?= |$)", text)
-        said = said or re.search(r"(?:From|Above) (\S+) (?:to|below) (\S+)\.(?= |$)", text)
-        assert said, text
+        match = re.search(r"The slider covers (\S+) to (\S+)\.(?= |$)", text)
+        match = match or re.search(r"(?:From|Above) (\S+) (?:to|below) (\S+)\.(?= |$)", text)
+        assert match, text
         near = pytest.approx((low, high), abs=(high - low) / 300)
-        assert (float(said[1]), float(said[2])) == near, text
+        assert (float(match[1]), float(match[2])) == near, text
 
 
 def test_keys_move_zoom_swap_and_undo(page):

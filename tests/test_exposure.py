@@ -1,4 +1,4 @@
-"""Exposure: by metering, against the formulas and percentiles that it stands for; by physics."""
+"""Exposure by metering and by physics, against formulas and percentiles."""
 
 import json
 import math

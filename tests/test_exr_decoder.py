@@ -1,4 +1,4 @@
-"""The two decoders of OpenEXR files: the same pixels, the same refusals."""
+"""The two decoders of OpenEXR files return the same pixels and the same errors."""
 
 import struct
 import sys
@@ -50,7 +50,7 @@ def outcome(path, **options):
 
 @pytest.fixture
 def decoded(monkeypatch):
-    """Read a file with both decoders, which must agree; whether the OpenEXR package did."""
+    """Read a file with both decoders, which must agree; return whether OpenEXR read it."""
 
     def both(path, **options):
         used = []

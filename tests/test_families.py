@@ -1,4 +1,4 @@
-"""Chains that differ in numbers: those that are computed are those that are made."""
+"""Traced chains equal resolved chains when only numbers differ."""
 
 import math
 import operator
@@ -30,14 +30,14 @@ def slow(seed):
 
 @pytest.fixture
 def families(monkeypatch):
-    """No chains are known yet."""
+    """Clear the cache of chains."""
     known = BoundedCache(64)
     monkeypatch.setattr("clpipe.chain.families.FAMILIES", known)
     return known
 
 
 def made(settings, monkeypatch):
-    """The chain of settings, made without a look at any family."""
+    """Resolve the chain of settings without a family."""
     with monkeypatch.context() as alone:
         alone.setattr("clpipe.chain.families.FAMILIES", BoundedCache(1))
         return make_chain(settings)
@@ -139,7 +139,7 @@ def test_chains_of_numbers_at_random_are_those_that_are_made(seed, families, mon
 
 
 def assert_alike(chain, expected):
-    """Fail unless a chain and its truths are those that are expected."""
+    """Check that a chain and its truths are as expected."""
     assert_equal(chain, expected)
     for name in COMPUTED:
         assert repr(getattr(chain, name)) == repr(getattr(expected, name))
@@ -188,7 +188,7 @@ def test_a_value_that_is_not_allowed_is_refused_in_a_family_too(families):
 
 
 def test_code_that_computes_beside_its_arguments_is_found_out(families, monkeypatch):
-    """The first chain that was not traced is compared with the one that is made."""
+    """The first untraced chain is compared with the resolved chain."""
     from clpipe.stages.exposure.gain import Gain
 
     seen = []

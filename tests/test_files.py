@@ -1,4 +1,4 @@
-"""Files are written whole or not at all, and what is read is a regular file."""
+"""Files are written completely or not at all, and only regular files are read."""
 
 import json
 import os
@@ -163,9 +163,9 @@ def test_the_log_has_whole_lines_only(tmp_path):
     log = RunLog(path, {})
     log.add(outcome(0))
     before = path.read_bytes()
-    for room in (0, 1, 100):
+    for free_bytes in (0, 1, 100):
         with (
-            file_limit(len(before) + room),
+            file_limit(len(before) + free_bytes),
             pytest.raises(OutputError, match=r"run\.jsonl: cannot"),
         ):
             log.add(outcome(1))

@@ -231,7 +231,7 @@ def test_filters_of_several_colours_add_up_what_the_light_gives_each(device, lig
     ],
 )
 def test_flat_colours_stay_under_any_white_balance(stages, settings):
-    """As on a Bayer pattern, but for a factor by which clear filters make a camera expose less."""
+    """Like on a Bayer pattern, except that clear filters reduce the exposure by a factor."""
     flat = np.full((24, 24, 3), 1, np.float32) * np.float32([0.2, 0.3, 0.4])
     light = {"red_gain": 1.2, "blue_gain": 3.0}
     if "inverse" in stages:
@@ -474,7 +474,7 @@ def test_settings_that_draw_an_array(clpipe):
     options = ("--set", "mosaic.method=array", "--set", f"mosaic.array={choices}")
     clpipe("run", STILL_LIFE, "-o", "out", *options, "--device", "numpy", "--until", "mosaic")
     assert Path("out/still_life.exr").exists()
-    assert ARRAYS  # what clpipe check goes through
+    assert ARRAYS  # the arrays of clpipe check
     with pytest.raises(KeyedError):
         settings_from({"mosaic": {"method": "array", "pattern": "RGGB"}})
 
@@ -510,7 +510,7 @@ def test_cells_are_binned_to_a_bayer_pattern(device):
     [("quad-RGGB", 2, (101, 67)), ("nona-RGGB", 3, (101, 67)), ("nona-RGGB", 3, (100, 2))],
 )
 def test_places_follow_the_cells_that_are_binned(array, factor, size):
-    """Of sizes that are no multiple of a cell: brightness tells where each pixel comes from."""
+    """Test sizes that are no multiple of a cell; brightness encodes the position of each pixel."""
     width, height = size
     chain = on(array, stages=["mosaic", "remosaic"], remosaic={"method": "binning"})
     runner = Runner(chain, None, encode=False, final=True)
@@ -611,10 +611,10 @@ def test_a_remosaiced_picture_is_as_the_array_saw_it(develop):
 
 
 def test_the_array_of_a_raw_is_that_of_its_pixels():
-    quad, wanted = "RRGG/RRGG/GGBB/GGBB", {"method": "linear_mmse", "pattern": "GBRG"}
+    quad, remosaic = "RRGG/RRGG/GGBB/GGBB", {"method": "linear_mmse", "pattern": "GBRG"}
     assert remosaiced("quad-RGGB", "binning").filters.pattern == quad
     assert remosaiced("quad-RGGB", "linear_mmse").filters.pattern == quad
-    assert on("RGGB", stages=WITH_REMOSAIC, remosaic=wanted).filters.pattern == "RGGB"
+    assert on("RGGB", stages=WITH_REMOSAIC, remosaic=remosaic).filters.pattern == "RGGB"
     charge = [*DEFAULT_CHAIN]
     charge.insert(charge.index("mosaic") + 1, "remosaic")
     assert on("quad-RGGB", stages=charge, remosaic={"method": "binning"}).filters.pattern == "RGGB"

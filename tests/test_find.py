@@ -1,4 +1,4 @@
-"""Which files of a folder a run is about, and what its outputs are called."""
+"""The input files of a folder, and the names of their outputs."""
 
 import json
 import logging
@@ -48,7 +48,7 @@ def test_the_real_path_wins_over_a_link_whatever_the_order_on_disk(folder, monke
 
 
 class Listing:
-    """A folder's entries in an order that a file system may have."""
+    """Return a folder's entries in any order of a file system."""
 
     def __init__(self, scandir, place, backwards):
         with scandir(place) as entries:
@@ -96,7 +96,7 @@ def test_exclude(folder, caplog):
 
 @pytest.mark.slow
 def test_a_folder_that_cannot_be_read_is_refused(tmp_path):
-    """Not silently left out; as another user, since root can read everything."""
+    """An unreadable folder is an error. Root can read everything, so run as another user."""
     (tmp_path / "in" / "locked").mkdir(parents=True)
     (tmp_path / "in" / "locked").chmod(0)
     (tmp_path / "in" / "a.exr").touch()

@@ -1,4 +1,4 @@
-"""First commands with a mistake: each is answered with what is wrong and with what was meant."""
+"""Mistakes in first commands: each message states the mistake and a suggestion."""
 
 import json
 from pathlib import Path
@@ -75,15 +75,15 @@ def folder(write_exr):
     ],
 )
 def test_what_was_meant_is_said(clpipe, folder, words, message):
-    said = clpipe(*words, status=2).stderr
-    assert message.format(IS_MISSING) in said
+    stderr = clpipe(*words, status=2).stderr
+    assert message.format(IS_MISSING) in stderr
     assert not Path("out").exists()
 
 
 def test_another_camera_is_not_built_in(clpipe, folder):
-    said = clpipe(*RUN, "--camera", "sony a7iii", status=2).stderr
-    assert "it is not built in" in said and "did you mean" not in said
-    assert "'clpipe cameras import' or 'clpipe calibrate'" in said
+    stderr = clpipe(*RUN, "--camera", "sony a7iii", status=2).stderr
+    assert "it is not built in" in stderr and "did you mean" not in stderr
+    assert "'clpipe cameras import' or 'clpipe calibrate'" in stderr
 
 
 def test_help_is_a_command(clpipe):
@@ -127,9 +127,9 @@ INPUTS = {
 
 @pytest.mark.parametrize("words", INPUTS.values(), ids=INPUTS)
 def test_a_missing_input_has_one_status_and_one_line(clpipe, folder, words):
-    said = clpipe(*words.format("gone").split(), status=2).stderr
-    assert said.startswith("clpipe: gone") and IS_MISSING in said
-    assert len(said.splitlines()) == 1
+    stderr = clpipe(*words.format("gone").split(), status=2).stderr
+    assert stderr.startswith("clpipe: gone") and IS_MISSING in stderr
+    assert len(stderr.splitlines()) == 1
 
 
 @pytest.mark.parametrize("name", ["jpeg", "TIFF", "tiff16", ".JPG"])
@@ -144,8 +144,8 @@ def test_formats_have_other_names(clpipe, folder, name):
 @pytest.mark.parametrize("output", ["in_the_way", "in_the_way/out"])
 def test_a_file_in_the_place_of_a_folder_is_named(clpipe, folder, command, output):
     Path("in_the_way").touch()
-    said = clpipe(*command.split(), "-o", output, status=2).stderr
-    assert said == "clpipe: --output: in_the_way is a file. Name an output directory.\n"
+    stderr = clpipe(*command.split(), "-o", output, status=2).stderr
+    assert stderr == "clpipe: --output: in_the_way is a file. Name an output directory.\n"
 
 
 @pytest.mark.parametrize(
@@ -154,18 +154,20 @@ def test_a_file_in_the_place_of_a_folder_is_named(clpipe, folder, command, outpu
 def test_an_array_of_numpy_is_called_one(clpipe, folder, words):
     clpipe(*RUN, "--device", "numpy", "--format", "npy")
     words = words.format("out/render.npy")
-    said = clpipe(*words.split(), status=2).stderr
-    assert said.startswith("clpipe: out/render.npy: this is a NumPy array")
-    assert "numpy.load" in said
+    stderr = clpipe(*words.split(), status=2).stderr
+    assert stderr.startswith("clpipe: out/render.npy: this is a NumPy array")
+    assert "numpy.load" in stderr
 
 
 @pytest.mark.parametrize("name", ["render.png", "render.exr"])
 def test_the_explorer_starts_with_an_image_that_can_be_read(clpipe, folder, name):
     pytest.importorskip("uvicorn", reason="needs uvicorn, in the extra explore")
     Path(name).write_bytes(b"no image")
-    said = clpipe("explore", name, "--device", "numpy", status=2).stderr
-    assert said.startswith(f"clpipe: {name}: cannot be read as an image")
-    assert "clpipe explore reads the same inputs as clpipe run" in said and said.count("\n") == 1
+    stderr = clpipe("explore", name, "--device", "numpy", status=2).stderr
+    assert stderr.startswith(f"clpipe: {name}: cannot be read as an image")
+    assert (
+        "clpipe explore reads the same inputs as clpipe run" in stderr and stderr.count("\n") == 1
+    )
 
 
 def test_one_image_is_counted_as_one(clpipe, folder):
@@ -175,17 +177,17 @@ def test_one_image_is_counted_as_one(clpipe, folder):
 
 
 def test_a_layer_that_is_not_there(clpipe, folder):
-    said = clpipe(*RUN, "--device", "numpy", "--carry", "Depth", status=1).stderr
+    stderr = clpipe(*RUN, "--device", "numpy", "--carry", "Depth", status=1).stderr
     expected = "the file has no layers besides the picture, and there is no render_Depth.exr next"
-    assert f"--carry: there is no layer 'Depth'; {expected}" in said
+    assert f"--carry: there is no layer 'Depth'; {expected}" in stderr
 
 
 def test_every_command_has_a_form_for_programs():
     for name in COMMANDS:
         command = main.get_command(click.Context(main), name)
         options = {option for each in command.params for option in each.opts}
-        wanted = "--json-lines" if name in {"run", "dataset"} else "--json"
-        assert wanted in options, name
+        expected = "--json-lines" if name in {"run", "dataset"} else "--json"
+        assert expected in options, name
 
 
 def test_answers_are_json(clpipe, folder):
@@ -206,6 +208,6 @@ def test_answers_are_json(clpipe, folder):
 
 
 def test_a_dataset_prints_its_log(clpipe, folder):
-    said = clpipe("dataset", "renders", "-o", "set", "--device", "numpy", "--json-lines")
-    lines = [json.loads(line) for line in said.stdout.splitlines()]
+    result = clpipe("dataset", "renders", "-o", "set", "--device", "numpy", "--json-lines")
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
     assert len(lines) == 3 and lines[1]["status"] == "done"

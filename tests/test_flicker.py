@@ -1,4 +1,4 @@
-"""Pulsed light: rows, layers of light and staggered exposures against the square wave itself."""
+"""Pulsed light: rows, light layers and staggered exposures against the square wave."""
 
 from pathlib import Path
 
@@ -114,7 +114,7 @@ def test_each_frame_has_the_light_of_its_time(lit):
 
 @pytest.mark.slow
 def test_a_short_exposure_misses_the_pulse(lit):
-    # On for 2 of each 10 ms; exposed for 8, 2 and 0.5 ms, one behind the other.
+    # The lamp is on for 2 of each 10 ms. Exposures of 8, 2 and 0.5 ms follow each other.
     lamp = {"flicker_frequency": 100.0, "flicker_duty": 0.2, "exposure_time": 8e-3}
     noise = {"method": "staggered", "ratio": 4.0, "a": 0.0, "b": 0.0}
     given = {f"sensor_noise.{name}": value for name, value in noise.items()}
@@ -131,7 +131,7 @@ def test_a_short_exposure_misses_the_pulse(lit):
 
 
 def test_what_is_refused(lit):
-    told = lit(
+    stderr = lit(
         "run",
         "in/f0.exr",
         "-o",
@@ -142,11 +142,11 @@ def test_what_is_refused(lit):
         "shutter.flicker_layer=Sun",
         status=1,
     ).stderr
-    assert "no layer 'Sun' with a picture; its layers: " in told and "Lamp" in told
+    assert "no layer 'Sun' with a picture; its layers: " in stderr and "Lamp" in stderr
     pipeline = Pipeline(device="numpy", shutter={"flicker_duty": 0.5, "flicker_layer": "Lamp"})
     with pytest.raises(RequestError, match="which an array does not have"):
         pipeline.process(np.ones((4, 4, 3), np.float32), "a")
     wide = ("--set", "projection.method=kannala_brandt", "--set", "shutter.flicker_layer=Lamp")
     wide += ("--set", "shutter.flicker_duty=0.2", "--set", "projection.fx=10")
-    told = lit("run", "in", "-o", "x", *wide, status=2).stderr
-    assert "panoramas have no light layers" in told
+    stderr = lit("run", "in", "-o", "x", *wide, status=2).stderr
+    assert "panoramas have no light layers" in stderr

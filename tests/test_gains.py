@@ -1,4 +1,4 @@
-"""The figure of what denoisers gain on real pictures."""
+"""The figure of the gains of denoisers on real pictures."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""tools/stress/gpu_compile.py, on a few kernels, for each target whose compilers are here."""
+"""tools/stress/gpu_compile.py on a few kernels, for targets with an installed compiler."""
 
 import re
 import subprocess
@@ -35,10 +35,10 @@ def job():
 
 def test_what_a_kernel_may_not_do(job):
     good = tool.Compiled(40, 0, 0, "100%", 500, 0)
-    assert tool.wrong_with(job, good) == ""
-    assert tool.wrong_with(job, replace(good, fused=1)) == "FUSED"
-    assert tool.wrong_with(job, replace(good, spilled=4)) == "SPILLS"
-    assert tool.wrong_with(replace(job, chain="gamma=srgb"), replace(good, fused=1)) == ""
+    assert tool.violation(job, good) == ""
+    assert tool.violation(job, replace(good, fused=1)) == "FUSED"
+    assert tool.violation(job, replace(good, spilled=4)) == "SPILLS"
+    assert tool.violation(replace(job, chain="gamma=srgb"), replace(good, fused=1)) == ""
 
 
 @pytest.mark.parametrize("target", ["sm_90", "gfx1030", "dg2"])
@@ -49,7 +49,7 @@ def test_the_raw_is_compiled_without_spills_and_fused_multiply_adds(job, target,
         result = tool.TARGETS[target](source)
     except tool.MissingError as error:
         pytest.skip(f"needs {str(error).removeprefix('no ')}")
-    assert tool.wrong_with(job, result) == "" and result.registers and result.instructions > 100
+    assert tool.violation(job, result) == "" and result.registers and result.instructions > 100
 
 
 def test_a_kernel_that_does_not_compile_is_told(job, tmp_path, monkeypatch):

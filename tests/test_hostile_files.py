@@ -1,4 +1,4 @@
-"""Files that ask for more than they hold, and things that are no files: refused, soon and small."""
+"""Malformed files are rejected quickly and within little memory."""
 
 import io
 import os
@@ -153,8 +153,8 @@ def test_images_that_claim_too_much_are_refused_in_little_memory(tmp_path):
         command, cwd=ROOT, capture_output=True, text=True, timeout=120, env=environment
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    told = ("rgb.png", "rgb.tif", "mosaic.tif", "rgb.pfm", "window.exr", "sensor.dng")
-    for name in (*told, "display.exr", "chroma.exr", "chroma_display.exr"):
+    large_files = ("rgb.png", "rgb.tif", "mosaic.tif", "rgb.pfm", "window.exr", "sensor.dng")
+    for name in (*large_files, "display.exr", "chroma.exr", "chroma_display.exr"):
         assert (
             f"{name}: this file has 60000x60000 pixels; at most 200000000 are read." in done.stdout
         )

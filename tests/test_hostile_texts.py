@@ -1,4 +1,4 @@
-"""Texts, numbers and names that no honest file holds: one clear line, and nothing else is lost."""
+"""Malformed texts, numbers and names: one clear message, and no other image is lost."""
 
 import json
 import os
@@ -157,8 +157,8 @@ def test_options_with_a_number_of_too_many_digits(parse, text, message):
 
 @pytest.mark.parametrize("command", [("bench",), ("emva", "--camera", "nikon-d850", "-o", "out")])
 def test_a_size_of_too_many_digits(clpipe, command):
-    said = clpipe(*command, "--size", f"640x{LONG}", status=2).stderr
-    assert "expected WIDTHxHEIGHT" in said
+    stderr = clpipe(*command, "--size", f"640x{LONG}", status=2).stderr
+    assert "expected WIDTHxHEIGHT" in stderr
 
 
 def test_names_that_no_file_can_have():

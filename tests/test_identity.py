@@ -1,4 +1,4 @@
-"""Noise belongs to the seed, the ISO and the image, and is shared only where somebody asks."""
+"""Noise depends on the seed, the ISO and the image, and is shared only on request."""
 
 import json
 import warnings

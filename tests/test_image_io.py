@@ -1,4 +1,4 @@
-"""Image files: the right picture or the right refusal."""
+"""Image files: the correct picture or the correct error."""
 
 import io
 

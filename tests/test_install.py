@@ -1,4 +1,4 @@
-"""The package as a user gets it: installed from another folder, kernels inside."""
+"""The installed package: used from another folder, with its kernels."""
 
 import re
 import subprocess
@@ -80,10 +80,14 @@ def test_no_text_installs_another_project_of_that_name():
 def test_pocl_is_asked_for_only_where_it_has_a_wheel(system, machine, expected):
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     here = {"sys_platform": system, "platform_machine": machine}
-    asked = [Requirement(text) for text in project["dependencies"]]
-    asked = [each for each in asked if each.marker is None or each.marker.evaluate(here)]
-    assert {each.name for each in asked if "cl" in each.name and each.name != "click"} == expected
-    assert not any(each.extras for each in asked)
+    requirements = [Requirement(text) for text in project["dependencies"]]
+    requirements = [
+        each for each in requirements if each.marker is None or each.marker.evaluate(here)
+    ]
+    assert {
+        each.name for each in requirements if "cl" in each.name and each.name != "click"
+    } == expected
+    assert not any(each.extras for each in requirements)
 
 
 def needed(project, extra):
@@ -112,10 +116,10 @@ def test_a_lock_has_all_that_is_asked_for(extra):
             versions.setdefault(canonicalize_name(locked.name), []).append(pinned.version)
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
     build = map(Requirement, pyproject["build-system"]["requires"])
-    for asked in (*needed(pyproject["project"], extra), *build):
-        found = versions.get(canonicalize_name(asked.name), [])
-        assert found, f"{asked} is not locked; run tools/versions lock {asked.name}"
-        assert all(version in asked.specifier for version in found), (asked, found)
+    for requirement in (*needed(pyproject["project"], extra), *build):
+        found = versions.get(canonicalize_name(requirement.name), [])
+        assert found, f"{requirement} is not locked; run tools/versions lock {requirement.name}"
+        assert all(version in requirement.specifier for version in found), (requirement, found)
 
 
 def test_a_lock_names_no_index_and_no_folder():

@@ -1,4 +1,4 @@
-"""Intrinsics in sidecars: points of a scene are where COLMAP's models say, in the picture."""
+"""Intrinsics in sidecars: scene points project as COLMAP's models state."""
 
 import json
 from pathlib import Path
@@ -61,8 +61,8 @@ def test_points_are_where_the_intrinsics_say(distortion, model):
     rendered = 600 * x + 330, 600 * y + 205
     start = rendered[0] * 0.51, rendered[1] * 0.51
     seen = destinations(chain.geometry, rendered, start, WIDTH, HEIGHT)
-    told = projected(x, y, camera)
-    off = np.hypot(seen[0] - told[0], seen[1] - told[1]).max()
+    expected = projected(x, y, camera)
+    off = np.hypot(seen[0] - expected[0], seen[1] - expected[1]).max()
     assert off < 0.01
     if distortion["method"] == "ptlens":  # whose powers are odd; what is fitted says how well
         assert 0.1 * camera["residual"] < off <= camera["residual"] + 2e-6 and off > 0
@@ -70,18 +70,18 @@ def test_points_are_where_the_intrinsics_say(distortion, model):
         assert camera["residual"] == 0
 
 
-def test_what_is_not_known_is_not_told():
-    def told(distortion, shot):
+def test_unknown_intrinsics_are_not_written():
+    def intrinsics_for(distortion, shot):
         chain = make_chain(settings_from({**HALVED, "distortion": distortion}))
         return chain.intrinsics(WIDTH, HEIGHT, shot)
 
-    assert told({"method": "none"}, {}) is None
-    assert told({"method": "poly3", "k1": -0.03}, {}) is None
-    # An image that enters behind the lens may have gone through one.
+    assert intrinsics_for({"method": "none"}, {}) is None
+    assert intrinsics_for({"method": "poly3", "k1": -0.03}, {}) is None
+    # An image that starts after the lens stages may already be distorted.
     entered = make_chain(settings_from({**HALVED, "distortion": BROWN}), start_at="exposure")
     image = SourceImage(np.zeros((HEIGHT, WIDTH, 3), np.float32), "", "", (), {}, RENDER)
     assert intrinsics_of(entered, image) is None
-    assert told(BROWN, {}).fx == pytest.approx(600 * 326 / 640)  # the lens knows it
+    assert intrinsics_for(BROWN, {}).fx == pytest.approx(600 * 326 / 640)  # the lens knows it
 
 
 def test_the_sidecar_has_them(clpipe, write_exr, tmp_path, monkeypatch):
@@ -96,5 +96,5 @@ def test_the_sidecar_has_them(clpipe, write_exr, tmp_path, monkeypatch):
     }
     contradictory = [f"distortion.{k}={v}" for k, v in (BROWN | {"fx": 45.0, "cx": 15.0}).items()]
     sets = [x for each in contradictory for x in ("--set", each)]
-    told = clpipe("run", "list.csv", "-o", "p", "--device", "numpy", *sets, status=2).stderr
-    assert "distortion.cx: 15 contradicts render.cx: 14; set one" in told
+    stderr = clpipe("run", "list.csv", "-o", "p", "--device", "numpy", *sets, status=2).stderr
+    assert "distortion.cx: 15 contradicts render.cx: 14; set one" in stderr

@@ -1,4 +1,4 @@
-"""The judge of tools/compare: it tells what differs, not what is alike, and reads pairs."""
+"""tools/compare/judge.py: it separates different noise, not equal noise, and reads pairs."""
 
 import json
 import sys
@@ -9,13 +9,13 @@ from PIL import Image
 from scipy import ndimage
 
 from tools.compare import judge
-from tools.compare.telling import PATCH, auc, distance, statistics, told
+from tools.compare.classifier import PATCH, auc, distance, held_out_auc, statistics
 
 pytestmark = pytest.mark.slow
 
 
 def patches(seed, count=60, blur=0.8, skew=0.0):
-    """The statistics of patches of noise of a blur, (patch, statistic)."""
+    """Return the statistics of patches of blurred noise, (patch, statistic)."""
     random = np.random.default_rng(seed)
     level = np.add.outer(np.arange(PATCH), np.arange(PATCH)) + 60.0
     found = []
@@ -27,14 +27,14 @@ def patches(seed, count=60, blur=0.8, skew=0.0):
     return np.array(found)
 
 
-def test_what_is_alike_cannot_be_told_and_what_differs_can():
+def test_only_different_noise_can_be_separated():
     real = {"a": patches(1), "b": patches(2)}
     alike = {"a": patches(3), "b": patches(4)}
-    assert 0.3 < told(real, alike, "a") < 0.7
+    assert 0.3 < held_out_auc(real, alike, "a") < 0.7
     for other in ({"blur": 1.0}, {"skew": 0.15}):
         different = {"a": patches(3, **other), "b": patches(4, **other)}
-        assert told(real, different, "a") > 0.95
-        assert told(real, different, "b") > 0.95
+        assert held_out_auc(real, different, "a") > 0.95
+        assert held_out_auc(real, different, "b") > 0.95
 
 
 def test_the_distance_grows_with_the_difference():
@@ -63,11 +63,11 @@ def test_auc_is_the_chance_of_the_larger_score():
 def test_pairs_of_two_cameras_are_judged(tmp_path, monkeypatch, capsys):
     random = np.random.default_rng(0)
     ramp = np.repeat(np.linspace(35, 170, 320)[None, :, None], 3, 2).repeat(256, 0)
-    ramp[:, 192:] += 25 * np.sin(np.arange(128) / 3)[:, None]  # so that the rest is flat
+    ramp[:, 192:] += 25 * np.sin(np.arange(128) / 3)[:, None]  # only the rest is flat
     for camera, blur in (("one", 0.6), ("two", 0.9)):
         for number in (1, 2):
-            own = ndimage.gaussian_filter(random.normal(0, 9, ramp.shape), (blur, blur, 0.5))
-            for name, pixels in (("mean", ramp), ("real", ramp + own)):
+            noise = ndimage.gaussian_filter(random.normal(0, 9, ramp.shape), (blur, blur, 0.5))
+            for name, pixels in (("mean", ramp), ("real", ramp + noise)):
                 file = tmp_path / f"{camera}_iso800_{number}_{name}.png"
                 Image.fromarray(np.rint(pixels).clip(0, 255).astype(np.uint8)).save(file)
     monkeypatch.setattr(judge, "STEPS", 2)
@@ -77,17 +77,17 @@ def test_pairs_of_two_cameras_are_judged(tmp_path, monkeypatch, capsys):
     assert found["pictures"] == {"one_iso800": 2, "two_iso800": 2}
     assert set(found["judged"]) == {"default", "iid", "intensity-dependent"}
     for camera in ("one_iso800", "two_iso800"):
-        for own in found["judged"].values():
-            assert 0 <= own[camera]["auc"] <= 1 and own[camera]["distance"] > 0
-        # Independent noise is further from correlated noise than a camera's is.
-        far, near = (found["judged"][way][camera]["distance"] for way in ("iid", "default"))
+        for scores in found["judged"].values():
+            assert 0 <= scores[camera]["auc"] <= 1 and scores[camera]["distance"] > 0
+        # Independent noise is farther from correlated noise than a camera's noise is.
+        far, near = (found["judged"][source][camera]["distance"] for source in ("iid", "default"))
         assert far > near
     white = found["figures"]["iid, as one_iso800"]
     assert abs(white[judge.CB_RIGHT]) < 0.1 and 0.3 < white[judge.CR_COARSE] < 3
     assert found["figures"]["iid, as one_iso800"]["half"] == pytest.approx(0.25, abs=0.03)
     print(judge.table(found))
-    said = capsys.readouterr().out
-    assert "one_iso800 and two_iso800: " in said and "tells most" in said
+    printed = capsys.readouterr().out
+    assert "one_iso800 and two_iso800: " in printed and "most different" in printed
     (tmp_path / "one_iso800_1_mean.png").unlink()
     with pytest.raises(SystemExit, match=r"has no one_iso800_1_mean\.png"):
         judge.read_pairs(tmp_path)

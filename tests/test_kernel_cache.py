@@ -1,4 +1,4 @@
-"""What is kept of compiled kernels is looked at before it is used, and is this user's alone."""
+"""The kernel cache is verified before use, and private to the user."""
 
 import mmap
 import os

@@ -1,4 +1,4 @@
-"""What a tool writes into the source of the Python API follows from the stages and options."""
+"""The generated source of the Python API matches the stages and options."""
 
 import inspect
 import typing

@@ -1,4 +1,4 @@
-"""Launches that are left out because their results are on the device: which, and the same bits."""
+"""Launches that are skipped because their results are on the device: same bits."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Which layer of a render is the picture: by known names, never by the alphabet."""
+"""The choice of a render's picture layer: by known names, never by the alphabet."""
 
 import json
 

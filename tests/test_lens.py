@@ -1,4 +1,4 @@
-"""Lenses: bent pictures, lateral colour, vignetting, and what lensfun knows of lenses."""
+"""Lenses: distortion, lateral colour, vignetting, and lensfun's data."""
 
 import json
 import sys
@@ -153,15 +153,15 @@ def test_a_lens_that_folds_the_image_is_refused(clpipe, write_exr):
     write_exr("a.exr", np.full((40, 60, 3), 0.5))
     fold = ("--set", "distortion.method=brown_conrady", "--set", "distortion.fx=25")
     run = ("run", "a.exr", "-o", "o", "--stages", "distortion", "--device", "numpy")
-    said = clpipe(*run, *fold, "--set", "distortion.k1=-0.5", status=1).stderr
-    assert "The distortion folds at r = 0.8165, 20 px from the principal point" in said
-    assert "the corner of 60x40 pixels is at r = 1.442" in said
-    said = clpipe(*run, "--set", "distortion.method=fisheye", status=2).stderr
-    assert "set fx (px), or focal_length and sensor_width (mm)" in said
+    stderr = clpipe(*run, *fold, "--set", "distortion.k1=-0.5", status=1).stderr
+    assert "The distortion folds at r = 0.8165, 20 px from the principal point" in stderr
+    assert "the corner of 60x40 pixels is at r = 1.442" in stderr
+    stderr = clpipe(*run, "--set", "distortion.method=fisheye", status=2).stderr
+    assert "set fx (px), or focal_length and sensor_width (mm)" in stderr
     both = ("--set", "distortion.focal_length=20", "--set", "distortion.sensor_width=30")
-    said = clpipe(*run, *fold, *both, status=1).stderr
-    assert "distortion.fx makes the focal length of this render of 60x40 pixels 25 px" in said
-    assert "but distortion.focal_length and distortion.sensor_width 40 px" in said
+    stderr = clpipe(*run, *fold, *both, status=1).stderr
+    assert "distortion.fx makes the focal length of this render of 60x40 pixels 25 px" in stderr
+    assert "but distortion.focal_length and distortion.sensor_width 40 px" in stderr
     lateral = PtLens(vr=1.0, br=-0.9)
     with pytest.raises(ImageError, match="The lateral colour folds"):
         lateral.resampling.grid(60, 40)
@@ -258,10 +258,10 @@ def test_a_lens_is_set_as_a_camera_is(clpipe, write_exr):
     )
     Path("c.toml").write_text("[distortion]\nfit = true\n[focal_length]\nuniform = [24, 70]\n")
     clpipe("run", "m.csv", "-o", "o", "-c", "c.toml", "--device", "numpy")
-    said = {s["name"]: s for s in json.loads(Path("o/a.json").read_text())["stages"]}
-    assert said["distortion"]["method"] == "ptlens" and said["vignetting"]["method"] == "pa"
-    assert said["distortion"]["parameters"]["a"] == pytest.approx(0.0153, abs=1e-5)
-    assert said["distortion"]["estimates"]["focal_length_factor"] > 1.0
+    record = {s["name"]: s for s in json.loads(Path("o/a.json").read_text())["stages"]}
+    assert record["distortion"]["method"] == "ptlens" and record["vignetting"]["method"] == "pa"
+    assert record["distortion"]["parameters"]["a"] == pytest.approx(0.0153, abs=1e-5)
+    assert record["distortion"]["estimates"]["focal_length_factor"] > 1.0
     lens = ("--lens", "Canon EF 24-70mm f/2.8L", "--focal-length", 24)
     Path("printed.toml").write_text(clpipe("plan", *lens, "--toml").stdout)
     assert 'method = "lens"' in Path("printed.toml").read_text()
@@ -320,8 +320,8 @@ def test_an_aperture_of_a_lens_whose_range_is_not_all_known(low, high, aperture,
 def test_what_is_said_without_lensfunpy(clpipe, monkeypatch):
     by_name._loaded.cache_clear()
     monkeypatch.setitem(sys.modules, "lensfunpy", None)
-    said = clpipe("plan", "--lens", "any", status=2).stderr
-    assert "lensfunpy, which is not installed; pip install lensfunpy" in said
+    stderr = clpipe("plan", "--lens", "any", status=2).stderr
+    assert "lensfunpy, which is not installed; pip install lensfunpy" in stderr
 
 
 def test_kernels_are_not_refused_for_the_image_that_compiles_them(device):

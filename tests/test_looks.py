@@ -1,4 +1,4 @@
-"""Configurations over others: the way to the raw of one, the development of the next."""
+"""Configurations on top of others: the raw of one, the development of the next."""
 
 import json
 

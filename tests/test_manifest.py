@@ -1,4 +1,4 @@
-"""Manifests: what their rows say, and what is said of a row that is wrong."""
+"""Manifests: the values of rows, and the messages about wrong rows."""
 
 import json
 import ntpath
@@ -329,7 +329,7 @@ def test_an_image_that_brings_its_own_camera_may_have_its_isos(manifest):
 
 def test_a_row_completes_and_replaces_what_options_set(tmp_path, monkeypatch):
     (tmp_path / "noise.json").write_text(json.dumps(noise_report(0.02, 0.02, 0.02)))
-    monkeypatch.chdir(tmp_path)  # what a row names is found beside the manifest, not here
+    monkeypatch.chdir(tmp_path)  # files named by rows are relative to the manifest
     (tmp_path / "rows").mkdir()
     (tmp_path / "noise.json").rename(tmp_path / "rows" / "noise.json")
 

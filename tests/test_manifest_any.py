@@ -1,4 +1,4 @@
-"""Whatever a manifest holds, what is said of it is a RequestError; what is written is read."""
+"""Any manifest is read or rejected with a RequestError; written manifests can be read."""
 
 import csv
 import io

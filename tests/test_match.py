@@ -1,4 +1,4 @@
-"""clpipe match: its columns, known developments that come back, the pictures that it refuses."""
+"""clpipe match: its figures, known developments that it recovers, rejected pictures."""
 
 import io
 import json
@@ -118,7 +118,7 @@ def test_noise_against_the_mean_of_a_burst_is_that_of_a_frame(burst):
     against_truth = figures_of(noise_of_frames(frames, truth), places)
     against_mean = figures_of(noise_of_frames(frames[:4], None), places)
     for name, column in COLUMNS.items():
-        # What is left of a frame beside the mean of few is skewed less, in both that are compared.
+        # A frame minus the mean of few frames is less skewed, so skew is excluded.
         if name not in TAILS and "skew" not in name and not np.isnan(against_truth[name]):
             assert abs(column.residual(against_mean[name], against_truth[name])) < 0.06, name
 
@@ -211,7 +211,7 @@ def test_the_table(burst, clpipe, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("numbers", "told"),
+    ("numbers", "reason"),
     [
         ({"iso": 6390.0}, "iso stopped at 6400, .* may have more noise"),
         ({"iso": 100.0}, "iso stopped at 100, .* may have less noise"),
@@ -219,8 +219,8 @@ def test_the_table(burst, clpipe, monkeypatch, tmp_path):
         ({"denoise.luma_strength": 1.0}, "$"),
     ],
 )
-def test_an_iso_that_stops_where_the_profile_ends_is_told_of(numbers, told):
-    assert re.match(told, ended_by(Settings(camera="nikon-d800", iso=6400), numbers))
+def test_an_iso_that_stops_where_the_profile_ends_is_told_of(numbers, reason):
+    assert re.match(reason, ended_by(Settings(camera="nikon-d800", iso=6400), numbers))
 
 
 def test_numbers_that_make_up_for_each_other_are_told_of():

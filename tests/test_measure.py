@@ -1,4 +1,4 @@
-"""clpipe measure, from the outside: real runs, other people's files, refusals."""
+"""clpipe measure as a command: real runs, foreign files, rejected inputs."""
 
 import json
 import re
@@ -30,7 +30,7 @@ def measured(clpipe):
 
 @pytest.fixture(scope="module")
 def developed(tmp_path_factory):
-    """Develop the still life with some options, once; what the names of its pictures begin with.
+    """Develop the still life once with some options, and return the start of its file names.
 
     It is the middle of the still life, of 640x480 px.
     """
@@ -192,7 +192,7 @@ def test_finished_pictures_of_others(tmp_path, measured):
 
 
 def test_the_whole_picture_and_the_covariance_of_channels(tmp_path, measured, clpipe):
-    """Noise is twice as large beside edges, so flat places have less; channels share a part."""
+    """Noise is twice as large next to edges; channels share a part of it."""
     random = np.random.default_rng(5)
     clean = np.full((256, 257, 3), 128.0)
     clean[:128, ::2] -= 40  # stripes: nowhere flat
@@ -251,15 +251,17 @@ def test_bursts_of_several_scenes_are_one_figure_for_each_iso(tmp_path, measured
         ("100", 2, 6),
         ("800", 1, 3),
     ]
-    for iso, wanted in (("100", (3**2 + 2 * 6**2) / 3), ("800", 9**2)):
+    for iso, variance_expected in (("100", (3**2 + 2 * 6**2) / 3), ("800", 9**2)):
         report = by_iso[iso]
         one = report["channels"]["G"]
         for found in (one["sigma_picture"] ** 2, report["covariance"]["picture"][1][1]):
-            assert found * 255**2 == pytest.approx(wanted, rel=0.05)
-        assert report["covariance"]["halved"][2][2] * 255**2 == pytest.approx(wanted / 4, rel=0.06)
+            assert found * 255**2 == pytest.approx(variance_expected, rel=0.05)
+        assert report["covariance"]["halved"][2][2] * 255**2 == pytest.approx(
+            variance_expected / 4, rel=0.06
+        )
         curve = one["intensity_picture"]
         variance = np.average(np.square(curve["sigma"]), weights=curve["samples"])
-        assert variance * 255**2 == pytest.approx(wanted, rel=0.05)
+        assert variance * 255**2 == pytest.approx(variance_expected, rel=0.05)
         assert one["energy_left_2x2"] == pytest.approx(0.25, abs=0.02)
         assert sum(one["histogram"]["samples"]) == one["samples"]
     low = measured(*sorted((out / "low").glob("*.frame?.png")))

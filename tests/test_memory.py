@@ -1,4 +1,4 @@
-"""Memory and processors: what people write, and what a machine has left."""
+"""Memory and processors: parsing of sizes, and the free resources of a machine."""
 
 import os
 

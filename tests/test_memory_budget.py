@@ -1,4 +1,4 @@
-"""How much memory images may take: what files claim, which image waits, and which is refused."""
+"""The memory budget of images: estimates, waiting images and rejected images."""
 
 import os
 import subprocess
@@ -38,7 +38,7 @@ class SharingDevice:
 
 
 def budget_of(free, *devices, size=None, drop=lambda: None):
-    """A budget in which so many bytes are free, less what devices hold."""
+    """Return a budget with so many free bytes, minus the memory of devices."""
     budget = MemoryBudget(
         size, devices, drop, lambda: Left(free - sum(d.bytes_held for d in devices), "x")
     )
@@ -62,7 +62,7 @@ def clock(monkeypatch):
 
 
 class Entering:
-    """A thread that takes budget, and whether it has to wait for it."""
+    """Take budget in a thread, and return whether it waits."""
 
     def __init__(self, budget, *arguments):
         self._budget, self._arguments = budget, arguments
@@ -181,7 +181,7 @@ def test_what_files_claim(write_exr, tmp_path):
     four = np.zeros((4, 10, 4), np.float32)
     assert bytes_of(four, "R,G,B,A") == (6, 14)  # of all four, and of the three together
     assert bytes_of(pixels[..., :1], "Raw", half=False, mosaic=True) == (4, 4)
-    (tmp_path / "a.pfm").write_bytes(b"PF\n6000 4000\n-1.0\n")  # nothing behind it is looked at
+    (tmp_path / "a.pfm").write_bytes(b"PF\n6000 4000\n-1.0\n")  # only the header is read
     claim = claim_of(tmp_path / "a.pfm")
     assert (claim.width, claim.image, claim.reading) == (6000, 288_000_000, 576_000_000)
     assert claim_of(tmp_path / "missing.exr") is None
@@ -225,7 +225,7 @@ def test_no_runtime_is_loaded_where_addresses_are_too_few(monkeypatch):
 
 
 def limited(text, megabytes):
-    """Run Python in a process with so much address space."""
+    """Run Python in a process with limited address space."""
     import resource
 
     return subprocess.run(

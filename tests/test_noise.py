@@ -1,4 +1,4 @@
-"""The noise: exact words, exact normals, and the statistics that they must have."""
+"""Noise: exact random words, exact normals, and the required statistics."""
 
 from math import sqrt
 

@@ -1,4 +1,4 @@
-"""Noise models of others as camera profiles: a DNG's, Android's, darktable's."""
+"""Foreign noise models as camera profiles: DNG, Android, darktable."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""One optics: what is stated of a camera anywhere reaches all stages, and contradicts nothing."""
+"""Optics: facts about the camera from any source reach all stages consistently."""
 
 import json
 from itertools import combinations
@@ -85,7 +85,7 @@ def stated(*places, **others):
 
 
 def others_for(fact):
-    """What else must be known: a focal length in px or mm."""
+    """Return the focal length that is also needed, in px or mm."""
     lengths = {"render": {"focal_length": 35.0, "sensor_width": 36.0}}
     return {
         "fx": {"render": {"sensor_width": 36.0}},
@@ -139,9 +139,9 @@ def test_places_that_contradict_each_other_are_named(fact, pair):
 def test_px_and_mm_that_contradict_each_other_are_named(clpipe, write_exr):
     write_exr("a.exr", np.full((40, 60, 3), 0.5))
     run = ("run", "a.exr", "-o", "o", "--device", "numpy", "--set", "motion_blur.fx=90")
-    said = clpipe(*run, "--focal-length", 35, "--set", "render.sensor_width=36", status=1).stderr
-    assert "motion_blur.fx makes the focal length of this render of 60x40 pixels 90 px" in said
-    assert "but focal_length and render.sensor_width 58.3333 px" in said
+    stderr = clpipe(*run, "--focal-length", 35, "--set", "render.sensor_width=36", status=1).stderr
+    assert "motion_blur.fx makes the focal length of this render of 60x40 pixels 90 px" in stderr
+    assert "but focal_length and render.sensor_width 58.3333 px" in stderr
     pipeline = clpipe_api.Pipeline(
         focal_length=35, render={"sensor_width": 36}, motion_blur={"fx": 90.0}, device="numpy"
     )
@@ -161,8 +161,8 @@ def test_px_and_mm_that_contradict_each_other_are_named(clpipe, write_exr):
 def test_what_counts_in_the_renders_pixels_comes_before_a_smaller_picture(later, parameter):
     (name,) = later
     settings = {"render": {"fx": 300.0, "cx": 90.0}, "resize": {"scale": 0.5}, **later}
-    said = f"{name}.{parameter}: found .*; list {name} before resize$"
-    with pytest.raises(RequestError, match=said):
+    message = f"{name}.{parameter}: found .*; list {name} before resize$"
+    with pytest.raises(RequestError, match=message):
         make_chain(settings_from({**settings, "stages": ["resize", name]}))
     make_chain(settings_from({**settings, "stages": [name, "resize"]}))
     make_chain(settings_from({**settings, "stages": ["resize", name], "resize": {"scale": 1.0}}))
@@ -206,8 +206,8 @@ def test_the_poses_of_a_35_mm_render_are_those_of_its_depth_of_field(clpipe, poi
     assert spread_of(Path("o/a.exr")) == pytest.approx(disc(35, 0.5, 0.1), abs=0.3)
     clpipe(*posed, "-o", "p", "--focal-length", 35)
     assert spread_of(Path("p/a.exr")) == pytest.approx(disc(35, 0.5, 0.1), abs=0.3)
-    said = clpipe(*posed, "-o", "q", status=2).stderr
-    assert "the focal length is 350 px, and its length in mm is not known; set" in said
+    stderr = clpipe(*posed, "-o", "q", status=2).stderr
+    assert "the focal length is 350 px, and its length in mm is not known; set" in stderr
 
 
 def test_a_lens_is_that_of_the_depth_of_field(clpipe, point):
@@ -221,8 +221,8 @@ def test_a_lens_by_name_is_that_of_the_depth_of_field(clpipe, point):
     run = [each if each != "defocus" else "defocus,vignetting" for each in (*RUN, *THIN)]
     clpipe(*run, *ZOOM, "--set", "render.sensor_width=36", "-o", "o")
     assert spread_of(Path("o/a.exr")) == pytest.approx(disc(70, 2.8, 0.1), abs=0.3)
-    said = clpipe(*run, *ZOOM, "--set", "render.focal_length=35", "-o", "p", status=2).stderr
-    assert "render.focal_length: 35 contradicts focal_length: 70; set one" in said
+    stderr = clpipe(*run, *ZOOM, "--set", "render.focal_length=35", "-o", "p", status=2).stderr
+    assert "render.focal_length: 35 contradicts focal_length: 70; set one" in stderr
 
 
 @pytest.mark.slow
@@ -240,8 +240,11 @@ def test_exif_has_it_wherever_it_is_stated(clpipe, point, stated):
 @pytest.mark.slow
 def test_what_an_exr_says_of_its_camera_is_taken_where_nothing_else_is_said(clpipe, point):
     with OpenEXR.File("in/a.exr", separate_channels=True) as file:
-        said = {"effectiveFocalLength": 35.0, "sensorOverallDimensions": np.float32([36, 24])}
-        header, channels = file.header() | said, {n: c.pixels for n, c in file.channels().items()}
+        attributes = {"effectiveFocalLength": 35.0, "sensorOverallDimensions": np.float32([36, 24])}
+        header, channels = (
+            file.header() | attributes,
+            {n: c.pixels for n, c in file.channels().items()},
+        )
     OpenEXR.File(header, channels).write("in/a.exr")
     clpipe(*RUN, *DEFOCUS, "-o", "o")
     assert spread_of(Path("o/a.exr")) == pytest.approx(disc(35, 0.5, 0.1), abs=0.3)
@@ -320,18 +323,18 @@ def test_a_lens_by_name_says_how_wide_its_sensor_is(clpipe, write_exr, size):
     write_exr("in/a.exr", np.full((height, width, 3), 0.3, np.float32))
     cosine = ("--set", "vignetting.method=cosine_fourth", "--aperture", 2.8)
     clpipe("run", "in", "-o", "o", "--device", "numpy", *CANON, *cosine)
-    told = json.loads(Path("o/a.json").read_text())
+    record = json.loads(Path("o/a.json").read_text())
     # By the diagonal, as lensfun's crop factors are.
     sensor = np.hypot(36, 24) * width / np.hypot(*size)
     fx = 24 / sensor * width
-    assert told["intrinsics"]["fx"] == pytest.approx(fx, rel=0.03)  # ptlens has a linear term
-    falloff = told["photometry"]["falloff"]["parameters"]
+    assert record["intrinsics"]["fx"] == pytest.approx(fx, rel=0.03)  # ptlens has a linear term
+    falloff = record["photometry"]["falloff"]["parameters"]
     assert falloff["focal_length"] == 24
     assert falloff["sensor_width"] == pytest.approx(sensor, rel=1e-6)
     stated = ("--set", "render.sensor_width=22.3")
     clpipe("run", "in", "-o", "p", "--device", "numpy", *CANON, *cosine, *stated)
-    told = json.loads(Path("p/a.json").read_text())
-    assert told["photometry"]["falloff"]["parameters"]["sensor_width"] == 22.3
+    record = json.loads(Path("p/a.json").read_text())
+    assert record["photometry"]["falloff"]["parameters"]["sensor_width"] == 22.3
 
 
 def test_a_lens_by_name_is_not_that_of_other_poses(clpipe, write_exr):
@@ -340,13 +343,13 @@ def test_a_lens_by_name_is_not_that_of_other_poses(clpipe, write_exr):
     for fx, status in ((40.0, 0), (42.0, 0), (83.0, 1)):
         k = [[fx, 0, 30], [0, fx, 20], [0, 0, 1]]
         Path("cameras.json").write_text(json.dumps({"views": [{**view, "K": k}]}))
-        told = clpipe(
+        stderr = clpipe(
             *("run", "in", "-o", f"o{fx}", "--device", "numpy", "--poses", "cameras.json"),
             *CANON,
             status=status,
         ).stderr
         text = "render.fx: the focal length of this render of 60x40 pixels is 83 px, but lens: "
-        assert (text in told) == bool(status)
+        assert (text in stderr) == bool(status)
 
 
 def test_a_pixel_pitch_says_how_wide_the_sensor_is():

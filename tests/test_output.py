@@ -1,4 +1,4 @@
-"""The formats that results are written in, and what [output] says of them."""
+"""Output formats and the table [output]."""
 
 import hashlib
 import json
@@ -197,8 +197,8 @@ def test_exif_and_profile(scene, tmp_path, name):
 
 def test_a_render_may_say_its_shot_and_a_request_wins(tmp_path):
     spec = oiio.ImageSpec(30, 20, 3, oiio.HALF)
-    said = {"ExposureTime": 0.5, "effectiveFocalLength": 35.0, "isoSpeed": 50.0}
-    for name, value in said.items():
+    attributes = {"ExposureTime": 0.5, "effectiveFocalLength": 35.0, "isoSpeed": 50.0}
+    for name, value in attributes.items():
         spec.attribute(name, value)
     spec.attribute("sensorOverallDimensions", oiio.TypeDesc("vector2"), (36.0, 24.0))
     path = tmp_path / "shot.exr"

@@ -1,4 +1,4 @@
-"""Overscan: what a data window has beyond the display window, where a lens shows it."""
+"""Overscan: pixels outside the display window, used where a lens shows them."""
 
 import json
 import re
@@ -185,10 +185,10 @@ def test_a_render_with_overscan(clpipe, write_exr):
     depth, valid = (part.channels[name].pixels for name in ("Z", "valid"))
     assert (valid == 1).all()
     assert np.array_equal(depth, np.floor(u) + 0.5 + 100 * (np.floor(v) + 0.5))
-    said = json.loads(Path("o/a.json").read_text())
-    assert said["overscan"] == AROUND._asdict()
-    assert (said["width"], said["height"]) == (WIDTH, HEIGHT)
-    assert {k: said["intrinsics"][k] for k in ("width", "fx", "cx", "cy")} == {
+    record = json.loads(Path("o/a.json").read_text())
+    assert record["overscan"] == AROUND._asdict()
+    assert (record["width"], record["height"]) == (WIDTH, HEIGHT)
+    assert {k: record["intrinsics"][k] for k in ("width", "fx", "cx", "cy")} == {
         **{"width": WIDTH, "fx": FX, "cx": WIDTH / 2, "cy": HEIGHT / 2}
     }
     # A picture of another size, or without a lens, is that of the display window.
@@ -241,8 +241,8 @@ def test_sub_frames_have_the_same_windows(clpipe, write_exr):
     clpipe(*RUN, *SETS, *mean)
     assert np.abs(read_image(Path("o/a.exr")).pixels - light(*seen(WIDTH, HEIGHT))).max() < 0.005
     write_render(write_exr, "in/b.exr", Margins(1))
-    said = clpipe(*RUN, *SETS, *mean, "--redo", "all", status=1).stderr
-    assert "72x48 with (1, 0, 0, 0) px of overscan" in said and "(15, 11, 9, 12)" in said
+    stderr = clpipe(*RUN, *SETS, *mean, "--redo", "all", status=1).stderr
+    assert "72x48 with (1, 0, 0, 0) px of overscan" in stderr and "(15, 11, 9, 12)" in stderr
 
 
 def test_truths_and_brackets_have_it_too(clpipe, write_exr):
@@ -257,14 +257,14 @@ def test_truths_and_brackets_have_it_too(clpipe, write_exr):
 @pytest.mark.parametrize("around", [NO_MARGINS, AROUND], ids=["without", "with"])
 def test_black_corners_are_told(clpipe, write_exr, around):
     write_render(write_exr, "in/a.exr", around)
-    told = clpipe(*BEND, "--set", f"render.fx={FX}").stderr
-    (black,) = re.findall(r"([\d.]+) % of the picture is black", told) or ["0"]
+    stderr = clpipe(*BEND, "--set", f"render.fx={FX}").stderr
+    (black,) = re.findall(r"([\d.]+) % of the picture is black", stderr) or ["0"]
     seen = read_image(Path("o/a.exr")).pixels.max(-1) < 0.5
     assert float(black) == pytest.approx(100 * seen.mean(), abs=1.5)
-    assert ("set distortion.fit=true" in told) == (around == NO_MARGINS)
+    assert ("set distortion.fit=true" in stderr) == (around == NO_MARGINS)
     if around == NO_MARGINS:
         assert float(black) > 1
-        (more,) = re.findall(r"render (\d+) px more on each side", told)
+        (more,) = re.findall(r"render (\d+) px more on each side", stderr)
         assert int(more) <= max(AROUND)
         assert "black" not in clpipe(*BEND, "--set", "distortion.fit=true").stderr
 
@@ -297,8 +297,8 @@ def test_windows_that_do_not_meet_or_are_too_far_apart(clpipe, write_exr):
     assert (read_image(Path("o/a.exr")).pixels == 0).all()
     assert "overscan" not in json.loads(Path("o/a.json").read_text())
     write_exr("in/a.exr", np.ones((1, 300, 3)), x=-100, **{"full_width": 2, "full_height": 200})
-    said = clpipe(*BEND, "--max-pixels", 1000, "--redo", "all", status=1).stderr
-    assert "300x200 pixels; at most 1000 are read" in said
+    stderr = clpipe(*BEND, "--max-pixels", 1000, "--redo", "all", status=1).stderr
+    assert "300x200 pixels; at most 1000 are read" in stderr
 
 
 def test_a_lens_that_folds_the_overscan_is_refused():

@@ -1,4 +1,4 @@
-"""tools/pages/figures.py makes the paper's figures; docs/paper.md names what there is."""
+"""tools/pages/figures.py makes the paper's figures, and docs/paper.md lists them."""
 
 import re
 import typing

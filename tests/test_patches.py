@@ -1,4 +1,4 @@
-"""Patches for training: the bits of whole pictures, wherever they are cut and however turned."""
+"""Training patches: the bits of whole pictures at any position and rotation."""
 
 import itertools
 from pathlib import Path

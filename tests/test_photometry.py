@@ -1,4 +1,4 @@
-"""What is said of a picture's light, in EXIF and sidecars, is what happened to it."""
+"""Photometry in EXIF and sidecars matches the processing."""
 
 import json
 import math
@@ -31,7 +31,7 @@ def exif(path):
         return image.getexif().get_ifd(0x8769)
 
 
-def said(path):
+def photometry_of(path):
     return json.loads(Path(path).read_text())["photometry"]
 
 
@@ -39,7 +39,7 @@ def light(folder, name):
     """The light of a picture's middle, by the inverse of its response."""
     with Image.open(folder / f"{name}.png") as image:
         codes = np.asarray(image, np.float64)[8:16, 12:24].mean((0, 1)) / 255
-    inverse = said(folder / f"{name}.json")["response"]["inverse"]
+    inverse = photometry_of(folder / f"{name}.json")["response"]["inverse"]
     return np.interp(codes, np.arange(256) / 255, inverse)[1]
 
 
@@ -74,7 +74,7 @@ def test_what_is_metered_is_said(clpipe, grey):
     one, other = exif("o/a.png"), exif("o/b.png")
     assert float(one[0x829A]) == pytest.approx(2 * float(other[0x829A]), rel=0.01)
     assert float(one[0x9204]) - float(other[0x9204]) == pytest.approx(1, abs=0.01)
-    assert said("o/a.json")["ev"] == pytest.approx(math.log2(0.18 / 0.15), abs=0.01)
+    assert photometry_of("o/a.json")["ev"] == pytest.approx(math.log2(0.18 / 0.15), abs=0.01)
 
 
 def test_a_picture_made_of_a_kept_image_says_the_same(clpipe, grey):
@@ -88,7 +88,7 @@ def test_a_picture_made_of_a_kept_image_says_the_same(clpipe, grey):
 def test_no_exposure_time_is_made_up(clpipe, grey):
     clpipe("run", "in/a.exr", "-o", "o", *RUN)
     assert 0x829A not in exif("o/a.png") and float(exif("o/a.png")[0x9204]) == 0
-    assert said("o/a.json")["exposure_time"] is None
+    assert photometry_of("o/a.json")["exposure_time"] is None
     clpipe("run", "in/a.exr", "-o", "p", *RUN, *PHOTOMETRIC)
     tags = exif("p/a.png")  # what is used where nothing is set
     assert (float(tags[0x829A]), float(tags[0x829D])) == (pytest.approx(0.01), 8)
@@ -142,22 +142,22 @@ def test_a_picture_is_what_its_photometry_says(clpipe, write_exr, style):
     set_ = ("--set", f"tone_curve.method={style}", "--set", "exposure.ev=-0.5", *falloff)
     balance = ("--set", "white_balance.red_gain=2.2")
     clpipe("run", "in/a.exr", "-o", "o", *RUN, *PLAIN, *set_)
-    told = said("o/a.json")
+    facts = photometry_of("o/a.json")
     y, x = np.indices((30, 40))
     r2 = ((y - 14.5) ** 2 + (x - 19.5) ** 2) / (14.5**2 + 19.5**2)
-    assert told["falloff"]["parameters"]["k1"] == -0.3
-    grey = told["gain"] * ramp[..., 0] * (1 - 0.3 * r2)
-    expected = 255 * np.interp(grey, np.arange(256) / 255, told["response"]["table"])
+    assert facts["falloff"]["parameters"]["k1"] == -0.3
+    grey = facts["gain"] * ramp[..., 0] * (1 - 0.3 * r2)
+    expected = 255 * np.interp(grey, np.arange(256) / 255, facts["response"]["table"])
     with Image.open("o/a.png") as image:
         seen = np.asarray(image, np.float64)
     middle = grey > 4 / 255  # below, a table of 256 is too coarse for gamma
     middle[[0, 1, -2, -1]] = middle[:, [0, 1, -2, -1]] = False  # where the ramp ends, for demosaic
     assert abs(seen.mean(-1) - expected)[middle].max() < 1.5
-    again = np.interp(seen[..., 1] / 255, np.arange(256) / 255, told["response"]["inverse"])
+    again = np.interp(seen[..., 1] / 255, np.arange(256) / 255, facts["response"]["inverse"])
     kept = middle & (expected < 250)
     assert abs(again / grey - 1)[kept].max() < 0.06
     clpipe("run", "in/a.exr", "-o", "p", *RUN, *PLAIN, *set_, *balance)
-    gains = said("p/a.json")["gains"]
+    gains = photometry_of("p/a.json")["gains"]
     assert gains["applied"][0] == 2.2 and gains["light"][0] != 2.2
 
 

@@ -1,4 +1,4 @@
-"""Noise on the finished picture: as given, or as measured on another."""
+"""Noise on finished pictures: from parameters, or measured on another picture."""
 
 import json
 
@@ -86,10 +86,12 @@ def test_sigma_follows_intensity(develop, grey):
 
 def test_measured_sigma(develop, grey, report):
     path = report()
-    for match, wanted in (("picture", 1), ("flat", 1 / 2), ("halved", 2**0.5)):
+    for match, expected in (("picture", 1), ("flat", 1 / 2), ("halved", 2**0.5)):
         values = {"measured": path, "match": match, "correlated": match == "flat"}
         noise = noisy(develop, grey, method="iid_gaussian", **values) - grey
-        assert noise.std((0, 1)) == pytest.approx(np.multiply(wanted, [0.01, 0.02, 0.03]), rel=0.01)
+        assert noise.std((0, 1)) == pytest.approx(
+            np.multiply(expected, [0.01, 0.02, 0.03]), rel=0.01
+        )
         if match == "halved":
             left = noise.reshape(150, 2, 200, 2, 3).mean((1, 3)).var((0, 1))
             assert left == pytest.approx(np.square([0.01, 0.02, 0.03]) / 2, rel=0.02)
@@ -99,7 +101,7 @@ def test_measured_sigma(develop, grey, report):
         for level, factor in ((0.0, 1), (0.5, 2), (1.0, 3)):
             image = np.full_like(grey, level)
             found = noisy(develop, image, method="intensity_dependent", **values) - image
-            sigma = np.multiply(wanted * factor / 5**0.5, [0.01, 0.02, 0.03])
+            sigma = np.multiply(expected * factor / 5**0.5, [0.01, 0.02, 0.03])
             assert found.std((0, 1)) == pytest.approx(sigma, rel=0.02)
 
 
@@ -144,11 +146,11 @@ def test_a_report_on_several_isos(tmp_path):
 
 @pytest.mark.parametrize("method", ["iid_gaussian", "intensity_dependent"])
 def test_channels_are_correlated_as_given(develop, grey, method):
-    wanted = (0.8, -0.4, 0.1)
-    noise = noisy(develop, grey, method=method, sigma=[0.02] * 3, correlation=wanted) - grey
+    expected = (0.8, -0.4, 0.1)
+    noise = noisy(develop, grey, method=method, sigma=[0.02] * 3, correlation=expected) - grey
     assert noise.std((0, 1)) == pytest.approx([0.02] * 3, rel=0.01)
     table = np.corrcoef(noise.reshape(-1, 3).T)
-    assert table[[0, 0, 1], [1, 2, 2]] == pytest.approx(wanted, abs=0.015)
+    assert table[[0, 0, 1], [1, 2, 2]] == pytest.approx(expected, abs=0.015)
     beside = np.corrcoef(noise[:, 1:].ravel(), noise[:, :-1].ravel())[0, 1]
     assert abs(beside) < 0.015
 

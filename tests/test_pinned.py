@@ -60,7 +60,7 @@ def render(folder: Path) -> None:
 
 
 def digest(path: Path) -> str:
-    """Of an image's samples, so that no library's way of packing them counts."""
+    """Return a digest of an image's samples, independent of the library's compression."""
     if path.suffix == ".npy":
         values = np.load(path)
     elif path.suffix == ".dng":

@@ -1,4 +1,4 @@
-"""Whole chains: the same bits whatever is kept, fused or run before; and sane pictures."""
+"""Whole chains: the same bits for any kept images, fusion or history."""
 
 from types import MappingProxyType
 

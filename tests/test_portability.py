@@ -1,4 +1,4 @@
-"""tools/stress/portability.py, as far as it needs no emulator."""
+"""tools/stress/portability.py, without an emulator."""
 
 import os
 import subprocess

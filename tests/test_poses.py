@@ -70,7 +70,7 @@ def renders(write_exr):
 
 
 def changed(**changes):
-    """A cameras.json in which the view of a.exr, or what holds for all, is different."""
+    """Write a cameras.json with changes to the view of a.exr or to all views."""
     values = json.loads(Path("cameras.json").read_text())
     common = {"width", "height"} & changes.keys()
     values |= {name: changes[name] for name in common}
@@ -80,13 +80,13 @@ def changed(**changes):
 
 
 def rotated(w, x, y, z):
-    """The rotation of a unit quaternion, as the Rodrigues formula has it."""
+    """Return the rotation of a unit quaternion by the Rodrigues formula."""
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
 
 
 def bent(x, y, k):
-    """Brown and Conrady's formula, as OpenCV's documentation has it."""
+    """Brown and Conrady's formula from OpenCV's documentation."""
     r2 = x * x + y * y
     grown = 1 + k.get("k1", 0) * r2 + k.get("k2", 0) * r2**2 + k.get("k3", 0) * r2**3
     p1, p2 = k.get("p1", 0), k.get("p2", 0)
@@ -100,8 +100,8 @@ def places(r, t, fx, fy, cx, cy, k):
     return np.stack([fx * x + cx, fy * y + cy], 1)
 
 
-def told(folder):
-    """Where each file of a folder says that the points are, by the name of the picture."""
+def written_poses(folder):
+    """Return the points that each file of a folder predicts, by the name of the picture."""
     by_form = {"cameras": {}, "nerf": {}, "colmap": {}}
     for view in json.loads((folder / "cameras.json").read_text())["views"]:
         (fx, _, cx), (_, fy, cy), _ = view["K"]
@@ -151,7 +151,7 @@ def test_points_are_where_each_file_says(clpipe, renders, is_bent):
         stages, options = "distortion,resize", [*sets("distortion", **BENT)]
         options += sets("resize", scale=0.75)
     clpipe("run", renders, "-o", "o", "--poses", "cameras.json", *RUN, stages, *options)
-    for by_name in told(Path("o")).values():
+    for by_name in written_poses(Path("o")).values():
         assert by_name.keys() == {"a.exr", "b.exr"}
         for name, where in by_name.items():
             assert np.abs(seen(f"o/{name}", where) - where).max() < 0.05
@@ -242,16 +242,16 @@ def test_frames_and_exposures_are_in_it(clpipe, write_exr):
     pose = sets("render", rotation="[[1, 0, 0], [0, 1, 0], [0, 0, 1]]", translation="[0, 0, 1]")
     run = ("run", "in", "-o", "o", "--device", "numpy", "--frames", 2, "--bracket=-1,0", *lens)
     clpipe(*run, "--format", "dng", "--format", "png", "--truth", "clean")
-    told = clpipe("poses", "o", "--json").stdout
-    assert json.loads(told)["files"][:2] == [
+    stdout = clpipe("poses", "o", "--json").stdout
+    assert json.loads(stdout)["files"][:2] == [
         "cameras.json",
         "sparse/0/cameras.txt",
     ]  # without poses
     clpipe(*run, *pose, "--format", "dng", "--format", "png")
-    told = clpipe("poses", "o").stdout
+    stdout = clpipe("poses", "o").stdout
     assert (
-        "6 pictures with a space in the name, which images.txt cannot hold" in told
-        and "x/a b.ev+0.frame0" in told
+        "6 pictures with a space in the name, which images.txt cannot hold" in stdout
+        and "x/a b.ev+0.frame0" in stdout
     )
     views = json.loads(Path("o/cameras.json").read_text())["views"]
     names = [
@@ -272,22 +272,22 @@ def test_a_lens_that_is_fitted_for_nerfstudio(clpipe, renders):
     lens = sets("distortion", **BENT | {"k4": 0.3, "k5": -0.1})
     clpipe("run", renders, "-o", "o", "--poses", "cameras.json", *RUN, "distortion", *lens)
     assert "FULL_OPENCV" in Path("o/sparse/0/cameras.txt").read_text()
-    told = json.loads(Path("o/transforms.json").read_text())
+    record = json.loads(Path("o/transforms.json").read_text())
     exact = json.loads(Path("o/a.json").read_text())["intrinsics"]
-    width, height, d = told["w"], told["h"], exact["distortion"]
-    # Of points that the picture shows: nerfstudio's model, and OpenCV's.
+    width, height, d = record["w"], record["h"], exact["distortion"]
+    # Compare nerfstudio's and OpenCV's models for points in the picture.
     x, y = np.mgrid[-1:1:41j, -1:1:41j] * np.array([width, height])[:, None, None] / exact["fx"]
     r2 = x * x + y * y
-    k = sum(told[f"k{i}"] * r2**i for i in (1, 2, 3, 4))
+    k = sum(record[f"k{i}"] * r2**i for i in (1, 2, 3, 4))
     above = 1 + sum(d[f"k{i}"] * r2**i for i in (1, 2, 3))
     factor = above / (1 + sum(d[f"k{i + 3}"] * r2**i for i in (1, 2, 3)))
-    off = np.hypot(x, y) * abs((1 + k) * told["fl_x"] - factor * exact["fx"])
+    off = np.hypot(x, y) * abs((1 + k) * record["fl_x"] - factor * exact["fx"])
     bent = np.hypot(x, y) * factor * exact["fx"]
     inside = bent < np.hypot(width, height) / 2
-    assert 0 < told["distortion_residual"] < 0.5
-    assert off[inside].max() <= told["distortion_residual"] * 1.01 + 1e-6
+    assert 0 < record["distortion_residual"] < 0.5
+    assert off[inside].max() <= record["distortion_residual"] * 1.01 + 1e-6
     for name in ("p1", "p2"):
-        assert told[name] * told["fl_x"] == pytest.approx(d[name] * exact["fx"])
+        assert record[name] * record["fl_x"] == pytest.approx(d[name] * exact["fx"])
 
 
 @pytest.mark.parametrize(
@@ -322,8 +322,8 @@ def test_a_view_that_is_wrong_fails_alone(clpipe, renders, changes, message):
         "distortion",
         *sets("distortion", **BENT),
     )
-    told = clpipe(*run, status=1).stderr
-    assert message in told
+    stderr = clpipe(*run, status=1).stderr
+    assert message in stderr
     assert Path("o/b.exr").exists() == is_alone
     assert not Path("o/a.exr").exists()
 
@@ -334,10 +334,10 @@ def test_what_is_wrong_with_all_is_refused(clpipe, renders):
     def refused(*arguments, status=2):
         return clpipe(*run, *arguments, status=status).stderr
 
-    told = refused("cameras.json", *sets("render", fx=1000))
-    assert f"has fx {FX}, but the configuration has render.fx 1000" in told
-    told = refused("cameras.json", *sets("render", focal_length=50, sensor_width=36), status=1)
-    assert "render.fx makes the focal length of this render of 240x160 pixels 230 px" in told
+    message = refused("cameras.json", *sets("render", fx=1000))
+    assert f"has fx {FX}, but the configuration has render.fx 1000" in message
+    message = refused("cameras.json", *sets("render", focal_length=50, sensor_width=36), status=1)
+    assert "render.fx makes the focal length of this render of 240x160 pixels 230 px" in message
     assert "no such file" in refused("missing.json").lower()
     assert "there is no images.txt" in refused("renders")
     Path("other.json").write_text('{"frames": 3}')
@@ -357,9 +357,9 @@ def test_renders_that_are_named_as_the_files_of_cameras(clpipe, write_exr):
     clpipe(*run)
     before = {path: path.read_bytes() for path in Path("out").glob("*.json")}
     for _ in range(2):
-        said = clpipe("poses", "out").output
-        assert "wrote out/sparse/0: 3 pictures" in said
-        assert "warning: out/cameras.json is the sidecar of a picture" in said
+        output = clpipe("poses", "out").output
+        assert "wrote out/sparse/0: 3 pictures" in output
+        assert "warning: out/cameras.json is the sidecar of a picture" in output
         assert {path: path.read_bytes() for path in Path("out").glob("*.json")} == before
     assert "there already" in clpipe(*run).stderr
 
@@ -373,21 +373,21 @@ def test_views_are_found_by_paths_and_by_names_that_are_unique(clpipe, write_exr
         r = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
         views = [{"file": n, "K": k, "R": r, "t": [i, 0, 0]} for i, n in enumerate(names)]
         Path("v.json").write_text(json.dumps({"views": views}))
-        told = clpipe(
+        stderr = clpipe(
             "run", "in", "-o", "o", "--poses", "v.json", *RUN, "exposure", status=status
         ).stderr
         made = json.loads(Path("o/cameras.json").read_text())["views"]
-        return {view["file"]: view["t"][0] for view in made}, told
+        return {view["file"]: view["t"][0] for view in made}, stderr
 
     all_found = {"a/1.exr": 1, "b/1.exr": 0, "b/2.exr": 2}
     assert found("b/1.png", "a/1.png", "2")[0] == all_found
     assert found("x/y/b/1", "./x/y/a/1", "elsewhere/2.0.png", "c/2.exr")[0] == all_found | {
         "b/2.exr": 3
     }
-    _, told = found("1.png", "b/2.exr", status=1)
-    assert "in/a/1.exr: --poses v.json: this file has no view a/1, and its view 1 may" in told
-    _, told = found("b/1", "a/1", "c/2", "d/2", status=1)
-    assert "b/2 may be any of the views c/2, d/2" in told
+    _, stderr = found("1.png", "b/2.exr", status=1)
+    assert "in/a/1.exr: --poses v.json: this file has no view a/1, and its view 1 may" in stderr
+    _, stderr = found("b/1", "a/1", "c/2", "d/2", status=1)
+    assert "b/2 may be any of the views c/2, d/2" in stderr
 
 
 def test_the_size_of_a_render_with_overscan_is_without_it(clpipe, write_exr):

@@ -1,4 +1,4 @@
-"""A run by several processes on this machine: the same bytes, whoever dies."""
+"""A run with several processes: the same bytes, even if a process dies."""
 
 import json
 import multiprocessing
@@ -37,7 +37,7 @@ ImageWorker.decode = planted
 
 
 def is_running(pid):
-    """Whether a process exists and is no zombie, which has no command any more."""
+    """Return whether a process exists and is not a zombie."""
     try:
         return bool(Path(f"/proc/{pid}/cmdline").read_bytes())
     except OSError:
@@ -49,14 +49,14 @@ def pictures():
 
 
 def held_run():
-    """A run by two processes that have both come to a held image, and the numbers of these two."""
+    """A run by two processes that both wait at a held image, and their process IDs."""
     process = start("in", *TWO, planted=HOLDING_PROCESSES)
     wait_until(lambda: len(held()) == 2, "two processes that hold", process)
     return process, held()
 
 
 def held():
-    """The numbers of the processes that have come to a held image."""
+    """Return the IDs of processes that wait at a held image."""
     return sorted(int(path.suffix[1:]) for path in Path().glob("held.*"))
 
 
@@ -65,10 +65,10 @@ def test_two_processes_make_the_bytes_of_one(clpipe, renders):
     Path("in/damaged.exr").write_bytes(b"no EXR")
     truth = ("--truth", "clean", "--trace", "t.json")
     clpipe("run", "in", "-o", "whole", *RUN[2:], *truth[:2], status=1)
-    told = clpipe("run", "in", *TWO, *truth, status=1)
+    result = clpipe("run", "in", *TWO, *truth, status=1)
     assert contents("out") == contents("whole")
-    assert told.stderr.count("in/damaged.exr: cannot be read") == 1
-    assert "24 of 25 images done, 1 failed" in told.stderr
+    assert result.stderr.count("in/damaged.exr: cannot be read") == 1
+    assert "24 of 25 images done, 1 failed" in result.stderr
     first, *images, last = read_log(Path("out/run.jsonl"))
     assert (first["event"], len(images), last["event"]) == ("start", 25, "end")
     events = json.loads(Path("t.json").read_text())["traceEvents"]
@@ -96,8 +96,8 @@ def test_processes_end_with_the_one_that_started_them(clpipe, renders):
     finish(process)
     wait_until(lambda: not any(map(is_running, others)), "the end of the other processes")
     assert pictures() <= 20
-    told = clpipe("run", "in", *RUN)
-    assert "30 of 30 images done (" in told.stderr
+    result = clpipe("run", "in", *RUN)
+    assert "30 of 30 images done (" in result.stderr
 
 
 def test_stopped_once_what_is_begun_is_finished(renders):
@@ -121,11 +121,11 @@ def test_an_image_that_kills_processes_fails_alone(clpipe, renders, monkeypatch)
     renders(9)
     Path("in/r005.exr").rename("in/deadly.exr")
     monkeypatch.setattr(processes, "START", f"exec({DEADLY!r}); {processes.START}")
-    told = clpipe("run", "in", *TWO, "--device", "numpy", status=1)
+    result = clpipe("run", "in", *TWO, "--device", "numpy", status=1)
     assert "in/deadly.exr: killed the process that took it, 3 times; the last one by signal 9" in (
-        told.stderr
+        result.stderr
     )
-    assert "8 of 9 images done, 1 failed" in told.stderr
+    assert "8 of 9 images done, 1 failed" in result.stderr
     found = statuses("out")
     assert [name for name, status in found.items() if status == "failed"] == ["deadly.exr"]
 
@@ -176,12 +176,12 @@ ImageWorker.runners = broken
 
 @pytest.mark.parametrize("side", [24, 1700])
 def test_a_kernel_that_does_not_compile_ends_the_run(write_exr, clpipe, monkeypatch, side):
-    """Also where all images are handed out already, and whoever decodes waits for more."""
+    """The run also ends if all images are distributed and decoders wait."""
     for i in range(2):
         write_exr(f"in/r{i}.exr", np.zeros((side, side, 3), np.float32))
     monkeypatch.setattr(processes, "START", f"exec({BROKEN!r}); {processes.START}")
-    told = clpipe("run", "in", *TWO, "--device", "numpy", status=3).stderr
-    assert "a kernel does not compile" in told
+    stderr = clpipe("run", "in", *TWO, "--device", "numpy", status=3).stderr
+    assert "a kernel does not compile" in stderr
 
 
 ALWAYS = """

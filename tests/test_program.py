@@ -1,4 +1,4 @@
-"""The digest of all that decides pixels."""
+"""The digest of all code that affects pixels."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""Compiled programs: shared by a process, kept between processes, and announced when slow."""
+"""Compiled programs: shared in a process, cached between processes, announced if slow."""
 
 import io
 import logging
@@ -51,10 +51,10 @@ def test_the_cache_folder_is_the_users_or_a_named_one(tmp_path):
         str(home),
         f"later runs find them in {home}",
     ]
-    told = python(FOLDER, HOME=tmp_path, CLPIPE_CACHE_DIR=named).split("\n")
-    assert told == [str(named), f"later runs find them in {named}"]
-    told = python(FOLDER, CLPIPE_CACHE_DIR=none).split("\n")
-    assert told == [
+    lines = python(FOLDER, HOME=tmp_path, CLPIPE_CACHE_DIR=named).split("\n")
+    assert lines == [str(named), f"later runs find them in {named}"]
+    lines = python(FOLDER, CLPIPE_CACHE_DIR=none).split("\n")
+    assert lines == [
         "None",
         f"later runs compile them again, because they cannot be cached in {none}",
     ]
@@ -166,14 +166,14 @@ def test_the_command_line_prints_it(clpipe, monkeypatch, options, count):
 
 
 def test_who_watches_is_told_how_far_compiling_is(device):
-    told = []
+    lines = []
     chain = make_chain(settings_from({"stages": ["exposure", "mosaic", "demosaic", "gamma"]}))
-    with programs.watched(lambda *counts: told.append(counts)):
+    with programs.watched(lambda *counts: lines.append(counts)):
         Runner(chain, Device(device.info)).compile()
-    count = told[-1][1]
-    assert count > 1 and told == [(i, count) for i in range(count + 1)]
+    count = lines[-1][1]
+    assert count > 1 and lines == [(i, count) for i in range(count + 1)]
     Runner(chain, Device(device.info)).compile()
-    assert len(told) == count + 1
+    assert len(lines) == count + 1
 
 
 def test_compiling_is_a_step_of_the_live_display(monkeypatch):

@@ -1,4 +1,4 @@
-"""What a Python user sees of the package: exported names, short reprs, attributes that refuse."""
+"""The package for Python users: exported names, short reprs, read-only attributes."""
 
 import inspect
 import re

@@ -1,4 +1,4 @@
-"""tools/pages/quality.py: the figures it measures are those of independent implementations."""
+"""tools/pages/quality.py: its figures match independent implementations."""
 
 import numpy as np
 import pytest

@@ -1,8 +1,8 @@
-"""Random chains of random passes: what their plans make is what their passes say.
+"""Random chains of random passes: their plans produce the results of their passes.
 
-A plan is executed with symbols for images: each slot has the one that was written there last. So a
-slot that is reused too soon, a launch that reads what is not written yet, a pass that is left out,
-repeated or moved, all show as another symbol in a result. Some of the chains run on the device.
+The tests execute a plan with symbols for images. Each slot holds the symbol that was last written.
+A wrong plan gives another symbol in a result: a slot reused too early, a read before the write, or
+a pass that is skipped, repeated or moved. Some of the chains also run on the device.
 """
 
 from collections.abc import Callable
@@ -89,7 +89,7 @@ def pointwise(is_inlined: bool) -> dict[str, tuple[Pass, ...]]:
 
 
 def mirrored(image: np.ndarray, dx: int, dy: int) -> np.ndarray:
-    """What each pixel has so far from it."""
+    """Shift an image, mirrored at its borders."""
     reach = max(abs(dx), abs(dy))
     wide = np.pad(image, ((reach, reach), (reach, reach), (0, 0))[: image.ndim], "reflect")
     height, width = image.shape[:2]
@@ -97,7 +97,7 @@ def mirrored(image: np.ndarray, dx: int, dy: int) -> np.ndarray:
 
 
 def around(src: np.ndarray, reach: int) -> np.ndarray:
-    """The kernel's function of that name, in NumPy."""
+    """The kernel function of that name in NumPy."""
     across = mirrored(src, -reach, 0) + mirrored(src, reach, 0)
     return (across + (mirrored(src, 0, -reach) + mirrored(src, 0, reach))) * np.float32(0.25)
 
@@ -202,7 +202,7 @@ class Symbols:
 
 
 def results_of_passes(chain: Chain, symbols: Symbols) -> dict[str, int]:
-    """What each step of a chain makes, by its passes alone."""
+    """Return the result of each step of a chain from its passes only."""
     image, found = symbols.of("source"), {}
     for step in chain.steps:
         known = {"src": image, "dst": image}
@@ -221,7 +221,7 @@ def results_of_passes(chain: Chain, symbols: Symbols) -> dict[str, int]:
 
 
 class Execution:
-    """A plan, executed with symbols."""
+    """Execute a plan with symbols."""
 
     def __init__(self, plan: Plan, symbols: Symbols):
         self.plan, self.symbols = plan, symbols
@@ -309,7 +309,7 @@ def test_what_a_plan_makes_is_what_the_passes_say(seed):
 
 
 def check_sizes(plan: Plan, chain: Chain) -> None:
-    """See that images are of the size of their level, and the border wide enough for all taps."""
+    """Check the size of each image, and that the border covers all taps."""
     passes = [each for step in chain.steps for each in step.method.passes()]
     resamplers = [p.access.resampler for p in passes if isinstance(p.access, Resample)]
     assert list(plan.resamplings) == resamplers[: len(plan.resamplings)]

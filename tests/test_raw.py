@@ -1,4 +1,4 @@
-"""Camera raws and headerless dumps: the right picture, or the right refusal."""
+"""Camera raws and dumps: the correct picture, or the correct error."""
 
 import json
 
@@ -361,6 +361,6 @@ def test_exif_is_found_in_files_that_are_no_tiff(tmp_path):
     tiff = write_dng(tmp_path / "a.dng", mosaic()).read_bytes()
     for start in (b"\0\0\0\x18ftypcrx " + bytes(60) + b"CMT1", b"FUJIFILM" * 9 + b"Exif\0\0"):
         (tmp_path / "b.raf").write_bytes(start + tiff)
-        said = read_exif(tmp_path / "b.raf")
-        assert said.text("Model") == "Canon EOS 5D Mark II"
-        assert said.number("ISOSpeedRatings", 0) == 400
+        exif = read_exif(tmp_path / "b.raf")
+        assert exif.text("Model") == "Canon EOS 5D Mark II"
+        assert exif.number("ISOSpeedRatings", 0) == 400

@@ -1,4 +1,4 @@
-"""Files of real cameras, and of real accidents: each is developed, or refused with its reason."""
+"""Raw files of real cameras, also damaged: each is developed, or rejected with its reason."""
 
 import numpy as np
 import pytest

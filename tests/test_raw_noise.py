@@ -1,4 +1,4 @@
-"""RawNoise: the chain's bits, for mosaics, planes and batches, and the same again when asked."""
+"""RawNoise: the chain's bits for mosaics, planes and batches, and reproducibility."""
 
 import pickle
 

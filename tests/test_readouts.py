@@ -1,4 +1,4 @@
-"""Several readouts and companding: noise against formulas, hand-overs, round trips."""
+"""Several readouts and companding: noise against formulas, transitions, round trips."""
 
 import json
 import re

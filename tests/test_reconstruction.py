@@ -1,4 +1,4 @@
-"""tools/reconstruction, its data and what it measures; the run itself only where OpenCV is."""
+"""tools/reconstruction: its data and figures; the whole run only with OpenCV."""
 
 import json
 
@@ -47,7 +47,7 @@ def test_depth_and_colours_of_the_shipped_views_agree(views):
         }
         seen = scene_views.visible(views[a], views[b])
         assert seen.mean() > 0.8
-        places, depth = scene_views.seen_from(views[a], views[b])
+        places, depth = scene_views.projected(views[a], views[b])
         x, y = np.floor(places[seen]).astype(int).T
         assert abs(views[b].depth[y, x] / depth[seen] - 1).mean() < 1e-3
         assert (views[b].texture[y, x] == views[a].texture[seen]).mean() > 0.99
@@ -105,7 +105,7 @@ def test_tables_have_the_deviation_of_seeds_and_kinds_without_isos_one_value():
         ["clean", "50.0", "50.0"],
         ["camera", "50.0 ± 1.4", "20.0 ± 1.4"],
     ]
-    *_, first, second = report.reactions({"here": table}).splitlines()
+    *_, first, second = report.costs_of({"here": table}).splitlines()
     assert first.split(" | ")[2:5] == ["0.0 %", "0.0 %", "0.0 %"]
     assert second == "| here | 800 | 60.0 % | 20.0 % | 40.0 % | 50 % |"
 
@@ -134,7 +134,7 @@ def test_pmvs_gets_cameras_whose_first_pixel_is_at_0(tmp_path):
     with pytest.raises(multiview.ProgramError, match=r"nothing: No such file"):
         multiview.run_pmvs(tmp_path / "nothing", tmp_path / "q", views, pictures, **options)
     program.write_text("#!/bin/sh\nexit 3\n")
-    with pytest.raises(multiview.ProgramError, match=r"status 3; see .*said\.txt"):
+    with pytest.raises(multiview.ProgramError, match=r"status 3; see .*log\.txt"):
         multiview.run_pmvs(program, tmp_path / "q", views, pictures, **options)
 
 
@@ -204,8 +204,8 @@ def test_what_is_missing_or_wrong_is_named(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(tool, "NEEDED", ("numpy", "no_such_module"))
     monkeypatch.setattr("sys.argv", ["reconstruction", "-o", str(tmp_path)])
     assert tool.main() == 1
-    said = "no_such_module: missing; .venv/bin/pip install -e '.[compare]'\n"
-    assert capsys.readouterr().err == said
+    message = "no_such_module: missing; .venv/bin/pip install -e '.[compare]'\n"
+    assert capsys.readouterr().err == message
     monkeypatch.setattr(tool, "NEEDED", ())
     monkeypatch.setattr(
         "sys.argv", ["reconstruction", "-o", str(tmp_path), "--data", str(tmp_path)]

@@ -1,4 +1,4 @@
-"""Going on from a kept image, from one that was edited, and from a mosaic of somebody else's."""
+"""Resuming from a kept image, an edited image, and a foreign mosaic."""
 
 import itertools
 import json
@@ -30,14 +30,14 @@ def crop(folder: Path, name: str = "crop.exr") -> Path:
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory):
-    """A folder with a picture and all that was kept on the way to it."""
+    """A folder with a picture and all kept images."""
     folder = tmp_path_factory.mktemp("kept")
     clpipe("run", crop(folder), "-o", folder / "out", *OPTIONS, *NUMPY, "--keep", "all")
     return folder / "out"
 
 
 def edited(path: Path, to: Path, change) -> Path:
-    """A copy with other pixels, all attributes kept, as an image editor makes it."""
+    """Copy a file with other pixels and the same attributes, like an image editor."""
     image = oiio.ImageBuf(str(path))
     pixels = change(image.get_pixels(oiio.FLOAT))
     copy = oiio.ImageBuf(image.spec())

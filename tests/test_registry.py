@@ -1,4 +1,4 @@
-"""Stages of other people: from a file, and from an installed package."""
+"""Users' own stages: from a file, and from an installed package."""
 
 import ast
 import re
@@ -170,7 +170,7 @@ def test_a_package_whose_stage_cannot_be_loaded(tmp_path):
     assert "Traceback" not in done.stderr
 
 
-# What these name is no stage: a truth, an attribute of kept images, a kind, a key of cameras.json.
+# These names are not stages: a truth, an attribute of kept images, a kind, a key of cameras.json.
 NO_STAGES = {
     ("chain/rendition.py", "mosaic"),
     ("inputs/kept.py", "sensor_noise"),
@@ -181,7 +181,7 @@ NO_STAGES = {
 
 
 def strings_of(path):
-    """The strings in code, docstrings apart."""
+    """Return the strings in code except docstrings."""
     if path.suffix != ".py":
         return re.findall(r'"([^"\n]*)"|`([^`]*)`', path.read_text())
     tree = ast.parse(path.read_text())
@@ -193,10 +193,10 @@ def strings_of(path):
     ]
 
 
-@pytest.mark.parametrize("room", ["chain", "inputs", "outputs", "explorer"])
-def test_no_stage_is_known_by_its_name(room):
-    """Clpipe's own stages are found by what they declare, as those of others are."""
-    folder = ROOT / "clpipe" / room
+@pytest.mark.parametrize("package", ["chain", "inputs", "outputs", "explorer"])
+def test_no_stage_is_known_by_its_name(package):
+    """clpipe finds its own stages by their declarations, like users' stages."""
+    folder = ROOT / "clpipe" / package
     names = [name for name, stage in all_stages().items() if stage.folder is None]
     parameter = re.compile(rf"\b({'|'.join(names)})\.[a-z_]+")
     found = [

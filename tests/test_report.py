@@ -1,4 +1,4 @@
-"""``clpipe report``: what its page says of runs, and what it does in a browser."""
+"""``clpipe report``: the text of its page, and the page in a browser."""
 
 import base64
 import io
@@ -54,7 +54,7 @@ class Page(HTMLParser):
             self.words.append(data)
 
     @property
-    def said(self) -> str:
+    def shown_text(self) -> str:
         return " ".join(" ".join(self.words).split())
 
 
@@ -93,7 +93,7 @@ def made(renders):
 
 @pytest.fixture(autouse=True)
 def few_drawings(monkeypatch):
-    """The noise of one picture is drawn: that is what takes long."""
+    """Draw the noise of one picture only, because this is slow."""
     monkeypatch.setattr("clpipe.reports.page.DRAWN", 1)
 
 
@@ -105,8 +105,8 @@ def out(made, tmp_path):
 
 def test_figures_pictures_and_failures(out):
     page = report(out)
-    assert "Images 3" in page.said and "Failed 1" in page.said
-    assert "cut.exr" in page.said
+    assert "Images 3" in page.shown_text and "Failed 1" in page.shown_text
+    assert "cut.exr" in page.shown_text
     entries = page.data["sheet-data"]
     assert [entry["name"] for entry in entries] == [SHOWN, "a", "b"]
     assert all(entry["image"].startswith("data:image/webp;base64,") for entry in entries)
@@ -114,9 +114,9 @@ def test_figures_pictures_and_failures(out):
     large = page.data["look-data"]
     assert [view["label"] for view in large[0]["views"]] == ["image", "truth", "after normalize"]
     assert [view["label"] for view in large[2]["views"]] == ["image", "truth"]
-    assert re.search(r"exposure\.ev ?: -?[\d.]+, -?[\d.]+, -?[\d.]+", page.said)
-    assert "sensor_noise skewed_gaussian" in page.said
-    assert "finished" in page.said
+    assert re.search(r"exposure\.ev ?: -?[\d.]+, -?[\d.]+, -?[\d.]+", page.shown_text)
+    assert "sensor_noise skewed_gaussian" in page.shown_text
+    assert "finished" in page.shown_text
 
 
 def test_it_is_one_file_in_which_nothing_is_markup_but_ours(out):
@@ -140,32 +140,32 @@ def test_names_with_characters_that_cannot_be_printed(out):
     out = out.rename(out.with_name(os.fsdecode(b"o\x1b\xff")))
     page = report(out)
     assert not re.search(r"[\x00-\x09\x0b-\x1f]|\\u001b", page.text)
-    assert r"o\x1b\udcff: report of a run" in page.said
-    assert page.said.count(SHOWN) > 2
+    assert r"o\x1b\udcff: report of a run" in page.shown_text
+    assert page.shown_text.count(SHOWN) > 2
 
 
 def test_the_law_is_held_against_raws(out):
     page = report(out)
-    assert "Raw noise compared with the noise model" in page.said
-    assert "deviates from the model" not in page.said
+    assert "Raw noise compared with the noise model" in page.shown_text
+    assert "deviates from the model" not in page.shown_text
     pair = (out / "a.normalize.exr", "--truth", out / "a.truth_mosaic.exr")
     report_of_it = json.loads(clpipe("measure", *pair, "--json"))
     fit = report_of_it["channels"]["mosaic"]["law"]
-    assert f"{fit['a']:.4g} ± {fit['a_error']:.1g}" in page.said
-    assert f"{fit['b']:.4g} ± {fit['b_error']:.1g}" in page.said
-    (name,) = re.findall(r"against (.*?)\.truth\.jpg in flat areas", page.said)
+    assert f"{fit['a']:.4g} ± {fit['a_error']:.1g}" in page.shown_text
+    assert f"{fit['b']:.4g} ± {fit['b_error']:.1g}" in page.shown_text
+    (name,) = re.findall(r"against (.*?)\.truth\.jpg in flat areas", page.shown_text)
     name = name.replace(SHOWN, HOSTILE)
     pair = (out / f"{name}.jpg", "--truth", out / f"{name}.truth.jpg")
     channels = json.loads(clpipe("measure", *pair, "--json"))["channels"]
-    assert f"R {channels['R']['sigma'] * 255:.2f}, G" in page.said
-    assert f"leaves {channels['Y']['energy_left_2x2']:.2f} of the luma" in page.said
+    assert f"R {channels['R']['sigma'] * 255:.2f}, G" in page.shown_text
+    assert f"leaves {channels['Y']['energy_left_2x2']:.2f} of the luma" in page.shown_text
     sidecar = out / "a.json"
     record = json.loads(sidecar.read_text())
-    asked = record["noise"]["signal"]["a"]
-    text = sidecar.read_text().replace(f'"a": {asked}, "b"', f'"a": {asked * 1.5}, "b"')
+    gain = record["noise"]["signal"]["a"]
+    text = sidecar.read_text().replace(f'"a": {gain}, "b"', f'"a": {gain * 1.5}, "b"')
     reseal(sidecar, json.loads(text))
     page = report(out)
-    assert page.said.count("deviates from the model") == 1
+    assert page.shown_text.count("deviates from the model") == 1
     assert page.data["look-data"][0]["name"] == "a"  # it is shown first
 
 
@@ -176,9 +176,9 @@ def test_files_that_are_gone_or_changed_are_named(out):
     (out / "b.jpg").write_bytes(changed)
     (out / "b.normalize.exr").write_bytes(b"short")
     page = report(out)
-    assert "a.jpg: is missing" in page.said
-    assert "b.jpg: was changed since; its SHA-256" in page.said
-    assert "b.normalize.exr: has 5 bytes, not the " in page.said
+    assert "a.jpg: is missing" in page.shown_text
+    assert "b.jpg: was changed since; its SHA-256" in page.shown_text
+    assert "b.normalize.exr: has 5 bytes, not the " in page.shown_text
     by_name = {entry["name"]: entry for entry in page.data["sheet-data"]}
     assert not by_name["a"]["image"] and not by_name["b"]["image"] and by_name[SHOWN]["image"]
     assert by_name["a"]["odd"] and not by_name[SHOWN]["odd"]
@@ -191,9 +191,9 @@ def test_half_a_run_and_a_log_that_is_cut_off(out):
     (out / "b.json").write_text((out / "b.json").read_text()[:200])
     (out / "notes.json").write_text('{"mine": 1}')
     page = report(out)
-    assert "killed, or still running" in page.said
-    assert "b.json: this sidecar was changed after clpipe wrote it" in page.said
-    assert "notes" not in page.said
+    assert "killed, or still running" in page.shown_text
+    assert "b.json: this sidecar was changed after clpipe wrote it" in page.shown_text
+    assert "notes" not in page.shown_text
     assert [entry["name"] for entry in page.data["sheet-data"]] == [SHOWN, "a"]
 
 
@@ -209,7 +209,7 @@ def test_hostile_sidecars(out):
     reseal(out / "a.json", record)
     page = report(out)
     assert "</script><script>alert(1)" not in page.text
-    assert "</script><script>alert(1)</script>" in page.said
+    assert "</script><script>alert(1)</script>" in page.shown_text
     assert [tag for tag, _ in page.tags if tag in ("b", "i")].count("i") == 0
     assert page.text.count("</style>") == page.text.count("<style")
 
@@ -229,7 +229,7 @@ def test_without_truths_a_picture_is_beside_another_of_its_image_or_sequence(ren
     clpipe(*run, "-o", tmp_path / "one", "--iso", 800)
     page = report(tmp_path / "one")
     assert views_of(page) == {"a": ["image"]}
-    assert "To get the image without noise, run with --truth clean" in page.said
+    assert "To get the image without noise, run with --truth clean" in page.shown_text
     for i in range(3):
         picture = np.asarray(np.random.default_rng(i).random((64, 96, 3)), np.float32)
         write(tmp_path / f"view{i}.exr", picture, ("R", "G", "B"), {})
@@ -247,17 +247,17 @@ def test_what_was_drawn_is_drawn_and_what_follows_is_folded(renders, tmp_path):
     clpipe("run", renders, "-o", out, "-c", config, "--seed", 4, *NUMPY, status=1)
     page = report(out)
     assert 'aria-label="Histogram of ISO"' in page.text
-    asked, _, follows = page.said.partition("Derived values")
-    assert re.search(r"ISO ?: \d+, \d+, \d+", asked)
-    assert "noise a" in follows and "noise a" not in asked
+    requested, _, follows = page.shown_text.partition("Derived values")
+    assert re.search(r"ISO ?: \d+, \d+, \d+", requested)
+    assert "noise a" in follows and "noise a" not in requested
     assert all(isinstance(entry["iso"], int) for entry in page.data["sheet-data"])
 
 
 def test_a_report_that_takes_long_says_where_it_is(out, monkeypatch):
     monkeypatch.setattr("clpipe.commands.progress.EVERY", 0)
-    said = clpipe("report", out)
+    result = clpipe("report", out)
     for text in ("sidecars", "noise of raw mosaics", "thumbnail 2 of 3", "comparison 1 of 3"):
-        assert f"{text}\n" in said
+        assert f"{text}\n" in result
 
 
 def test_tars_and_series_are_read(renders, tmp_path):
@@ -269,7 +269,7 @@ def test_tars_and_series_are_read(renders, tmp_path):
     page = report(out / "s")
     names = {entry["name"]: entry["iso"] for entry in page.data["sheet-data"]}
     assert names == {"iso100/a": 100, "iso100/b": 100, "iso1600/a": 1600, "iso1600/b": 1600}
-    assert "ISO : 100, 1600" in page.said
+    assert "ISO : 100, 1600" in page.shown_text
     page = report(out / "t")
     assert [entry["name"] for entry in page.data["sheet-data"]] == ["a", "b"]
     assert all(entry["image"] for entry in page.data["sheet-data"])
@@ -277,7 +277,7 @@ def test_tars_and_series_are_read(renders, tmp_path):
     assert views == ["image", "truth_clean"]
     tar = out / "t" / "000000.tar"
     tar.write_bytes(tar.read_bytes()[:3000])
-    assert "000000.tar: cannot be read to its end" in report(out / "t").said
+    assert "000000.tar: cannot be read to its end" in report(out / "t").shown_text
 
 
 def test_of_a_large_picture_the_page_has_all_reduced_and_crops_as_they_are(out, monkeypatch):
@@ -294,7 +294,7 @@ def test_of_a_large_picture_the_page_has_all_reduced_and_crops_as_they_are(out, 
     whole = pixels_of(base64.b64decode(view["image"].partition(",")[2]))
     means = picture.reshape(48, 2, 80, 2, 3).mean((1, 3))
     assert np.abs(whole - means).mean() < 3
-    assert "2 x 2 pixels are averaged" in page.said
+    assert "2 x 2 pixels are averaged" in page.shown_text
 
 
 def test_places_of_a_reduced_picture_are_around_what_was_found():
@@ -324,7 +324,7 @@ def test_two_runs_are_compared(out, renders, tmp_path):
     more = ("--iso", 400, "--set", "denoise.luma_strength=2", "--truth", "development")
     clpipe("run", renders / "a.exr", "-o", other, *NUMPY, *more)
     page = report(out, other)
-    assert "denoise.luma_strength 0.5 2" in page.said
+    assert "denoise.luma_strength 0.5 2" in page.shown_text
     large = {each["name"]: each for each in page.data["look-data"]}
     labels = [view["label"] for view in large["a"]["views"]]
     assert labels[:2] == ["out image", "other image"]
@@ -336,7 +336,7 @@ def test_many_pictures_are_sampled_within_the_budget(out, monkeypatch):
     monkeypatch.setattr("clpipe.reports.page.BUDGET", 3_000)
     page = report(out)
     assert len(page.data["sheet-data"]) < 3
-    assert re.search(r"\d of 3 images are shown: unusual ones", page.said)
+    assert re.search(r"\d of 3 images are shown: unusual ones", page.shown_text)
 
 
 @pytest.mark.parametrize(

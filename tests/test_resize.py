@@ -1,4 +1,4 @@
-"""Smaller pictures: their sizes, their pixels, and all that is of another size with them."""
+"""Smaller pictures: their sizes, pixels, and everything that scales with them."""
 
 import json
 from pathlib import Path
@@ -181,8 +181,8 @@ def test_all_that_is_written_of_a_smaller_picture(clpipe, write_exr):
         tags = picture.getexif().get_ifd(0x8769)
     assert tags[0xA405] == 24  # FocalLengthIn35mmFilm: the same field of view
     assert abs(float(tags[0xA20E]) - 120 / 36) < 1e-3  # pixels/cm of the sensor
-    said = json.loads(Path("o/a.json").read_text())
-    assert (said["width"], said["height"]) == (12, 8)
+    record = json.loads(Path("o/a.json").read_text())
+    assert (record["width"], record["height"]) == (12, 8)
     clpipe("run", "o/a.normalize.exr", "-o", "again", "--start-at", "white_balance", *RUN[:2])
     assert Path("again/a.normalize.jpg").read_bytes() == Path("o/a.jpg").read_bytes()
 

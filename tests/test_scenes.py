@@ -1,4 +1,4 @@
-"""``clpipe dataset``: scenes and folders of renders become datasets; resumed, they are the same."""
+"""``clpipe dataset``: scenes and folders of renders become datasets, also resumed."""
 
 import csv
 import io
@@ -38,9 +38,11 @@ def scene(tmp_path):
 
 
 def test_a_scene_becomes_a_dataset(clpipe, scene, blender, tmp_path):
-    said = clpipe("dataset", scene, "-o", "set", *blender, *NUMPY, "--views", 5, "--iso", "100,400")
-    assert "rendered view_004  5 of 5" in said.stderr
-    assert "10 of 10 images done, 0 failed" in said.stderr
+    result = clpipe(
+        "dataset", scene, "-o", "set", *blender, *NUMPY, "--views", 5, "--iso", "100,400"
+    )
+    assert "rendered view_004  5 of 5" in result.stderr
+    assert "10 of 10 images done, 0 failed" in result.stderr
     made = tmp_path / "set"
     each = ("jpg", "json", "truth_clean.jpg", "truth_clean.json", "carried.exr")
     each += ("Depth.png", "IndexOB.png")
@@ -100,10 +102,10 @@ def test_it_goes_on_where_it_was_and_makes_the_same(clpipe, scene, blender, tmp_
     command = ("dataset", scene, *blender, *NUMPY, "--path", "arc", "--views", 4, "--iso", 800)
     clpipe(*command, "-o", "whole")
     scene.write_text("die after 2")
-    said = clpipe(*command, "-o", "set", status=2).stderr
-    assert "Blender ended with status 11. Its last output:" in said
-    assert "Segmentation fault (not really)" in said
-    assert "2 of 4 images done, 0 failed, 2 not begun" in said
+    stderr = clpipe(*command, "-o", "set", status=2).stderr
+    assert "Blender ended with status 11. Its last output:" in stderr
+    assert "Segmentation fault (not really)" in stderr
+    assert "2 of 4 images done, 0 failed, 2 not begun" in stderr
     assert not (tmp_path / "set/README.md").exists()
     record = tmp_path / "set/dataset.json"
     record.write_text(record.read_text().replace(sha256_of(scene)[0], "0" * 64))
@@ -140,8 +142,8 @@ def test_a_dataset_grows(clpipe, scene, blender, tmp_path):
     command = ("dataset", scene, "-o", "set", *blender, *NUMPY, "--views", 9)
     clpipe(*command, "--iso", 800, "--licence", "CC-BY-4.0", "--author", "A. Maker")
     first = {name: (tmp_path / "set" / name).stat().st_mtime_ns for name in written(Path("set"))}
-    said = clpipe(*command, "--iso", "800,3200").stderr
-    assert "18 of 18 images done (9 of them were there already)" in said
+    stderr = clpipe(*command, "--iso", "800,3200").stderr
+    assert "18 of 18 images done (9 of them were there already)" in stderr
     clpipe(*command, "--iso", 100)
     clpipe(*command, "--iso", 100, "--camera", "canon-5d2", "-c", "default")
     made = written(Path("set"))
@@ -164,11 +166,11 @@ def test_a_dataset_grows(clpipe, scene, blender, tmp_path):
     named = [part.strip("`") for part in re.findall(r"`[\w./]+\.(?:txt|csv|json)`", readme)]
     assert all(any(f.endswith(name) for f in made) for name in named if "NAME" not in name)
     for folder in folders:
-        told = json.loads((tmp_path / "set" / folder / "transforms.json").read_text())
-        assert len(told["frames"]) == 9
-        assert told["val_filenames"] == ["view_003.jpg"]
-        assert told["test_filenames"] == ["view_007.jpg"]
-        assert len(told["train_filenames"]) == 7
+        record = json.loads((tmp_path / "set" / folder / "transforms.json").read_text())
+        assert len(record["frames"]) == 9
+        assert record["val_filenames"] == ["view_003.jpg"]
+        assert record["test_filenames"] == ["view_007.jpg"]
+        assert len(record["train_filenames"]) == 7
         assert (
             len(json.loads((tmp_path / "set" / folder / "cameras.json").read_text())["views"]) == 9
         )
@@ -177,8 +179,8 @@ def test_a_dataset_grows(clpipe, scene, blender, tmp_path):
 @pytest.mark.slow
 def test_views_that_see_too_little_are_told(clpipe, scene, blender, tmp_path):
     scene.write_text("a maze")
-    said = clpipe("dataset", scene, "-o", "set", *blender, *NUMPY, "--views", 2).stderr
-    assert "note: 3 of 9 places see too little" in said
+    stderr = clpipe("dataset", scene, "-o", "set", *blender, *NUMPY, "--views", 2).stderr
+    assert "note: 3 of 9 places see too little" in stderr
     assert "**Which views:** 3 of 9 places" in (tmp_path / "set/README.md").read_text()
 
 
@@ -186,8 +188,8 @@ def test_views_that_see_too_little_are_told(clpipe, scene, blender, tmp_path):
 def test_a_lens_takes_the_focal_length_of_the_scenes_cameras(clpipe, scene, blender, tmp_path):
     lens = ("--set", "distortion.method=brown_conrady", "--set", "distortion.k1=-0.1")
     clpipe("dataset", scene, "-o", "set", *blender, *NUMPY[:2], "--views", 1, *lens)
-    told = json.loads((tmp_path / "set/iso100/view_000.json").read_text())
-    assert told["intrinsics"]["fx"] == 40
+    record = json.loads((tmp_path / "set/iso100/view_000.json").read_text())
+    assert record["intrinsics"]["fx"] == 40
     wrong = ("--set", "distortion.method=brown")
     assert "unknown" in clpipe("dataset", scene, "-o", "n", *blender, *wrong, status=2).stderr
 
@@ -197,9 +199,9 @@ def test_cameras_of_a_file_are_rendered(clpipe, scene, blender, tmp_path):
     clpipe("dataset", scene, "-o", "a", *blender, *NUMPY, "--views", 2)
     poses = tmp_path / "a/renders/cameras.json"
     clpipe("dataset", scene, "-o", "b", *blender, *NUMPY, "--poses", poses)
-    asked = json.loads((tmp_path / "b/dataset.json").read_text())["views"]["cameras"]
+    record = json.loads((tmp_path / "b/dataset.json").read_text())["views"]["cameras"]
     view = json.loads(poses.read_text())["views"][1]
-    assert asked[1] == {"name": "view_001", **{k: v for k, v in view.items() if k != "file"}}
+    assert record[1] == {"name": "view_001", **{k: v for k, v in view.items() if k != "file"}}
 
 
 def test_renders_that_exist_become_a_dataset(clpipe, write_exr, tmp_path):
@@ -228,8 +230,8 @@ def test_renders_that_exist_become_a_dataset(clpipe, write_exr, tmp_path):
     assert transforms["train_filenames"] == ["a.png", "sub/b.png"]
     assert (tmp_path / "set/train.txt").read_text() == "a\nsub/b\n"
     write_exr("others/a.exr", np.zeros((12, 16, 3), np.float32))
-    said = clpipe("dataset", "others", "-o", "set", *NUMPY, status=2).stderr
-    assert 'has a dataset with renders "renders", but the request has "others"' in said
+    stderr = clpipe("dataset", "others", "-o", "set", *NUMPY, status=2).stderr
+    assert 'has a dataset with renders "renders", but the request has "others"' in stderr
 
 
 @pytest.mark.parametrize(
@@ -247,26 +249,26 @@ def test_renders_that_exist_become_a_dataset(clpipe, write_exr, tmp_path):
 )
 def test_what_is_refused(clpipe, scene, blender, tmp_path, options, message):
     (tmp_path / "cameras.json").write_text('{"views": [{"file": "a.exr"}]}')
-    said = clpipe("dataset", scene, "-o", "set", *blender, *options, status=2).stderr
-    assert message in said
+    stderr = clpipe("dataset", scene, "-o", "set", *blender, *options, status=2).stderr
+    assert message in stderr
     assert not (tmp_path / "set/dataset.json").exists()
 
 
 def test_scenes_that_cannot_be_rendered(clpipe, scene, blender, tmp_path, monkeypatch):
     scene.write_text("refuse: it has no camera; add one")
-    said = clpipe("dataset", scene, "-o", "set", *blender, status=2).stderr
-    assert said == f"clpipe: {scene}: it has no camera; add one\n"
+    stderr = clpipe("dataset", scene, "-o", "set", *blender, status=2).stderr
+    assert stderr == f"clpipe: {scene}: it has no camera; add one\n"
     assert "no such file" in clpipe("dataset", "no.blend", "-o", "set", *blender, status=2).stderr
     Path("no").touch()
     assert "neither a .blend nor a folder" in clpipe("dataset", "no", "-o", "s", status=2).stderr
     monkeypatch.setitem(sys.modules, "bpy", None)
-    said = clpipe("dataset", scene, "-o", "set", status=2).stderr
-    assert "pass an installed Blender, or a Python that has bpy, with --blender PATH" in said
+    stderr = clpipe("dataset", scene, "-o", "set", status=2).stderr
+    assert "pass an installed Blender, or a Python that has bpy, with --blender PATH" in stderr
     none = ("--blender", tmp_path / "none")
     assert "No such file" in clpipe("dataset", scene, "-o", "set", *none, status=2).stderr
     (tmp_path / "renders").mkdir()
-    said = clpipe("dataset", "renders", "-o", "set", "--samples", 3, status=2).stderr
-    assert "--samples: this option applies only to a .blend" in said
+    stderr = clpipe("dataset", "renders", "-o", "set", "--samples", 3, status=2).stderr
+    assert "--samples: this option applies only to a .blend" in stderr
 
 
 def example(folder, name, *words):
@@ -309,24 +311,24 @@ def seen_again(folder, one, two):
 
 
 def test_views_of_a_room_see_what_the_camera_looks_at(clpipe, tmp_path):
-    """An orbit leads behind the walls; no view is from there, and each sees most objects."""
+    """An orbit passes outside the walls, but no view is there, and each view sees most objects."""
     pytest.importorskip("bpy", reason="needs bpy, in the extra blender")
     example(tmp_path, "room_scene.py", "room.blend")
     small = ("--resolution", "48x32", "--samples", 1, "--device", "numpy", "--no-denoise")
-    said = clpipe("dataset", "room.blend", "-o", "set", "--views", 8, *small).stderr
-    assert "places on the orbit see too little" in said
+    stderr = clpipe("dataset", "room.blend", "-o", "set", "--views", 8, *small).stderr
+    assert "places on the orbit see too little" in stderr
     for path in sorted(Path("set/renders").glob("*.exr")):
         parts = OpenEXR.File(str(path), separate_channels=True).parts
         channels = {name: c for part in parts for name, c in part.channels.items()}
         (own,) = (c for name, c in channels.items() if "Index" in name)
         numbers, counts = np.unique(own.pixels, return_counts=True)
         assert len(numbers) >= 4 and counts.max() < 0.7 * 48 * 32
-    said = clpipe("dataset", "room.blend", "-o", "box", "--path", "random", *small).stderr
-    assert "24 of 24 images done" in said
+    stderr = clpipe("dataset", "room.blend", "-o", "box", "--path", "random", *small).stderr
+    assert "24 of 24 images done" in stderr
 
 
 def test_blender_itself_renders_a_scene(clpipe, tmp_path):
-    """Its depth, cameras and object numbers agree with each other, and it makes the same again."""
+    """Depth, cameras and object numbers of the example agree, and it is reproducible."""
     pytest.importorskip("bpy", reason="needs bpy, in the extra blender")
     example(tmp_path, "room_scene.py", "room.blend")
     small = ("--resolution", "48x32", "--samples", 4, "--device", "numpy", "--path", "arc")

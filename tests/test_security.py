@@ -1,4 +1,4 @@
-"""The promises of SECURITY.md, by their numbers; what has tests of its own elsewhere is named."""
+"""The promises of SECURITY.md, by number, or the names of their tests."""
 
 import json
 import os
@@ -44,7 +44,7 @@ def render(tmp_path):
 
 @pytest.fixture(autouse=True)
 def _here(clpipe):
-    """Every test runs in a folder of its own."""
+    """Run every test in its own folder."""
 
 
 def test_1_no_data_runs_code(clpipe, render):
@@ -145,7 +145,7 @@ def test_6_a_batch_goes_on_and_the_terminal_is_safe(clpipe, render):
 
 @pytest.mark.slow
 def test_faults_of_all_kinds_in_small():
-    """A few of the faults of tools/stress/faults.py; the whole of it takes an hour."""
+    """Run a few faults of tools/stress/faults.py; all of them take an hour."""
     options = ("--images", 8, "--repeats", 1, "--device", "numpy")
     done = run_python("-m", "tools.stress.faults", *options, "full", "power")
     assert done.stdout.count("1 times") == 2

@@ -1,4 +1,4 @@
-"""Photo-electrons, read noise and what is fixed to a sensor: laws, parametrisations, bounds."""
+"""Photo-electrons, read noise and fixed patterns: distributions, parameters, bounds."""
 
 from math import sqrt
 
@@ -26,7 +26,7 @@ def words_of(j):
 
 
 def draw(develop, level, count=1_000_000, **parameters):
-    """Sensor noise alone on a flat mosaic."""
+    """Return only sensor noise on a flat mosaic."""
     flat = np.full((count // 2000, 2000), level, np.float32)
     stages = {"stages": ["sensor_noise"], "sensor_noise": parameters}
     return develop(flat, source=Kind.MOSAIC, **stages).final.astype(np.float64)

@@ -1,4 +1,4 @@
-"""Profiles of special sensors: what their sources say, found again in what clpipe makes of them."""
+"""Profiles of special sensors: the figures of their sources, measured on clpipe's output."""
 
 import numpy as np
 import pytest

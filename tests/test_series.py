@@ -1,4 +1,4 @@
-"""Series: the same images with several cameras and ISOs, each in a folder of its own."""
+"""Series: the same images with several cameras and ISOs, each in its own folder."""
 
 import json
 import tarfile
@@ -30,7 +30,7 @@ def test_each_member_is_as_if_it_were_made_alone(clpipe, renders, tmp_path):
     for name in ("a.jpg", "b/c.jpg"):
         member = tmp_path / "all/canon-5d2/iso1600" / name
         assert member.read_bytes() == (tmp_path / "one" / name).read_bytes()
-    # A second run has nothing to do; another ISO is made beside those that are there.
+    # A second run only makes the pictures of the additional ISO.
     clpipe("run", "renders", "-o", "all", *NUMPY, *TWO[:4], "--iso", "100,1600,400")
     end = json.loads((tmp_path / "all/run.jsonl").read_text().splitlines()[-1])
     assert (end["done"], end["skipped"]) == (4, 8)
@@ -73,5 +73,5 @@ def test_what_is_refused(clpipe, renders, options, message):
 
 def test_a_manifest_that_says_it_too_is_refused(clpipe, renders, tmp_path):
     (tmp_path / "rows.csv").write_text("path,iso\nrenders/a.exr,400\n")
-    said = clpipe("run", "rows.csv", "-o", "out", *NUMPY, "--iso", "100,200", status=2).stderr
-    assert "rows.csv, row 2): this row sets iso, but --iso lists several; remove one" in said
+    stderr = clpipe("run", "rows.csv", "-o", "out", *NUMPY, "--iso", "100,200", status=2).stderr
+    assert "rows.csv, row 2): this row sets iso, but --iso lists several; remove one" in stderr

@@ -1,4 +1,4 @@
-"""Runs from Python: the same files as the command's, and what a script can do with outcomes."""
+"""Runs from Python: the command's files, and the use of outcomes in scripts."""
 
 import json
 from pathlib import Path

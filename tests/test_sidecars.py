@@ -1,4 +1,4 @@
-"""Sidecars carry their own digest: an edited one is a missing one, and every reader says so."""
+"""Sidecars contain their own digest: every reader treats an edited one as missing."""
 
 import copy
 import hashlib
@@ -23,7 +23,7 @@ CAMERA = ("--set", "render.fx=30", "--set", "render.fy=30")
 
 @pytest.fixture
 def made(clpipe, write_exr):
-    """Run two renders; running it again gives the status of each by its name."""
+    """Run two renders, and return a function that runs again and returns their status by name."""
     for name, value in (("a", 0.25), ("b", 0.5)):
         write_exr(f"in/{name}.exr", np.full((8, 8, 3), value, np.float32))
 
@@ -75,16 +75,16 @@ def test_an_edited_sidecar_is_a_missing_one(made, clpipe, edit):
     sidecar, whole = Path("out/a.json"), Path("out/a.json").read_bytes()
     edit(sidecar)
     for command in ("poses", "report"):
-        said = clpipe(command, "out").output
+        printed = clpipe(command, "out").output
         if command == "report":
-            said = Path("out/report.html").read_text()
-        assert "a.json" in said and "was changed after clpipe wrote it" in said
-        assert "repeat the same clpipe run" in said
+            printed = Path("out/report.html").read_text()
+        assert "a.json" in printed and "was changed after clpipe wrote it" in printed
+        assert "repeat the same clpipe run" in printed
     views = json.loads(Path("out/cameras.json").read_text())["views"]
     assert [view["file"] for view in views] == ["b.jpg"]
-    said = clpipe("replay", sidecar, "-o", "again", status=2).stderr
-    assert said.startswith(f"clpipe: {sidecar}: {CHANGED}")
-    assert "use options or a configuration" in said
+    printed = clpipe("replay", sidecar, "-o", "again", status=2).stderr
+    assert printed.startswith(f"clpipe: {sidecar}: {CHANGED}")
+    assert "use options or a configuration" in printed
     assert made() == {"a": "done", "b": "skipped"}
     assert sidecar.read_bytes() == whole
     assert made() == {"a": "skipped", "b": "skipped"}
@@ -128,7 +128,7 @@ ODD = [7, -1.5, [], ["x"], None, "", "\0", {}, {"a": {"b": [1]}}, True, 10**400,
 
 
 def places(values, at=()):
-    """The keys on the way to each value of a sidecar; of a list, to its first."""
+    """Return the path of keys to each value of a sidecar; for a list, to its first item."""
     if at:
         yield at
     if isinstance(values, dict):
@@ -156,9 +156,9 @@ PATCHES = ("--patch", 4, "--patches-per-image", 2, "--keep", "normalize", "--for
 @pytest.mark.parametrize("options", [(), PATCHES])
 def test_whatever_a_forged_sidecar_holds_no_command_ends_in_a_traceback(made, clpipe, options):
     made(*options)
-    whole, luck = read_sidecar(Path("out/a.json")), random.Random(0)
+    whole, rng = read_sidecar(Path("out/a.json")), random.Random(0)
     everywhere = [(at, odd) for at in places(whole) for odd in ODD]
-    for number, (at, odd) in enumerate(luck.sample(everywhere, 200)):
+    for number, (at, odd) in enumerate(rng.sample(everywhere, 200)):
         Path(f"odd/{number}").mkdir(parents=True)
         os.link("out/a.jpg", f"odd/{number}/a.jpg")
         reseal(Path(f"odd/{number}/a.json"), edited(whole, at, odd))
@@ -172,7 +172,7 @@ def test_whatever_a_forged_sidecar_holds_no_command_ends_in_a_traceback(made, cl
     run = ("run", "in", "-o", "out", "--device", "numpy", *CAMERA, *options)
     assert "unexpected" not in clpipe(*run).stderr
     for key in whole["request"]:
-        for odd in luck.sample(ODD, 2):
+        for odd in rng.sample(ODD, 2):
             reseal(Path("e.json"), edited(whole, ("request", key), odd))
             again = clpipe("replay", "e.json", *NUMPY, status=(0, 1, 2))
             assert "unexpected" not in again.stderr, (key, odd)
@@ -228,8 +228,8 @@ def test_an_edited_sidecar_in_a_tar(clpipe, write_exr, options, names):
     for name in names:
         edited_in_tar(tar, name)
         clpipe("report", "out")
-        said = Path("out/report.html").read_text()
-        assert f"{name}: this sidecar was changed after clpipe wrote it" in said
+        text = Path("out/report.html").read_text()
+        assert f"{name}: this sidecar was changed after clpipe wrote it" in text
         clpipe(*run)
         assert tar.read_bytes() == whole
 
@@ -241,7 +241,7 @@ def test_a_dataset_without_what_was_edited_and_cannot_be_made_again(clpipe, writ
     clpipe(*run)
     lay_out_anew(Path("out/iso100/a.json"))
     Path("in/a.exr").write_bytes(b"no picture")
-    said = clpipe(*run, status=1).stderr
-    assert f"out/iso100/a.json: {CHANGED}" in said
+    stderr = clpipe(*run, status=1).stderr
+    assert f"out/iso100/a.json: {CHANGED}" in stderr
     rows = Path("out/manifest.csv").read_text().splitlines()[1:]
     assert [row.split(",")[0] for row in rows] == ["b"]

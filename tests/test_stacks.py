@@ -1,4 +1,4 @@
-"""Stacks: what goes through a device in common launches has the bits that it has alone."""
+"""Stacks: images that share launches get the same bits as single images."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from clpipe.engine.runner import Result, Runner, cut_out, submit_together
 from clpipe.stage import Kind
 from tests.conftest import worker_of
 
-# Of each kind of launch: lines and stencils; a resampling, sums, a mosaic with a period.
+# These chains have each kind of launch: stencils, resampling, sums, a mosaic with a period.
 CHAINS = {
     "default": {"row_noise": {"sigma": 0.002}},
     "others": {
@@ -48,12 +48,12 @@ def equal(one: Result, two: Result) -> None:
 
 @pytest.fixture(params=["CPU", pytest.param("GPU", marks=pytest.mark.slow)])
 def on(device, request):
-    """The device, also as if its memory were its own."""
+    """The device, and the same device as if it had its own memory."""
     return Device(replace(device.info, type=request.param))
 
 
 class Asked(NamedTuple):
-    """An image that is to go through a runner."""
+    """An image to submit to a runner."""
 
     runner: Runner
     image: np.ndarray
@@ -75,20 +75,20 @@ def submissions(device, stages, sizes=SIZES):
 
 @pytest.mark.parametrize("name", CHAINS)
 def test_members_have_the_bits_that_they_have_alone(on, launches, name):
-    asked = submissions(on, CHAINS[name])
-    alone = [each.runner.run(each.image, each.noise_key) for each in asked]
+    submitted = submissions(on, CHAINS[name])
+    alone = [each.runner.run(each.image, each.noise_key) for each in submitted]
     launches.clear()
-    for wait, expected in zip(submit_together(asked), alone, strict=True):
+    for wait, expected in zip(submit_together(submitted), alone, strict=True):
         equal(wait(), expected)
     assert {size[2:] for size in launches} == {(3,)}
     assert len(launches) < 20
 
 
 def test_patches_of_one_image_and_of_others_go_together(on, launches):
-    asked = submissions(on, CHAINS["default"])
-    wholes = [each.runner.run(each.image, each.noise_key) for each in asked]
+    submitted = submissions(on, CHAINS["default"])
+    wholes = [each.runner.run(each.image, each.noise_key) for each in submitted]
     boxes = [Box(0, 0, 16, 20), Box(7, 3, 23, 23), Box(16, 1, 32, 21)]
-    cut = [each._replace(options=RunOptions(boxes=boxes)) for each in asked]
+    cut = [each._replace(options=RunOptions(boxes=boxes)) for each in submitted]
     launches.clear()
     for wait, whole in zip(submit_together(cut), wholes, strict=True):
         found = wait()
@@ -106,24 +106,24 @@ def test_the_check_of_a_device_tries_them(on, launches):
 
 @pytest.mark.parametrize("sizes", [[(1, 7), (1, 40), (1, 1)], [(9, 1), (2, 1), (30, 1)]])
 def test_lines_of_pixels(on, sizes):
-    asked = submissions(on, {"stages": ["mosaic", "demosaic", "gamma"]}, sizes)
-    runners = {each.runner for each in asked}
+    submitted = submissions(on, {"stages": ["mosaic", "demosaic", "gamma"]}, sizes)
+    runners = {each.runner for each in submitted}
     for runner in runners:
         runner.keep = ()
-    alone = [each.runner.run(each.image, each.noise_key) for each in asked]
-    for wait, expected in zip(submit_together(asked), alone, strict=True):
+    alone = [each.runner.run(each.image, each.noise_key) for each in submitted]
+    for wait, expected in zip(submit_together(submitted), alone, strict=True):
         equal(wait(), expected)
 
 
 def test_more_than_one_stack_where_memory_is_short(on, launches, monkeypatch):
-    asked = submissions(on, CHAINS["default"])
-    alone = [each.runner.run(each.image, each.noise_key) for each in asked]
+    submitted = submissions(on, CHAINS["default"])
+    alone = [each.runner.run(each.image, each.noise_key) for each in submitted]
     monkeypatch.setattr(stack, "FEWEST", 2)
 
     def depths():
         """Submit the images and return how many of them each launch covers."""
         launches.clear()
-        for wait, expected in zip(submit_together(asked), alone, strict=True):
+        for wait, expected in zip(submit_together(submitted), alone, strict=True):
             equal(wait(), expected)
         return {size[2:] for size in launches}
 
@@ -139,12 +139,12 @@ def test_more_than_one_stack_where_memory_is_short(on, launches, monkeypatch):
 
 
 def test_what_takes_other_kernels_goes_by_itself(on, launches):
-    asked = submissions(on, CHAINS["default"])
+    submitted = submissions(on, CHAINS["default"])
     chain = make_chain(settings_from({"stages": ["exposure", "gamma"]}))
-    other = asked[0]._replace(runner=Runner(chain, on))
-    alone = [each.runner.run(each.image, each.noise_key) for each in (*asked, other)]
+    other = submitted[0]._replace(runner=Runner(chain, on))
+    alone = [each.runner.run(each.image, each.noise_key) for each in (*submitted, other)]
     launches.clear()
-    waits = submit_together([asked[0], other, *asked[1:]])
+    waits = submit_together([submitted[0], other, *submitted[1:]])
     found = [wait() for wait in waits]
     for result, expected in zip([found[0], *found[2:], found[1]], alone, strict=True):
         equal(result, expected)
@@ -153,9 +153,9 @@ def test_what_takes_other_kernels_goes_by_itself(on, launches):
 
 @pytest.mark.parametrize("error", [cl.RuntimeError("INVALID_OPERATION"), cl.MemoryError("full")])
 def test_a_stack_that_fails_is_done_image_by_image(on, monkeypatch, error):
-    asked = submissions(on, CHAINS["default"])
-    alone = [each.runner.run(each.image, each.noise_key) for each in asked]
-    before = submit_together(asked)
+    submitted = submissions(on, CHAINS["default"])
+    alone = [each.runner.run(each.image, each.noise_key) for each in submitted]
+    before = submit_together(submitted)
     launch = cl.enqueue_nd_range_kernel
 
     def launched(queue, kernel, size, *rest, **options):
@@ -164,7 +164,7 @@ def test_a_stack_that_fails_is_done_image_by_image(on, monkeypatch, error):
         return launch(queue, kernel, size, *rest, **options)
 
     monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
-    for wait, expected in zip([*before, *submit_together(asked)], alone * 2, strict=True):
+    for wait, expected in zip([*before, *submit_together(submitted)], alone * 2, strict=True):
         equal(wait(), expected)
 
 
@@ -184,11 +184,11 @@ def test_small_images_of_a_run_share_launches(
         size = (24, 32) if number % 3 else (17, 40)
         pixels = rng.random((*size, 3)).astype(np.float32) / 2
         write_exr(tmp_path / f"in/r{number}.exr", pixels)
-    asked = {"a burst and its truth": {"frames": 3, "truth": ("clean",)}}
-    asked["patches"] = {"patch": 16, "patches_per_image": 2}
+    submitted = {"a burst and its truth": {"frames": 3, "truth": ("clean",)}}
+    submitted["patches"] = {"patch": 16, "patches_per_image": 2}
 
     def made(name):
-        worker, jobs = worker_of(tmp_path, name, values={"iso": 3200}, **asked.get(what, {}))
+        worker, jobs = worker_of(tmp_path, name, values={"iso": 3200}, **submitted.get(what, {}))
         outcomes = list(WAYS[way](worker, device).run(jobs))
         assert [outcome.status for outcome in outcomes] == ["done"] * 7
         files = (tmp_path / name).rglob("*.png")

@@ -1,4 +1,4 @@
-"""Staggered exposures between which the light changes: sub-frames, rows, flicker."""
+"""Staggered exposures in changing light: sub-frames, rows, flicker."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ from clpipe.engine.runner import Runner
 from clpipe.stage import Span
 from clpipe.stages.shutter import Rows
 
-# Of seven frames the first exposure has four, the second two, the last one.
+# The first exposure covers four of seven frames, the second two, and the last one.
 STAGGERED = {"method": "staggered", "count": 3, "ratio": 2.0}
 SPANS = (Span(0, 1), Span(1, 0.5), Span(1.5, 0.25))
 BAR = 3.0
@@ -77,11 +77,11 @@ def test_each_exposure_sees_its_own_frames(frames, clpipe):
     clpipe(*RUN, *CLEAN, "-o", "o")
     row = np.load("o/f0.npy")[11]
     assert row == pytest.approx(merged(expected), abs=3e-4)
-    # Where the first exposure is white, the bar has the edges of the shorter ones: it begins at
-    # column 12, where the last one has it, though it stood at columns 6 to 12 all of the time.
+    # Where the first exposure is white, the bar has the edges of the shorter exposures. It begins
+    # at column 12, like in the last exposure.
     assert row[6:8] == pytest.approx(0.1, abs=1e-3)
     assert row[12:16] == pytest.approx(BAR, abs=1e-3)
-    assert row[18:] == pytest.approx(0.1, abs=1e-3)  # nor what came after the first had ended
+    assert row[18:] == pytest.approx(0.1, abs=1e-3)  # no light from after the first exposure
     (record,) = [json.loads(path.read_text()) for path in Path("o").glob("*.json")]
     assert len(record["subframes"]) == 7
 
@@ -99,8 +99,8 @@ def test_truth_and_samples_have_the_same_motion(frames, clpipe):
 
 
 def test_rows_roll_in_each_exposure(frames, clpipe):
-    # The shutter goes over the rows while the last four of 11 parts of time pass: as if frames
-    # had been 7/11 as long, and the last rows see those 4 parts later.
+    # The shutter rolls over the rows during the last 4 of 11 parts of the time. So frames are
+    # 11/7 s long, and the last row is exposed 4 s later.
     times = ("--set", "shutter.exposure_time=4", "--set", f"shutter.line_time={4 / 23}")
     clpipe(*RUN, *CLEAN, "-o", "o", *times, "--set", "sensor_noise.part=2")
     found = np.load("o/f0.npy")
@@ -185,5 +185,5 @@ def test_what_is_refused(settings, message):
 
 
 def test_a_variance_is_not_known(frames, clpipe):
-    told = clpipe(*RUN, "-o", "o", "--truth", "variance", status=2).stderr
-    assert "sensor_noise (staggered) cannot compute the variance" in told
+    stderr = clpipe(*RUN, "-o", "o", "--truth", "variance", status=2).stderr
+    assert "sensor_noise (staggered) cannot compute the variance" in stderr

@@ -1,4 +1,4 @@
-"""What a picture's file states about its samples is applied, or named in a warning."""
+"""Metadata about a picture's samples is applied, or named in a warning."""
 
 import json
 import struct
@@ -183,7 +183,7 @@ def test_the_finished_picture_is_turned_once(tmp_path):
 
 @pytest.mark.parametrize("type_", [oiio.UINT8, oiio.FLOAT])
 def test_alpha_of_tiff(tmp_path, type_):
-    """Straight alpha multiplies light; what it has multiplied already stays as it is."""
+    """Straight alpha multiplies light; premultiplied light is unchanged."""
     share = ALPHA[..., None] / np.float32(255)
     straight = np.concatenate([LIGHT, share], -1)
     path = write_tiff(tmp_path / "a.tif", straight, type_, "R,G,B,A", oiio__UnassociatedAlpha=1)
@@ -308,7 +308,7 @@ def test_one_bit_and_sixteen_bits_in_grey(tmp_path):
 
 
 def with_chunks(path, **chunks):
-    """A PNG of CODES with further chunks behind its header."""
+    """Return a PNG of CODES with further chunks after its header."""
     Image.fromarray(CODES).save(path)
     data = path.read_bytes()
     made = b"".join(

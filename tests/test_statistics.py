@@ -1,4 +1,4 @@
-"""Statistics of noise whose law is known."""
+"""Statistics of noise with a known distribution."""
 
 from math import erfc, sqrt
 

@@ -1,4 +1,4 @@
-"""shutter.subframes: exposures that a renderer gives as several frames."""
+"""shutter.subframes: exposures from several frames of a renderer."""
 
 import json
 import os
@@ -99,9 +99,9 @@ def test_each_frame_is_compared_with_what_it_was(frames, clpipe):
     os.utime(fifth, (1e9, 1e9))  # of the same size, and older than all
     assert is_made_again()
     record = json.loads(Path("o/f00.json").read_text())
-    told = [(each["size"], each["modified"]) for each in record["subframes"]]
+    recorded = [(each["size"], each["modified"]) for each in record["subframes"]]
     found = [Path(f"in/f{number:02}.exr").stat() for number in range(8)]
-    assert told == [(status.st_size, status.st_mtime_ns) for status in found]
+    assert recorded == [(status.st_size, status.st_mtime_ns) for status in found]
 
 
 def test_a_dataset_and_a_manifest_group_frames_too(frames, write_exr):
@@ -136,8 +136,8 @@ def test_rows_that_differ_are_no_exposure(frames, clpipe):
 def test_a_frame_of_another_size_fails_alone(frames, clpipe, write_exr):
     write_exr("in/f03.exr", np.zeros((24, 39, 3), np.float16))
     options = ("--set", "shutter.subframes=4", "--device", "numpy")
-    told = clpipe("run", "in", "-o", "o", *options, status=1).stderr
-    assert "this frame is 39x24, but that of in/f00.exr, in the same exposure, is 40x24" in told
+    stderr = clpipe("run", "in", "-o", "o", *options, status=1).stderr
+    assert "this frame is 39x24, but that of in/f00.exr, in the same exposure, is 40x24" in stderr
     with Image.open("o/f04.jpg") as picture:
         assert picture.size == (40, 24)
 

@@ -1,4 +1,4 @@
-"""Layers are interpolated within a surface alone, without a shift; what is unknown is invalid."""
+"""Layers are interpolated within a surface only, without a shift; unknown pixels are invalid."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ GEOMETRIES = {
 
 
 def room(x, y):
-    """A floor, a wall behind it, and a pillar before both: depth, normals, label."""
+    """Return a floor, a wall and a pillar in front of them: depth, normals, label."""
     u, v = (x - WIDTH / 2) / 90, (y - HEIGHT / 2) / 90
     with np.errstate(divide="ignore"):
         floor = np.where(v > 0, 1.5 / v, np.inf)
@@ -55,7 +55,7 @@ def test_each_layer_is_that_of_one_surface(geometry):
     same = (valid == 1) & (own[..., 0] == true_label)
     assert same.sum() > 0.95 * valid.sum() > 0.8 * valid.size
     relative = abs(z[..., 0] / true_z - 1)[same]
-    # On an edge between two surfaces it is a pixel's own, beside it.
+    # On an edge, each pixel has the depth of one surface.
     assert np.median(relative) < 1e-6 and (relative < 1e-4).mean() > 0.93
     assert relative.max() < 0.05  # never between two
     assert abs(n - true_n)[same].max() < 1e-6 or (abs(n - true_n)[same] < 1e-6).mean() > 0.99

@@ -1,4 +1,4 @@
-"""What Linux has and macOS or Windows lacks is taken away; clpipe goes on, and makes the same."""
+"""Without features that macOS or Windows lack, clpipe works and returns the same results."""
 
 import errno
 import os
@@ -71,7 +71,7 @@ for module in pkgutil.walk_packages(clpipe.__path__, "clpipe."):
 print(loaded)
 """
 
-# PoCL 3.0, which only Linux has, is told its CPU through /proc/self/mem.
+# PoCL 3.0, which only exists for Linux, receives its CPU through /proc/self/mem.
 FOR_POCL = TAKE_AWAY.replace(" pread pwrite ", " ")
 
 RUN = "from clpipe.commands.main import main; main()"

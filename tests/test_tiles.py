@@ -1,4 +1,4 @@
-"""Images in tiles: the same bits as whole, in whatever memory there is."""
+"""Tiled images: the same bits as whole images, in any amount of memory."""
 
 from contextlib import contextmanager
 
@@ -34,7 +34,7 @@ def plan_of(**settings) -> Plan:
 
 
 def memory_for(plan: Plan, columns: int, rows: int, lanes: int) -> int:
-    """What a tile takes that has so many pixels beside its halo."""
+    """Return the memory of a tile with so many pixels, without its halo."""
     halo = 2 * halos_of(plan)[0] + lanes
     whole = whole_image(plan, columns + halo, rows + halo, lanes)
     return sum(buffer_sizes(plan, whole).values()) + 4 * 1024
@@ -76,7 +76,7 @@ def in_tiles(
 def in_less_memory(
     runner: Runner, image: np.ndarray, monkeypatch: pytest.MonkeyPatch, half: bool = False
 ) -> None:
-    """See that an image is the same in three fifths of the memory, and that each tile has its."""
+    """Check an image in three fifths of the memory, and the memory of each tile."""
     whole, device = runner.run(image, "k"), runner.device
     plan, size = runner.plan(half), (*image.shape[1::-1], device.info.lanes)
     memory = sum(buffer_sizes(plan, whole_image(plan, *size)).values()) * 6 // 10
@@ -101,7 +101,7 @@ def patches_in(whole: Result) -> list[Box]:
 
 
 def cut(whole: Result, boxes: list[Box]) -> Result:
-    """The result with parts of its images, behind each other."""
+    """Return the result with parts of its images, one after another."""
     final, encoded = (
         None if image is None else cut_out(image, boxes) for image in (whole.final, whole.encoded)
     )
@@ -299,7 +299,7 @@ def test_memory_that_is_not_there_all_the_same(device, monkeypatch, call):
 
     @contextmanager
     def left(size):
-        """Another program has nearly filled the device."""
+        """Another program has filled most of the device's memory."""
 
         def scarce(*arguments, **options):
             if device.bytes_held > size:
@@ -312,7 +312,7 @@ def test_memory_that_is_not_there_all_the_same(device, monkeypatch, call):
             patch.setattr(cl, call, scarce)
             yield
 
-    # Room for the image alone, but not beside what the larger one has left behind.
+    # The memory suffices for the image, but not together with the larger image's buffers.
     enough = sum(buffer_sizes(plan, whole_image(plan, 203, 150, 8)).values())
     for size, tries in ((enough, 1), (enough // 3, 3), (enough // 9, 5)):
         with left(size):

@@ -154,11 +154,11 @@ def test_a_style_is_undone(values, seed):
     style = Standard(**values)
     curved = run_reference(style, light)
     again = run_reference(InverseStandard(**values), curved)
-    # Where the curve is level, light cannot be told; where colours left 0 to 1, neither.
+    # Light cannot be recovered where the curve is level, or where colours left 0 to 1.
     high = light.max(-1, keepdims=True)
     step = style.curve(high + np.float32(1e-3)) - style.curve(high - np.float32(1e-3))
-    told = (step > 1e-4) & (curved.min(-1, keepdims=True) > 0)
-    assert np.abs(np.where(told, again - light, 0)).max() < 1e-4
+    invertible = (step > 1e-4) & (curved.min(-1, keepdims=True) > 0)
+    assert np.abs(np.where(invertible, again - light, 0)).max() < 1e-4
 
 
 def test_what_the_parameters_of_a_style_say():

@@ -1,4 +1,4 @@
-"""clpipe.torch: NumPy's bits for a key, and noise of the same law without; gradients."""
+"""clpipe.torch: NumPy's bits with a key, the same distribution without; gradients."""
 
 import numpy as np
 import pytest

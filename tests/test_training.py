@@ -1,4 +1,4 @@
-"""tools/training: denoisers that are trained on what clpipe makes, and how they are judged."""
+"""tools/training: denoisers trained on clpipe's pictures, and their scores."""
 
 import json
 
@@ -14,7 +14,7 @@ torch = pytest.importorskip("torch", reason="needs PyTorch, in the extra train")
 
 @pytest.fixture
 def tool(tmp_path):
-    """Run one of the tools in a folder with a render; what it told."""
+    """Return a function that runs a tool in a folder with a render, and returns its output."""
     (tmp_path / "renders").mkdir()
     (tmp_path / "renders/a.exr").write_bytes(STILL_LIFE.read_bytes())
 
@@ -27,7 +27,7 @@ def tool(tmp_path):
 
 @pytest.fixture
 def real(clpipe, tmp_path):
-    """A folder with pairs that stand for a camera's: a development, and that without noise."""
+    """A folder of simulated camera pairs: a development, and the same without noise."""
     made = tmp_path / "made"
     clpipe(
         "run", STILL_LIFE, "-o", made, "--iso", 3200, "--truth", "development", "--format", "png"
@@ -43,10 +43,10 @@ def real(clpipe, tmp_path):
 
 def test_denoisers_are_compared_on_real_pictures(tool, real, tmp_path):
     words = ("renders/a.exr", "--real", real, "--steps", 150, "--seeds", 1, "-o", "out")
-    told = tool(
+    printed = tool(
         "train_on_real", *words, "--regimes", "clpipe", "awgn", "real", "--pairs", _other(real)
     )
-    assert "6 pictures to train on, 2 real ones to test on" in told
+    assert "6 pictures to train on, 2 real ones to test on" in printed
     found = json.loads((tmp_path / "out/scores.json").read_text())
     assert list(found["regimes"]) == ["noisy", "clpipe", "awgn", "real"]
     table = (tmp_path / "out/table.md").read_text()
@@ -62,7 +62,7 @@ def test_denoisers_are_compared_on_real_pictures(tool, real, tmp_path):
 
 
 def _other(real):
-    """A folder with the first pair under another name, so that it is not the one that is tested."""
+    """A folder with the first pair under another name, so training does not use the test pair."""
     other = real.parent / "other"
     other.mkdir()
     for kind in ("real", "mean"):
@@ -71,28 +71,28 @@ def _other(real):
 
 
 def test_what_is_tested_is_not_trained_on(tool, real):
-    told = tool("train_on_real", real / "cam_1_mean.png", "--real", real, status=2)
-    assert "is tested on (cam_1), so it cannot be trained on" in told
-    told = tool("train_on_real", "renders/a.exr", "--real", real, "--pairs", real, status=2)
-    assert "--pairs FOLDER is what the regime real is trained on" in told
+    printed = tool("train_on_real", real / "cam_1_mean.png", "--real", real, status=2)
+    assert "is in the test set (cam_1); do not train on it" in printed
+    printed = tool("train_on_real", "renders/a.exr", "--real", real, "--pairs", real, status=2)
+    assert "the regime real needs --pairs FOLDER" in printed
     words = ("--regimes", "real", "--pairs", real)
-    told = tool("train_on_real", "renders/a.exr", "--real", real, *words, status=2)
-    assert "is tested on" in told
+    printed = tool("train_on_real", "renders/a.exr", "--real", real, *words, status=2)
+    assert "is in the test set" in printed
 
 
 def test_a_range_that_misses_the_pictures_is_said(tool, real):
     words = ("--iso", 100, 110, "--steps", 1, "--seeds", 1, "--regimes", "clpipe")
-    told = tool("train_on_real", "renders/a.exr", "--real", real, *words)
-    assert "warning: 2 of 2 real pictures have less or more noise than what is trained on" in told
+    printed = tool("train_on_real", "renders/a.exr", "--real", real, *words)
+    assert "warning: 2 of 2 real pictures have less or more noise than the training" in printed
 
 
 def test_noise_models_are_compared_on_raws(tool, tmp_path, write_exr):
     write_exr("b.exr", np.random.default_rng(0).random((96, 130, 3)).astype(np.float32) ** 2)
     words = ("renders/a.exr", "--test", "b.exr", "--steps", 2, "--seeds", 1, "-o", "raw.json")
-    told = tool("train_on_raw", *words)
+    printed = tool("train_on_raw", *words)
     found = json.loads((tmp_path / "raw.json").read_text())
     assert list(found) == ["noisy", "full", "poisson-gaussian", "iid"]
-    rows = [line for line in told.splitlines() if line.startswith("| ")]
+    rows = [line for line in printed.splitlines() if line.startswith("| ")]
     kld = {row.split(" | ")[0][2:]: row.split(" | ")[-1][:-2] for row in rows[2:]}
     assert float(kld["full"]) < float(kld["poisson-gaussian"]) < float(kld["iid"])
 

@@ -1,4 +1,4 @@
-"""Pixels on their way to a device and back: where they lie, or through staging buffers."""
+"""Transfers to and from a device: zero-copy, or through staging buffers."""
 
 from dataclasses import replace
 from typing import Any
@@ -23,13 +23,13 @@ IMAGES = [example(Kind.RGB, (40, 48), half=True, seed=seed) for seed in range(5)
 
 
 def planes_of(image: np.ndarray) -> np.ndarray:
-    """The channels of an image one behind the other, (3, height, width)."""
+    """Return the channels of an image as planes, (3, height, width)."""
     return np.ascontiguousarray(image.transpose(2, 0, 1))
 
 
 @pytest.fixture
 def runner(device: Device) -> Runner:
-    """A single launch, on a device of its own."""
+    """A single launch on its own device."""
     return Runner(make_chain(settings_from({"stages": ["exposure", "gamma"]})), Device(device.info))
 
 
@@ -57,11 +57,11 @@ def test_a_cpu_uses_an_image_where_it_is(runner, copied):
     expected = Runner(runner.chain, None).run(image, "k").encoded
     assert np.abs(into.astype(int) - expected).max() <= 1
     assert not copied
-    room = np.zeros((60, 40, 3), np.float16)  # rows behind the image, for whole blocks
-    room[:37] = image[:37, :40]
-    whole = runner.run(room[:37].copy(), "k").encoded
+    padded = np.zeros((60, 40, 3), np.float16)  # with rows after the image, for whole blocks
+    padded[:37] = image[:37, :40]
+    whole = runner.run(padded[:37].copy(), "k").encoded
     assert len(copied) == 1
-    assert np.array_equal(runner.run(room[:37], "k").encoded, whole)
+    assert np.array_equal(runner.run(padded[:37], "k").encoded, whole)
     assert len(copied) == 1
 
 
@@ -113,7 +113,7 @@ def test_both_ways_give_the_same(device, type_, memory):
 
 
 def queued(device: Device, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
-    """What is enqueued from now on, and in which queue."""
+    """Record the following enqueued operations and their queues."""
     seen = []
 
     def watched(name: str) -> None:
@@ -146,8 +146,8 @@ def test_transfers_of_an_image_run_beside_the_kernels_of_its_neighbours(gpu_runn
     cl._enqueue_marker_with_wait_list(device.flow.queue, [gate])
     timings: list[list[Timing]] = [[], []]
     begun = [gpu_runner.submit(IMAGES[i], "k", RunOptions(timings[i])) for i in range(2)]
-    wanted = ["enqueue_copy", "enqueue_nd_range_kernel", "enqueue_copy"] * 2
-    assert [name for name, _ in seen] == wanted  # and the host did not wait
+    target = ["enqueue_copy", "enqueue_nd_range_kernel", "enqueue_copy"] * 2
+    assert [name for name, _ in seen] == target  # and the host did not wait
     up, run, down = (queue for _, queue in seen[:3])
     assert len({up, run, down}) == 3
     assert [queue for _, queue in seen[3:]] == [up, run, down]

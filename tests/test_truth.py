@@ -1,4 +1,4 @@
-"""The truth beside noisy pictures: the development, the mosaic, and the variance of the noise."""
+"""Ground truth of noisy pictures: the development, the mosaic, the noise variance."""
 
 import json
 import os
@@ -37,7 +37,7 @@ PATCHES = np.repeat(
 
 
 def tall(rows=1600):
-    """The patches again and again, as 400 frames of four rows one below the other."""
+    """Return the patches as 400 frames of four rows, one below another."""
     return np.ascontiguousarray(np.broadcast_to(PATCHES, (rows, 64, 3)))
 
 
@@ -55,7 +55,7 @@ def known(image, device=None, **settings):
 
 
 def agree(noisy, clean, variance, axis=1):
-    """See that the noise of each patch and colour is as large as is said, within 4 standard errors.
+    """Check the predicted noise of each patch and colour within 4 standard errors.
 
     Rows (axis 1), or columns (axis 0), may share noise; among each other they do not. Means differ
     by up to half a DN, to which the clean mosaic is rounded.
@@ -265,9 +265,9 @@ def test_the_clean_picture_is_written_kept_and_entered_again(clpipe, write_exr):
     assert all(np.array_equal(clean, each) for each in cleans)
     assert np.array_equal(other, again)
     assert not np.array_equal(clean, other)
-    said = json.loads(Path("o/a.truth_clean.json").read_text())
-    assert said["noise"] is None
-    assert {s["name"]: s["method"] for s in said["stages"]}["denoise"] == "none"
+    record = json.loads(Path("o/a.truth_clean.json").read_text())
+    assert record["noise"] is None
+    assert {s["name"]: s["method"] for s in record["stages"]}["denoise"] == "none"
 
 
 def stamps():

@@ -1,4 +1,4 @@
-"""From a finished picture back to a raw, and through another camera."""
+"""From a finished picture back to a raw, and development with another camera."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Inputs and tars behind URLs, on a file system that fails in many ways."""
+"""Inputs and tars at URLs, on an unreliable file system."""
 
 import io
 import json
@@ -24,13 +24,13 @@ RUN = ("--iso", 3200, "--device", "numpy", "--skip", "noise")
 
 
 class Flaky(MemoryFileSystem):
-    """A bucket in memory: requests fail, or bring half a file, by chance."""
+    """A bucket in memory, where requests randomly fail or return half a file."""
 
     protocol = "flaky"
     store: ClassVar = {}
     pseudo_dirs: ClassVar = [""]
     rate = 0.0
-    luck = random.Random(0)
+    rng = random.Random(0)
     failures: ClassVar = Counter()
     forbidden = ""
 
@@ -44,9 +44,9 @@ class Flaky(MemoryFileSystem):
     def _may_fail(self, what, path):
         if self.forbidden and self.forbidden in path:
             raise PermissionError("the token has expired")
-        if self.luck.random() < self.rate:
+        if self.rng.random() < self.rate:
             self.failures[what] += 1
-            raise self.luck.choice([OSError("503 slow down"), TimeoutError(), ConnectionError()])
+            raise self.rng.choice([OSError("503 slow down"), TimeoutError(), ConnectionError()])
 
     def find(self, path, *arguments, **more):
         self._may_fail("find", path)
@@ -75,7 +75,7 @@ class Flaky(MemoryFileSystem):
 
 @pytest.fixture
 def bucket(write_exr, clpipe, monkeypatch):
-    """Seven renders in a bucket, and here."""
+    """Seven renders, in a bucket and in the working directory."""
     monkeypatch.setattr(urls, "FIRST_WAIT", 0.0)
     monkeypatch.setattr(urls, "TRIES", 30)
     fsspec.register_implementation("flaky", Flaky, clobber=True)
@@ -108,8 +108,8 @@ def tars(system, folder="/b/set"):
 def test_renders_behind_a_url_make_the_pictures_of_files(bucket, clpipe, rate):
     clpipe("run", "in", "-o", "whole", *RUN)
     Flaky.rate = rate
-    told = clpipe("run", "flaky://b/renders", "-o", "o", *RUN).stderr
-    assert "7 of 7 images done, 0 failed" in told
+    stderr = clpipe("run", "flaky://b/renders", "-o", "o", *RUN).stderr
+    assert "7 of 7 images done, 0 failed" in stderr
     pictures = {n: data for n, data in contents("o").items() if n.endswith(".jpg")}
     # What is drawn for an image belongs to its name among the inputs and to its bytes.
     assert pictures == {n: d for n, d in contents("whole").items() if n.endswith(".jpg")}
@@ -122,8 +122,8 @@ def test_renders_behind_a_url_make_the_pictures_of_files(bucket, clpipe, rate):
     assert Flaky.failures["half of /b/renders/x0/r0.exr"] == (rate > 0)
     again = clpipe("run", "flaky://b/renders", "-o", "o", *RUN).stderr
     assert "(7 of them were there already)" in again
-    said = clpipe("replay", "o/x0/r2.json", "-o", "again", *RUN[2:4]).output
-    assert "the same bytes" in said
+    output = clpipe("replay", "o/x0/r2.json", "-o", "again", *RUN[2:4]).output
+    assert "the same bytes" in output
     Flaky.rate = 0.0
     bucket.pipe_file("/b/renders/x0/r0.exr", Path("in/x1/r1.exr").read_bytes())
     again = clpipe("run", "flaky://b/renders", "-o", "o", *RUN).stderr
@@ -171,29 +171,31 @@ def test_tars_behind_urls_are_streamed(bucket, clpipe):
 def test_what_is_wrong_with_a_url_is_said(bucket, clpipe, monkeypatch):
     monkeypatch.setattr(urls, "TRIES", 2)
 
-    def told(*arguments, status):
+    def stderr_of(*arguments, status):
         text = clpipe("run", *arguments, *RUN, status=status).stderr
         assert "Traceback" not in text
         return " ".join(text.split())
 
-    assert "flaky://b/none: there are no images at this URL" in told(
+    assert "flaky://b/none: there are no images at this URL" in stderr_of(
         "flaky://b/none", "-o", "o", status=2
     )
     for url in ("nosuch://b/x", "nosuch://b/x.exr"):
-        assert f"clpipe: {url}: Protocol not known" in told(url, "-o", "o", status=2)
-    text = told("flaky://b/gone.exr", "in/x0/r0.exr", "-o", "o", status=1)
+        assert f"clpipe: {url}: Protocol not known" in stderr_of(url, "-o", "o", status=2)
+    text = stderr_of("flaky://b/gone.exr", "in/x0/r0.exr", "-o", "o", status=1)
     assert "flaky://b/gone.exr: cannot be read: " in text and "1 of 2 images done" in text
-    assert "'..'" in told("flaky://b/../x.exr", "-o", "o", status=2)
-    text = told("in", "-o", "flaky://b/set", status=2)
+    assert "'..'" in stderr_of("flaky://b/../x.exr", "-o", "o", status=2)
+    text = stderr_of("in", "-o", "flaky://b/set", status=2)
     assert "found flaky://b/set; only tars are written to a URL, so add --webdataset N" in text
     text = clpipe("meter", "in", "-o", "flaky://b/m.csv", status=2).stderr
     assert "only clpipe run writes to URLs" in text
     Flaky.forbidden = "r3"
-    text = told("flaky://b/renders", "-o", "o", status=1)
+    text = stderr_of("flaky://b/renders", "-o", "o", status=1)
     assert "flaky://b/renders/x1/r3.exr: cannot be read: the token has expired" in text
     assert "6 of 7 images done, 1 failed" in text
     Flaky.forbidden, Flaky.rate = "", 1.0
-    assert "flaky://b/renders: cannot be listed: " in told("flaky://b/renders", "-o", "p", status=2)
+    assert "flaky://b/renders: cannot be listed: " in stderr_of(
+        "flaky://b/renders", "-o", "p", status=2
+    )
 
 
 @pytest.mark.slow
@@ -214,10 +216,12 @@ def test_tars_behind_a_url_are_those_of_a_folder(bucket, clpipe, rate):
     logs = [each for each in bucket.find("/b/set") if each.endswith(".jsonl")]
     assert len(logs) == 1
     Flaky.rate = rate
-    told = clpipe("run", "in", "-o", "flaky://b/set", "--webdataset", 3, *RUN).stderr
-    assert "7 of 7 images done (7 of them were there already)" in told
-    told = clpipe("run", "in", "-o", "flaky://b/set", "--webdataset", 3, "--redo", "damaged", *RUN)
-    assert "(7 of them were there already)" in told.stderr
+    stderr = clpipe("run", "in", "-o", "flaky://b/set", "--webdataset", 3, *RUN).stderr
+    assert "7 of 7 images done (7 of them were there already)" in stderr
+    result = clpipe(
+        "run", "in", "-o", "flaky://b/set", "--webdataset", 3, "--redo", "damaged", *RUN
+    )
+    assert "(7 of them were there already)" in result.stderr
 
 
 @pytest.mark.slow
@@ -225,16 +229,16 @@ def test_a_run_that_was_cut_off_goes_on(bucket, clpipe, monkeypatch):
     command = ("run", "in", "-o", "flaky://b/set", "--webdataset", 3, *RUN)
     monkeypatch.setattr(urls, "TRIES", 1)
     Flaky.forbidden = "000001.tar"
-    told = clpipe(*command, status=1).stderr
-    assert "flaky://b/set/000001.tar: cannot be written: the token has expired" in told
+    stderr = clpipe(*command, status=1).stderr
+    assert "flaky://b/set/000001.tar: cannot be written: the token has expired" in stderr
     # The last one, of a single image, may have been on its way when the second one was refused.
     begun = set(tars(bucket))
     assert {"000000.tar"} <= begun <= {"000000.tar", "000002.tar"}
     Flaky.forbidden = ""
     before = bucket.modified("/b/set/000000.tar")
-    told = clpipe(*command).stderr
+    stderr = clpipe(*command).stderr
     there = 2 + len(begun)
-    assert f"7 of 7 images done ({there} of them were there already)" in told
+    assert f"7 of 7 images done ({there} of them were there already)" in stderr
     assert bucket.modified("/b/set/000000.tar") == before
     assert sorted(tars(bucket)) == ["000000.tar", "000001.tar", "000002.tar"]
     # A tar that was cut off, and one whose index was: both are made again.
@@ -259,8 +263,8 @@ def test_what_lies_behind_a_url_is_looked_at(bucket, clpipe):
     )
     clpipe(*command, "--redo", "all")
     assert len(tars(bucket)) == 3
-    told = clpipe(*command[:5], 4, *RUN, status=2).stderr
-    assert "000002.tar: is of another run, as this one makes 2 tars" in told
+    stderr = clpipe(*command[:5], 4, *RUN, status=2).stderr
+    assert "000002.tar: is of another run, as this one makes 2 tars" in stderr
 
 
 def test_an_image_that_fails_is_tried_again(bucket, clpipe):
@@ -268,8 +272,8 @@ def test_an_image_that_fails_is_tried_again(bucket, clpipe):
     command = ("run", "in", "-o", "flaky://b/set", "--webdataset", 3, *RUN)
     clpipe(*command, status=1)
     assert json.loads(bucket.cat_file("/b/set/000000.index.json"))["failed"] == ["x0/r2"]
-    told = clpipe(*command, status=1).stderr
-    assert "6 of 7 images done (4 of them were there already), 1 failed" in told
+    stderr = clpipe(*command, status=1).stderr
+    assert "6 of 7 images done (4 of them were there already), 1 failed" in stderr
 
 
 def test_from_python(bucket, monkeypatch):
@@ -286,11 +290,11 @@ def test_from_python(bucket, monkeypatch):
 
 @pytest.mark.slow
 def test_one_render_by_several_isos_and_processes(bucket, clpipe):
-    told = clpipe(
+    stderr = clpipe(
         *("run", "flaky://b/renders/x0", "-o", "o", *RUN[2:], "--iso", "100,200,400,800"),
         *("--jobs", 4),
     ).stderr
-    assert "16 of 16 images done, 0 failed" in told
+    assert "16 of 16 images done, 0 failed" in stderr
     rows = "".join(f"flaky://b/renders/x1/r1.exr,a{n},{n}\n" for n in range(12))
     Path("twice.csv").write_text(f"path,name,seed\n{rows}")
     assert "12 of 12 images done" in clpipe("run", "twice.csv", "-o", "p", *RUN).stderr
@@ -305,8 +309,8 @@ def test_manifests_behind_urls_do_not_lead_out_of_their_bucket(bucket, clpipe, t
     assert sidecar["input"] == "flaky://b/renders/x0/r0.exr"
     for path in (b"../../../../tmp/x.exr", b"/etc/x.exr", b"..\\x.exr"):
         bucket.pipe_file("/b/lists/b.csv", b"path\n" + path + b"\n")
-        told = clpipe("run", "flaky://b/lists/b.csv", "-o", "p", *RUN, status=2).stderr
-        assert "leads out of flaky://b" in told or "a URL may not contain" in told
+        stderr = clpipe("run", "flaky://b/lists/b.csv", "-o", "p", *RUN, status=2).stderr
+        assert "leads out of flaky://b" in stderr or "a URL may not contain" in stderr
 
 
 def test_a_listing_that_fails_is_no_empty_bucket(bucket, clpipe, monkeypatch):

@@ -1,4 +1,4 @@
-"""tools/pages/validate.py: known noise comes back; finished pictures are like a real camera's."""
+"""tools/pages/validate.py: known noise is recovered; pictures resemble a real camera's."""
 
 import doctest
 from dataclasses import replace
@@ -14,7 +14,7 @@ from clpipe.camera.profile import load_camera
 from clpipe.images.read import read_image
 from clpipe.pipeline import Pipeline
 from clpipe.reference.transfer import srgb_curve
-from tools.pages import real_cameras, side_by_side, validate
+from tools.pages import comparison_page, real_cameras, validate
 
 pytestmark = pytest.mark.slow
 
@@ -92,7 +92,7 @@ def test_the_cameras_that_were_measured_are_in_the_range():
         assert not real_cameras.outside(record), name
 
 
-@pytest.mark.parametrize("module", [real_cameras, side_by_side])
+@pytest.mark.parametrize("module", [real_cameras, comparison_page])
 def test_the_examples_of_what_tools_share(module):
     assert doctest.testmod(module).failed == 0
 
@@ -123,23 +123,23 @@ def test_the_section_of_cameras(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(validate, "DOCS", tmp_path)
     monkeypatch.setattr(real_cameras, "develop", lambda *_: pair)
     status = validate.main()
-    said = capsys.readouterr().out
-    assert status == 0, said
-    assert "| Nikon D800, ISO 3200 | 5.3 | 3.4 |" in said
-    assert "| x, 1 measured here | " in said
-    assert "Photo-electrons" not in said
-    assert "**" not in said.partition("| asked for |")[2]
+    printed = capsys.readouterr().out
+    assert status == 0, printed
+    assert "| Nikon D800, ISO 3200 | 5.3 | 3.4 |" in printed
+    assert "| x, 1 measured here | " in printed
+    assert "Photo-electrons" not in printed
+    assert "**" not in printed.partition("| target |")[2]
     assert "ISO 6400" in (tmp_path / "real_cameras.svg").read_text()
     for crops, columns in ((tmp_path, 4), (out, 5)):
         with Image.open(crops / "real_cameras_crops.png") as image:
-            assert image.width // (side_by_side.WIDTH * side_by_side.SCALE) == columns
+            assert image.width // (comparison_page.WIDTH * comparison_page.SCALE) == columns
     independent = np.random.default_rng(0).normal(0, 5, pair.clean.shape)
     other = replace(pair, noisy=np.rint(pair.clean + independent).astype(np.uint8))
     monkeypatch.setattr(real_cameras, "develop", lambda *_: other)
     monkeypatch.setattr("sys.argv", command[:3])
     assert validate.main() == 1
-    assert "| clpipe, ISO 800 | " in (said := capsys.readouterr().out)
-    assert "| **-0.0" in said or "| **0.0" in said  # the autocorrelation
+    assert "| clpipe, ISO 800 | " in (printed := capsys.readouterr().out)
+    assert "| **-0.0" in printed or "| **0.0" in printed  # the autocorrelation
 
 
 def test_the_page(monkeypatch, capsys, tmp_path, jpegs):
@@ -161,7 +161,7 @@ def test_the_page(monkeypatch, capsys, tmp_path, jpegs):
         "Calibration of known noise",
         "Photo-electrons",
         "A real camera's finished",
-        "Real cameras",
+        "Comparison with real cameras",
     ):
         assert heading in out
     monkeypatch.setattr(validate, "close_loop", lambda *_: replace(loop, a=0.5))

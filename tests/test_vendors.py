@@ -1,4 +1,4 @@
-"""Intel's runtime for CPUs, found where pip puts it."""
+"""Intel's CPU runtime, found where pip installs it."""
 
 import os
 from importlib.metadata import PackagePath

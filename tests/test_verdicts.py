@@ -1,4 +1,4 @@
-"""OpenCL's runtimes are tried before they are trusted, in a process that they may end."""
+"""OpenCL runtimes are tested in a separate process before use, because they may crash."""
 
 import json
 import sys
@@ -19,7 +19,7 @@ from clpipe.engine.verdicts import Verdicts, tried
 
 @pytest.fixture
 def program(tmp_path, monkeypatch):
-    """A shell script in place of the trial; it is given what is known on its standard input."""
+    """Replace the test of runtimes by a shell script, which reads known results from stdin."""
 
     def be(script):
         path = tmp_path / "python"
@@ -194,15 +194,15 @@ def test_what_fails_is_passed_over_and_what_helps_is_said(device, monkeypatch):
 
 
 def test_a_device_that_was_not_there_is_tried(device, monkeypatch):
-    asked = []
+    queried = []
 
     def answer(again=False, missing=()):
-        asked.extend(missing)
+        queried.extend(missing)
         return Verdicts(attempts=dict.fromkeys(missing, ""))
 
     monkeypatch.setattr(discovery, "verdicts", answer)
     found = next(d for d in find_devices() if d.handle == device.info.handle)
-    assert not found.problem and any(found.name in name for name in asked)
+    assert not found.problem and any(found.name in name for name in queried)
 
 
 def test_what_another_process_does_not_see_is_trusted(program):

@@ -1,4 +1,4 @@
-"""The version follows the commit, wherever the code came from."""
+"""The version matches the commit, for every origin of the code."""
 
 import json
 import os

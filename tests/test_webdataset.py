@@ -1,4 +1,4 @@
-"""WebDataset shards: what readers see in them, and that they resume as folders do."""
+"""WebDataset shards: their contents for readers, and resuming."""
 
 import io
 import json
@@ -75,10 +75,10 @@ def test_what_readers_see(clpipe, renders):
     clpipe("run", "in", "-o", "plain", "--iso", 3200, "--keep", "quantize")
     for sample in (sample for tar in tars for sample in tar):
         assert set(sample) == {"__key__", "jpg", "json", "quantize.exr"}
-        said = json.loads(sample["json"])
+        record = json.loads(sample["json"])
         image = Image.open(io.BytesIO(sample["jpg"]))
-        assert image.size == (said["width"], said["height"])
-        stem = Path("plain", said["image_key"].partition("@")[0])
+        assert image.size == (record["width"], record["height"])
+        stem = Path("plain", record["image_key"].partition("@")[0])
         for ending in ("jpg", "quantize.exr"):
             assert sample[ending] == stem.with_suffix(f".{ending}").read_bytes()
 
@@ -370,7 +370,7 @@ def test_patches_are_samples_as_dataset_makes_them(clpipe, renders):
     floats = api.Dataset("in", **given, dtype="float16")
     raws = api.Dataset("in", **given, raw="mosaic")
     for sample, pictures, made in zip(found, floats, raws, strict=True):
-        said = json.loads(sample.pop("json"))
+        record = json.loads(sample.pop("json"))
         arrays = {name: np.load(io.BytesIO(data)) for name, data in sample.items()}
         expected = {
             "npy": pictures["image"],
@@ -382,10 +382,10 @@ def test_patches_are_samples_as_dataset_makes_them(clpipe, renders):
         for name, array in expected.items():
             assert arrays[name].dtype == array.dtype
             assert np.array_equal(arrays[name], array)
-        assert (said["place"], said["turn"]) == (made["place"].tolist(), made["turn"])
-        assert said["noise"]["signal"] == {"a": made["a"], "b": made["b"]}
+        assert (record["place"], record["turn"]) == (made["place"].tolist(), made["turn"])
+        assert record["noise"]["signal"] == {"a": made["a"], "b": made["b"]}
         for name in ("camera", "iso", "seed", "cfa", "black_level", "white_level"):
-            assert said[name] == made[name]
+            assert record[name] == made[name]
 
 
 @pytest.mark.slow

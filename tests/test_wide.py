@@ -1,4 +1,4 @@
-"""projection: wide lenses over cubes, maps and overlapping views, against scenes known exactly."""
+"""projection: wide lenses from cubes, maps and overlapping views, against exact scenes."""
 
 import json
 from pathlib import Path
@@ -54,7 +54,7 @@ def unit(rays):
 
 
 def light(rays):
-    """What is seen in a direction: waves about 2 px long at the narrowest."""
+    """Return the light from a direction: waves, at least about 2 px long."""
     x, y, z = unit(rays)
     waves = np.cos(9 * x + 3 * y + 5 * z), np.sin(8 * y - 4 * z), np.cos(7 * z + 6 * x - 2 * y)
     return np.stack([0.5 + 0.4 * wave for wave in waves], -1)
@@ -104,7 +104,7 @@ def places_of(lens):
 
 
 def off_by(picture, lens, scene=light):
-    """How far, in px at least, a picture is from the scene where the lens sees it."""
+    """Return a lower bound of the error of a picture's positions, in px."""
     x, y, rays = places_of(lens)
     step = 1e-3
     slopes = [
@@ -235,8 +235,8 @@ def test_six_files_a_cube_map_and_a_map_become_a_picture(write, clpipe):
         "a cube map, not a picture. To view it through a wide lens"
     )
     write("in/room_up.exr", **colours(np.zeros((9, 9, 3))))
-    told = clpipe("run", "in", "-o", "o", *RUN, *options_of("unified"), status=1).output
-    assert "room_up.exr: this view has 9x9" in " ".join(told.split())
+    output = clpipe("run", "in", "-o", "o", *RUN, *options_of("unified"), status=1).output
+    assert "room_up.exr: this view has 9x9" in " ".join(output.split())
 
 
 def test_overlapping_views_and_what_no_view_shows(write, clpipe):
@@ -249,9 +249,9 @@ def test_overlapping_views_and_what_no_view_shows(write, clpipe):
         views[-1]["t"] = [0, 0, 0]
     Path("rig.json").write_text(json.dumps({"views": views}))
     options = options_of("kannala_brandt", views="rig.json")
-    told = clpipe("run", "in", "-o", "o", *RUN, *options).output
+    output = clpipe("run", "in", "-o", "o", *RUN, *options).output
     assert "of the lens's field of view is black, because no view covers it" in " ".join(
-        told.split()
+        output.split()
     )
     seen, lens = read_image(Path("o/a.exr")).pixels, lens_of("kannala_brandt")
     rays = places_of(lens)[2]
@@ -261,19 +261,19 @@ def test_overlapping_views_and_what_no_view_shows(write, clpipe):
     assert shown[np.isfinite(rays[0]) & band].all()
     off = np.abs(seen - light(rays))[shown]
     assert np.percentile(off, 99) < 0.004
-    assert off.max() < 0.02  # beside the outermost half pixels of a view
+    assert off.max() < 0.02  # next to the outermost half pixels of a view
     views[1]["t"] = [0, 0, 1]
     Path("rig.json").write_text(json.dumps({"views": views}))
-    told = clpipe("run", "in", "-o", "q", *RUN, *options, status=2).output
-    assert "up to 1 apart" in " ".join(told.split())
+    output = clpipe("run", "in", "-o", "q", *RUN, *options, status=2).output
+    assert "up to 1 apart" in " ".join(output.split())
 
 
 def test_one_render_is_a_view_of_its_own_focal_length(write, clpipe):
     view = View.of_angle(FRONT, SIDE, SIDE, 100.0)
     write("a.exr", **colours(light(rays_of(view))))
     narrow = options_of("kannala_brandt", field_of_view=90.0)
-    told = clpipe("run", "a.exr", "-o", "o", *RUN, *narrow, status=1).output
-    assert "the focal length of the render is not known" in " ".join(told.split())
+    output = clpipe("run", "a.exr", "-o", "o", *RUN, *narrow, status=1).output
+    assert "the focal length of the render is not known" in " ".join(output.split())
     clpipe("run", "a.exr", "-o", "o", *RUN, *narrow, "--set", f"render.fx={view.fx}")
     seen = read_image(Path("o/a.exr")).pixels
     assert off_by(seen, lens_of("kannala_brandt", field_of_view=90.0)).max() < 0.03
@@ -291,9 +291,9 @@ def test_one_render_is_a_view_of_its_own_focal_length(write, clpipe):
 def test_lenses_that_cannot_be(write, clpipe, options, status, message):
     for name, image in zip(CUBE, images_of(PANORAMAS["cube"]), strict=True):
         write(f"in/room_{name}.exr", **colours(image))
-    told = clpipe("run", "in", "-o", "o", *RUN, *options, status=status).output
-    assert message in " ".join(told.split())
-    assert "Traceback" not in told
+    output = clpipe("run", "in", "-o", "o", *RUN, *options, status=status).output
+    assert message in " ".join(output.split())
+    assert "Traceback" not in output
 
 
 @pytest.mark.parametrize(
@@ -332,15 +332,15 @@ def test_a_view_has_one_focal_length(write, clpipe):
     wide = options_of("kannala_brandt", face_angle=90.0)
     for said, of_view in ((SIDE / 2, 0), (1.4 * SIDE, 1)):
         options = (*RUN, *wide, "--set", f"render.fx={said}")
-        told = clpipe("run", "in", "-o", "o", *options, status=of_view).output
-        assert ("remove one of them" in told) == bool(of_view)
+        output = clpipe("run", "in", "-o", "o", *options, status=of_view).output
+        assert ("remove one of them" in output) == bool(of_view)
     for name, image in zip(CUBE, images_of(PANORAMAS["cube"]), strict=True):
         write(f"cube/room_{name}.exr", **colours(image))
     lengths = ("--focal-length", 35, "--set", "render.sensor_width=36")
-    told = clpipe("run", "cube", "-o", "o", *RUN, *wide, *lengths, status=1).output
+    output = clpipe("run", "cube", "-o", "o", *RUN, *wide, *lengths, status=1).output
     assert (
         "render's focal length is 93.33 px, but a view of 96x96 pixels with this angle has 48 px"
-        in (" ".join(told.split()))
+        in (" ".join(output.split()))
     )
 
 
@@ -356,7 +356,7 @@ def plane_and_sky(rays):
 
 
 def moved(rays, distance, by):
-    """Directions of what is seen there once the camera has moved."""
+    """Return the directions of the same points after the camera has moved."""
     return unit(rays) * distance - np.array(by).reshape(3, *[1] * (rays.ndim - 1))
 
 
@@ -473,8 +473,10 @@ def test_only_faces_that_a_lens_sees_are_rendered():
 
 def test_a_cube_map_that_is_none(write, clpipe):
     write("a.exr", {"envmap": OpenEXR.ENVMAP_CUBE}, **colours(np.zeros((40, 9, 3))))
-    told = clpipe("run", "a.exr", "-o", "o", *RUN, *options_of("unified"), status=1).output
-    assert "this cube map has 9x40 pixels, but its height must be 6 times" in " ".join(told.split())
+    output = clpipe("run", "a.exr", "-o", "o", *RUN, *options_of("unified"), status=1).output
+    assert "this cube map has 9x40 pixels, but its height must be 6 times" in " ".join(
+        output.split()
+    )
 
 
 def test_a_map_without_a_border_is_an_image_as_well(device):

@@ -1,4 +1,4 @@
-"""What a type checker sees of a user's script. mypy checks it; nobody calls it."""
+"""A user's script for the type checker. mypy checks it; nothing calls it."""
 
 from typing import Any, assert_type
 

@@ -1,9 +1,14 @@
-"""Programs of the project's developers, in groups; ``sh tools/run GROUP NAME`` runs one.
+"""Programs for the project's developers, in groups. ``sh tools/run GROUP NAME`` runs one.
 
-compare sets clpipe beside other programs, stress looks for faults, pages measures and draws what
-the documentation shows, reconstruction is the paper's experiment, blender makes the extension and
-the test render. Modules import those of other groups by their full names; examples are for users
-and import clpipe alone.
+- compare: compares clpipe with other programs.
+- stress: looks for faults.
+- pages: measures and draws figures for the documentation.
+- reconstruction: repeats the paper's experiment.
+- training: trains denoisers on clpipe's pictures.
+- blender: builds the extension and the test render.
+- examples: scripts for users, which import only clpipe.
+
+Modules import those of other groups by their full names.
 """
 
 from pathlib import Path

@@ -19,7 +19,7 @@ from tools import ROOT
 
 CHECKED = (
     *("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "docs", "clpipe"),
-    *("tools/prose.py", "tools/pages/quality.py"),
+    *("tools",),
 )
 
 MOST_WORDS = 30  # in a sentence
@@ -45,6 +45,7 @@ RULES = {
 
 CODE = re.compile(r"``.+?``|`[^`]+`|:\w+:`[^`]+`|\{[^}]*\}|https?://\S+")
 SENTENCE = re.compile(r"(?<=[.!?])\s+(?=[A-Z\"'(]|clpipe\b|code\b)")
+SENTENCE_END = re.compile(r"[.!?](?:\s|$)")
 ENTRY = re.compile(r"^\s*(?:[-*]|\d+\.|\w[\w, *`|]*:)\s")  # of a list, or of Args
 ABBREVIATION = re.compile(r"\b(?:e\.g|i\.e|etc|al|eq|sec|vol|Fig|Int|Rev|No|Inst|Math)\.")
 
@@ -87,9 +88,10 @@ def texts_of(path: Path) -> Iterator[Text]:
             yield from paragraphs(str(ast.get_docstring(node, clean=False)), first.lineno)
         elif isinstance(node, ast.Constant | ast.JoinedStr) and node not in docstrings:
             text = node.value if isinstance(node, ast.Constant) else message_of(node)
-            is_code = isinstance(text, str) and "__global " in text  # of OpenCL
-            if isinstance(text, str) and len(text.split()) > 3 and not is_code:
-                yield from paragraphs(text, node.lineno)
+            if isinstance(text, str) and len(text.split()) > 3 and "__global " not in text:
+                for line, paragraph in paragraphs(text, node.lineno):
+                    if "\n" not in text or SENTENCE_END.search(paragraph):  # else code or data
+                        yield line, paragraph
     comments: list[Text] = []  # lines, of which those on lines of their own belong together
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:

@@ -141,8 +141,8 @@ def refused(error: OSError) -> ClpipeError:
     if isinstance(error, FileNotFoundError):  # only the working directory has no name
         return RequestError("the working directory no longer exists; change to another one")
     *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
-    room, _, _ = innermost.f_globals["__name__"].partition(".")
-    if room in ("click", "rich"):
+    package, _, _ = innermost.f_globals["__name__"].partition(".")
+    if package in ("click", "rich"):
         return RequestError(f"cannot print: {error.strerror}")
     return OutputError(f"the operating system reported an error: {error.strerror or error}")
 

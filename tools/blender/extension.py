@@ -1,7 +1,7 @@
-"""Build clpipe-blender.zip: an extension of Blender that develops its renders; see docs/blender.md.
+"""Build clpipe-blender.zip, a Blender extension that develops renders (see docs/blender.md).
 
-Its source is tools/blender/source. Wheels are those of the machine that this runs on, of clpipe as
-it is in the checkout and of what it depends on, as pip finds it.
+Its source is tools/blender/source. The zip contains wheels of clpipe, built from the checkout, and
+of its dependencies, chosen by pip for the machine that this runs on.
 
 Usage: tools/run blender extension [-o clpipe-blender.zip]
 """
@@ -25,16 +25,16 @@ from clpipe.commands.cameras import make_and_model
 from tools import ROOT
 
 SOURCE = ROOT / "tools" / "blender" / "source"
-# The first Blender that has a Python, and the first one that has it no longer.
+# For each Python, the first Blender that has it, and the first that no longer has it.
 BLENDERS = {"3.11": ("4.2.0", "5.1.0"), "3.13": ("5.1.0", None)}
-# What Blender itself has, in versions that may be others. A wheel of it would take the place of
-# Blender's own for all add-ons (NumPy 2 breaks what is compiled for NumPy 1), so these go into a
-# folder that clpipe's process alone knows.
+# Packages that Blender ships, perhaps in other versions. A wheel would replace Blender's own for
+# all add-ons, and NumPy 2 breaks add-ons compiled for NumPy 1. So they go into a private folder,
+# which only clpipe's process has on its path.
 PRIVATE = {"numpy", "openimageio"}
 
 
 def manifest(python: str, wheels: list[str]) -> dict[str, Any]:
-    """What blender_manifest.toml says.
+    """Return the contents of blender_manifest.toml.
 
     Args:
         python: the version of Blender's Python.
@@ -56,12 +56,12 @@ def manifest(python: str, wheels: list[str]) -> dict[str, Any]:
         "license": [f"SPDX:{project['license']}"],
         "platforms": [sysconfig.get_platform().replace("x86_64", "x64")],
         "wheels": [f"./wheels/{name}" for name in wheels],
-        "permissions": {"files": "Write linear renders and pictures beside the render"},
+        "permissions": {"files": "Write linear renders and pictures next to the render"},
     }
 
 
 def toml(values: dict[str, Any]) -> str:
-    """Plain values, lists and tables of strings as TOML, whose strings and lists are JSON's."""
+    """Format plain values, lists and tables of strings as TOML."""
     lines = [f"{k} = {json.dumps(v)}" for k, v in values.items() if not isinstance(v, dict)]
     for name, table in values.items():
         if isinstance(table, dict):
@@ -70,7 +70,7 @@ def toml(values: dict[str, Any]) -> str:
 
 
 def choices() -> dict[str, Any]:
-    """What the panel offers: clpipe's cameras and configurations, and its defaults."""
+    """Return the panel's choices: clpipe's cameras and configurations, and its defaults."""
     return {
         "cameras": {name: make_and_model(load_camera(name)) for name in built_in_cameras()},
         "looks": [*built_in_configs()],
@@ -81,16 +81,16 @@ def choices() -> dict[str, Any]:
 
 
 def collect_wheels(folder: Path, python: str) -> list[Path]:
-    """The wheels of clpipe and all that it needs, in a folder.
+    """Put the wheels of clpipe and its dependencies into a folder, and return their paths.
 
     Raises:
-        CalledProcessError: pip failed; it has said why.
+        CalledProcessError: pip failed, and printed the reason.
     """
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
     subprocess.run([*pip, "wheel", "--no-deps", "-w", folder, ROOT], check=True)
     (own,) = folder.glob("*.whl")
-    wanted = ["--only-binary=:all:", f"--python-version={python}", "-d", folder, own]
-    subprocess.run([*pip, "download", *wanted], check=True)
+    arguments = ["--only-binary=:all:", f"--python-version={python}", "-d", folder, own]
+    subprocess.run([*pip, "download", *arguments], check=True)
     return sorted(folder.glob("*.whl"))
 
 
@@ -115,7 +115,7 @@ def build(output: Path, python: str, wheels: list[Path]) -> None:
 
 
 def main() -> int:
-    """Build what the command line says; the exit status."""
+    """Build the extension, and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("clpipe-blender.zip"), help="the extension"
@@ -124,11 +124,11 @@ def main() -> int:
         "--python",
         choices=BLENDERS,
         default="3.11",
-        help="that of Blender: 3.11, or 3.13 from Blender 5.1 on",
+        help="Blender's Python version: 3.11, or 3.13 from Blender 5.1 on",
     )
     options = parser.parse_args()
     if not options.output.absolute().parent.is_dir():
-        parser.error(f"{options.output}: its folder does not exist")
+        parser.error(f"{options.output}: the parent folder does not exist; create it")
     with tempfile.TemporaryDirectory() as folder:
         try:
             wheels = collect_wheels(Path(folder), options.python)

@@ -1,8 +1,8 @@
-"""Render the linear still life that the tests develop: tests/data/still_life.exr.
+"""Render tests/data/still_life.exr, the linear still life that the tests develop.
 
-The scene is built from code alone (meshes and procedural materials, no outside assets) and rendered
-by Blender's Cycles on the CPU.  Values are scene linear Rec.709, scaled so that 1.0 is sensor white
-at EV 0.  Blender is not a dependency of the project: it goes into a Python 3.11 venv of its own.
+The scene is built only from code, with meshes and procedural materials and no outside assets.
+Blender's Cycles renders it on the CPU. Values are scene-linear Rec. 709; 1.0 is sensor white at
+EV 0. Blender is not a dependency of the project, so install it into a separate Python 3.11 venv.
 
     pip install bpy==5.0.1
     python tools/blender/still_life.py tests/data/still_life.exr
@@ -35,7 +35,7 @@ CHART_SRGB = """
 
 
 class Material:
-    """A Principled material, and the few node-graph helpers that the patterns need."""
+    """A Principled material, with helpers that build node graphs for patterns."""
 
     def __init__(self, color: Point, roughness: float = 1.0, **inputs: Any) -> None:
         self.data = bpy.data.materials.new("material")
@@ -48,7 +48,7 @@ class Material:
             self.bsdf.inputs[name.replace("_", " ").title()].default_value = value
 
     def node(self, kind: str, inputs: dict[str | int, Any], **properties: Any) -> Any:
-        """Add a node, return its outputs; an input is a value or the socket that feeds it."""
+        """Add a node and return its outputs. An input is a value or a socket."""
         node = self.tree.nodes.new("ShaderNode" + kind)
         for name, value in properties.items():
             setattr(node, name, value)
@@ -93,7 +93,7 @@ def wood() -> Material:
 
 
 def woven(pitch: float) -> Material:
-    """Plain-weave tartan: warp and weft take turns on top, thread by thread."""
+    """Plain-weave tartan: warp and weft alternate on top, thread by thread."""
     m = Material((0.5, 0.5, 0.5))
     axes = m.node("SeparateXYZ", {0: m.position((1 / pitch, 1 / pitch, 1.0))})[:2]
     waves = [m.math("SINE", m.math("MULTIPLY", axis, pi)) for axis in axes]
@@ -140,7 +140,7 @@ def paper_edges() -> Material:
 def box(
     size: Point, at: Point, material: Material, turn: Point = (0, 0, 0), bevel: float = 0.0
 ) -> Any:
-    """A box around `at`, turned by Euler angles in degrees, its edges rounded by `bevel`."""
+    """Add a box centred at `at`, rotated by Euler angles in degrees, with bevelled edges."""
     angles = [radians(a) for a in turn]
     bpy.ops.mesh.primitive_cube_add(size=1, location=at, rotation=angles, scale=size)
     thing = bpy.context.object
@@ -152,7 +152,7 @@ def box(
 
 
 def lathe(profile: Sequence[tuple[float, float]], at: Point, material: Material) -> Any:
-    """Turn a smoothed profile of (radius, height) about the z axis through `at`."""
+    """Revolve a smoothed profile of (radius, height) about the z axis through `at`."""
     data = bpy.data.meshes.new("lathe")
     edges = [(k, k + 1) for k in range(len(profile) - 1)]
     data.from_pydata([(radius, 0, height) for radius, height in profile], edges, [])
@@ -211,7 +211,7 @@ def add_room() -> None:
 
 
 def add_chart(at: Point, patch: float) -> None:
-    """The chart leans back so that it faces the camera."""
+    """Add a colour chart, tilted to face the camera."""
     frame = box((6.6 * patch, 0.08, 4.6 * patch), at, Material((0.02, 0.02, 0.02)), (-10, 0, 0))
     values = [int(v) / 255 for v in CHART_SRGB.split()]
     linear = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in values]
@@ -222,7 +222,7 @@ def add_chart(at: Point, patch: float) -> None:
 
 
 def add_niche(at: Point, width: float, depth: float, height: float) -> None:
-    """An open-fronted case: dark lacquer outside, black inside, a brass line round the opening."""
+    """Add an open-fronted case: dark lacquer, a black inside, a brass line around the opening."""
     lacquer = Material((0.03, 0.022, 0.018), 0.25)
     velvet = Material((0.018, 0.018, 0.019))
     x, y, z = at
@@ -288,7 +288,7 @@ def add_fruit(apple_at: Point, pear_at: Point) -> None:
 
 
 def add_books(at: Point) -> float:
-    """Three books; returns the height of the pile."""
+    """Add three books, and return the height of the pile."""
     x, y, z = at
     for color, wide, thick, turn in (
         ((0.02, 0.2, 0.16), 1.75, 0.34, 3),

@@ -1,4 +1,4 @@
-"""Charts whose colours are known, as linear renders: square patches on grey, six in a row."""
+"""Charts of known colours as linear renders: square patches on grey, six in a row."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,11 +8,12 @@ from clpipe.reference.transfer import inverse_srgb_curve
 
 SIDE = 64  # px, of a patch
 EDGE = SIDE // 8  # px of background around each
-INNER = SIDE // 4  # px from a patch's place to what counts of it: no neighbour reaches that far
+INNER = SIDE // 4  # px from the border of a patch to its measured part
 ROW = 6  # patches
 BACKGROUND = 0.18  # linear
 
-GREY = 21  # of CHART: the grey patch, 19.5 % of white
+GREY = 21  # the number of the grey patch in CHART, which is 19.5 % of white
+
 # sRGB levels of the 24 patches of a ColorChecker, row by row, after X-Rite, "Colorimetric values
 # for ColorChecker family of targets" (charts made before November 2014).
 CHART = (
@@ -23,15 +24,15 @@ CHART = (
     *((160, 160, 160), (122, 122, 121), (85, 85, 85), (52, 52, 52)),
 )
 
-# Linear light of the saturated chart: each hue bright and dim, with a darkest channel near black,
-# where a colour difference that passes noise on shows most.
+# Linear light of the saturated chart. Each hue is bright and dim, with its darkest channel near
+# black, where noise that leaks through colour differences is most visible.
 BRIGHT = (0.7, 0.2)
 DARK = (0.03, 0.004)
 HUES = ((1, 0, 0), (1, 0.4, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1))
 
 
 def chart_patches() -> Doubles:
-    """The 24 patches of a ColorChecker, (24, 3) in sRGB levels, 0 to 255, row by row.
+    """Return the 24 patches of a ColorChecker, (24, 3) in sRGB levels, 0 to 255, row by row.
 
     >>> chart_patches()[GREY].tolist()
     [122.0, 122.0, 121.0]
@@ -40,7 +41,7 @@ def chart_patches() -> Doubles:
 
 
 def linear(levels: NDArray[np.number]) -> Doubles:
-    """The linear light, 0 to 1, of sRGB levels, 0 to 255.
+    """Convert sRGB levels, 0 to 255, to linear light, 0 to 1.
 
     >>> linear(np.array([0, 122, 255])).round(3).tolist()
     [0.0, 0.195, 1.0]
@@ -49,7 +50,7 @@ def linear(levels: NDArray[np.number]) -> Doubles:
 
 
 def saturated_patches() -> Doubles:
-    """24 saturated colours, (24, 3) in linear light: six hues, two brightnesses, two darknesses.
+    """Return 24 saturated colours, (24, 3) linear: six hues, two bright levels, two dark levels.
 
     >>> saturated_patches()[0].tolist()
     [0.7, 0.03, 0.03]
@@ -59,7 +60,7 @@ def saturated_patches() -> Doubles:
 
 
 def patch_image(colours: Doubles) -> Floats:
-    """Flat patches on grey as a linear render, (rows * 64, 384, 3).
+    """Return flat patches on grey as a linear render, (rows * 64, 384, 3).
 
     Args:
         colours: (patch, 3), linear RGB.
@@ -73,15 +74,15 @@ def patch_image(colours: Doubles) -> Floats:
 
 
 def chart_image() -> Floats:
-    """The 24 patches of :func:`chart_patches` as a linear render, (256, 384, 3)."""
+    """Return the 24 patches of :func:`chart_patches` as a linear render, (256, 384, 3)."""
     return patch_image(linear(chart_patches()))
 
 
 def saturated_image() -> Floats:
-    """The 24 patches of :func:`saturated_patches` above ramps and fine textures of their hues.
+    """Return the patches of :func:`saturated_patches` above ramps and fine textures of their hues.
 
-    A linear render, (640, 384, 3): below row 256 each hue has a column of a ramp to black, then
-    one of stripes and grains of 1 to 4 px.
+    The result is a linear render, (640, 384, 3). From row 256 down, each hue has a column: two
+    ramps to black, then stripes of 2 to 4 px and grains of 2 px.
     """
     flat = patch_image(saturated_patches())
     height, width = 6 * SIDE, SIDE
@@ -105,7 +106,7 @@ def saturated_image() -> Floats:
 
 
 def patch_places(height: int, patches: int = 24) -> Mask:
-    """The inner halves of the patches of an image of them, (height, 384).
+    """Return the mask, (height, 384), of the inner halves of an image's patches.
 
     >>> int(patch_places(256).sum()) == 24 * 32 * 32
     True
@@ -116,10 +117,10 @@ def patch_places(height: int, patches: int = 24) -> Mask:
 
 
 def patch_means(picture: NDArray[np.number], patches: int = 24) -> Doubles:
-    """What the patches of an image came out as, (patch, 3): the means of their inner halves.
+    """Return the means of the inner halves of an image's patches, (patch, 3).
 
     Args:
-        picture: (height, 384, 3), of any unit.
+        picture: (height, 384, 3), in any unit.
 
     >>> bool(np.allclose(patch_means(chart_image()), linear(chart_patches())))
     True
@@ -131,9 +132,9 @@ def patch_means(picture: NDArray[np.number], patches: int = 24) -> Doubles:
 
 
 def slanted_edge(size: int = 128, dark: float = 0.05, bright: float = 0.5) -> Floats:
-    """An edge five degrees from upright, grey, for the sharpness of a picture (ISO 12233).
+    """Return a grey edge, five degrees from vertical, to measure sharpness (ISO 12233).
 
-    Each pixel holds the mean light of its own area.
+    Each pixel is the mean light over its area.
 
     Returns:
         (size, size, 3), linear, ``dark`` on the left and ``bright`` on the right.

@@ -1,26 +1,27 @@
-"""Develop clpipe's raws with other raw converters, and put them beside clpipe's own pictures.
+"""Develop clpipe's raws with other raw converters, and compare them with clpipe's own pictures.
 
     tools/run compare converters [RENDER ...] [-c CONFIG ...]
 
-`clpipe run` writes pictures and DNGs, with and without noise; dcraw, darktable-cli and RawTherapee
-develop the DNGs (Debian: apt-get install dcraw darktable rawtherapee). Those that are missing are
-named and left out. Three tables are printed, and crops written to the output folder:
+`clpipe run` writes pictures and DNGs, with and without noise. dcraw, darktable-cli and RawTherapee
+develop the DNGs (Debian: apt-get install dcraw darktable rawtherapee). The tool names and skips
+converters that are not installed. It prints three tables, and writes crops to the output directory.
 
-Noise: the signature (clpipe.analysis.matching.columns) of a noisy development less the same without
-noise, and dots that noise makes. Kurtosis also on the flat patches of a saturated chart.
+Noise: the signature (clpipe.analysis.matching.columns) of a noisy development minus the same
+development without noise, and dots caused by noise. Kurtosis is also measured on the flat patches
+of a saturated chart.
 
-Colours: the patches of a ColorChecker at ISO 100 without noise, against the chart, in CIELAB.
+Colours: the patches of a ColorChecker at ISO 100 without noise, compared with the chart in CIELAB.
 
-Edges: at ISO 100 without noise, the middle of each render and the saturated chart against what
-their own development makes of the same enlarged eight times, where no pixel is interpolated
-across an edge. So each is compared with its own tone and colours, whatever they are; what
-smoothing and sharpening change counts.
+Edges: at ISO 100 without noise, the middle of each render and the saturated chart. The reference is
+the same converter's development of the image enlarged eight times, where interpolation never
+crosses an edge. So tone and colours of a converter cancel out. Smoothing and sharpening count.
 
-Converters run as they come, and so their colours are compared: dcraw brightens by histogram, and
+Colours are compared with each converter's default settings. dcraw brightens by histogram.
 RawTherapee, with the profile that its window gives to a raw (-d), takes its tones from the preview
-in the DNG. Both would make two exposures of one, so noise and edges are compared without: dcraw
-with -W, RawTherapee with its neutral profile. These two have no tone curve, and are darker by the
-headroom that clpipe's exposure leaves in the raw; what is darker errs by fewer levels.
+in the DNG. Both adapt the exposure to the picture. Noise and edges are therefore compared without
+adaptation: dcraw with -W, RawTherapee with its neutral profile. These two have no tone curve, and
+are darker by the headroom that clpipe's exposure leaves in the raw. Errors of dark pictures are
+smaller in levels.
 """
 
 import argparse
@@ -50,27 +51,31 @@ from tools.compare.charts import (
     saturated_image,
 )
 from tools.compare.fidelity import colour_errors, delta_e, dots, psnr
-from tools.pages.side_by_side import COLUMNS, cells, markdown, sheet, telling_places
+from tools.pages.comparison_page import COLUMNS, cells, markdown, sheet, significant_places
 
-LIMIT = 600  # seconds a development
+LIMIT = 600  # seconds for each development
 BASE_ISO = 100
 ENLARGED = 8
-MIDDLE = 512  # px, the side of the part of a render that is enlarged
-BORDER = 8  # px that count nowhere; RawTherapee cuts off 4
-SMALLEST = 128, 128  # px, of a render: height, width
+MIDDLE = 512  # px, side of the enlarged part of a render
+BORDER = 8  # px that are excluded everywhere; RawTherapee crops 4
+SMALLEST = 128, 128  # px, height and width of a render
 CHART, SATURATED = "chart", "saturated"
 
 
 class ComparisonError(Exception):
-    """A development failed; the message says which, and how."""
+    """A development failed. The message names it and the reason."""
 
 
 @dataclass(frozen=True)
 class Converter:
-    """A raw converter: its command, with words for the DNG, the picture and a folder of its own.
+    """A raw converter.
 
-    It prints the picture where PICTURE is no word of the command. One that ``adapts`` chooses its
-    tones by the picture: of that one colours are compared, and nothing else.
+    Args:
+        name: the heading in tables.
+        package: Debian's package.
+        command: the command, with DNG, PICTURE and HOME (a private folder) as placeholders. Without
+            PICTURE, it prints the picture.
+        adapts: whether tones depend on the picture. If so, only colours are compared.
     """
 
     name: str
@@ -99,9 +104,10 @@ CONVERTERS = (
 
 @dataclass(frozen=True)
 class Comparison:
-    """The developments: OUT/MAKER/isoISO/NAME.png, without noise NAME.truth.png.
+    """The developments in OUT/DEVELOPER/isoISO: NAME.png, and NAME.truth.png without noise.
 
-    A maker is a converter or a configuration of clpipe, the first of which makes the DNGs, too.
+    A developer is a configuration of clpipe or a converter. The first configuration also writes the
+    DNGs.
     """
 
     out: Path
@@ -109,34 +115,34 @@ class Comparison:
     converters: tuple[Converter, ...]
 
     @property
-    def makers(self) -> dict[str, str]:
-        """What each maker is called in tables, and its folder."""
+    def developers(self) -> dict[str, str]:
+        """Names of the developers in tables, with their folders."""
         ours = {f"clpipe, {Path(c).stem}": f"clpipe-{Path(c).stem}" for c in self.configs}
         return ours | {c.name: c.name for c in self.converters}
 
     @property
     def steady(self) -> list[str]:
-        """The makers that develop each picture alike."""
+        """The developers whose tones do not depend on the picture."""
         adapting = {c.name for c in self.converters if c.adapts}
-        return [maker for maker in self.makers if maker not in adapting]
+        return [developer for developer in self.developers if developer not in adapting]
 
-    def folder(self, maker: str, iso: float) -> Path:
-        """Where a maker's pictures of an ISO are."""
-        return self.out / self.makers[maker] / f"iso{iso:g}"
+    def folder(self, developer: str, iso: float) -> Path:
+        """Return the folder of a developer's pictures at an ISO."""
+        return self.out / self.developers[developer] / f"iso{iso:g}"
 
     def develop(self, images: Sequence[Path], iso: float, noisy: bool = True) -> None:
-        """Develop renders, with and without noise by the steady makers; else, without, by all.
+        """Develop renders: with and without noise by ``steady``, or only without noise by all.
 
         Raises:
             ComparisonError: a program fails.
         """
-        ours = list(self.makers)[: len(self.configs)]
-        for config, maker in zip(self.configs, ours, strict=True):
-            dng = ["--format", "dng"] if maker == ours[0] else []
+        ours = list(self.developers)[: len(self.configs)]
+        for config, developer in zip(self.configs, ours, strict=True):
+            dng = ["--format", "dng"] if developer == ours[0] else []
             command = [sys.executable, "-m", "clpipe", "run", *images]
             command += [
                 "-o",
-                self.folder(maker, iso),
+                self.folder(developer, iso),
                 "-c",
                 config,
                 "--iso",
@@ -155,7 +161,7 @@ class Comparison:
                     self.convert(converter, negative, picture)
 
     def convert(self, converter: Converter, negative: Path, picture: Path) -> None:
-        """Develop a DNG with a converter whose settings are nobody's: its folders are its own.
+        """Develop a DNG with a converter in a private home folder, so without a user's settings.
 
         Raises:
             ComparisonError: the converter fails.
@@ -171,51 +177,51 @@ class Comparison:
         if "PICTURE" not in converter.command:
             picture.write_bytes(printed)
         if not picture.exists():
-            raise ComparisonError(f"{converter.name} made nothing of {negative}")
+            raise ComparisonError(f"{converter.name} wrote no picture of {negative}")
 
-    def picture(self, maker: str, iso: float, name: str, noisy: bool = True) -> Array:
-        """A development, (height, width, 3) uint8, of the size of clpipe's own.
+    def picture(self, developer: str, iso: float, name: str, noisy: bool = True) -> Array:
+        """Read a development, (height, width, 3) uint8, in the size of clpipe's picture.
 
-        What a converter cuts off at its borders is filled with its outermost pixels.
+        If a converter crops the borders, its outermost pixels are repeated.
 
         Raises:
-            ComparisonError: it has another size.
+            ComparisonError: the picture has another size.
         """
         file = f"{name}.png" if noisy else f"{name}.truth.png"
-        with Image.open(self.folder(next(iter(self.makers)), iso) / file) as own:
-            wanted = own.size[::-1]
-        with Image.open(self.folder(maker, iso) / file) as image:
+        with Image.open(self.folder(next(iter(self.developers)), iso) / file) as own:
+            expected = own.size[::-1]
+        with Image.open(self.folder(developer, iso) / file) as image:
             pixels = np.asarray(image.convert("RGB"))
-        lacking = [(want - have) for want, have in zip(wanted, pixels.shape, strict=False)]
-        if not all(lack in range(0, 2 * BORDER + 1, 2) for lack in lacking):
+        cropped = [(full - side) for full, side in zip(expected, pixels.shape, strict=False)]
+        if not all(count in range(0, 2 * BORDER + 1, 2) for count in cropped):
             raise ComparisonError(
-                f"{self.folder(maker, iso) / file} is {pixels.shape[1]}x{pixels.shape[0]}; "
-                f"expected {wanted[1]}x{wanted[0]}, as clpipe makes it"
+                f"{self.folder(developer, iso) / file} is {pixels.shape[1]}x{pixels.shape[0]}; "
+                f"expected {expected[1]}x{expected[0]}, the size of clpipe's picture"
             )
-        down, right = (lack // 2 for lack in lacking)
+        down, right = (count // 2 for count in cropped)
         return np.pad(pixels, ((down, down), (right, right), (0, 0)), "edge")
 
 
 def run(command: Sequence[str], environment: dict[str, str]) -> bytes:
-    """What a program prints.
+    """Run a program, and return its standard output.
 
     Raises:
-        ComparisonError: it fails, or takes more than ten minutes.
+        ComparisonError: the program fails, or takes more than ten minutes.
     """
     try:
         done = subprocess.run(
             command, capture_output=True, env=environment, timeout=LIMIT, check=False
         )
     except subprocess.TimeoutExpired:
-        raise ComparisonError(f"{command[0]}: not done after {LIMIT} s") from None
+        raise ComparisonError(f"{command[0]} did not end within {LIMIT} s") from None
     if done.returncode:
-        lines = done.stderr.decode(errors="replace").strip().splitlines() or ["it said nothing"]
+        lines = done.stderr.decode(errors="replace").strip().splitlines() or ["it printed nothing"]
         raise ComparisonError(f"{Path(command[0]).name} failed: {lines[-1]}")
     return done.stdout
 
 
 def inside(shape: Sequence[int]) -> Mask:
-    """The pixels that are not of the border, (height, width)."""
+    """Return the mask, (height, width), of pixels inside the border."""
     mask = np.zeros(shape[:2], bool)
     mask[BORDER:-BORDER, BORDER:-BORDER] = True
     return mask
@@ -224,50 +230,59 @@ def inside(shape: Sequence[int]) -> Mask:
 def noise_rows(
     comparison: Comparison, names: Sequence[str], isos: Sequence[float]
 ) -> Iterator[list[str]]:
-    """The rows of the table of noise."""
+    """Yield the rows of the table of noise."""
     for iso in isos:
-        for maker in comparison.steady:
-            chart = [comparison.picture(maker, iso, SATURATED, noisy) for noisy in (True, False)]
+        for developer in comparison.steady:
+            chart = [
+                comparison.picture(developer, iso, SATURATED, noisy) for noisy in (True, False)
+            ]
             y = luma(chart[1])
             patches = patch_places(len(y)) & (y >= DARKEST) & (y <= BRIGHTEST)
             saturated = signature(*chart, patches)["kurtosis"]
             for name in names:
-                noisy, clean = (comparison.picture(maker, iso, name, n) for n in (True, False))
+                noisy, clean = (comparison.picture(developer, iso, name, n) for n in (True, False))
                 found = signature(noisy, clean, flat_places(clean) & inside(clean.shape))
                 made = dots(noisy, clean)
-                yield [name, f"{iso:g}", maker, *cells(found), f"{saturated:.1f}", f"{made:.1f}"]
+                yield [
+                    name,
+                    f"{iso:g}",
+                    developer,
+                    *cells(found),
+                    f"{saturated:.1f}",
+                    f"{made:.1f}",
+                ]
 
 
 def colour_rows(comparison: Comparison) -> Iterator[list[str]]:
-    """The rows of the table of colours."""
-    for maker in comparison.makers:
-        means = patch_means(comparison.picture(maker, BASE_ISO, CHART, noisy=False))
+    """Yield the rows of the table of colours."""
+    for developer in comparison.developers:
+        means = patch_means(comparison.picture(developer, BASE_ISO, CHART, noisy=False))
         of = colour_errors(means, chart_patches())
-        turned = f"{of.hue:.1f} / {of.largest_hue:.1f}"
-        yield [maker, f"{of.grey:.0f}", f"{of.lightness:+.1f}", turned, f"{of.chroma:.2f}"]
+        hue = f"{of.hue:.1f} / {of.largest_hue:.1f}"
+        yield [developer, f"{of.grey:.0f}", f"{of.lightness:+.1f}", hue, f"{of.chroma:.2f}"]
 
 
 def edge_rows(comparison: Comparison, names: Sequence[str]) -> Iterator[list[str]]:
-    """The rows of the table of edges."""
+    """Yield the rows of the table of edges."""
     for name in names:
-        for maker in comparison.steady:
-            small = comparison.picture(maker, BASE_ISO, name, noisy=False)
-            large = comparison.picture(maker, BASE_ISO, f"{name}-enlarged", noisy=False)
+        for developer in comparison.steady:
+            small = comparison.picture(developer, BASE_ISO, name, noisy=False)
+            large = comparison.picture(developer, BASE_ISO, f"{name}-enlarged", noisy=False)
             reference, picture = (
                 x[BORDER:-BORDER, BORDER:-BORDER] for x in (reduced(large), small)
             )
-            far = (delta_e(picture, reference) > 20).mean()
-            near, lone = psnr(picture, reference), dots(picture, reference)
-            yield [name, maker, f"{near:.1f}", f"{far:.2%}", f"{lone:.1f}"]
+            differing = (delta_e(picture, reference) > 20).mean()
+            ratio, isolated = psnr(picture, reference), dots(picture, reference)
+            yield [name, developer, f"{ratio:.1f}", f"{differing:.2%}", f"{isolated:.1f}"]
 
 
 def enlarged(image: Floats) -> Floats:
-    """An image of which each pixel is a block of eight by eight."""
+    """Enlarge an image eight times; each pixel becomes a block."""
     return image.repeat(ENLARGED, 0).repeat(ENLARGED, 1)
 
 
 def reduced(picture: Array) -> Array:
-    """The middle of each block of eight by eight, the mean of four pixels, (height, width, 3)."""
+    """Return the middle of each block of 8x8, the mean of four pixels, (height, width, 3)."""
     height, width = (side // ENLARGED for side in picture.shape[:2])
     middle = slice(ENLARGED // 2 - 1, ENLARGED // 2 + 1)
     blocks = picture.reshape(height, ENLARGED, width, ENLARGED, 3)
@@ -275,27 +290,27 @@ def reduced(picture: Array) -> Array:
 
 
 def middle_of(image: Floats) -> Floats:
-    """The middle of an image, at most 512 pixels a side."""
+    """Crop the middle of an image, at most 512 pixels a side."""
     height, width = (min(side, MIDDLE) for side in image.shape[:2])
     top, left = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2
     return image[top : top + height, left : left + width]
 
 
 def crops(comparison: Comparison, names: Sequence[str], isos: Sequence[float]) -> Image.Image:
-    """The sheet: two places of each image, a column a maker."""
-    makers = comparison.steady
+    """Return a sheet with two crops of each image, in a column for each developer."""
+    developers = comparison.steady
     rows = {}
     for name in names:
-        places = telling_places(comparison.picture(makers[0], isos[0], name, noisy=False))
+        places = significant_places(comparison.picture(developers[0], isos[0], name, noisy=False))
         for place in places:
             for iso in isos:
-                pictures = [comparison.picture(maker, iso, name) for maker in makers]
+                pictures = [comparison.picture(developer, iso, name) for developer in developers]
                 rows[f"{name}, {place.name}, ISO {iso:g}"] = [place.of(each) for each in pictures]
-    return sheet(makers, rows)
+    return sheet(developers, rows)
 
 
 def compare(comparison: Comparison, renders: Sequence[Path], isos: Sequence[float]) -> None:
-    """Develop, print the tables, write the crops.
+    """Develop the renders, print the tables, and write the crops.
 
     Raises:
         ComparisonError: a program fails.
@@ -306,7 +321,7 @@ def compare(comparison: Comparison, renders: Sequence[Path], isos: Sequence[floa
         image = images[path.stem] = middle_of(read_image(path).pixels.astype(np.float32))
         if image.shape[0] < SMALLEST[0] or image.shape[1] < SMALLEST[1]:
             raise ComparisonError(
-                f"{path} is {image.shape[1]}x{image.shape[0]}; give a render of at least "
+                f"{path} is {image.shape[1]}x{image.shape[0]}; choose a render of at least "
                 f"{SMALLEST[1]}x{SMALLEST[0]}"
             )
     edges = {f"{name}-middle": image for name, image in images.items()}
@@ -339,26 +354,30 @@ EDGE_HEADS = ["image", "", "PSNR", "dE > 20", "dots in 10,000"]
 
 
 def main() -> int:
-    """Compare what is there."""
+    """Compare the installed converters."""
     parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
     parser.add_argument("renders", nargs="*", type=Path, metavar="RENDER", help="[the still life]")
     parser.add_argument(
-        "-c", "--config", action="append", default=[], help="beside the default; may be repeated"
+        "-c",
+        "--config",
+        action="append",
+        default=[],
+        help="in addition to the default; may be repeated",
     )
     parser.add_argument("--iso", action="append", type=float, help="may be repeated [1600, 6400]")
     parser.add_argument(
         "-o", "--output", type=Path, default=ROOT / "build/converters", metavar="OUT"
     )
-    given = parser.parse_args()
-    configs = ("default", *given.config)
+    options = parser.parse_args()
+    configs = ("default", *options.config)
     if len({Path(config).stem for config in configs}) < len(configs):
-        parser.error(f"two configurations have one name: {', '.join(configs)}")
-    there = [c for c in CONVERTERS if shutil.which(c.command.split()[0])]
-    for missing in (c for c in CONVERTERS if c not in there):
-        print(f"{missing.name} is left out: apt-get install {missing.package}", file=sys.stderr)
-    comparison = Comparison(given.output.resolve(), configs, tuple(there))
+        parser.error(f"two configurations have the same name: {', '.join(configs)}")
+    installed = [c for c in CONVERTERS if shutil.which(c.command.split()[0])]
+    for missing in (c for c in CONVERTERS if c not in installed):
+        print(f"{missing.name} is skipped: apt-get install {missing.package}", file=sys.stderr)
+    comparison = Comparison(options.output.resolve(), configs, tuple(installed))
     try:
-        compare(comparison, given.renders or [RENDER], given.iso or [1600.0, 6400.0])
+        compare(comparison, options.renders or [RENDER], options.iso or [1600.0, 6400.0])
     except (ComparisonError, ClpipeError) as error:
         print(f"compare_converters: {error}", file=sys.stderr)
         return 1

@@ -1,6 +1,6 @@
-"""How near a finished picture comes to what it pictures: colours, brightness, errors of edges.
+"""Measures the fidelity of finished pictures: colours, brightness, edges and sharpness.
 
-All pictures are of sRGB levels, 0 to 255.
+All pictures are in sRGB levels, 0 to 255.
 """
 
 from dataclasses import asdict, dataclass
@@ -13,13 +13,13 @@ from clpipe.base.types import Doubles
 from clpipe.camera.profile import SRGB_TO_XYZ
 from tools.compare.charts import GREY, linear
 
-HAS_HUE = 10.0  # CIELAB chroma of a colour from which on its hue is compared
-DOT = 32  # levels of luma from the median of the 3x3
-SMOOTH = 16  # the same, of the reference, where a dot can be told
+HAS_HUE = 10.0  # the lowest CIELAB chroma at which hues are compared
+DOT = 32  # levels of luma between a dot and the median of its 3x3
+SMOOTH = 16  # the largest such difference in the reference, so that a dot is visible
 
 
 def cielab(levels: NDArray[np.number]) -> Doubles:
-    """CIELAB of sRGB levels under D65, (..., 3): L*, a*, b* (CIE 15:2018, eq. 8.3 to 8.11).
+    """Convert sRGB levels to CIELAB under D65, (..., 3): L*, a*, b* (CIE 15:2018, eq. 8.3 to 8.11).
 
     >>> cielab(np.array([[255, 255, 255], [122, 122, 122], [255, 0, 0]])).round(1).tolist()
     [[100.0, 0.0, 0.0], [51.2, 0.0, 0.0], [53.2, 80.1, 67.2]]
@@ -33,9 +33,9 @@ def cielab(levels: NDArray[np.number]) -> Doubles:
 
 @dataclass(frozen=True)
 class ColourErrors:
-    """How the patches of a chart came out, against the chart itself, in CIELAB.
+    """Errors of a chart's patches in CIELAB.
 
-    Hue and chroma are of the patches whose own chroma is at least 10; others have no hue to keep.
+    Hue and chroma are compared only for patches with a chroma of at least 10.
     """
 
     grey: float  # level of green of the grey patch; 122 in the chart
@@ -45,7 +45,7 @@ class ColourErrors:
     chroma: float  # median ratio to the chart's
 
     def record(self) -> dict[str, float]:
-        """The figures by name."""
+        """Return the figures by name."""
         return asdict(self)
 
 
@@ -54,22 +54,23 @@ def colour_errors(pictured: NDArray[np.number], true: NDArray[np.number]) -> Col
 
     Args:
         pictured: (24, 3).
-        true: (24, 3), as of :func:`~tools.compare.charts.chart_patches`.
+        true: (24, 3), as from :func:`~tools.compare.charts.chart_patches`.
 
     >>> from tools.compare.charts import chart_patches
     >>> true = chart_patches()
     >>> colour_errors(true, true)
     ColourErrors(grey=122.0, lightness=0.0, hue=0.0, largest_hue=0.0, chroma=1.0)
     """
-    found, asked = cielab(pictured), cielab(true)
+    found, expected = cielab(pictured), cielab(true)
     (found_chroma, found_hue), (chroma, hue) = (
-        (np.hypot(lab[:, 1], lab[:, 2]), np.arctan2(lab[:, 2], lab[:, 1])) for lab in (found, asked)
+        (np.hypot(lab[:, 1], lab[:, 2]), np.arctan2(lab[:, 2], lab[:, 1]))
+        for lab in (found, expected)
     )
     coloured = chroma >= HAS_HUE
     hue_errors = np.degrees(np.abs((found_hue - hue + np.pi) % (2 * np.pi) - np.pi))[coloured]
     return ColourErrors(
         grey=float(pictured[GREY, 1]),
-        lightness=float((found[:, 0] - asked[:, 0]).mean()),
+        lightness=float((found[:, 0] - expected[:, 0]).mean()),
         hue=float(np.median(hue_errors)),
         largest_hue=float(hue_errors.max()),
         chroma=float(np.median(found_chroma[coloured] / chroma[coloured])),
@@ -77,7 +78,7 @@ def colour_errors(pictured: NDArray[np.number], true: NDArray[np.number]) -> Col
 
 
 def delta_e(one: NDArray[np.number], two: NDArray[np.number]) -> Doubles:
-    """The distance of colours in CIELAB (CIE 1976), pixel by pixel.
+    """Return the distance of colours in CIELAB (CIE 1976), pixel by pixel.
 
     >>> delta_e(np.array([255, 0, 0]), np.array([0, 255, 0])).round(1).tolist()
     170.6
@@ -86,13 +87,14 @@ def delta_e(one: NDArray[np.number], two: NDArray[np.number]) -> Doubles:
 
 
 def dots(picture: NDArray[np.number], reference: NDArray[np.number]) -> float:
-    """Lone pixels that the reference lacks, per 10,000.
+    """Return the number of isolated pixels per 10,000 that the reference lacks.
 
-    A dot's luma is more than 32 from the median of its 3x3, where the reference's own is within 16.
+    A dot's luma differs by more than 32 from the median of its 3x3. The reference's luma at the
+    same place differs by at most 16.
 
     Args:
         picture: (height, width, 3).
-        reference: the same without what makes dots: a mosaic, noise.
+        reference: the same picture without the cause of dots, such as a mosaic or noise.
 
     >>> grey = np.full((100, 100, 3), 128.0)
     >>> spotted = grey.copy()
@@ -102,15 +104,15 @@ def dots(picture: NDArray[np.number], reference: NDArray[np.number]) -> float:
     """
     from scipy import ndimage
 
-    def alone(levels: NDArray[np.number]) -> Doubles:
+    def isolation(levels: NDArray[np.number]) -> Doubles:
         y = luma(levels)
         return np.abs(y - ndimage.median_filter(y, 3))
 
-    return float(1e4 * ((alone(picture) > DOT) & (alone(reference) <= SMOOTH)).mean())
+    return float(1e4 * ((isolation(picture) > DOT) & (isolation(reference) <= SMOOTH)).mean())
 
 
 def psnr(one: NDArray[np.number], two: NDArray[np.number]) -> float:
-    """Peak signal-to-noise ratio, dB, over all channels; infinite where both are the same.
+    """Return the peak signal-to-noise ratio over all channels, dB; infinite if both are equal.
 
     >>> round(psnr(np.zeros((2, 2, 3)), np.ones((2, 2, 3))), 2)
     48.13
@@ -121,19 +123,19 @@ def psnr(one: NDArray[np.number], two: NDArray[np.number]) -> float:
 
 @dataclass(frozen=True)
 class Sharpness:
-    """How an upright edge comes out (ISO 12233, slanted edge)."""
+    """Sharpness of a vertical edge (ISO 12233, slanted edge)."""
 
-    mtf50: float  # cycles per pixel at which half of the contrast is left
-    mtf25: float  # share of the contrast that is left at a quarter of a cycle per pixel
-    overshoot: float  # of the edge, over its height
+    mtf50: float  # cycles per pixel at which half of the contrast remains
+    mtf25: float  # share of the contrast at a quarter of a cycle per pixel
+    overshoot: float  # as a share of the edge's height
 
 
 def sharpness(picture: NDArray[np.number]) -> Sharpness:
-    """The sharpness of a picture of :func:`~tools.compare.charts.slanted_edge`, in linear light.
+    """Measure the sharpness of a picture of :func:`~tools.compare.charts.slanted_edge`.
 
-    The edge is found in each row and fitted with a line. The pixels of all rows, by their distance
-    from it, give its profile in steps of a quarter of a pixel; the transfer function is the
-    spectrum of the profile's slope.
+    The function works in linear light. It finds the edge in each row and fits a line to it. The
+    distances of all pixels to this line give the edge's profile in steps of a quarter of a pixel.
+    The transfer function is the spectrum of the profile's slope.
 
     Args:
         picture: (height, width, 3); the edge crosses every row once, near the middle.

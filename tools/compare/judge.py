@@ -1,18 +1,20 @@
-"""Whether noise can be told from a real camera's: a linear judge, distances, and the figures.
+"""Measure how well a classifier separates clpipe's noise from that of real cameras.
 
     sh tools/judge FOLDER [--config NAME]... [--json]
 
-FOLDER has pairs of one camera picture and the mean of many of the same scene: NAME_real.png and
-NAME_mean.png, where NAME without its last number is the camera. Each mean is put back into linear
-light and developed again by a configuration, at the ISO at which its luma noise is as strong as the
-picture's, so that both show the same scenes and places. In patches of 48x48 pixels 80 statistics
-are taken that do not depend on how strong the noise is. A logistic regression is trained to tell
-real from made on all cameras but one, and tested on that one.
+FOLDER contains pairs of a camera's picture and the mean of many pictures of the same scene:
+NAME_real.png and NAME_mean.png. NAME without its last number is the camera. The tool converts each
+mean to linear light and develops it with a configuration. It chooses the ISO so that the luma noise
+is as strong as in the picture. Both therefore show the same scene.
 
-- AUC: 0.5 cannot tell, 1 always can. It saturates.
-- Mahalanobis distance of the mean statistics, with the covariance of patches, without those of
-  colour: as far as two cameras are apart is near enough.
-- KLD of the histograms of noise, in nats: it is told by strength and tails alone.
+From patches of 48x48 pixels, the tool computes 80 statistics that do not depend on the strength of
+the noise. A logistic regression learns to separate real from simulated patches on all cameras but
+one, and is tested on that one. The figures are:
+
+- AUC: 0.5 is chance, 1 is perfect separation. It saturates.
+- Mahalanobis distance of the mean statistics, without those of colour, with the covariance of
+  patches. The distance between two cameras is a good target.
+- KLD of the histograms of noise, in nats. It depends only on strength and tails.
 """
 
 import argparse
@@ -40,18 +42,25 @@ from clpipe.chain.files import load_settings
 from clpipe.chain.settings import overlay
 from clpipe.engine.device import open_device
 from clpipe.images.jpeg import JpegEncoding
-from tools.compare.telling import PATCH, Judged, distance, over_white, statistics, told
+from tools.compare.classifier import (
+    PATCH,
+    Statistics,
+    distance,
+    held_out_auc,
+    over_white,
+    statistics,
+)
 
 FEWEST = 4  # patches of a camera
-COVERED = 0.6  # share of a patch that is flat, neither dark nor bright
+COVERED = 0.6  # lowest share of a patch that is flat, and neither dark nor bright
 CONFIGS = ("default", "nikon-d800-jpeg", "canon-5d3-jpeg")
 SHOWN = ("sigma_12", "sigma_24", "sigma_40", "sigma_96", "sigma_128", "skew_shadows", "kurtosis")
 SHOWN += ("right", "diagonal", "two_right", "right_3", "half", "chroma_right", "chroma_two_right")
 SHOWN += ("red_green", "edges")
-COARSE = 16  # px, of the means of chroma
+COARSE = 16  # px, side of the blocks for means of chroma
 CB_RIGHT, CR_COARSE = "Cb, 2 right", f"Cr after {COARSE}x{COARSE} means, over white noise's"
 RELATIVE_TO = "sigma_64"
-STEPS = 4  # of the search for an ISO
+STEPS = 4  # iterations of the search for an ISO
 
 
 @dataclass(frozen=True)
@@ -63,26 +72,26 @@ class Pair:
 
 
 def read_pairs(folder: Path) -> list[Pair]:
-    """The pairs of a folder.
+    """Read the pairs of a folder.
 
     Raises:
-        SystemExit: there is none, or a picture has no mean.
+        SystemExit: the folder has no pair, or a picture has no mean.
     """
     found = []
     for real in sorted(folder.glob("*_real.png")):
         name = real.name.removesuffix("_real.png")
         mean = real.with_name(f"{name}_mean.png")
         if not mean.exists():
-            raise SystemExit(f"{real} has no {mean.name} beside it")
+            raise SystemExit(f"{real} has no {mean.name} next to it")
         scenes = load_scenes([str(real)], [str(mean)])
         found += [Pair(name.rstrip("0123456789").rstrip("_"), scene) for scene in scenes.each]
     if not found:
-        raise SystemExit(f"{folder}: no NAME_real.png with its NAME_mean.png")
+        raise SystemExit(f"{folder} has no pairs NAME_real.png and NAME_mean.png")
     return found
 
 
-def made_by(config: str, simulator: Simulator) -> Callable[[Scene], Noise]:
-    """What a configuration makes of a scene, as strong as the real noise."""
+def simulated_by(config: str, simulator: Simulator) -> Callable[[Scene], Noise]:
+    """Return a function that simulates a scene's noise, as strong as the real noise."""
     settings = load_settings(config)
     low, high = settings.isos().low, settings.isos().high
     output = settings.output
@@ -93,8 +102,8 @@ def made_by(config: str, simulator: Simulator) -> Callable[[Scene], Noise]:
         target = target_of(scene)
         iso = float(np.sqrt(low * high))
         for _ in range(STEPS):
-            own = simulator.noise(overlay(settings, {"iso": iso}), scene, "iso", 1)
-            ratio = target.figures["rms"] / figures_of(own, target.places)["rms"]
+            simulated = simulator.noise(overlay(settings, {"iso": iso}), scene, "iso", 1)
+            ratio = target.figures["rms"] / figures_of(simulated, target.places)["rms"]
             iso = float(np.clip(iso * ratio**2, low, high))
         return simulator.noise(overlay(settings, {"iso": iso}), scene, "judged", 1)
 
@@ -102,31 +111,30 @@ def made_by(config: str, simulator: Simulator) -> Callable[[Scene], Noise]:
 
 
 def iid(scene: Scene) -> Noise:
-    """Independent Gaussian noise of the real noise's variance in each channel."""
-    own = scene.noise
-    mask = scene.flat
-    sigma = own.rgb[:, mask].std((0, 1))
-    normals = np.random.default_rng(0).normal(size=own.rgb[:1].shape)
-    return Noise(normals * sigma, own.level)
+    """Return independent Gaussian noise with the real noise's variance in each channel."""
+    real = scene.noise
+    sigma = real.rgb[:, scene.flat].std((0, 1))
+    normals = np.random.default_rng(0).normal(size=real.rgb[:1].shape)
+    return Noise(normals * sigma, real.level)
 
 
 def intensity_dependent(scene: Scene) -> Noise:
-    """The same, of its variance at each luma."""
-    own, mask = scene.noise, scene.flat
-    bins = (own.level // 16).astype(int)
+    """Return independent Gaussian noise with the real noise's variance at each luma."""
+    real, mask = scene.noise, scene.flat
+    bins = (real.level // 16).astype(int)
     sigma = np.zeros((17, 3))
     for number in range(17):
         at = mask & (bins == number)
-        sigma[number] = own.rgb[:, at].std((0, 1)) if at.sum() > 200 else np.nan
+        sigma[number] = real.rgb[:, at].std((0, 1)) if at.sum() > 200 else np.nan
     for channel in sigma.T:
         known = ~np.isnan(channel)
         channel[:] = np.interp(np.arange(17), np.flatnonzero(known), channel[known])
-    normals = np.random.default_rng(0).normal(size=own.rgb[:1].shape)
-    return Noise(normals * sigma[bins], own.level)
+    normals = np.random.default_rng(0).normal(size=real.rgb[:1].shape)
+    return Noise(normals * sigma[bins], real.level)
 
 
 def patches_of(noise: Noise, scene: Scene) -> Iterator[tuple[Doubles, Doubles]]:
-    """The patches that are flat: noise (48, 48, 3) and luma (48, 48)."""
+    """Yield the noise, (48, 48, 3), and luma, (48, 48), of flat patches."""
     bright = scene.flat & (noise.level >= 30)
     height, width = bright.shape
     for y in range(0, height - PATCH + 1, PATCH):
@@ -136,10 +144,10 @@ def patches_of(noise: Noise, scene: Scene) -> Iterator[tuple[Doubles, Doubles]]:
                 yield noise.rgb[0][at], noise.level[at]
 
 
-def judged(
+def patch_statistics(
     pairs: Sequence[Pair], noise_of: Callable[[Scene], Noise]
-) -> tuple[Judged, dict[str, list[Noise]], list[str]]:
-    """The statistics of all patches by camera, the noise that they are of, and their names."""
+) -> tuple[Statistics, dict[str, list[Noise]], list[str]]:
+    """Return the statistics of all patches by camera, the noise by camera, and their names."""
     rows: dict[str, list[list[float]]] = {}
     noises: dict[str, list[Noise]] = {}
     names: list[str] = []
@@ -150,11 +158,11 @@ def judged(
             found = statistics(patch, level)
             names = list(found)
             rows.setdefault(pair.camera, []).append(list(found.values()))
-    return {camera: np.array(own) for camera, own in rows.items()}, noises, names
+    return {camera: np.array(table) for camera, table in rows.items()}, noises, names
 
 
 def divergence(real: Sequence[Noise], made: Sequence[Noise], pairs: Sequence[Pair]) -> float:
-    """The KLD of the histograms of noise in levels, of red, green and blue together, in nats."""
+    """Return the KLD of the histograms of noise, red, green and blue together, in nats."""
     edges = np.arange(-60.5, 61.5)
     counts = []
     for noises in (real, made):
@@ -165,8 +173,8 @@ def divergence(real: Sequence[Noise], made: Sequence[Noise], pairs: Sequence[Pai
     return float((p * np.log(p / q)).sum())
 
 
-def shown(noises: Sequence[Noise], pairs: Sequence[Pair]) -> dict[str, float]:
-    """The plain figures of noise: medians over pictures; sigma by luma is over that at 64 to 95."""
+def median_figures(noises: Sequence[Noise], pairs: Sequence[Pair]) -> dict[str, float]:
+    """Return medians over pictures; sigma by luma is relative to sigma at luma 64 to 95."""
     rows = []
     for noise, pair in zip(noises, pairs, strict=True):
         places = pair.scene.places()
@@ -184,69 +192,72 @@ def shown(noises: Sequence[Noise], pairs: Sequence[Pair]) -> dict[str, float]:
 
 
 def report(folder: Path, configs: Sequence[str]) -> dict[str, Any]:
-    """All that is found, as JSON values."""
+    """Return all results as JSON values."""
     pairs = read_pairs(folder)
     cameras = {name: [p for p in pairs if p.camera == name] for name in (p.camera for p in pairs)}
     simulator = Simulator(open_device(None))
-    ways = {config: made_by(config, simulator) for config in configs}
-    ways |= {"iid": iid, "intensity-dependent": intensity_dependent}
-    real, of_real, names = judged(pairs, lambda scene: scene.noise)
-    if bare := [name for name in cameras if len(real.get(name, ())) < FEWEST]:
-        raise SystemExit(f"{bare[0]}: fewer than {FEWEST} patches of {PATCH} px that are flat")
+    sources = {config: simulated_by(config, simulator) for config in configs}
+    sources |= {"iid": iid, "intensity-dependent": intensity_dependent}
+    real, of_real, names = patch_statistics(pairs, lambda scene: scene.noise)
+    if lacking := [name for name in cameras if len(real.get(name, ())) < FEWEST]:
+        raise SystemExit(f"{lacking[0]} has fewer than {FEWEST} flat patches of {PATCH} px")
     kept = [k for k, name in enumerate(names) if not name.startswith("colour")]
-    figures = {f"real {name}": shown(of_real[name], own) for name, own in cameras.items()}
+    figures = {f"real {name}": median_figures(of_real[name], p) for name, p in cameras.items()}
     found: dict[str, dict[str, Any]] = {}
-    for way, noise_of in ways.items():
-        made, of_made, _ = judged(pairs, noise_of)
-        for camera, own in cameras.items():
+    for source, noise_of in sources.items():
+        made, of_made, _ = patch_statistics(pairs, noise_of)
+        for camera, own_pairs in cameras.items():
             gap = (made[camera].mean(0) - real[camera].mean(0)) / (real[camera].std(0) + 1e-9)
-            found.setdefault(way, {})[camera] = {
-                "auc": told(real, made, camera),
+            found.setdefault(source, {})[camera] = {
+                "auc": held_out_auc(real, made, camera),
                 "distance": distance(real[camera], made[camera], kept),
-                "kld": divergence(of_real[camera], of_made[camera], own),
-                "telling": {names[k]: float(gap[k]) for k in np.argsort(-abs(gap))[:5]},
+                "kld": divergence(of_real[camera], of_made[camera], own_pairs),
+                "most_different": {names[k]: float(gap[k]) for k in np.argsort(-abs(gap))[:5]},
             }
-            figures[f"{way}, as {camera}"] = shown(of_made[camera], own)
-    apart = {
+            figures[f"{source}, as {camera}"] = median_figures(of_made[camera], own_pairs)
+    distances = {
         f"{one} and {two}": distance(real[one], real[two], kept)
         for one, two in itertools.combinations(cameras, 2)
     }
     return {
-        "pictures": {name: len(own) for name, own in cameras.items()},
+        "pictures": {name: len(p) for name, p in cameras.items()},
         "patches": {name: len(real[name]) for name in cameras},
         "statistics": len(names),
-        "between_cameras": apart,
+        "between_cameras": distances,
         "judged": found,
         "figures": figures,
     }
 
 
 def table(found: Mapping[str, Any]) -> str:
-    """The report for people."""
+    """Format the report as text."""
     counts = zip(found["pictures"].items(), found["patches"].values(), strict=True)
     lines = [f"{name}: {n} pictures, {patches} patches" for (name, n), patches in counts]
-    lines += [f"{between}: {d:.1f} apart" for between, d in found["between_cameras"].items()]
-    lines += ["", f"{'':24}{'camera':18}{'AUC':>6}{'distance':>10}{'KLD':>7}  tells most, sigmas"]
-    for name, own in found["judged"].items():
-        for camera, one in own.items():
-            telling = ", ".join(f"{key} {gap:+.1f}" for key, gap in one["telling"].items())
+    lines += [f"{cameras}: distance {d:.1f}" for cameras, d in found["between_cameras"].items()]
+    lines += [
+        "",
+        f"{'':24}{'camera':18}{'AUC':>6}{'distance':>10}{'KLD':>7}  most different, sigmas",
+    ]
+    for name, scores in found["judged"].items():
+        for camera, one in scores.items():
+            gaps = ", ".join(f"{key} {gap:+.1f}" for key, gap in one["most_different"].items())
             numbers = f"{one['auc']:6.2f}{one['distance']:10.1f}{one['kld']:7.3f}"
-            lines.append(f"{name:24}{camera:18}{numbers}  {telling}")
+            lines.append(f"{name:24}{camera:18}{numbers}  {gaps}")
     lines.append("")
     for key in (*SHOWN, CB_RIGHT, CR_COARSE):
-        over = f", over that at {RELATIVE_TO[6:]}" if key.startswith("sigma") else ""
+        over = f", relative to luma {RELATIVE_TO[6:]} to 95" if key.startswith("sigma") else ""
         text = COLUMNS[key].text.removesuffix(", levels") if key in COLUMNS else key
         lines.append(f"{text}{over}")
-        lines += [f"    {name:40}{own[key]:8.2f}" for name, own in found["figures"].items()]
+        lines += [f"    {name:40}{values[key]:8.2f}" for name, values in found["figures"].items()]
     return "\n".join(lines)
 
 
 def main() -> None:
-    """Read the command line, judge, print."""
+    """Compare the noise, and print the report."""
     formatter = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=formatter)
     parser.add_argument("folder", type=Path, metavar="FOLDER")
-    text = "A configuration to judge; may be repeated."
+    text = "a configuration to compare; may be repeated"
     parser.add_argument("--config", action="append", help=text)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()

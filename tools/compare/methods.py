@@ -1,10 +1,12 @@
-"""Methods of other Python packages beside clpipe's of the same name, on the same image.
+"""Compares clpipe's methods with those of other Python packages, on the same image.
 
-Arrays in memory to arrays in memory, in float32, with the default threads of each. Windows are as
-clpipe's: 5x5 for the bilateral filters, 9x9 with patches of 3x3 for non-local means, which
-scikit-image runs in its fast mode. scikit-image's and OpenCV's filter RGB, OpenCV's non-local means
-in eight bits; clpipe's work in YCbCr, with a strength for luma and one for chroma. HDRutils' noise
-and clpipe's are Gaussian of variance a*y + b, drawn and quantized.
+Inputs and outputs are float32 arrays in memory. Each package uses its default number of threads.
+Windows have clpipe's sizes: 5x5 for bilateral filters, and 9x9 with patches of 3x3 for non-local
+means. scikit-image runs its fast mode.
+
+scikit-image and OpenCV filter RGB; OpenCV's non-local means works in eight bits. clpipe works in
+YCbCr, with separate strengths for luma and chroma. The noise of HDRutils and of clpipe is Gaussian
+with variance a*y + b, drawn and quantized.
 """
 
 import importlib
@@ -25,10 +27,10 @@ from clpipe.chain.settings import settings_from
 from clpipe.engine.bench import scene
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
-from tools.compare.turns import Comparison, in_turns
+from tools.compare.timing import Comparison, interleaved
 
 SIZE = 1536, 1024  # px: width, height
-SIGMA = 0.05  # of differences in value
+SIGMA = 0.05  # of the range kernel
 
 
 @dataclass(frozen=True)
@@ -36,11 +38,11 @@ class Other:
     """A method of another package.
 
     Args:
-        package: as it is installed.
-        module: what is imported.
-        stages: clpipe's, with the parameters, nested as in a configuration.
-        make: makes the call from the module and the image, which the first stage reads: RGB,
-            (height, width, 3), or an RGGB mosaic, (height, width), float32.
+        package: the name for pip.
+        module: the name to import.
+        stages: clpipe's stages with their parameters, nested like a configuration.
+        make: returns the call, from the module and the image that the first stage reads. The image
+            is float32: RGB, (height, width, 3), or an RGGB mosaic, (height, width).
     """
 
     package: str
@@ -50,13 +52,13 @@ class Other:
 
     @property
     def label(self) -> str:
-        """The method, as clpipe calls it, and whose the other one is."""
+        """clpipe's name of the method, and the other package."""
         name, table = next(iter(self.stages.items()))
         return f"{name} {table['method']}: {self.package}"
 
 
 def demosaicing(name: str, method: str) -> Other:
-    """A function of colour-demosaicing."""
+    """Return a method of the package colour-demosaicing."""
     return Other(
         "colour-demosaicing",
         "colour_demosaicing",
@@ -66,14 +68,14 @@ def demosaicing(name: str, method: str) -> Other:
 
 
 def hdrutils_noise(module: Any, mosaic: Array) -> Callable[[], object]:
-    """HDRutils' noise of clpipe's default camera, quantized to 14 bits."""
+    """Return HDRutils' noise of clpipe's default camera, quantized to 14 bits."""
     logging.getLogger("HDRutils").setLevel(logging.ERROR)
     model = module.NormalNoise("Sony", "ILCE-7RM2", 100)
     return lambda: model.simulate(mosaic, 1)
 
 
 def opencv_non_local_means(cv2: Any, rgb: Array) -> Callable[[], object]:
-    """OpenCV's non-local means, which has no float variant."""
+    """Return OpenCV's non-local means, which has no float variant."""
     picture = np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
     h = 255 * SIGMA
     return lambda: cv2.fastNlMeansDenoisingColored(picture, None, h, h, 3, 9)
@@ -125,20 +127,20 @@ OTHERS = (
 
 
 def imported(other: Other) -> ModuleType | None:
-    """The module of another package; None, with a line on stderr, where it is not there."""
+    """Import another package. If it is missing, print a line and return None."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of optional parts that are missing
+            warnings.simplefilter("ignore")  # about missing optional parts
             return importlib.import_module(other.module)
     except ImportError as error:
-        print(f"{other.label} is left out: {error}", file=sys.stderr)
+        print(f"{other.label} is skipped: {error}", file=sys.stderr)
         return None
 
 
 def compare_methods(
     device: Device, repeat: int, others: Sequence[Other] = OTHERS
 ) -> list[Comparison]:
-    """Time the methods whose packages are there."""
+    """Time the methods whose packages are installed."""
     width, height = SIZE
     rgb = scene(width, height).astype(np.float32)
     mosaic = rgb[..., 1].copy()
@@ -155,8 +157,8 @@ def compare_methods(
             "ours": lambda runner=runner, image=image: runner.run(image, "compare"),
             "other": other.make(module, image),
         }
-        in_turns(works, 1)
-        seconds = in_turns(works, repeat)
+        interleaved(works, 1)
+        seconds = interleaved(works, repeat)
         theirs = {"other": seconds["other"]}
         rows.append(Comparison(other.label, width * height / 1e6, seconds["ours"], theirs))
     return rows

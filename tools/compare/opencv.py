@@ -1,26 +1,27 @@
-"""Time clpipe's default chain against the same work in OpenCV and NumPy, in turns, in one run.
+"""Compare the speed of clpipe's default chain with the same work in OpenCV and NumPy.
 
     tools/run compare opencv [--device N] [--arrays WxH ...] [--files COUNTxWxH ...] [--methods]
 
-It needs the extra "compare" (.venv/bin/pip install -e '.[compare]'). opencv_chain.py says, stage by
-stage, what stands for what, and where OpenCV does less. The script runs in two ways: on whole
-images with OpenCV's own threads, as most would write it; and in bands of rows that stay in the
-cache, in a pool of threads, the fastest that was found.
+It needs the extra "compare" (.venv/bin/pip install -e '.[compare]'). opencv_chain.py lists
+the OpenCV functions that replace each stage, and where OpenCV does less work. The OpenCV script
+runs in two ways. The first works on whole images with OpenCV's own threads, like most scripts. The
+second works in a pool of threads on bands of rows that fit into the cache. It was the fastest way
+of those tried.
 
-Arrays: a render of half floats in memory becomes a picture of eight bits in memory; for clpipe also
-from device to device, as `clpipe bench` measures.
+Arrays: a render of half floats in memory becomes an 8-bit picture in memory. clpipe also runs from
+device to device, like `clpipe bench`.
 
-Files: half EXRs become JPEGs of one quality and subsampling. clpipe hashes what it reads, writes
-sidecars and brings each file to the disk before it gets its name; the script does not. It decodes
-with the OpenEXR package, which is faster there than cv2.imread or as fast, encodes with
-cv2.imencode, which is faster than Pillow, and has the fastest of some numbers of threads. Links to
-a few renders stand for many.
+Files: half EXRs become JPEGs of the same quality and subsampling. clpipe hashes its inputs, writes
+sidecars and syncs each file to the disk before it renames it; the script does none of this. The
+script decodes with the OpenEXR package, which is at least as fast as cv2.imread. It encodes with
+cv2.imencode, which is faster than Pillow. It uses the fastest of several numbers of threads. Links
+to a few renders replace many files.
 
-Methods: colour-demosaicing, scikit-image and HDRutils beside clpipe's methods of the same name; see
-methods.py.
+Methods: see methods.py for the comparison with colour-demosaicing, scikit-image and HDRutils.
 
-Each turn runs all once. Speeds are medians; ratios are those within a turn, their median and
-quartiles. First both develop the test image, and their pictures and noise are compared.
+A round runs each candidate once, so that other load on the machine affects all of them. Speeds are
+medians. Ratios are computed within rounds; the tables show their median and quartiles. First, both
+programs develop the test image, and the script compares their pictures and noise.
 """
 
 import argparse
@@ -57,7 +58,7 @@ from clpipe.inputs.find import find_jobs
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.writer import OutputWriter
 from tools import RENDER
-from tools.compare.turns import Comparison, Work, in_turns
+from tools.compare.timing import Comparison, Work, interleaved
 
 NEEDED = ("cv2", "OpenEXR")
 WHOLE, BANDS = "opencv_whole", "opencv_bands"
@@ -68,10 +69,11 @@ HEADINGS = (
 
 
 class Likeness(NamedTuple):
-    """How alike clpipe and the script are.
+    """The similarity of clpipe's and the script's results.
 
-    ``difference`` is the mean of that of the pictures of the test image, in levels of 255;
-    ``noise`` is the variance of the script's noise in a grey raw over that of clpipe's.
+    Args:
+        difference: the mean absolute difference of their pictures of the test image, in levels.
+        noise: the variance of the script's noise in a grey raw, relative to clpipe's.
     """
 
     difference: float
@@ -79,7 +81,7 @@ class Likeness(NamedTuple):
 
 
 def likeness(device: Device) -> Likeness:
-    """Compare what both make."""
+    """Compare the results of both."""
     from tools.compare.opencv_chain import OpenCVChain
 
     chain = Request.from_options().chain()
@@ -88,7 +90,9 @@ def likeness(device: Device) -> Likeness:
     ours, theirs = Runner(chain, device).run(render, "").image, script.run_in_bands(render)
     grey = np.full((512, 512, 3), 0.18, np.float16)
     raw = Request.from_options(until="quantize").chain()
-    own = Runner(raw, None, encode=False, final=True).run(grey, "").image  # the same as on it
+    own = (
+        Runner(raw, None, encode=False, final=True).run(grey, "").image
+    )  # same result as on the device
     return Likeness(
         float(abs(ours.astype(np.int16) - theirs).mean()),
         variance(script.expose(script.blur(grey))) / variance(own),
@@ -96,12 +100,12 @@ def likeness(device: Device) -> Likeness:
 
 
 def variance(raw: Array) -> float:
-    """The mean variance of the colours of an even mosaic."""
+    """Return the mean variance of the colours of a uniform mosaic."""
     return float(np.mean([raw[i::2, j::2].astype(float).var() for i in (0, 1) for j in (0, 1)]))
 
 
 def compare_arrays(device: Device, width: int, height: int, repeat: int) -> list[Comparison]:
-    """Arrays to arrays, on the device alone and from memory to memory."""
+    """Time arrays, once on the device only and once from memory to memory."""
     import cv2
 
     from tools.compare.opencv_chain import OpenCVChain, pool
@@ -125,8 +129,8 @@ def compare_arrays(device: Device, width: int, height: int, repeat: int) -> list
             WHOLE: whole,
             BANDS: bands,
         }
-        in_turns(works, 1)  # compiles, and touches memory
-        seconds = in_turns(works, repeat)
+        interleaved(works, 1)  # compiles, and touches memory
+        seconds = interleaved(works, repeat)
     theirs = {name: seconds[name] for name in (WHOLE, BANDS)}
     megapixels, size = width * height / 1e6, f"{width}x{height}"
     return [
@@ -136,7 +140,7 @@ def compare_arrays(device: Device, width: int, height: int, repeat: int) -> list
 
 
 class Files:
-    """A load of files in a folder, and what clpipe and the script make of them."""
+    """A set of files, which clpipe and the script develop."""
 
     def __init__(self, device: Device, load: Load, folder: Path) -> None:
         from tools.compare.opencv_chain import OpenCVChain
@@ -153,7 +157,7 @@ class Files:
         self.threads = available_processors()
 
     def clear(self) -> None:
-        """An empty folder for what is made."""
+        """Empty the output directory."""
         shutil.rmtree(self.out, ignore_errors=True)
         self.out.mkdir()
 
@@ -161,7 +165,7 @@ class Files:
         """Develop the first ``count`` files with clpipe.
 
         Raises:
-            ClpipeError: one fails.
+            ClpipeError: a file fails.
         """
         worker = ImageWorker(self.loader, Folder(self.writer), self.chain)
         for outcome in Batch(worker, [self.device]).run(self.jobs[:count]):
@@ -189,7 +193,7 @@ class Files:
             list(threads.map(one, [job.path for job in self.jobs[:count]]))
 
     def choose_threads(self) -> None:
-        """Take the number of threads that is fastest for the script."""
+        """Choose the number of threads that is fastest for the script."""
         processors = available_processors()
         seconds = {}
         for self.threads in (processors, processors + 1, 2 * processors):
@@ -202,23 +206,23 @@ class Files:
 
 @contextmanager
 def files_of(device: Device, load: Load) -> Iterator[Files]:
-    """A load of files in a temporary folder."""
+    """Provide a set of files in a temporary folder."""
     with tempfile.TemporaryDirectory(prefix="clpipe-compare-") as name:
         yield Files(device, load, Path(name))
 
 
 def compare_files(device: Device, load: Load, repeat: int) -> Comparison:
-    """Files to files."""
+    """Time files."""
     with files_of(device, load) as files:
         files.clear()
-        files.clpipe(count=8)  # compiles, and brings the files into memory
+        files.clpipe(count=8)  # compiles kernels, and loads the files into the page cache
         files.choose_threads()
         works: dict[str, Work] = {
             "clpipe": files.clpipe,
             WHOLE: lambda: files.opencv(bands=False),
             BANDS: lambda: files.opencv(bands=True),
         }
-        seconds = in_turns(works, repeat, files.clear)
+        seconds = interleaved(works, repeat, files.clear)
     return Comparison(
         f"{load.images} files of {load.width}x{load.height}, {files.threads} threads",
         load.images * load.width * load.height / 1e6,
@@ -228,28 +232,28 @@ def compare_files(device: Device, load: Load, repeat: int) -> Comparison:
 
 
 def size_of(text: str) -> tuple[int, int]:
-    """WxH as two even numbers."""
+    """Parse WxH as two even numbers."""
     width, height = numbers_of(text, 2)
     return width, height
 
 
 def load_of(text: str) -> Load:
-    """COUNTxWxH."""
+    """Parse COUNTxWxH."""
     return Load(*numbers_of(text, 3))
 
 
-def turns_of(text: str) -> int:
-    """How many turns: at least one."""
+def rounds_of(text: str) -> int:
+    """Parse a number of rounds, at least one."""
     if not text.isdecimal() or not int(text):
         raise argparse.ArgumentTypeError(f"found {text!r}; expected a whole number from 1 on")
     return int(text)
 
 
 def numbers_of(text: str, count: int) -> list[int]:
-    """Whole numbers between x; all but a count are even.
+    """Parse whole numbers separated by x; widths and heights must be even.
 
     Raises:
-        argparse.ArgumentTypeError: they are not.
+        argparse.ArgumentTypeError: the text has another form.
     """
     words = text.split("x")
     if len(words) != count or not all(w.isdecimal() and int(w) for w in words):
@@ -262,16 +266,16 @@ def numbers_of(text: str, count: int) -> list[int]:
 
 
 def main() -> int:
-    """Compare, print the tables."""
+    """Compare, and print the tables."""
     parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
-    parser.add_argument("--device", metavar="N|NAME", help="as for clpipe")
+    parser.add_argument("--device", metavar="N|NAME", help="like clpipe's --device")
     parser.add_argument(
         "--arrays",
         nargs="*",
         type=size_of,
         metavar="WxH",
         default=[(3000, 2000), (6000, 4000)],
-        help="sizes of images in memory; none for no such comparison",
+        help="sizes of images in memory; without values, skip this comparison",
     )
     parser.add_argument(
         "--files",
@@ -279,10 +283,14 @@ def main() -> int:
         type=load_of,
         metavar="COUNTxWxH",
         default=[Load(20, 6000, 4000), Load(1000, 512, 512), Load(200, 1920, 1080)],
-        help="numbers and sizes of files; none for no such comparison",
+        help="numbers and sizes of files; without values, skip this comparison",
     )
-    parser.add_argument("--methods", action="store_true", help="other projects' methods, too")
-    parser.add_argument("--repeat", type=turns_of, default=5, metavar="N", help="turns (default 5)")
+    parser.add_argument(
+        "--methods", action="store_true", help="also compare methods of other packages"
+    )
+    parser.add_argument(
+        "--repeat", type=rounds_of, default=5, metavar="N", help="rounds (default 5)"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args()
     if missing := [name for name in NEEDED if not importlib.util.find_spec(name)]:
@@ -298,7 +306,7 @@ def main() -> int:
 
 
 def compare(options: argparse.Namespace) -> int:
-    """All comparisons that are asked for.
+    """Run the selected comparisons.
 
     Raises:
         ClpipeError: there is no such device, or it fails.
@@ -307,7 +315,7 @@ def compare(options: argparse.Namespace) -> int:
 
     device = open_device(options.device)
     if device is None:
-        raise ClpipeError("numpy is no device to time")
+        raise ClpipeError("--device numpy cannot be timed; choose an OpenCL device")
     alike = likeness(device)
     rows = []
     for size in options.arrays:

@@ -1,28 +1,31 @@
-"""clpipe's default chain with OpenCV and NumPy, as one who knows both would write it.
+"""clpipe's default chain in OpenCV and NumPy, as an experienced user would write it.
 
-Stage by stage, with the parameters of clpipe's own chain:
+It takes its parameters from clpipe's own chain. These functions replace the stages:
 
 - optical_blur: cv2.sepFilter2D with the same weights.
-- exposure, mosaic, inverse_white_balance: a strided copy from the render for each colour of the
-  pattern, and one gain a colour.
-- sensor_noise, row_noise: cv2.randn (three times faster than NumPy's generators), times the root
-  of a*y + b. Less: the noise is that of no seed, and depends on the machine.
+- exposure, mosaic, inverse_white_balance: a strided copy from the render and one gain for each
+  colour of the pattern.
+- sensor_noise, row_noise: cv2.randn, times the square root of a*y + b. It is three times faster
+  than NumPy's generators.
 - quantize: cv2.addWeighted into 16 bits, which rounds and saturates.
-- normalize, white_balance: one table for each colour, cv2.LUT on the 16 bits of the raw. It gives
-  the root of the signal, which all that follows works on, in 16 bits.
-- demosaic: OpenCV's edge-aware demosaicing (COLOR_Bayer*_EA). Less: it has no bounds for red and
-  blue, so edges have fringes, and its green is that of the direction with the smaller gradient.
-- denoise: cv2.bilateralFilter on float luma and chroma, 4 neighbours in luma and 12 in each chroma,
-  where ``biweight`` has 8 and 8; the same share of grain. cv2.bilateralFilter on three channels
-  would cost twice as much.
-- sharpen: an unsharp mask of the same sigma, amount and limit. Less: it is added to luma, and does
-  not scale the colours.
-- tone_curve: by the largest colour, with tables, cv2.LUT; gamma, eight bits: another table.
+- normalize, white_balance: cv2.LUT on the 16-bit raw, with one table for each colour. The tables
+  return the square root of the signal in 16 bits, on which all later steps work.
+- demosaic: OpenCV's edge-aware demosaicing (COLOR_Bayer*_EA).
+- denoise: cv2.bilateralFilter on float luma and chroma, with the same share of grain. It has 4
+  neighbours in luma and 12 in each chroma; ``biweight`` has 8 in each. cv2.bilateralFilter on three
+  channels would cost twice as much.
+- sharpen: an unsharp mask with the same sigma, amount and limit.
+- tone_curve: tables of the largest colour, with cv2.LUT. gamma and quantization to eight bits:
+  another table.
 
-It does not go through the camera's colours (inverse_color_matrix, color_matrix), so its noise is
-another one in colours.
+It does less than clpipe:
 
-There is no clipping to a display, no tile, and no size but an even one.
+- The noise has no seed, and depends on the machine.
+- Demosaicing has no bounds for red and blue, so edges have fringes. Green follows the direction
+  with the smaller gradient.
+- Sharpening adds to luma, and does not scale the colours.
+- It skips the camera's colours (inverse_color_matrix, color_matrix), so its colour noise differs.
+- It does not clip to a display, has no tiles, and only accepts even sizes.
 """
 
 import math
@@ -41,26 +44,26 @@ from clpipe.reference.transfer import srgb_curve
 
 CODES = 65536  # of 16 bits
 TOP = CODES - 1
-BLUR_HALO = 4  # rows that the blur looks at beyond a band, or more
-HALO = 8  # rows that demosaicing, denoising and sharpening look at beyond a band
-BAND = 500_000  # pixels, most of which stay in the cache; found by trying
+BLUR_HALO = 4  # rows around a band that the blur may read, at least
+HALO = 8  # rows around a band that demosaicing, denoising and sharpening read
+BAND = 500_000  # pixels, most of which fit into the cache; found by experiment
 
 Each = Callable[[Callable[[int], None], Iterable[int]], Iterable[None]]  # such as map
 
 
 def pool(threads: int) -> ThreadPoolExecutor:
-    """Threads whose noise differs: OpenCV's generators all begin alike, one in each thread."""
+    """Return a pool whose threads have differently seeded generators of OpenCV."""
     return ThreadPoolExecutor(
         threads, initializer=lambda: cv2.setRNGSeed(int.from_bytes(os.urandom(3)))
     )
 
 
 class OpenCVChain:
-    """The default chain with the parameters of a resolved one.
+    """The default chain with the parameters of a resolved chain.
 
     Args:
-        chain: clpipe's own.
-        bgr: whether pictures are in OpenCV's order of colours, blue first.
+        chain: clpipe's chain.
+        bgr: whether pictures are in OpenCV's order of channels, blue first.
     """
 
     def __init__(self, chain: Chain, bgr: bool = False) -> None:
@@ -84,16 +87,16 @@ class OpenCVChain:
             return np.minimum(np.rint(root * TOP), TOP).astype(np.uint16)
 
         red, green, blue = map(roots, (after.red_gain, 1.0, after.blue_gain))
-        # Two pixels of a row are two channels, so that one table is for both colours of it.
+        # Two pixels of a row are two channels, so one table serves both colours of the row.
         self.row_tables = np.stack([red, green], -1)[None], np.stack([green, blue], -1)[None]
-        # A Gaussian of a third of the reach has nearly the shape of the biweight.
+        # A Gaussian whose sigma is a third of the range nearly has the shape of the biweight.
         self.luma_sigma, self.chroma_sigma = (r / root_of_top / 3 for r in denoise.ranges)
         self.grain = denoise.grain
         self.radius, self.amount = sharpen.radius, np.float32(sharpen.amount)
         self.limit = np.float32(sharpen.limit / root_of_top)
         light = np.clip((np.arange(CODES) / TOP * root_of_top) ** 2 - offset, 0, 1)
         self.light, style = np.float32(light), of["tone_curve"]
-        # By the largest colour: what the others are multiplied with, and what is added.
+        # As functions of the largest colour: the factor and the offset of all colours.
         to_high = style.curve(self.light)
         self.part = style.colourfulness(self.light) * to_high / np.maximum(self.light, 1e-9)
         self.part = np.float32(self.part)
@@ -102,12 +105,12 @@ class OpenCVChain:
         self.to_colours = cv2.COLOR_YCrCb2BGR if bgr else cv2.COLOR_YCrCb2RGB
 
     def blur(self, render: Array) -> Floats:
-        """A render as the lens spreads it: (height, width, 3) half or float to float32."""
+        """Blur a render like the lens: (height, width, 3) half or float to float32."""
         light = render.astype(np.float32)
         return cv2.sepFilter2D(light, -1, self.spread, self.spread, light)
 
     def expose(self, render: Floats) -> Array:
-        """The raw of what falls on the sensor: (height, width, 3) to (height, width) uint16."""
+        """Simulate the raw of a blurred render: (height, width, 3) to (height, width) uint16."""
         height, width = render.shape[:2]
         y = np.empty((height, width), np.float32)
         for row, colours in enumerate(((0, 1), (1, 2))):  # of RGGB
@@ -128,7 +131,7 @@ class OpenCVChain:
         return np.minimum(raw, np.uint16(self.white), out=raw)
 
     def develop(self, raw: Array) -> Array:
-        """The picture of a raw, (height, width, 3) uint8."""
+        """Develop a raw into a picture, (height, width, 3) uint8."""
         height, width = raw.shape
         roots = np.empty_like(raw)
         for row, table in enumerate(self.row_tables):
@@ -168,11 +171,11 @@ class OpenCVChain:
         return cv2.addWeighted(plane, TOP, plane, 0, 0, dtype=cv2.CV_16U)
 
     def run(self, render: Array) -> Array:
-        """A render through the chain, whole: (height, width, 3) uint8."""
+        """Process a whole render: (height, width, 3) uint8."""
         return self.develop(self.expose(self.blur(render)))
 
     def run_in_bands(self, render: Array, each: Each = map) -> Array:
-        """The same in bands of rows that stay in the cache; ``each`` may be a pool's map."""
+        """Process a render in bands of rows; ``each`` may be a pool's map."""
         height, width = render.shape[:2]
         rows = max(BAND // width, 4 * HALO) // 2 * 2
         raw = np.empty((height, width), np.uint16)

@@ -1,10 +1,10 @@
-"""A Dask cluster of this machine's processors, and a run of clpipe on it.
+"""Run clpipe on a Dask cluster of this machine's processors.
 
     pip install distributed
     python tools/examples/dask_local.py frames/ -o out --iso 3200
 
-All arguments go to clpipe run. On one machine clpipe alone does the same with less ado: this shows
-what a cluster needs, and a worker that dies (try: kill -9 it) takes nothing with it.
+All arguments go to clpipe run. On one machine, clpipe run without Dask is simpler. This example
+shows what a cluster needs. If a worker dies (try kill -9), no image is lost.
 """
 
 import sys
@@ -16,7 +16,7 @@ from clpipe.commands.main import main
 
 if __name__ == "__main__":  # the workers import this file
     processors = available_processors()
-    # Processes, each with its own OpenCL device; their threads are for decoding and encoding.
+    # Each process has its own OpenCL device. Its threads decode and encode.
     with LocalCluster(
         n_workers=max(1, processors // 4),
         threads_per_worker=min(4, processors),

@@ -1,12 +1,15 @@
-"""A Dask cluster of machines that are reached by SSH, and a run of clpipe on it.
+"""Run clpipe on a Dask cluster of machines that you reach by SSH.
 
     pip install distributed asyncssh
     HOSTS="node1 node2 node3" python tools/examples/dask_ssh.py /data/frames -o /data/out --iso 3200
 
-All arguments go to clpipe run. Each host starts a worker, the first one the scheduler too. They
-need a login by key (and to be in known_hosts), the same clpipe and distributed in a Python at the
-same path as here, inputs, output and the current folder at the same paths, and OpenCL devices of
-one kind.
+All arguments go to clpipe run. Each host starts a worker, and the first one also the scheduler. The
+hosts need:
+
+- a login by key, and an entry in known_hosts
+- the same versions of clpipe and distributed, in a Python at the same path as here
+- the inputs, the output directory and the current folder at the same paths
+- OpenCL devices of the same kind
 """
 
 import os
@@ -19,7 +22,7 @@ from clpipe.commands.main import main
 if __name__ == "__main__":
     first, *others = os.environ["HOSTS"].split()
     with SSHCluster(
-        [first, first, *others],  # the first of these is the scheduler's
+        [first, first, *others],  # the first is for the scheduler
         remote_python=sys.executable,
         worker_options={"nthreads": 4},  # for decoding and encoding
         scheduler_options={"port": 8786, "dashboard_address": ":0"},

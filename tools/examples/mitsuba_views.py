@@ -4,8 +4,8 @@
     python tools/examples/mitsuba_views.py renders --views 8
     clpipe dataset renders -o set --iso 100,3200
 
-The views are on an arc. Depth is along the axis of view, as clpipe and
-COLMAP count it; Mitsuba's own is along each ray.
+The views are on an arc. Depth is along the optical axis, as clpipe and COLMAP expect it. Mitsuba's
+own depth is along each ray.
 """
 
 import argparse
@@ -22,7 +22,7 @@ FOV = 40.0  # degrees, across
 
 
 def surface(kind, place, colour, **more):
-    """A shape with a matt surface; `colour` is a name of a texture's plugin, or a number."""
+    """Return a shape with a matte surface; `colour` is a number or the name of a texture plugin."""
     texture = {"type": "rgb", "value": colour}
     if isinstance(colour, str):
         texture = {"type": colour, "to_uv": T().scale(8)}
@@ -35,7 +35,7 @@ def surface(kind, place, colour, **more):
 
 
 def scene():
-    """A room's corner with a checked floor, a white wall, a glass ball and two lamps."""
+    """Return a scene: a checked floor, a white wall, a box, a glass ball and two lamps."""
     upright = T().rotate([1, 0, 0], 90)
     glass = {"type": "dielectric"}
     ball = {"type": "sphere", "center": [-0.7, 0, 0.5], "radius": 0.5, "bsdf": glass}
@@ -57,9 +57,9 @@ def scene():
     }
 
 
-def camera(turn, size, samples):
-    """A sensor that looks at the middle, `turn` degrees around it."""
-    place = T().rotate([0, 0, 1], turn) @ mi.ScalarPoint3f(0, -4.5, 1.6)
+def camera(angle, size, samples):
+    """Return a sensor that looks at the middle from an angle in degrees."""
+    place = T().rotate([0, 0, 1], angle) @ mi.ScalarPoint3f(0, -4.5, 1.6)
     film = {
         **{"type": "hdrfilm", "width": size[0], "height": size[1], "pixel_format": "rgb"},
         "rfilter": {"type": "box"},
@@ -70,7 +70,7 @@ def camera(turn, size, samples):
 
 
 def pinhole(name, sensor, size):
-    """A view of cameras.json: x = K (R X + t) with OpenCV's axes; Mitsuba reverses x and y."""
+    """Return a view of cameras.json, x = K (R X + t) by OpenCV; Mitsuba reverses x and y."""
     focal = size[0] / 2 / np.tan(np.deg2rad(FOV / 2))
     place = np.array(sensor["to_world"].matrix, float)
     rotation = np.diag([-1.0, -1.0, 1.0]) @ place[:3, :3].T
@@ -86,13 +86,13 @@ def main(folder, count, size, samples):
     """Render the views into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     world, views = mi.load_dict(scene()), []
-    for number, turn in enumerate(np.linspace(-25, 25, count)):
-        sensor, name = camera(float(turn), size, samples), f"view_{number:03d}.exr"
+    for number, angle in enumerate(np.linspace(-25, 25, count)):
+        sensor, name = camera(float(angle), size, samples), f"view_{number:03d}.exr"
         views.append(pinhole(name, sensor, size))
         pixels = np.array(mi.render(world, sensor=mi.load_dict(sensor), seed=number))
         colour, places, normals = pixels[..., :3], pixels[..., 3:6], pixels[..., 6:9]
         depth = places @ np.array(views[-1]["R"])[2] + views[-1]["t"][2]
-        depth[np.abs(normals).sum(-1) == 0] = np.inf  # nothing is there
+        depth[np.abs(normals).sum(-1) == 0] = np.inf  # no surface
         layers = np.concatenate([colour, depth[..., None], normals], -1, dtype=np.float32)
         channels = ["R", "G", "B", "Depth.Z", "Normal.X", "Normal.Y", "Normal.Z"]
         bitmap = mi.Bitmap(layers, mi.Bitmap.PixelFormat.MultiChannel, channels)
@@ -107,5 +107,5 @@ if __name__ == "__main__":
     parser.add_argument("--views", type=int, default=8)
     parser.add_argument("--size", type=int, nargs=2, default=(480, 320), metavar=("W", "H"))
     parser.add_argument("--samples", type=int, default=128)
-    asked = parser.parse_args()
-    main(asked.folder, asked.views, asked.size, asked.samples)
+    options = parser.parse_args()
+    main(options.folder, options.views, options.size, options.samples)

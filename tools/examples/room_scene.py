@@ -1,4 +1,4 @@
-"""Make a small scene for clpipe dataset: a room with a brick and a white wall, glass, two lamps.
+"""Make a small scene for clpipe dataset: a room with two walls, glass, metal and two lamps.
 
     blender -b -P tools/examples/room_scene.py -- room.blend
 
@@ -6,7 +6,8 @@ or, without Blender, in a Python 3.11 venv (pip install bpy==5.0.1):
 
     python tools/examples/room_scene.py room.blend
 
-Everything is made of code: meshes and procedural materials. One unit is a metre; z points up.
+The scene is built only from code, with meshes and procedural materials. One unit is a metre; z
+points up.
 """
 
 import sys
@@ -19,7 +20,7 @@ WHITE, WARM, COLD = (0.8, 0.8, 0.8, 1), (1, 0.75, 0.5, 1), (0.6, 0.8, 1, 1)
 
 
 def material(name, colour=WHITE, texture=None, scale=1.0, **inputs):
-    """A Principled material; `texture` is a node that paints it, by the name of its kind."""
+    """Return a Principled material; `texture` is the name of a texture node, such as "Brick"."""
     made = bpy.data.materials.new(name)
     made.use_nodes = True
     tree = made.node_tree
@@ -37,7 +38,7 @@ def material(name, colour=WHITE, texture=None, scale=1.0, **inputs):
 
 
 def add(kind, name, paint, location, **options):
-    """A mesh of a kind of Blender's, such as "cube"."""
+    """Add one of Blender's primitive meshes, such as "cube"."""
     getattr(bpy.ops.mesh, f"primitive_{kind}_add")(location=location, **options)
     thing = bpy.context.object
     thing.name = name
@@ -46,7 +47,7 @@ def add(kind, name, paint, location, **options):
 
 
 def lamp(name, colour, power, location, size):
-    """An area lamp that shines down on the middle of the room."""
+    """Add an area lamp that points at the middle of the room."""
     data = bpy.data.lights.new(name, "AREA")
     data.energy, data.color, data.size = power, colour[:3], size
     thing = bpy.data.objects.new(name, data)
@@ -56,7 +57,7 @@ def lamp(name, colour, power, location, size):
 
 
 def room():
-    """The scene."""
+    """Build the scene."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     white = material("white wall")
     bricks = material("bricks", texture="Brick", scale=6)

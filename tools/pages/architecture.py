@@ -1,6 +1,6 @@
-"""Draw the pictures of docs/architecture.md from the code: its rooms, and a chain's launches.
+"""Draw the pictures of docs/architecture.md from the code: packages and a chain's launches.
 
-A test compares them with the code, so they are drawn again when rooms or launches have changed.
+Run this again after packages or launches have changed. A test compares the pictures with the code.
 """
 
 import ast
@@ -18,7 +18,7 @@ from click.testing import CliRunner
 from clpipe.commands.main import main as command
 from tools import ROOT
 
-PICTURES = ROOT / "docs"
+DOCS = ROOT / "docs"
 STYLE = """<style>
 text { font: 13px sans-serif; fill: #24292e; dominant-baseline: middle; }
 text.pale { fill: #5d676f; } .name { font: 600 13px monospace; } .middle { text-anchor: middle; }
@@ -36,41 +36,41 @@ text { fill: #e4e6e8; } text.pale { fill: #a0a8b0; }
 
 
 def svg(width: int, height: int, parts: Sequence[str]) -> str:
-    """A picture with its own paper, so that it can be read on pages of any colour."""
+    """Return an SVG with its own background, readable on pages of any colour."""
     frame = f'<rect width="{width}" height="{height}" rx="6" class="paper"/>'
     size = f'viewBox="0 0 {width} {height}" width="{width}" height="{height}"'
     lines = [f'<svg xmlns="http://www.w3.org/2000/svg" {size}>', STYLE + frame, *parts, "</svg>"]
     return "\n".join(lines) + "\n"
 
 
-def text(x: float, y: float, said: str, kind: str = "", more: str = "") -> str:
-    """A line of text; y is its middle."""
-    return f'<text x="{x:g}" y="{y:g}" class="{kind}"{more}>{escape(said)}</text>'
+def text(x: float, y: float, line: str, kind: str = "", more: str = "") -> str:
+    """Return a line of text, vertically centred on y."""
+    return f'<text x="{x:g}" y="{y:g}" class="{kind}"{more}>{escape(line)}</text>'
 
 
 def box(x: float, y: float, width: float, height: float, colour: str, more: str = "") -> str:
-    """A rectangle of one of the colours of STYLE."""
+    """Return a rectangle in one of the colours of STYLE."""
     place = f'x="{x:g}" y="{y:g}" width="{width:g}" height="{height:g}"'
     return f'<rect {place} class="{colour}"{more}/>'
 
 
-def floors() -> list[list[str]]:
-    """The rooms of each layer, from the highest, as import-linter's contract has them."""
+def layers() -> list[list[str]]:
+    """Return the packages of each layer, highest first, from import-linter's contract."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]
     (layers,) = (each["layers"] for each in settings["contracts"] if each["type"] == "layers")
     return [layer.split(" | ") for layer in layers]
 
 
-def what_is_in(room: str) -> str:
-    """How a room's docstring begins, up to its first colon, semicolon or full stop."""
-    folder = ROOT / "clpipe" / room
+def summary_of(package: str) -> str:
+    """Return a package's docstring up to its first colon, semicolon or full stop."""
+    folder = ROOT / "clpipe" / package
     path = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
-    said = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
-    return re.split(r"[:;.](?:\s|$)", " ".join(said.replace("``", "").split()), maxsplit=1)[0]
+    docstring = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
+    return re.split(r"[:;.](?:\s|$)", " ".join(docstring.replace("``", "").split()), maxsplit=1)[0]
 
 
 def imports() -> set[tuple[str, str]]:
-    """Each pair of rooms of which the first imports the second when it runs."""
+    """Return pairs of packages where the first imports the second at run time."""
     graph = grimp.build_graph("clpipe", exclude_type_checking_imports=True, cache_dir=None)
     return {
         (one.split(".")[1], two.split(".")[1])
@@ -80,23 +80,23 @@ def imports() -> set[tuple[str, str]]:
     }
 
 
-def rooms_picture() -> str:
-    """The rooms, floor by floor, and which others each imports: all dots are on one side."""
-    names, pairs = list(chain.from_iterable(floors())), imports()
+def packages_picture() -> str:
+    """Draw the import matrix of the packages, layer by layer: all dots are on one side."""
+    names, pairs = list(chain.from_iterable(layers())), imports()
     left, top, step = 384, 92, 22
     width, height = left + step * len(names) + 16, top + step * len(names) + 12
-    parts = [text(12, 28, "A dot: the room in that row imports the one in that column.", "pale")]
+    parts = [text(12, 28, "A dot: the package in that row imports the one in that column.", "pale")]
     row = 0
-    for number, floor in enumerate(floors()):
+    for number, layer in enumerate(layers()):
         if number % 2 == 0:
-            parts.append(box(0, top + row * step, width, step * len(floor), "band"))
-        row += len(floor)
+            parts.append(box(0, top + row * step, width, step * len(layer), "band"))
+        row += len(layer)
     for i, name in enumerate(names):
         x, y = left + (i + 0.5) * step, top + (i + 0.5) * step
         turned = f' transform="rotate(-60 {x:g} {top - 8})"'
         parts += [
             text(12, y, name, "name"),
-            text(96, y, what_is_in(name), "pale"),
+            text(96, y, summary_of(name), "pale"),
             text(x, top - 8, name, "pale", turned),
             box(x - 4, y - 4, 8, 8, "line"),
         ]
@@ -109,14 +109,14 @@ def rooms_picture() -> str:
     return svg(width, height, parts)
 
 
-def images_of(said: str) -> list[tuple[str, tuple[int, ...]]]:
-    """The kinds and slots of images, as in ``mosaic in 3; ycbcr in 1,2,4``."""
-    found = re.findall(r"(\w+) in ([\d,]+)", said)
+def images_of(text: str) -> list[tuple[str, tuple[int, ...]]]:
+    """Parse the kinds and slots of images, as in ``mosaic in 3; ycbcr in 1,2,4``."""
+    found = re.findall(r"(\w+) in ([\d,]+)", text)
     return [(kind, tuple(map(int, slots.split(",")))) for kind, slots in found]
 
 
-def stays(launches: Sequence[dict[str, str]]) -> Iterator[tuple[str, int, int, int]]:
-    """The kind of each plane's image, its slot, the launch that writes it, the last to read it."""
+def lifetimes(launches: Sequence[dict[str, str]]) -> Iterator[tuple[str, int, int, int]]:
+    """Yield for each plane its kind, its slot, the launch that writes it, and its last reader."""
     for written, launch in enumerate(launches):
         for kind, slots in images_of(launch["writes"]):
             last = written
@@ -129,7 +129,7 @@ def stays(launches: Sequence[dict[str, str]]) -> Iterator[tuple[str, int, int, i
 
 
 def launches_picture() -> str:
-    """The launches of the default chain, one below the other, and how long each slot is taken."""
+    """Draw the launches of the default chain, and the lifetime of each slot's images."""
     printed = CliRunner().invoke(command, ["plan", "--json"], catch_exceptions=False)
     plan = json.loads(printed.output)
     launches, slots = plan["launches"], plan["slots"]
@@ -148,12 +148,12 @@ def launches_picture() -> str:
         parts += [
             text(14, y + 18, f"{number + 1}", "pale"),
             text(36, y + 18, launch["launch"], "name"),
-            text(36, y + 38, opened(launch), "pale"),
+            text(36, y + 38, reason_of(launch), "pale"),
             *(text(36, y + 58 + 18 * i, line) for i, line in enumerate(lines)),
         ]
-    for kind, slot, written, last in stays(launches):
+    for kind, slot, written, last in lifetimes(launches):
         begin, end = tops[written] + 14, tops[last + 1] - 14
-        if last > written:  # it is written where one launch ends, and read until another does
+        if last > written:  # from the end of the writing launch to the end of the last reader
             begin, end = tops[written + 1] - 22, tops[last + 1] - 26
         x = left + slot * step
         colour = kind if kind in ("rgb", "mosaic", "ycbcr") else "other"
@@ -166,21 +166,21 @@ def launches_picture() -> str:
     return svg(width, bottom + 40, parts)
 
 
-def opened(launch: dict[str, str]) -> str:
-    """What opens a launch, as a phrase."""
+def reason_of(launch: dict[str, str]) -> str:
+    """Return a phrase that states why a launch starts."""
     stage, _, rest = launch["opened_by"].partition(": ")
     if rest:
         return f"opened by {stage}, a {rest.replace(', ', ' of ')}"
     return f"from the {launch['reads']}" if launch["reads"] else stage
 
 
-PAGES = {"rooms.svg": rooms_picture, "launches.svg": launches_picture}
+PICTURES = {"packages.svg": packages_picture, "launches.svg": launches_picture}
 
 
 def main() -> None:
     """Write the pictures."""
-    for name, picture in PAGES.items():
-        (PICTURES / name).write_text(picture(), "utf-8")
+    for name, picture in PICTURES.items():
+        (DOCS / name).write_text(picture(), "utf-8")
 
 
 if __name__ == "__main__":

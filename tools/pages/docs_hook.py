@@ -1,7 +1,6 @@
-"""The pages of the site that are made when it is built: from the stages, the cameras, the commands.
+"""Generates pages of the site from the stages, cameras, configurations and commands.
 
-A hook of mkdocs. All that it takes from inside clpipe is imported here, and nothing of mkdocs is
-needed to call :func:`pages`.
+MkDocs calls this hook. :func:`pages` works without MkDocs.
 """
 
 import base64
@@ -22,7 +21,7 @@ NOTEBOOK = "first_steps"
 
 
 def pages() -> dict[str, str | bytes]:
-    """What the generated files hold, by their paths in docs/."""
+    """Return the contents of generated files by their paths in docs/."""
     return {
         "stages.md": stages_page(),
         "cameras.md": cameras_page(),
@@ -36,7 +35,7 @@ def pages() -> dict[str, str | bytes]:
 
 
 def json_of(*command: str) -> Any:
-    """What a command of clpipe prints with --json."""
+    """Run a command of clpipe with --json, and return the parsed output."""
     result = CliRunner().invoke(main, [*command, "--json"], catch_exceptions=False)
     if result.exit_code:
         raise RuntimeError(result.output)
@@ -44,30 +43,30 @@ def json_of(*command: str) -> Any:
 
 
 def cell(text: object) -> str:
-    """Text for a cell of a table."""
+    """Escape text for a cell of a table."""
     return str(text).replace("|", "\\|")
 
 
 def table(headings: list[str], rows: list[list[object]]) -> str:
-    """A table in Markdown."""
+    """Format a table in Markdown."""
     lines = [headings, ["---"] * len(headings), *rows]
     return "\n".join("| " + " | ".join(map(cell, line)) + " |" for line in lines) + "\n"
 
 
 def code(text: object) -> str:
-    """Text in code style; nothing where there is none."""
+    """Format text as code; empty text stays empty."""
     return f"`{text}`" if text else ""
 
 
 def prose(text: str) -> str:
-    """A docstring without its doctests; roles of reStructuredText as plain code."""
+    """Convert a docstring: without doctests, and with reStructuredText roles as plain code."""
     text = re.sub(r"\n\s*>>>.*?(?=\n\s*\n|\Z)", "", cleandoc(text), flags=re.DOTALL)
     text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text)
     return text.replace("``", "`").strip()
 
 
 def sources(method: type[Method]) -> str:
-    """The files of a method: its declaration, with the NumPy reference, and its kernel."""
+    """List the files of a method: its declaration with the NumPy reference, and its kernel."""
     files = [f"{method.__module__.replace('.', '/')}.py"]
     if not (ROOT / files[0]).is_file():
         files = [f"{method.__module__.replace('.', '/')}/__init__.py"]
@@ -80,20 +79,22 @@ def sources(method: type[Method]) -> str:
 
 
 def stages_page() -> str:
-    """Every stage with its methods and their parameters, from the declarations."""
+    """Generate the page of all stages with their methods and parameters."""
     records = json_of("stages")
     default = [step["stage"] for step in default_chain()]
     parts = [
         "# Stages and methods\n\n"
-        "This page is made from the declarations of the stages; `clpipe stages NAME` prints the "
-        "same, with the values that automatic parameters take for a `--camera` and an `--iso`. "
-        "The first method of a stage is its default. A parameter is set as "
-        "`--set STAGE.PARAMETER=VALUE` or in the table `[STAGE]` of a configuration; "
-        "`--set STAGE.method=NAME` chooses a method. Stages follow in the order of the default "
-        "chain; those after `picture_noise` are not part of it.\n\n"
-        "The kinds of image are *rgb* (linear, 1 = full scale of the sensor at EV 0), *mosaic* "
-        "(one plane, as signal: 0 = black level, 1 = white level), *raw* (the mosaic in DN) and "
-        "*display* (0 to 1, encoded for a screen).\n",
+        "This page is generated from the declarations of the stages. `clpipe stages NAME` prints "
+        "one of them. With `--camera` and `--iso`, it prints the values of automatic parameters. "
+        "The first method of a stage is its default. To set a parameter, use "
+        "`--set STAGE.PARAMETER=VALUE` or the table `[STAGE]` of a configuration. To choose a "
+        "method, use `--set STAGE.method=NAME`. Stages are listed in the order of the default "
+        "chain. Those after `picture_noise` are not part of it.\n\n"
+        "The kinds of image are:\n\n"
+        "- *rgb*: linear, 1 = full scale of the sensor at EV 0\n"
+        "- *mosaic*: one plane of signal, 0 = black level, 1 = white level\n"
+        "- *raw*: the mosaic in DN\n"
+        "- *display*: 0 to 1, encoded for a screen\n",
         table(
             ["stage", "image", "methods", "what it does"],
             [
@@ -113,7 +114,7 @@ def stages_page() -> str:
 
 
 def default_chain() -> list[dict[str, Any]]:
-    """The stages of the default chain, as the plan's TOML lists them."""
+    """Return the stages of the default chain from the plan's TOML."""
     import tomllib
 
     result = CliRunner().invoke(main, ["plan", "--toml"], catch_exceptions=False)
@@ -121,21 +122,21 @@ def default_chain() -> list[dict[str, Any]]:
 
 
 def kinds(record: dict[str, Any]) -> str:
-    """What a stage reads and writes."""
+    """Format the kinds of image that a stage reads and writes."""
     reads, writes = record["reads"], record["writes"]
     return reads if reads == writes else f"{reads} → {writes}"
 
 
 def stage_part(record: dict[str, Any]) -> str:
-    """One stage."""
+    """Generate the section of a stage."""
     stage = all_stages()[record["name"]]
     parts = [f"## {stage.name}\n", f"{record['summary']} Image: {kinds(record)}.\n"]
     for each in record["methods"]:
         parts.append(f"### {each['name']} {{ #{stage.name}-{each['name']} }}\n")
         parts.append(f"{sentence(each['summary'])}\n")
         method = stage.by_name[each["name"]]
-        if own := method.__dict__.get("__doc__"):
-            text = prose(own)
+        if docstring := method.__dict__.get("__doc__"):
+            text = prose(docstring)
             if text.strip(" .").lower() != each["summary"].strip(" .").lower():
                 parts.append(f"{text}\n")
         if each["parameters"]:
@@ -153,12 +154,12 @@ def stage_part(record: dict[str, Any]) -> str:
 
 
 def sentence(text: str) -> str:
-    """A summary as a sentence."""
+    """Format a summary as a sentence."""
     return text[:1].upper() + text[1:].rstrip(".") + "."
 
 
 def figure(value: object) -> str:
-    """A number with four digits; a dash where none is known."""
+    """Format a number with four digits, or None as a dash."""
     if value is None:
         return "-"
     if isinstance(value, list):
@@ -169,17 +170,18 @@ def figure(value: object) -> str:
 
 
 def nowrap(text: str) -> str:
-    """A number in one line: a hyphen that does not break."""
+    """Make the hyphens of a number non-breaking."""
     return text.replace("-", "\N{NON-BREAKING HYPHEN}")
 
 
 def cameras_page() -> str:
-    """The built-in cameras, their noise at every measured ISO and where the figures are from."""
+    """Generate the page of built-in cameras: noise at every measured ISO, and sources."""
     parts = [
         "# Cameras\n\n"
-        "This page is made from the built-in profiles. `clpipe cameras NAME` prints one of them, "
-        "`clpipe cameras NAME --iso N` the noise at one ISO. [Noise and cameras](noise.md) "
-        "explains the figures and shows how to write a profile of your own.\n"
+        "This page is generated from the built-in profiles. `clpipe cameras NAME` prints one of "
+        "them. `clpipe cameras NAME --iso N` prints the noise at one ISO. "
+        "[Noise and cameras](noise.md) explains the figures, and shows how to write your own "
+        "profile.\n"
     ]
     for camera in json_of("cameras"):
         low, high = camera["iso_range"]
@@ -217,11 +219,11 @@ def cameras_page() -> str:
 
 
 def configurations_page() -> str:
-    """The built-in configurations, as they are."""
+    """Generate the page of built-in configurations."""
     parts = [
         "# Configurations\n\n"
-        "The configurations that `-c NAME` takes, as their files are. "
-        "[Configuration and draws](configuration.md) explains the format.\n"
+        "These are the files of the built-in configurations. To use one, add `-c NAME`. For the "
+        "format, see [Configuration and draws](configuration.md).\n"
     ]
     for path in sorted(ROOT.glob("clpipe/**/configs/*.toml")):
         parts.append(f"## {path.stem}\n\n```toml\n{path.read_text('utf-8')}```\n")
@@ -229,14 +231,19 @@ def configurations_page() -> str:
 
 
 def cli_page() -> str:
-    """The command line; mkdocs-click fills it in."""
+    """Generate the page of the command line; mkdocs-click inserts the commands."""
     module = main.callback.__module__ if main.callback else ""
     return f"""# Command line
 
-This page is made from the program; `clpipe COMMAND --help` prints the same.
+This page is generated from the program. `clpipe COMMAND --help` prints the same text.
 
-Exit status: 0, all well; 1, some images failed and the others are written; 2, the request was
-wrong and nothing is written; 3, there is no usable device; 130, interrupted.
+| exit status | meaning |
+|---|---|
+| 0 | success |
+| 1 | some images failed; the others are written |
+| 2 | the request was wrong; nothing is written |
+| 3 | there is no usable device |
+| 130 | interrupted |
 
 ::: mkdocs-click
     :module: {module}
@@ -255,7 +262,7 @@ wrong and nothing is written; 3, there is no usable device; 130, interrupted.
 
 
 def notebook_files(path: Path) -> dict[str, str | bytes]:
-    """A notebook with its outputs as a page, and its pictures."""
+    """Convert a notebook with its outputs to a page and its pictures."""
     notebook = json.loads(path.read_text("utf-8"))
     name, parts, files = path.stem, [], {}
     for cell_number, each in enumerate(notebook["cells"]):
@@ -276,7 +283,7 @@ def notebook_files(path: Path) -> dict[str, str | bytes]:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the generated pages; called by mkdocs."""
+    """Add the generated pages. MkDocs calls this function."""
     from mkdocs.structure.files import File
 
     for path, content in pages().items():
@@ -285,7 +292,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
-    """Show roles of reStructuredText and examples of commands as code; called by mkdocs."""
+    """Format roles and examples of commands as code. MkDocs calls this function."""
     if page.file.src_uri == "cli.md":
         html = re.sub(r"<p>(clpipe [^<]+)</p>", r"<pre><code>\1</code></pre>", html)
     return re.sub(r":\w+:<code>~?([^<]+)</code>", r"<code>\1</code>", html)

@@ -3,16 +3,17 @@
     tools/run pages figures [-o FOLDER] [--render FILE.exr] [--raw FILE]
 
 The paper is Bielova, Haensch, Ley and Hellwich, "A Digital Image Processing Pipeline for Modelling
-of Realistic Noise in Synthetic Images" (CVPR Workshops 2019). Every command of clpipe is printed as
-it runs. Each figure is written as PDF and PNG:
+of Realistic Noise in Synthetic Images" (CVPR Workshops 2019). The tool prints each command of
+clpipe before it runs. It writes each figure as PDF and PNG:
 
-demosaicing     methods of demosaicing on one noisy mosaic (the paper's figure 3)
-iso100, iso1600 camera noise beside independent noise, intensity-dependent noise and none (4 and 5)
-statistics      noise by intensity in the raw and in the picture, autocorrelation, power spectrum
+- demosaicing: methods of demosaicing on one noisy mosaic (the paper's figure 3).
+- iso100, iso1600: camera noise, independent noise, intensity-dependent noise, and no noise
+  (figures 4 and 5).
+- statistics: noise by intensity in the raw and in the picture, autocorrelation, power spectrum.
 
---raw names a camera's raw. It goes through the same pipeline; then there are raw_demosaicing, and
-the raw's picture in one more column of the figure whose ISO is nearer to its own (raw_iso100 or
-raw_iso1600). docs/paper.md says what is seen.
+With --raw, a camera's raw is developed by the same pipeline. The tool then also writes
+raw_demosaicing, and adds the raw's picture as a column to the figure with the nearest ISO
+(raw_iso100 or raw_iso1600). docs/paper.md explains the figures.
 """
 
 import argparse
@@ -44,9 +45,9 @@ SUFFIXES = (".pdf", ".png")
 LEVELS = 255
 
 ISOS = (100, 1600)
-# The paper's methods, and the default chain's.
+# The paper's methods, and the method of the default chain.
 METHODS = ("bilinear", "edge_directed", "median", "edge_directed_median", "bounded")
-# What a picture and its baselines are called, by the ending of their names; and their truths.
+# Labels of a picture and its baselines by the end of the file name, and their ground truths.
 PICTURES = {
     ".png": "camera noise",
     ".iid.png": "independent",
@@ -60,7 +61,7 @@ PLACES = ("textured", "saturated", "flat")
 
 
 def clpipe(*words: str | Path | int) -> None:
-    """Run a command of clpipe, printed as it would be typed; end with its status where it fails."""
+    """Print and run a command of clpipe. If it fails, exit with its status."""
     texts = list(map(str, words))
     print(f"$ clpipe {shlex.join(texts)}", flush=True)
     done = subprocess.run([sys.executable, "-m", "clpipe", *texts], check=False)
@@ -69,7 +70,7 @@ def clpipe(*words: str | Path | int) -> None:
 
 
 def options(name: str, values: Iterable[str | Path]) -> list[str]:
-    """An option with each of some values.
+    """Repeat an option with each of several values.
 
     >>> options("--crop", ["flat", "dark"])
     ['--crop', 'flat', '--crop', 'dark']
@@ -78,7 +79,7 @@ def options(name: str, values: Iterable[str | Path]) -> list[str]:
 
 
 def outputs(figure: Path) -> list[str]:
-    """The options for a figure in both formats.
+    """Return the options for a figure in both formats.
 
     >>> outputs(Path("figures/iso100"))
     ['-o', 'figures/iso100.pdf', '-o', 'figures/iso100.png']
@@ -87,7 +88,7 @@ def outputs(figure: Path) -> list[str]:
 
 
 def develop(render: Path, out: Path) -> dict[int, Path]:
-    """The pictures of a render by ISO; beside each its baselines, truths and normalised mosaics."""
+    """Develop a render by ISO, with baselines, ground truths and normalised mosaics next to it."""
     isos = ",".join(map(str, ISOS))
     several = [*options("--keep", ["normalize"]), *options("--truth", ["iid", "intensity"])]
     clpipe("run", render, "-o", out, "-c", "paper", "--iso", isos, "--format", "png", *several)
@@ -95,11 +96,14 @@ def develop(render: Path, out: Path) -> dict[int, Path]:
 
 
 def demosaicing(sources: Sequence[Path], out: Path) -> dict[str, list[Path]]:
-    """What each method makes of mosaics, developed without denoising, by the method's name.
+    """Develop mosaics with each method of demosaicing, without denoising.
 
     Args:
         sources: raws, or mosaics that were kept after normalize.
-        out: the folder; each method has one within.
+        out: the output directory, with a folder for each method.
+
+    Returns:
+        The pictures by the method's name.
     """
     start = () if sources[0].suffix != ".exr" else ("--start-at", "white_balance")
     made = {}
@@ -112,11 +116,11 @@ def demosaicing(sources: Sequence[Path], out: Path) -> dict[str, list[Path]]:
 
 
 def compare_methods(made: Mapping[str, Sequence[Path]], figure: Path) -> None:
-    """The figure of what :func:`demosaicing` made.
+    """Draw the figure of the pictures of :func:`demosaicing`.
 
     Args:
-        made: by method its picture, and its truth where there is one.
-        figure: the file, without ending.
+        made: the picture by method, with its ground truth if there is one.
+        figure: the file, without extension.
     """
     pictures = [paths[0] for paths in made.values()]
     truths = options("--truth", (paths[1] for paths in made.values() if len(paths) > 1))
@@ -126,11 +130,11 @@ def compare_methods(made: Mapping[str, Sequence[Path]], figure: Path) -> None:
 
 
 def compare_noise(picture: Path, figure: Path) -> None:
-    """The figure of a picture beside its baselines.
+    """Draw the figure that compares a picture with its baselines.
 
     Args:
-        picture: NAME.png; the others are beside it.
-        figure: the file, without ending.
+        picture: NAME.png, with the baselines in the same folder.
+        figure: the file, without extension.
     """
     pictures = [picture.with_suffix(ending) for ending in PICTURES]
     truths = options("--truth", (picture.with_suffix(ending) for ending in TRUTHS.values()))
@@ -140,14 +144,14 @@ def compare_noise(picture: Path, figure: Path) -> None:
 
 
 def with_raw(picture: Path, developed: Path) -> Comparison:
-    """What :func:`compare_noise` shows, and one more column: a raw's picture, at its own places.
+    """Add a column with a raw's picture to the figure of :func:`compare_noise`.
 
     Args:
-        picture: NAME.png, as before.
+        picture: NAME.png, as for :func:`compare_noise`.
         developed: the raw's picture.
 
     Raises:
-        ClpipeError: a picture cannot be read, or the raw's is smaller than a place.
+        ClpipeError: a picture cannot be read, or the raw's picture is smaller than a crop.
     """
     pictures, truths = (
         [picture.with_suffix(ending) for ending in endings]
@@ -166,15 +170,15 @@ def with_raw(picture: Path, developed: Path) -> Comparison:
 
 
 def raw_figures(raw: Path, pictures: Mapping[int, Path], out: Path) -> None:
-    """The figures of a camera's raw.
+    """Draw the figures of a camera's raw.
 
     Args:
         raw: the file.
-        pictures: of a render by ISO, as :func:`compare_noise` takes them.
-        out: the folder.
+        pictures: pictures of a render by ISO, for :func:`compare_noise`.
+        out: the output directory.
 
     Raises:
-        ClpipeError: its picture cannot be used.
+        ClpipeError: the raw's picture cannot be used.
     """
     compare_methods(demosaicing([raw], out / "raw"), out / "raw_demosaicing")
     clpipe("run", raw, "-o", out / "raw", "-c", "paper", "--format", "png", "--quiet")
@@ -187,12 +191,12 @@ def raw_figures(raw: Path, pictures: Mapping[int, Path], out: Path) -> None:
 
 
 def statistics(picture: Path, figure: Path, title: str) -> None:
-    """Draw the noise of a raw by intensity; of pictures by intensity, its correlation and spectrum.
+    """Draw noise by intensity in raw and picture, and autocorrelation and spectrum in the picture.
 
     Args:
-        picture: NAME.png, with its baselines, truths and normalised mosaics beside it.
-        figure: the file, without ending.
-        title: above it.
+        picture: NAME.png, with its baselines, ground truths and mosaics in the same folder.
+        figure: the file, without extension.
+        title: the title of the figure.
 
     Raises:
         ClpipeError: a file cannot be read.
@@ -243,34 +247,34 @@ def statistics(picture: Path, figure: Path, title: str) -> None:
             sheet.savefig(figure.with_suffix(suffix), dpi=110, metadata=METADATA[suffix])
 
 
-def caption(axes: Axes, title: str, below: str, beside: str) -> None:
-    """What a plot shows."""
+def caption(axes: Axes, title: str, x_label: str, y_label: str) -> None:
+    """Set the titles, grid and legend of a plot."""
     axes.set_title(title, fontsize=9)
-    axes.set_xlabel(below, fontsize=8)
-    axes.set_ylabel(beside, fontsize=8)
+    axes.set_xlabel(x_label, fontsize=8)
+    axes.set_ylabel(y_label, fontsize=8)
     axes.tick_params(labelsize=7)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7)
 
 
 def main() -> int:
-    """Make the figures; the exit status."""
+    """Make the figures, and return the exit status."""
     parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("figures"), metavar="FOLDER")
     parser.add_argument("--render", type=Path, default=RENDER, metavar="FILE.exr")
     parser.add_argument("--raw", type=Path, metavar="FILE", help="a camera's raw, for comparison")
-    given = parser.parse_args()
-    out: Path = given.output
+    arguments = parser.parse_args()
+    out: Path = arguments.output
     try:
-        pictures = develop(given.render, out / "pictures")
-        if given.raw:
-            raw_figures(given.raw, pictures, out)
+        pictures = develop(arguments.render, out / "pictures")
+        if arguments.raw:
+            raw_figures(arguments.raw, pictures, out)
         high = pictures[ISOS[-1]]
         mosaics = [high.with_suffix(end) for end in (".normalize.exr", ".truth.normalize.exr")]
         compare_methods(demosaicing(mosaics, out / "demosaicing"), out / "demosaicing")
         for iso, picture in pictures.items():
             compare_noise(picture, out / f"iso{iso}")
-        statistics(high, out / "statistics", f"Noise at ISO {ISOS[-1]}, {given.render.name}")
+        statistics(high, out / "statistics", f"Noise at ISO {ISOS[-1]}, {arguments.render.name}")
     except ClpipeError as error:
         print(f"figures: {error}", file=sys.stderr)
         return error.exit_status

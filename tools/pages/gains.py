@@ -1,9 +1,9 @@
-"""Draw what denoisers gain on real pictures, of scores.json of tools/train_on_real.
+"""Draw the gains of denoisers on real pictures, from scores.json of tools/train_on_real.
 
     sh tools/run pages gains TITLE=scores.json... [-o docs/training.svg]
 
-Each dot is a picture, at the PSNR that a network trained in one way gains over the noisy picture;
-the line is their mean.
+Each dot is a picture. Its position is the gain in PSNR over the noisy picture, for a network of one
+regime. The line is the mean.
 """
 
 import argparse
@@ -41,13 +41,13 @@ text { fill: #e4e6e8; } text.pale { fill: #a0a8b0; } .paper { fill: #1f2227; }
 
 
 def gains_of(scores: Mapping[str, Mapping[str, list[list[float]]]]) -> dict[str, np.ndarray]:
-    """By regime, the gain of each picture over the noisy one, dB: means over seeds."""
+    """Return each picture's gain over the noisy picture by regime, dB, as means over seeds."""
     psnr = {regime: np.mean(each["psnr"], axis=0) for regime, each in scores.items()}
     return {regime: psnr[regime] - psnr["noisy"] for regime in LABELS if regime in psnr}
 
 
 def drawn(panels: Mapping[str, Mapping[str, np.ndarray]]) -> str:
-    """The figure: a panel for each set of pictures, a row for each regime."""
+    """Return the figure as SVG: a panel for each set of pictures, a row for each regime."""
     regimes = [r for r in LABELS if any(r in gains for gains in panels.values())]
     width = LEFT + len(panels) * (PANEL + GAP)
     height = TOP + ROW * len(regimes) + 34
@@ -65,8 +65,8 @@ def drawn(panels: Mapping[str, Mapping[str, np.ndarray]]) -> str:
         count = len(next(iter(gains.values())))
         middle = left + PANEL / 2
         parts.append(f'<text class="middle" x="{middle}" y="20">{escape(title)}</text>')
-        told = f"{count} pictures, gain over the noisy one"
-        parts.append(f'<text class="pale middle" x="{middle}" y="38">{told}</text>')
+        subtitle = f"{count} pictures, gain over the noisy one"
+        parts.append(f'<text class="pale middle" x="{middle}" y="38">{subtitle}</text>')
         bottom = TOP + ROW * len(regimes)
         for tick in range(int(LOW), int(HIGH) + 1):
             kind = "grid" if tick else "zero"
@@ -99,18 +99,18 @@ def drawn(panels: Mapping[str, Mapping[str, np.ndarray]]) -> str:
 
 
 def main() -> None:
-    """Read, and draw."""
+    """Read the scores, and draw the figure."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scores", nargs="+", metavar="TITLE=scores.json")
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "training.svg")
-    given = parser.parse_args()
+    options = parser.parse_args()
     panels = {}
-    for each in given.scores:
+    for each in options.scores:
         title, _, path = each.partition("=")
         panels[title] = gains_of(json.loads(Path(path).read_text("utf-8"))["regimes"])
-    given.output.write_text(drawn(panels), "utf-8")
+    options.output.write_text(drawn(panels), "utf-8")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Make the pictures of the documentation's first page: cameras and ISOs, and truths of a scene.
+"""Make the pictures of the documentation's first page: cameras and ISOs, and ground truth.
 
     tools/run pages gallery
 
 It writes docs/gallery_cameras.webp and docs/gallery_truths.webp. Their cells are results of the
-commands above them in docs/index.md. The scene's render gets a layer of object numbers first.
+commands above them in docs/index.md. The tool first adds a layer of object numbers to the render.
 """
 
 import json
@@ -23,7 +23,7 @@ CAMERAS = ("sony-a7s2", "canon-6d", "nikon-d800", "oppo-reno-10x")
 ISOS = (100, 1600, 6400)
 CROP = (560, 292, 120, 96)  # x, y, width, height, with smooth places, edges and a dark corner
 SCENES = ROOT / "tools" / "reconstruction" / "data"
-# x, y and radius of the objects that tools/reconstruction/scene.py adds before the wall, in m.
+# x, y and radius, in m, of the objects that tools/reconstruction/scene.py adds.
 OBJECTS = (
     (-1.1, 0.1, 0.55),
     (-0.45, 0.55, 0.32),
@@ -82,11 +82,11 @@ def truths(folder: Path) -> Image.Image:
         "truth_clean.png": Image.open(folder / f"{name}.truth_clean.png"),
         "truth_variance.exr": coloured(np.sqrt(layer(folder / f"{name}.truth_variance.exr", 0))),
     }
-    along = folder / f"{name}.carried.exr"
-    names = oiio.ImageBuf(str(along)).spec().channelnames
+    carried = folder / f"{name}.carried.exr"
+    names = oiio.ImageBuf(str(carried)).spec().channelnames
     depth, label = (next(i for i, n in enumerate(names) if key in n) for key in ("Z", "object"))
-    pictures["carried.exr: depth"] = coloured(-layer(along, depth))
-    pictures["carried.exr: objects"] = coloured(layer(along, label), "tab20")
+    pictures["carried.exr: depth"] = coloured(-layer(carried, depth))
+    pictures["carried.exr: objects"] = coloured(layer(carried, label), "tab20")
     size = (240, 160)
     small = [i.convert("RGB").resize(size, Image.Resampling.BOX) for i in pictures.values()]
     return grid([small], list(pictures), [""])
@@ -102,8 +102,8 @@ def with_objects(folder: Path) -> Path:
     rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(k).T
     points = (rays * depth[..., None] - view["t"]) @ np.array(view["R"])  # in the world
     centres, radii = np.array(OBJECTS)[:, :2], np.array(OBJECTS)[:, 2]
-    away = np.linalg.norm(points[..., None, :2] - centres, axis=-1) / radii
-    numbers = np.where(points[..., 2] < 0.01, FLOOR, away.argmin(-1))
+    distances = np.linalg.norm(points[..., None, :2] - centres, axis=-1) / radii
+    numbers = np.where(points[..., 2] < 0.01, FLOOR, distances.argmin(-1))
     numbers = np.where(points[..., 1] > 1.19, WALL, numbers)
     samples = np.dstack([*(layer(SCENES / view["file"], i) for i in range(4)), numbers])
     spec = oiio.ImageSpec(width, height, 5, oiio.FLOAT)
@@ -122,7 +122,7 @@ def layer(path: Path, channel: int) -> Array:
 
 
 def coloured(values: Array, colours: str = "viridis") -> Image.Image:
-    """Return values as colours. The scale leaves out the lowest and the highest 1 %."""
+    """Return values as colours. The scale excludes the lowest and the highest 1 %."""
     low, high = np.percentile(values[np.isfinite(values)], (1, 99))
     scaled = np.clip((values - low) / max(high - low, 1e-9), 0, 1)
     pixels = matplotlib.colormaps[colours](np.nan_to_num(scaled))[..., :3]

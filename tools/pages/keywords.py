@@ -1,10 +1,10 @@
-"""Write what editors, type checkers and the documentation read in the source of the Python API.
+"""Write the parts of the Python API's source that depend on stages and options.
 
     tools/run pages keywords
 
-This is clpipe/chain/keywords.pyi, from the stages, and the arguments in the docstring of
-``clpipe.run``, from the keys of its options. A test compares both with what this tool writes, so
-run it again after you have changed a parameter or an option.
+These are clpipe/chain/keywords.pyi, for editors and type checkers, and the arguments in the
+docstring of ``clpipe.run``. Run this tool again after you have changed a parameter or an option; a
+test compares both files with its output.
 """
 
 import inspect
@@ -51,7 +51,7 @@ NAMES = {"number": "Number", "integer": "Whole", "string": "Text", "boolean": "F
 
 
 def types_of(schema: Mapping[str, Any]) -> set[str]:
-    """The types of a value, from its JSON schema."""
+    """Return the types of a value from its JSON schema."""
     if "anyOf" in schema:
         return set().union(*map(types_of, schema["anyOf"]))
     if "enum" in schema:
@@ -61,7 +61,7 @@ def types_of(schema: Mapping[str, Any]) -> set[str]:
 
 
 def fields_of(*models: type[BaseModel]) -> dict[str, set[str]]:
-    """The types of each parameter that one of some models has."""
+    """Return the types of each parameter of several models."""
     fields: dict[str, set[str]] = {}
     for model in models:
         for name, schema in model.model_json_schema().get("properties", {}).items():
@@ -70,13 +70,13 @@ def fields_of(*models: type[BaseModel]) -> dict[str, set[str]]:
 
 
 def class_of(name: str, fields: Mapping[str, set[str]]) -> str:
-    """A TypedDict; any of its keys may be missing."""
+    """Return a TypedDict whose keys are all optional."""
     lines = [f"    {key}: {' | '.join(sorted(types))}" for key, types in fields.items()]
     return "\n".join([f"class {name}(TypedDict, total=False):", *lines])
 
 
 def text_of() -> str:
-    """The module, formatted."""
+    """Return the formatted stub file."""
     parts, tables = [START], {}
     for name, stage in all_stages().items():
         if stage.folder is None:
@@ -96,7 +96,7 @@ def text_of() -> str:
 
 
 def argument_of(key: Key) -> str:
-    """The entry of an option in a docstring."""
+    """Return the entry of an option in a docstring."""
     text = key.text if key.text[1].isupper() else key.text[0].lower() + key.text[1:]
     listed = ", ".join(f'"{name}"' for name in key.choices)
     choices = f" The choices are {listed}." if listed else ""
@@ -110,7 +110,7 @@ def argument_of(key: Key) -> str:
 
 
 def api_text() -> str:
-    """The module of ``clpipe.run`` with the arguments in its docstring."""
+    """Return the module of ``clpipe.run`` with the arguments in its docstring."""
     names = [name for name in inspect.signature(run).parameters if name != "settings"]
     before, start, rest = API.read_text("utf-8").partition("    Args:\n")
     _, end, after = rest.partition("        **settings:")

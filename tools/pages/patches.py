@@ -1,7 +1,7 @@
-"""Time training patches: samples a second through ``clpipe.Dataset``, by workers as PyTorch's are.
+"""Measure training patches per second through ``clpipe.Dataset``, with workers like PyTorch's.
 
-Each sample is a noisy and a clean raw and a noisy and a clean picture, of a camera and an ISO that
-are drawn. Renders are made up and written first. Without options it prints a line of
+Each sample has a noisy and a clean raw and a noisy and a clean picture, with a random camera and
+ISO. The tool first writes synthetic renders. Without options, it prints a line of
 docs/performance.md.
 """
 
@@ -22,7 +22,7 @@ BATCH = 32
 
 
 def write_renders(folder: Path, count: int, side: int) -> None:
-    """Half EXRs of smooth colours with a fine texture."""
+    """Write half EXRs of smooth colours with a fine texture."""
     y, x = np.mgrid[0:side, 0:side] / side
     for i in range(count):
         texture = np.random.default_rng(i).random((side, side, 3)) * 0.1
@@ -32,7 +32,7 @@ def write_renders(folder: Path, count: int, side: int) -> None:
 
 
 def dataset(folder: Path, patch: int, epochs: int) -> clpipe.Dataset:
-    """What is timed."""
+    """Return the dataset to time."""
     return clpipe.Dataset(
         folder,
         patch=patch,
@@ -44,11 +44,11 @@ def dataset(folder: Path, patch: int, epochs: int) -> clpipe.Dataset:
 
 
 def work(samples: clpipe.Dataset, number: int, workers: int, ready, begin, done) -> None:
-    """Every ``workers``-th batch, from the ``number``-th on, as a DataLoader's worker does."""
+    """Load every ``workers``-th batch from ``number`` on, like a worker of a DataLoader."""
     start = time.perf_counter()
     samples[0]
     first = time.perf_counter() - start
-    samples.__getitems__(range(BATCH))  # in which more kernels may be compiled
+    samples.__getitems__(range(BATCH))  # may compile more kernels
     ready.put(first)
     begin.wait()
     cpu = time.process_time()
@@ -61,9 +61,9 @@ def work(samples: clpipe.Dataset, number: int, workers: int, ready, begin, done)
 
 
 def main() -> None:
-    """Time patches, and print what comes of it."""
+    """Time the patches, and print a row of the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--patches", type=int, default=10_000, help="about how many")
+    parser.add_argument("--patches", type=int, default=10_000, help="approximate number of patches")
     parser.add_argument("--patch", type=int, default=128, help="the sides of a patch, in px")
     parser.add_argument("--side", type=int, default=512, help="the sides of a render, in px")
     parser.add_argument("--workers", type=int, default=2)

@@ -1,4 +1,4 @@
-"""Make docs/before_after.png, the README's picture: crops of the render and of what comes out.
+"""Make docs/before_after.png, the README's picture: crops of a render and of clpipe's pictures.
 
 Usage: tools/run pages readme_picture
 """
@@ -19,12 +19,12 @@ ISOS = (800, 6400)
 
 
 def plain(pixels: Array) -> Array:
-    """Linear RGB as a viewer shows it: clipped, in sRGB, eight bits."""
+    """Convert linear RGB like a viewer: clipped, in sRGB, eight bits."""
     return to_8_bit(np.float32(srgb_curve(np.clip(pixels.astype(np.float64), 0, 1))))
 
 
 def sheet(columns: list[tuple[str, Image.Image]]) -> Image.Image:
-    """The crops of every picture, enlarged, a column a picture with its caption above."""
+    """Draw enlarged crops, with a captioned column for each picture."""
     gap, head = 6, 30
     width, height = (side * SCALE for side in CROPS[0][2:])
     size = (len(columns) * (width + gap) - gap, head + len(CROPS) * (height + gap) - gap)

@@ -1,4 +1,4 @@
-"""Real cameras' finished pictures beside clpipe's: signatures, plots, crops; for validate.py."""
+"""Compares real cameras' finished pictures with clpipe's: signatures, plots, crops."""
 
 import re
 from collections import defaultdict
@@ -21,16 +21,16 @@ from clpipe.base.types import Array, Doubles, Floats
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Runner
 from clpipe.images.jpeg import JpegEncoding, through_jpeg
-from tools.pages.side_by_side import COLUMNS, cells, sheet, telling_places
+from tools.pages.comparison_page import COLUMNS, cells, sheet, significant_places
 
 ISOS = (800, 1600, 3200, 6400)
 TRUTH, PICTURE = "_mean.png", "_real.png"
 RINGS = 16  # of spatial frequency, up to half a cycle per pixel
 
-# Cameras' own JPEGs in their native size, each less the mean of many of the same scene: medians
-# over pictures, measured by clpipe.analysis.matching.columns. The pictures are not shipped. They
-# are of Nam, Hwang, Matsushita and Kim, "A holistic approach to cross-channel image noise modeling
-# and its application to image denoising" (CVPR 2016).
+# Medians over cameras' own JPEGs in native size, measured by clpipe.analysis.matching.columns.
+# Noise is a picture minus the mean of many of the same scene. The pictures are not part of the
+# repository. They are from Nam, Hwang, Matsushita and Kim, "A holistic approach to cross-channel
+# image noise modeling and its application to image denoising" (CVPR 2016).
 MEASURED: dict[str, dict[str, float]] = {
     name: dict(zip((attribute for _, attribute, _ in COLUMNS), values, strict=True))
     for name, values in {
@@ -40,7 +40,7 @@ MEASURED: dict[str, dict[str, float]] = {
     }.items()
 }
 
-# What is asked of a camera-like development: around these cameras, lowest and highest.
+# Target ranges of a camera-like development, lowest and highest, around these cameras.
 RANGES: dict[str, tuple[float, float]] = {
     "kurtosis": (3.0, 5.5),
     "beyond_4_sigma": (0, 30),
@@ -56,27 +56,27 @@ RANGES: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class Pair:
-    """A picture and the same without noise, (height, width, 3) uint8."""
+    """A picture and the same picture without noise, (height, width, 3) uint8."""
 
     noisy: Array
     clean: Array
 
     def signature(self) -> Figures:
-        """The columns."""
+        """Return the figures of the table."""
         return signature(self.noisy, self.clean)
 
 
 def read_pairs(folder: Path) -> dict[str, list[Pair]]:
-    """The pairs NAME_NUMBER_real.png and NAME_NUMBER_mean.png of a folder, by NAME.
+    """Read the pairs NAME_NUMBER_real.png and NAME_NUMBER_mean.png of a folder, by NAME.
 
     Raises:
-        FileNotFoundError: there are none, or one lacks its mean; the message says which.
+        FileNotFoundError: the folder has no pairs, or a picture has no mean. The message names it.
     """
     found: dict[str, list[Pair]] = defaultdict(list)
     for path in sorted(folder.glob(f"*{PICTURE}")):
         mean = path.with_name(path.name.removesuffix(PICTURE) + TRUTH)
         if not mean.exists():
-            raise FileNotFoundError(f"{path} has no {mean.name} beside it")
+            raise FileNotFoundError(f"{path} has no {mean.name} next to it")
         name = re.sub(r"_?\d+$", "", path.name.removesuffix(PICTURE))
         found[name].append(Pair(_read(path), _read(mean)))
     if not found:
@@ -90,12 +90,12 @@ def _read(path: Path) -> Array:
 
 
 def develop(render: Floats, iso: float, device: str | None = None) -> Pair:
-    """A render's picture by the default chain, as the JPEG that is written, and its truth.
+    """Develop a render with the default chain, as a decoded JPEG, and its ground truth.
 
     Args:
         render: (height, width, 3), linear.
         iso: the ISO.
-        device: as for :class:`clpipe.Pipeline`.
+        device: the device, as for :class:`clpipe.Pipeline`.
     """
     pipeline = clpipe.Pipeline(iso=iso, device=device)
     ideal = Runner(pipeline.chain.without_noise(), open_device(device))
@@ -107,37 +107,38 @@ def develop(render: Floats, iso: float, device: str | None = None) -> Pair:
 
 
 def medians(pairs: Iterable[Pair]) -> dict[str, float]:
-    """The columns of several pairs: the median of each."""
+    """Return the median of each figure over several pairs."""
     records = [pair.signature() for pair in pairs]
     return {name: float(np.median([record[name] for record in records])) for name in records[0]}
 
 
 def outside(record: Mapping[str, float]) -> list[str]:
-    """The columns that, as the table shows them, are not in the range asked for; NaN never is."""
+    """Return the figures whose rounded values are outside their target range, or NaN."""
     shown = {of: float(format(record[of], form)) for _, of, form in COLUMNS}
     return [name for name, (low, high) in RANGES.items() if not low <= shown[name] <= high]
 
 
 def row(name: str, record: Mapping[str, float], marked: Sequence[str] = ()) -> list[str]:
-    """A row of the table; columns that are marked are bold."""
+    """Return a row of the table, with marked columns in bold."""
     texts = zip(COLUMNS, cells(record), strict=True)
     return [name, *(f"**{text}**" if of in marked else text for (_, of, _), text in texts)]
 
 
 def range_row() -> list[str]:
-    """The row of the ranges."""
+    """Return the row of the target ranges."""
     texts = [
         f"{RANGES[of][0]:{form}} - {RANGES[of][1]:{form}}" if of in RANGES else ""
         for _, of, form in COLUMNS
     ]
-    return ["asked for", *texts]
+    return ["target", *texts]
 
 
 def spectrum(pair: Pair) -> tuple[Doubles, Doubles]:
-    """The power spectrum of luma noise in flat places: frequencies in cycles per pixel, power.
+    """Return the power spectrum of luma noise in flat areas: frequencies in cycles per px, power.
 
-    It is the Fourier transform of the autocorrelation up to eight pixels under a Hann window
-    (Blackman and Tukey 1958), the mean over rings of equal frequency. Independent noise has 1.
+    The spectrum is the Fourier transform of the autocorrelation, up to eight pixels, with a Hann
+    window (Blackman and Tukey 1958). Each value is the mean over a ring of equal frequency.
+    Independent noise has a power of 1.
 
     >>> grey = np.full((128, 128, 3), 128.0)
     >>> noisy = grey + np.random.default_rng(0).normal(0, 5, grey.shape)
@@ -159,7 +160,7 @@ def spectrum(pair: Pair) -> tuple[Doubles, Doubles]:
 
 
 def sigma_by_intensity(pairs: Iterable[Pair]) -> tuple[Doubles, Doubles]:
-    """The sigma of luma noise in flat places by the luma without noise, in levels: luma, sigma.
+    """Return clean luma and the sigma of luma noise in flat areas, both in levels.
 
     >>> ramp = np.repeat(np.linspace(40, 200, 400)[None, :, None], 3, 2).repeat(200, 0)
     >>> noisy = ramp + np.random.default_rng(0).normal(0, 1, (200, 400, 1)) * ramp / 20
@@ -205,17 +206,17 @@ def draw(
         figure.savefig(path, metadata={"Date": None})
 
 
-def _label(axes: Axes, title: str, below: str, beside: str) -> None:
+def _label(axes: Axes, title: str, x_label: str, y_label: str) -> None:
     axes.set_title(title)
-    axes.set_xlabel(below)
-    axes.set_ylabel(beside)
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
     axes.grid(alpha=0.3)
 
 
 def crops(groups: Mapping[str, Pair]) -> Image.Image:
-    """Two places of each picture at 400 %, a column each."""
+    """Draw two crops of each picture at 400 %, with a column for each picture."""
     columns = {
-        name: {place.name: place.of(pair.noisy) for place in telling_places(pair.clean)}
+        name: {place.name: place.of(pair.noisy) for place in significant_places(pair.clean)}
         for name, pair in groups.items()
     }
     places = next(iter(columns.values()))

@@ -1,8 +1,8 @@
-"""Make the pictures of pages that clpipe shows: docs/screen_report.webp, docs/screen_explore.webp.
+"""Make screenshots of clpipe's pages: docs/screen_report.webp and docs/screen_explore.webp.
 
     tools/run pages screens
 
-It needs a Chromium, and Playwright: .venv/bin/python -m pip install playwright
+It needs Chromium and Playwright: .venv/bin/python -m pip install playwright
 """
 
 import hashlib
@@ -30,16 +30,16 @@ SIZE = {"width": 1366, "height": 768}
 
 
 def pages_digest() -> str:
-    """Return a digest of the pages' files. Pictures store it, so a test finds old ones."""
+    """Return a digest of the pages' files, with which a test detects outdated screenshots."""
     digest = hashlib.sha256()
-    for room in ("analysis", "explorer", "reports"):
-        for path in sorted((ROOT / "clpipe" / room / "page").iterdir()):
+    for package in ("analysis", "explorer", "reports"):
+        for path in sorted((ROOT / "clpipe" / package / "page").iterdir()):
             digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
-def taken(page: Any, name: str) -> None:
-    """Write what a page shows."""
+def save_screenshot(page: Any, name: str) -> None:
+    """Write a screenshot of a page."""
     path = ROOT / "docs" / f"screen_{name}.webp"
     picture = Image.open(BytesIO(page.screenshot())).convert("RGB")
     picture.save(path, quality=86, method=6, xmp=pages_digest().encode())
@@ -47,7 +47,7 @@ def taken(page: Any, name: str) -> None:
 
 
 def report(page: Any, folder: Path) -> None:
-    """The report of a small run."""
+    """Show the report of a small run."""
     out = folder / "out"
     list(clpipe.run(RENDER, out, iso=[400, 6400], truth="clean", camera="sony-a7r2"))
     path = out / "report.html"
@@ -56,11 +56,11 @@ def report(page: Any, folder: Path) -> None:
     page.locator("#look-image").select_option(index=1)
     page.get_by_role("heading", name="Compare").evaluate("e => e.scrollIntoView()")
     page.wait_for_timeout(500)
-    taken(page, "report")
+    save_screenshot(page, "report")
 
 
 def explorer(page: Any) -> None:
-    """The explorer on a render, at a high ISO."""
+    """Show the explorer with a render at a high ISO."""
     jobs = [Job(RENDER, RENDER.name)]
     server = Server(
         Explorer(jobs, Request.from_options(values={"iso": 6400}), open_device(None)), 0
@@ -68,7 +68,7 @@ def explorer(page: Any) -> None:
     threading.Thread(target=server.run, daemon=True).start()
     page.goto(server.address)
     page.wait_for_timeout(6000)
-    taken(page, "explore")
+    save_screenshot(page, "explore")
 
 
 def main() -> None:
@@ -76,10 +76,10 @@ def main() -> None:
     try:
         from playwright.sync_api import sync_playwright
     except ModuleNotFoundError:
-        sys.exit("needs Playwright: .venv/bin/python -m pip install playwright")
+        sys.exit("screens needs Playwright: .venv/bin/python -m pip install playwright")
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     if not chromium:
-        sys.exit("needs a Chromium (Debian: apt-get install chromium)")
+        sys.exit("screens needs Chromium (Debian: apt-get install chromium)")
     with sync_playwright() as play, TemporaryDirectory() as name:
         browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page(viewport=SIZE)

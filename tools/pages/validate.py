@@ -39,7 +39,7 @@ from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.reference.poisson import poisson_of
 from tools import RENDER, ROOT
 from tools.pages import real_cameras
-from tools.pages.side_by_side import COLUMNS, markdown
+from tools.pages.comparison_page import COLUMNS, markdown
 
 DOCS = ROOT / "docs"
 CAMERAS = ("sony-a7r2", "sony-a7s2", "canon-5d2")
@@ -49,7 +49,7 @@ MEANS = (0.1, 1, 5, 9.9, 10.1, 50, 1000, 1e5)
 NOISE = ("prnu", "defect_pixels", "sensor_noise", "dsnu", "row_noise", "column_noise")
 
 # JPEGs of a Canon EOS 5D Mark II at ISO 3200 and 6400: 11 pairs; noise is one frame minus the mean
-# of many, in flat areas. Autocorrelation one to the right, one below, diagonally, two to the right.
+# of many, in flat areas. "1 right" is the autocorrelation at an offset of one pixel to the right.
 REAL = {
     "luma, 1 right": 0.30,
     "luma, 1 below": 0.26,
@@ -204,9 +204,9 @@ def finished(config: str, iso: float) -> dict[str, float]:
     }
 
 
-def closed_loop(given: argparse.Namespace) -> bool:
+def closed_loop(options: argparse.Namespace) -> bool:
     """Print the section of the closed loop; return whether all targets are met."""
-    width, height = map(int, given.size.split("x"))
+    width, height = map(int, options.size.split("x"))
     missed = []
     print(LOOP.format(frames=FRAMES, width=width, height=height))
     print("| camera | ISO | a, % | in s.e. | b, % | in s.e. | rows, % | columns, % | hot wrong |")
@@ -226,17 +226,17 @@ def closed_loop(given: argparse.Namespace) -> bool:
     return not missed
 
 
-def photo_electrons(given: argparse.Namespace) -> bool:
+def photo_electrons(options: argparse.Namespace) -> bool:
     """Print the section of Poisson numbers; return whether the target is met."""
-    print(POISSON.format(draws=given.draws))
+    print(POISSON.format(draws=options.draws))
     print("| mean, e- | " + " | ".join(f"{mean:g}" for mean in MEANS) + " |")
     print("|---" * (len(MEANS) + 1) + "|")
-    values = [poisson_p(mean, given.draws) for mean in MEANS]
+    values = [poisson_p(mean, options.draws) for mean in MEANS]
     print("| p | " + " | ".join(f"{p:.3f}" for p in values) + " |", flush=True)
     return min(values) > 0.001
 
 
-def canon(given: argparse.Namespace) -> bool:
+def canon(options: argparse.Namespace) -> bool:
     """Print the section of canon-5d2-jpeg; return whether all targets are met."""
     good = True
     print(CANON)
@@ -250,10 +250,10 @@ def canon(given: argparse.Namespace) -> bool:
     return good
 
 
-def cameras(given: argparse.Namespace) -> bool:
+def cameras(options: argparse.Namespace) -> bool:
     """Print the section of real cameras; return whether the default chain meets the targets."""
-    renders = [read_image(path).pixels for path in (RENDER, *given.renders)]
-    real = real_cameras.read_pairs(given.real) if given.real else {}
+    renders = [read_image(path).pixels for path in (RENDER, *options.renders)]
+    real = real_cameras.read_pairs(options.real) if options.real else {}
     ours = {
         f"clpipe, ISO {iso}": [real_cameras.develop(render, iso) for render in renders]
         for iso in real_cameras.ISOS
@@ -269,16 +269,16 @@ def cameras(given: argparse.Namespace) -> bool:
         missed = real_cameras.outside(record)
         good &= not missed
         rows.append(real_cameras.row(name, record, missed))
-    names = ", ".join(path.stem for path in (RENDER, *given.renders))
-    print(BESIDE.format(renders=names))
+    names = ", ".join(path.stem for path in (RENDER, *options.renders))
+    print(CAMERA_SECTION.format(renders=names))
     print(markdown(["", *(head for head, *_ in COLUMNS)], rows))
     print(PICTURES, flush=True)
     first_ours, first_real = ({k: pairs[0] for k, pairs in group.items()} for group in (ours, real))
     real_cameras.crops(first_ours).save(DOCS / "real_cameras_crops.png", optimize=True)
     if real:
         real_cameras.draw(real, ours, DOCS / "real_cameras.svg")
-        given.output.mkdir(parents=True, exist_ok=True)
-        written = given.output / "real_cameras_crops.png"
+        options.output.mkdir(parents=True, exist_ok=True)
+        written = options.output / "real_cameras_crops.png"
         real_cameras.crops(first_real | first_ours).save(written)
         print(f"crops next to the real ones: {written}", file=sys.stderr)
     return good
@@ -316,11 +316,11 @@ def main() -> int:
         metavar="OUT",
         help="for crops of the pairs",
     )
-    given = parser.parse_args()
-    if not given.only:
+    options = parser.parse_args()
+    if not options.only:
         print(PAGE)
     try:
-        good = [SECTIONS[name](given) for name in given.only or SECTIONS]
+        good = [SECTIONS[name](options) for name in options.only or SECTIONS]
     except (ClpipeError, FileNotFoundError) as error:
         print(f"validate: {error}", file=sys.stderr)
         return 1
@@ -363,8 +363,8 @@ to these figures on this render. The target is a difference below 0.1 at ISO 320
 0.25 after averaging 2x2.
 """
 
-BESIDE = """
-## Real cameras and the default chain { #real-cameras-beside-ours }
+CAMERA_SECTION = """
+## Comparison with real cameras
 
 This section compares cameras' JPEGs at native size with pictures of the default chain ({renders}). Noise is one picture minus the mean of many
 of the same scene. For the default chain, it is the picture minus its development without noise. Drifting light is removed (a Gaussian of 12 px).

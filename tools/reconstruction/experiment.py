@@ -1,22 +1,24 @@
-"""Reconstruct a scene from six views with a camera's noise and with others', over the ISO.
+"""Reconstruct a scene from six views, with the noise of a camera and with simpler noise, by ISO.
 
     tools/run reconstruction experiment -o OUT [--iso ISO ...] [--seeds N] [-c CONFIG] [--pmvs PATH]
         [--colmap PATH] [--data FOLDER] [--render BLENDER]
 
-It needs pip install '.[calibrate,compare]' in the checkout. This is the experiment of section 3.2
-of the paper (Bielova, Haensch, Ley and Hellwich, CVPR Workshops 2019), on a scene whose depth is
-known; see docs/reconstruction.md for what was found.
+It needs pip install '.[calibrate,compare]' in the checkout. It repeats the experiment of section
+3.2 of the paper on a scene with known depth. The paper is by Bielova, Haensch, Ley and Hellwich
+(CVPR Workshops 2019). See docs/reconstruction.md for the results.
 
-clpipe develops the views (pictures.py): clean; clean and denoised; with the camera's
-noise; with independent noise of the same variance, the same everywhere or following intensity,
-added to the clean picture; with independent noise that has the camera's variance after averaging
-2x2; and with the camera's noise without denoising.
+clpipe develops each view in these ways (pictures.py):
+
+- clean, and clean and denoised
+- with the camera's noise, and with the camera's noise without denoising
+- with independent noise of the same variance, uniform or by intensity, added to the clean picture
+- with independent noise that has the camera's variance after averaging 2x2
 
 OpenCV's semi-global matching finds the depth of neighbouring views at full and half resolution
-(stereo.py). With --pmvs, PMVS2 finds points in all views, too; with --colmap, COLMAP's dense
-stereo, where CUDA is (multiview.py).
+(stereo.py). With --pmvs, PMVS2 also finds points in all views. With --colmap, COLMAP's dense stereo
+finds points; it needs CUDA (multiview.py).
 
-Tables are printed and written to OUT as Markdown and CSV, beside the figures and the pictures.
+The tool prints tables, and writes them with the figures and pictures to OUT, as Markdown and CSV.
 """
 
 import argparse
@@ -36,16 +38,16 @@ import numpy as np
 
 from clpipe.base.errors import ClpipeError
 from clpipe.base.processors import available_processors
-from tools.pages.side_by_side import markdown
+from tools.pages.comparison_page import markdown
 from tools.reconstruction.multiview import THRESHOLDS, ProgramError, run_colmap, run_pmvs, true_of
 from tools.reconstruction.pictures import CAMERA, CLEAN, HALF, IID, KINDS, Pictures, energy_left
 from tools.reconstruction.report import (
     as_markdown,
     cloud_picture,
+    costs_of,
     depth_picture,
     draw,
     points_of,
-    reactions,
     sheet,
     table_of,
 )
@@ -56,7 +58,7 @@ DATA = Path(__file__).with_name("data")
 NEEDED = ("cv2", "matplotlib")
 ISOS = (100, 400, 1600, 3200, 6400, 12800)
 SEEDS = 3
-SHOWN = 6400  # the ISO of the pictures, or the nearest
+SHOWN = 6400  # the ISO of the pictures in figures, or the nearest
 RESOLUTIONS = {"full": False, "half": True}
 ALL = "all"
 Job = tuple[str, int, int]  # kind, ISO, seed
@@ -64,7 +66,7 @@ Job = tuple[str, int, int]  # kind, ISO, seed
 
 @dataclass(frozen=True)
 class StereoRow:
-    """What matching found in the pairs of a kind of picture; see :class:`stereo.Score`."""
+    """Results of matching for a kind of picture; see :class:`stereo.Score`."""
 
     resolution: str
     kind: str
@@ -80,7 +82,7 @@ class StereoRow:
 
 @dataclass(frozen=True)
 class PointsRow:
-    """How many points a program found in all views of a kind, and how many are on a surface."""
+    """The number of points that a program found for a kind of picture, and how many are true."""
 
     program: str
     resolution: str
@@ -94,7 +96,7 @@ class PointsRow:
 
 
 def compare_stereo(views: Sequence[View], pictures: Pictures) -> Iterator[StereoRow]:
-    """Match the neighbours of all kinds."""
+    """Match neighbouring views for all kinds of picture."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -130,7 +132,7 @@ def compare_stereo(views: Sequence[View], pictures: Pictures) -> Iterator[Stereo
 def compare_points(
     programs: dict[tuple[str, str, float], partial], views: Sequence[View], pictures: Pictures
 ) -> Iterator[PointsRow]:
-    """Find the points of all kinds by programs, each of a name, a resolution and a threshold."""
+    """Find points for all kinds of picture, with each program, resolution and threshold."""
 
     def rows(work: tuple[tuple[str, str, float], Job]) -> list[PointsRow]:
         (name, resolution, threshold), job = work
@@ -158,10 +160,10 @@ def points_until_stopped(
     views: Sequence[View],
     pictures: Pictures,
 ) -> list[PointsRow]:
-    """All rows of :func:`compare_points`; after Ctrl-C, those of what was run for all pictures.
+    """Collect the rows of :func:`compare_points`; after Ctrl-C, only those of finished programs.
 
     Raises:
-        KeyboardInterrupt: there are none.
+        KeyboardInterrupt: no program is finished.
     """
     rows: list[PointsRow] = []
     try:
@@ -174,17 +176,17 @@ def points_until_stopped(
         rows = [row for row in rows if (row.program, row.resolution, row.threshold) in whole]
         if not rows:
             raise
-        print(f"stopped; reported is what was run for all pictures: {len(whole)}", file=sys.stderr)
+        print(f"stopped; the report covers {len(whole)} finished programs", file=sys.stderr)
     return rows
 
 
 def programs_of(pmvs: Path | None, colmap: Path | None) -> dict[tuple[str, str, float], partial]:
-    """What finds points, by its name, resolution and threshold.
+    """Return the functions that find points, by name, resolution and threshold.
 
-    PMVS2 has one thread, with which it found the same points in each run.
+    PMVS2 uses one thread, because its points are then the same in each run.
     """
     found = {}
-    for resolution, half in reversed(RESOLUTIONS.items()):  # the quick ones first
+    for resolution, half in reversed(RESOLUTIONS.items()):  # the faster ones first
         if pmvs:
             for threshold in THRESHOLDS:
                 options = {"level": int(half), "threshold": threshold, "threads": 1}
@@ -207,7 +209,7 @@ def write_csv(path: Path, rows: Sequence[StereoRow | PointsRow]) -> None:
 def stereo_pictures(
     views: Sequence[View], pictures: Pictures, kinds: Sequence[str], iso: int
 ) -> None:
-    """Write the depth maps of the middle pair, and its points, of some kinds at an ISO."""
+    """Write depth maps and points of the first pair, for some kinds of picture at an ISO."""
     a, b = pairs(views)[0]
     view, seed = views[a], pictures.seeds[0]
     span = view.depth.min(), view.depth.max()
@@ -233,7 +235,7 @@ def stereo_pictures(
 
 
 def report_stereo(out: Path, rows: Sequence[StereoRow], text: list[str]) -> None:
-    """Write the tables and the figure of matching, and append the tables to a text."""
+    """Write the CSV and the figure of matching, and append tables to the text."""
     write_csv(out / "stereo.csv", rows)
     panels, weak = [], {}
     for resolution in RESOLUTIONS:
@@ -255,12 +257,12 @@ def report_stereo(out: Path, rows: Sequence[StereoRow], text: list[str]) -> None
                 for name in (*TEXTURES, ALL)
             }
             text.append(as_markdown(f"{label} error, {resolution} resolution, mm", errors, ".1f"))
-    text.append(reactions(weak))
+    text.append(costs_of(weak))
     draw(out / "stereo.svg", panels, columns=len(TEXTURES), factor=1)
 
 
 def report_points(out: Path, rows: Sequence[PointsRow], text: list[str]) -> None:
-    """Write the tables and the figure of points, and append the tables to a text."""
+    """Write the CSV and the figure of points, and append tables to the text."""
     write_csv(out / "points.csv", rows)
     panels, counts = [], {}
     for program, resolution, threshold in dict.fromkeys(
@@ -283,12 +285,12 @@ def report_points(out: Path, rows: Sequence[PointsRow], text: list[str]) -> None
         text.append(as_markdown(f"On a surface: {name}, %", true, ".1f"))
         counts[name] = tables[ALL]
         panels.append((name, "points / 1000", tables[ALL]))
-    text.append(reactions(counts))
+    text.append(costs_of(counts))
     draw(out / "points.svg", panels, columns=2, factor=1e-3)
 
 
 def energies(pictures: Pictures) -> str:
-    """How much of the noise's variance survives averaging 2x2, as a table."""
+    """Format the share of the noise's variance after averaging 2x2 as a table."""
     seed = pictures.seeds[0]
     rows = [
         [name, *(f"{energy_left(pictures.noise(name, iso, seed)):.2f}" for iso in pictures.isos)]
@@ -298,15 +300,15 @@ def energies(pictures: Pictures) -> str:
     return f"### Variance that survives averaging 2x2\n\n{markdown(heads, rows)}\n"
 
 
-def whole(text: str) -> int:
-    """A whole number above 0."""
+def positive_int(text: str) -> int:
+    """Parse a whole number above 0."""
     if not text.isdecimal() or not int(text):
         raise argparse.ArgumentTypeError(f"found {text!r}; expected a whole number above 0")
     return int(text)
 
 
 def program(text: str) -> Path:
-    """The path of a program."""
+    """Find the path of a program."""
     path = shutil.which(text)
     if path is None:
         raise argparse.ArgumentTypeError(f"found {text!r}; expected a program")
@@ -320,17 +322,17 @@ def main() -> int:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add = parser.add_argument
-    add("-o", "--output", type=Path, required=True, metavar="OUT", help="folder of what is made")
-    add("--iso", type=whole, nargs="+", default=ISOS, help="the ISOs")
-    add("--seeds", type=whole, default=SEEDS, help="how many seeds the noise has")
-    add("-c", "--config", default="paper", help="configuration of clpipe's")
+    add("-o", "--output", type=Path, required=True, metavar="OUT", help="output directory")
+    add("--iso", type=positive_int, nargs="+", default=ISOS, help="the ISOs")
+    add("--seeds", type=positive_int, default=SEEDS, help="number of seeds of the noise")
+    add("-c", "--config", default="paper", help="configuration of clpipe")
     add("--pmvs", type=program, metavar="PATH", help="the program pmvs2")
     add("--colmap", type=program, metavar="PATH", help="the program colmap, built with CUDA")
     add("--data", type=Path, default=DATA, help="folder of the views")
     add(
         "--render",
         metavar="BLENDER",
-        help="render the views into --data; a Blender, or a Python with bpy",
+        help="render the views into --data, with Blender or a Python with bpy",
     )
     options = parser.parse_args()
     for module in NEEDED:
@@ -353,7 +355,7 @@ def main() -> int:
         if programs:
             report_points(options.output, points_until_stopped(programs, views, pictures), text)
     except subprocess.CalledProcessError:
-        return 1  # it has said why
+        return 1  # clpipe printed the reason
     except (ClpipeError, ProgramError, ValueError, OSError) as error:
         print(error, file=sys.stderr)
         return 1

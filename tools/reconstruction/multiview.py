@@ -1,8 +1,8 @@
-"""Points from all views at once by programs that the user builds: PMVS2 and COLMAP's dense stereo.
+"""Points from all views at once, by programs that you build: PMVS2 and COLMAP's dense stereo.
 
-PMVS2 is that of Furukawa and Ponce 2010 ("Accurate, dense, and robust multiview stereopsis"): small
-patches grow from features, and stay where their textures correlate by more than a threshold in
-enough views. Its file formats: https://www.di.ens.fr/pmvs/documentation.html.
+PMVS2 implements Furukawa and Ponce 2010 ("Accurate, dense, and robust multiview stereopsis"). Small
+patches grow from features. PMVS2 keeps patches whose textures correlate by more than a threshold in
+enough views. For its file formats, see https://www.di.ens.fr/pmvs/documentation.html.
 """
 
 import subprocess
@@ -19,8 +19,8 @@ from clpipe.outputs.views import COLMAP, colmap
 from clpipe.reference.intrinsics import PINHOLE, Intrinsics
 from tools.reconstruction.views import SAME, View
 
-THRESHOLDS = (0.7, 0.9)  # of PMVS2's correlation; its own default, and one for few and sure points
-# All others are PMVS2's defaults: a patch each 2x2 pixels, windows of 7x7, three views at least.
+THRESHOLDS = (0.7, 0.9)  # of PMVS2's correlation: the default, and one for fewer, safer points
+# The other values are PMVS2's defaults: a patch per 2x2 pixels, windows of 7x7, at least 3 views.
 OPTIONS = """\
 level {level}
 csize 2
@@ -37,12 +37,12 @@ quad 2.5
 timages -1 0 {count}
 oimages 0
 """
-LIMIT = 3600  # s a program
-SOURCES = 3  # of COLMAP's stereo: the nearest other views
+LIMIT = 3600  # s for each program
+SOURCES = 3  # nearest other views for COLMAP's stereo
 
 
 class ProgramError(Exception):
-    """A program failed; the message says which, and how."""
+    """A program failed. The message names it and the reason."""
 
 
 def run_pmvs(
@@ -51,10 +51,10 @@ def run_pmvs(
     """Run PMVS2 on all views.
 
     Args:
-        program: pmvs2.
-        folder: for its files; it is made.
+        program: the path of pmvs2.
+        folder: a folder for its files, which is created.
         views: the cameras.
-        pictures: of each view, (height, width, 3) uint8.
+        pictures: the picture of each view, (height, width, 3) uint8.
         options: level (0 is full resolution, 1 is half), threshold, threads.
 
     Returns:
@@ -65,7 +65,9 @@ def run_pmvs(
     """
     for name in ("visualize", "txt", "models"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    middle = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # its first pixel's centre is (0, 0)
+    middle = np.array(
+        [[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]]
+    )  # PMVS2's first pixel centre is (0, 0)
     for number, (view, picture) in enumerate(zip(views, pictures, strict=True)):
         Image.fromarray(picture).save(folder / "visualize" / f"{number:08d}.ppm")
         matrix = middle @ view.k @ np.column_stack([view.r, view.t])
@@ -79,12 +81,12 @@ def run_pmvs(
 
 
 def write_colmap(folder: Path, views: Sequence[View], pictures: Sequence[Array]) -> None:
-    """Write what COLMAP's dense stereo starts from, below a folder: images/ and sparse/0.
+    """Write the inputs of COLMAP's dense stereo into a folder: images/ and sparse/0.
 
     Args:
-        folder: it is made.
+        folder: a folder, which is created.
         views: the cameras.
-        pictures: of each view, (height, width, 3) uint8.
+        pictures: the picture of each view, (height, width, 3) uint8.
     """
     (folder / "images").mkdir(parents=True, exist_ok=True)
     (folder / COLMAP).mkdir(parents=True, exist_ok=True)
@@ -106,14 +108,15 @@ def run_colmap(
 ) -> tuple[Doubles, Array]:
     """Run COLMAP's dense stereo, which needs CUDA, on all views.
 
-    There are no sparse points to choose partners and the range of depth by, so both are said.
+    COLMAP usually chooses partners and depth ranges from sparse points. There are none here, so
+    the function sets both.
 
     Args:
-        program: colmap.
-        folder: for its files; it is made.
+        program: the path of colmap.
+        folder: a folder for its files, which is created.
         views: the cameras, with depth.
-        pictures: of each view, (height, width, 3) uint8.
-        half: at half resolution.
+        pictures: the picture of each view, (height, width, 3) uint8.
+        half: whether to use half resolution.
 
     Returns:
         The fused points, (n, 3) in m, and their colours, (n, 3) uint8.
@@ -142,12 +145,12 @@ def run_colmap(
 
 
 def words(options: dict[str, object]) -> list[str]:
-    """Options as words of a command."""
+    """Return options as words of a command."""
     return [str(word) for option in options.items() for word in option]
 
 
 def partners(views: Sequence[View]) -> str:
-    """COLMAP's patch-match.cfg: for each view the nearest others."""
+    """Return COLMAP's patch-match.cfg with the nearest other views of each view."""
     places = np.array([-view.r.T @ view.t for view in views])
     lines = []
     for number, view in enumerate(views):
@@ -158,30 +161,32 @@ def partners(views: Sequence[View]) -> str:
 
 
 def run(command: list[str], folder: Path) -> None:
-    """Run a program; what it says is kept in a file of the folder.
+    """Run a program, and write its output to log.txt in the folder.
 
     Raises:
-        ProgramError: it cannot be started, fails, or takes too long.
+        ProgramError: the program cannot be started, fails, or takes too long.
     """
-    said = folder / "said.txt"
+    log = folder / "log.txt"
     try:
-        with said.open("w", encoding="utf-8") as file:
+        with log.open("w", encoding="utf-8") as file:
             status = subprocess.run(
                 command, stdout=file, stderr=subprocess.STDOUT, check=False, timeout=LIMIT
             ).returncode
     except OSError as error:
-        raise ProgramError(f"{command[0]}: {error.strerror}; name the program") from None
+        raise ProgramError(
+            f"{command[0]}: {error.strerror}; give the path of the program"
+        ) from None
     except subprocess.TimeoutExpired:
-        raise ProgramError(f"{command[0]}: took more than {LIMIT} s; see {said}") from None
+        raise ProgramError(f"{command[0]}: took more than {LIMIT} s; see {log}") from None
     if status:
-        raise ProgramError(f"{command[0]}: ended with status {status}; see {said}")
+        raise ProgramError(f"{command[0]}: ended with status {status}; see {log}")
 
 
 def read_ply(path: Path) -> tuple[Doubles, Array]:
-    """The points of a PLY, text or binary: (n, 3) in its unit, and (n, 3) uint8 colours.
+    """Read the points of a text or binary PLY, (n, 3), and their colours, (n, 3) uint8.
 
     Raises:
-        ProgramError: it cannot be read, or has no coloured points.
+        ProgramError: the file cannot be read, or has no coloured points.
     """
     types = {"float": "<f4", "uchar": "u1", "double": "<f8", "int": "<i4"}
     try:
@@ -203,23 +208,23 @@ def read_ply(path: Path) -> tuple[Doubles, Array]:
 
 
 def true_of(points: Doubles, views: Sequence[View]) -> tuple[Mask, Array]:
-    """Which points lie on a surface, by the depth of the view that they agree with best.
+    """Check which points lie on a surface, with the best-matching view of each point.
 
     Args:
         points: (n, 3), m.
-        views: those whose depth is known.
+        views: views with known depth.
 
     Returns:
-        Of each whether it is off by less than :data:`scene_views.SAME` of its depth, and the
-        texture where it is, 0 where no view sees it.
+        For each point, whether its error is below :data:`views.SAME` of its
+        depth, and the texture at its pixel (0 if no view sees it).
     """
     error, texture = np.full(len(points), np.inf), np.zeros(len(points), np.uint8)
     for view in views:
-        there = (points @ view.r.T + view.t) @ view.k.T
-        depth = there[:, 2]
+        projected = (points @ view.r.T + view.t) @ view.k.T
+        depth = projected[:, 2]
         height, width = view.depth.shape
         with np.errstate(divide="ignore", invalid="ignore"):
-            x, y = np.floor(there[:, :2] / depth[:, None]).T
+            x, y = np.floor(projected[:, :2] / depth[:, None]).T
         inside = (depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
         at = np.where(inside, y, 0).astype(np.intp), np.where(inside, x, 0).astype(np.intp)
         own = np.where(inside, np.abs(view.depth[at] / np.where(inside, depth, 1) - 1), np.inf)

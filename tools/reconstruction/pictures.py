@@ -1,4 +1,4 @@
-"""The kinds of picture that the experiment compares, and how clpipe makes them."""
+"""The kinds of picture in the experiment, and the commands of clpipe that make them."""
 
 import os
 import subprocess
@@ -19,9 +19,9 @@ class Kind(NamedTuple):
     """A kind of picture.
 
     Args:
-        run: which of the two runs of clpipe makes it, see :data:`RUNS`.
-        ending: of its name, behind that of the view.
-        each_iso, each_seed: whether the pictures of ISOs and seeds differ.
+        run: the run of clpipe that makes it, a key of :data:`RUNS`.
+        ending: the end of the file's name, after the view's name.
+        each_iso, each_seed: whether pictures differ by ISO and by seed.
     """
 
     run: str
@@ -50,13 +50,13 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Pictures:
-    """The pictures of some views, as developed by clpipe with noise of several seeds.
+    """Pictures that clpipe develops of some views, with noise of several seeds.
 
     Args:
-        out: the folder that they are in: RUN/seedSEED/isoISO/NAME.png.
-        names: of the views.
-        isos: in ascending order.
-        seeds: of the noise.
+        out: the output directory, with files RUN/seedSEED/isoISO/NAME.png.
+        names: the names of the views.
+        isos: the ISOs in ascending order.
+        seeds: the seeds of the noise.
     """
 
     out: Path
@@ -65,14 +65,14 @@ class Pictures:
     seeds: Sequence[int]
 
     def develop(self, data: Path, config: str) -> None:
-        """Make them all; those that are up to date stay.
+        """Make all pictures, and keep those that are up to date.
 
         Args:
             data: the folder of the views.
-            config: a configuration of clpipe's.
+            config: a configuration of clpipe.
 
         Raises:
-            subprocess.CalledProcessError: clpipe fails; it has said why.
+            subprocess.CalledProcessError: clpipe failed, and printed the reason.
         """
         inputs = [str(data / f"{name}.exr") for name in self.names]
         for run, options in RUNS.items():
@@ -85,7 +85,7 @@ class Pictures:
                 subprocess.run(command, check=True, env=os.environ)
 
     def all(self) -> list[tuple[str, int, int]]:
-        """Each kind, ISO and seed whose pictures differ from others'; kinds in their order."""
+        """Return each distinct combination of kind, ISO and seed, in the order of the kinds."""
         return [
             (name, iso, seed)
             for name, kind in KINDS.items()
@@ -94,10 +94,10 @@ class Pictures:
         ]
 
     def read(self, name: str, iso: int, seed: int) -> list[Array]:
-        """The pictures of all views, (height, width, 3) uint8.
+        """Read the pictures of all views, (height, width, 3) uint8.
 
         Raises:
-            OSError: one cannot be read.
+            OSError: a picture cannot be read.
         """
         pictures = [self._read(KINDS[name], iso, seed, view) for view in self.names]
         if name != HALF:
@@ -109,7 +109,7 @@ class Pictures:
         ]
 
     def noise(self, name: str, iso: int, seed: int) -> list[Doubles]:
-        """The noise of all views: the pictures of a kind less what they are made of."""
+        """Return the noise of all views: pictures of a kind minus the same without noise."""
         basis = {CAMERA: DENOISED, IID: CLEAN}[name]
         noisy, clean = ([p.astype(float) for p in self.read(n, iso, seed)] for n in (name, basis))
         return [a - b for a, b in zip(noisy, clean, strict=True)]
@@ -123,12 +123,12 @@ class Pictures:
 
 
 def with_noise(picture: Array, sigma: Doubles, rng: np.random.Generator) -> Array:
-    """A picture, uint8, with independent Gaussian noise of a sigma for each channel, in levels."""
+    """Add independent Gaussian noise to a uint8 picture, with a sigma in levels per channel."""
     noisy = picture + sigma * rng.standard_normal(picture.shape)
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
 def energy_left(noise: Sequence[Doubles]) -> float:
-    """How much of the variance of noise survives averaging 2x2; 0.25 of independent noise."""
+    """Return the share of variance that averaging 2x2 leaves; 0.25 for independent noise."""
     left = np.mean([halved(each).var((0, 1)) for each in noise])
     return float(left / np.mean([each.var((0, 1)) for each in noise]))

@@ -1,4 +1,4 @@
-"""What the experiment prints and draws: tables over the ISO, figures, depth, points."""
+"""Tables and figures of the experiment: values by ISO, depth maps and point clouds."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from clpipe.base.types import Array, Doubles, Floats
-from tools.pages.side_by_side import markdown
+from tools.pages.comparison_page import markdown
 from tools.reconstruction.pictures import CAMERA, CLEAN, HALF, IID, KINDS
 from tools.reconstruction.views import View
 
@@ -20,27 +20,27 @@ COLOURS = dict(
         strict=True,
     )
 )
-EMPTY = 255, 60  # the grey of places without depth, and behind points
-POINT = 2  # px, the side of what a point covers
-TURN, TILT, ZOOM = 25.0, -15.0, 0.85  # degrees, and of the focal length: where points are seen from
+EMPTY = 255, 60  # grey levels of pixels without depth, and of the background of points
+POINT = 2  # px, side of a point
+TURN, TILT, ZOOM = 25.0, -15.0, 0.85  # view of points: degrees, and factor of the focal length
 GAP, HEAD = 6, 24  # px
 
 
 class Mean(NamedTuple):
-    """A value over the seeds: its mean, and its standard deviation, NaN of one seed."""
+    """The mean and the standard deviation of a value over the seeds; NaN for one seed."""
 
     value: float
     deviation: float
 
     def text(self, form: str) -> str:
-        """It as a cell."""
+        """Format the value for a cell."""
         if not np.isfinite(self.deviation):
             return format(self.value, form)
         return f"{self.value:{form}} ± {self.deviation:{form}}"
 
 
 class Table:
-    """Values by kind and ISO, over the seeds; kinds that do not depend on the ISO have one."""
+    """Means of values by kind and ISO. Kinds that do not depend on the ISO have one value."""
 
     def __init__(self, values: Iterable[tuple[str, int, float]]) -> None:
         grouped: dict[tuple[str, int], list[float]] = defaultdict(list)
@@ -54,36 +54,36 @@ class Table:
         }
 
     def mean(self, kind: str, iso: int) -> Mean:
-        """The value of a kind at an ISO."""
+        """Return the value of a kind at an ISO."""
         return self._means[kind, iso if KINDS[kind].each_iso else self.isos[0]]
 
     def rows(self, form: str) -> list[list[str]]:
-        """A row of cells for each kind, its name first."""
+        """Return a row of cells for each kind, starting with its name."""
         return [
             [kind, *(self.mean(kind, iso).text(form) for iso in self.isos)] for kind in self.kinds
         ]
 
 
 def table_of(rows: Sequence[Any], value: Callable[[Any], float], **where: object) -> Table:
-    """The values of those rows whose attributes are as they are said."""
+    """Return a table of the rows whose attributes have the values of ``where``."""
     chosen = [r for r in rows if all(getattr(r, name) == what for name, what in where.items())]
     return Table((row.kind, row.iso, value(row)) for row in chosen)
 
 
 def as_markdown(title: str, tables: Mapping[str, Table], form: str) -> str:
-    """Tables of one ISO range as one, each below its name."""
+    """Format tables of the same ISOs as one table in Markdown."""
     isos = next(iter(tables.values())).isos
     rows = [[name, *row] for name, table in tables.items() for row in table.rows(form)]
     heads = ["texture", "picture", *(f"ISO {iso}" for iso in isos)]
     return f"### {title}\n\n{markdown(heads, rows)}\n"
 
 
-def reactions(tables: Mapping[str, Table]) -> str:
-    """What noise costs, and how much of the gap its energy after averaging 2x2 explains.
+def costs_of(tables: Mapping[str, Table]) -> str:
+    """Format the cost of noise, and the share of the gap that variance after averaging explains.
 
-    The cost is the share of what is found in the clean pictures. The gap is between the camera's
-    noise and independent noise of its variance; what is explained of it is the part that is there
-    with independent noise of the camera's variance after averaging, too.
+    The cost is the loss relative to clean pictures. The gap is the difference between the camera's
+    noise and independent noise of the same variance. Its explained share is the part that also
+    appears with independent noise of the camera's variance after averaging 2x2.
     """
     rows = []
     for name, table in tables.items():
@@ -101,13 +101,13 @@ def reactions(tables: Mapping[str, Table]) -> str:
 
 
 def draw(path: Path, panels: Sequence[tuple[str, str, Table]], columns: int, factor: float) -> None:
-    """Draw tables over the ISO, a line for each kind, with the deviation of the seeds.
+    """Draw values by ISO, with a line for each kind and error bars over the seeds.
 
     Args:
-        path: of an SVG.
-        panels: the title, the axis and the table of each, row by row.
-        columns: panels side by side.
-        factor: what values are multiplied by.
+        path: the SVG.
+        panels: the title, the axis label and the table of each panel, row by row.
+        columns: the number of panels in a row.
+        factor: a factor for all values.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -142,7 +142,7 @@ def draw(path: Path, panels: Sequence[tuple[str, str, Table]], columns: int, fac
 
 
 def depth_picture(depth: Floats, nearest: float, farthest: float) -> Array:
-    """Depth in colours, near bright: (height, width), m, to (height, width, 3) uint8."""
+    """Draw depth, (height, width) in m, as colours, (height, width, 3) uint8, bright if near."""
     from matplotlib import colormaps
 
     share = (1 / depth - 1 / farthest) / (1 / nearest - 1 / farthest)
@@ -151,11 +151,11 @@ def depth_picture(depth: Floats, nearest: float, farthest: float) -> Array:
 
 
 def points_of(view: View, depth: Floats, picture: Array) -> tuple[Doubles, Array]:
-    """The points of found depth, NaN where there is none: (n, 3) in m, and (n, 3) uint8 colours.
+    """Convert depth to points, (n, 3) in m, with colours, (n, 3) uint8.
 
     Args:
-        view: that sees them, of the resolution of the depth or a multiple of it.
-        depth: (height, width), m.
+        view: the view, in the resolution of the depth or a multiple of it.
+        depth: (height, width), m; NaN where there is none.
         picture: (height, width, 3), of the same size.
     """
     height, width = depth.shape
@@ -167,26 +167,26 @@ def points_of(view: View, depth: Floats, picture: Array) -> tuple[Doubles, Array
 
 
 def cloud_picture(points: Doubles, colours: Array, view: View) -> Array:
-    """Points as they are seen from the side and from above, (height / 2, width / 2, 3) uint8.
+    """Draw points from the side and from above, (height / 2, width / 2, 3) uint8.
 
     Args:
         points: (n, 3), m.
         colours: (n, 3) uint8.
-        view: a camera, which is turned about the middle of what it sees.
+        view: a camera, which is rotated about the middle of its scene.
     """
     height, width = (side // 2 for side in view.depth.shape)
     turn, tilt = np.radians(TURN), np.radians(TILT)
     about_y = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
     about_x = [[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]]
     middle = np.array([0, 0, np.median(view.depth)])
-    here = points @ view.r.T + view.t - middle
-    here = here @ np.transpose(np.array(about_x) @ about_y) + middle
-    near = here[:, 2] > middle[2] / 4
-    here, colours = here[near], colours[near]
+    rotated = points @ view.r.T + view.t - middle
+    rotated = rotated @ np.transpose(np.array(about_x) @ about_y) + middle
+    near = rotated[:, 2] > middle[2] / 4
+    rotated, colours = rotated[near], colours[near]
     scale = ZOOM * view.k[0, 0] / 2
-    x, y = (scale * here[:, :2] / here[:, 2:] + np.array([width, height]) / 2).T
+    x, y = (scale * rotated[:, :2] / rotated[:, 2:] + np.array([width, height]) / 2).T
     image = np.full((height, width, 3), EMPTY[1], np.uint8)
-    order = np.argsort(-here[:, 2], kind="stable")  # the nearest last
+    order = np.argsort(-rotated[:, 2], kind="stable")  # draws the nearest last
     cell = np.arange(POINT)
     x, y = (np.floor(each[order]).astype(np.intp)[:, None, None] for each in (x, y))
     x, y = np.broadcast_arrays(x + cell, y + cell[:, None])
@@ -197,7 +197,7 @@ def cloud_picture(points: Doubles, colours: Array, view: View) -> Array:
 
 
 def sheet(rows: Sequence[Sequence[tuple[str, Array]]]) -> Image.Image:
-    """Pictures, (height, width, 3) uint8 of one size, with their names above them."""
+    """Draw a sheet of pictures of one size, (height, width, 3) uint8, with names above them."""
     height, width = rows[0][0][1].shape[:2]
     columns = max(map(len, rows))
     size = columns * (width + GAP) - GAP, len(rows) * (height + HEAD)

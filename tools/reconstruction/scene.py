@@ -2,12 +2,15 @@
 
     python tools/reconstruction/scene.py FOLDER
 
-It needs Blender's package bpy, or Blender itself: blender -b -P tools/reconstruction/scene.py --
-FOLDER. It writes FOLDER/colour.blend and FOLDER/centres.blend, the same scene: the first is
-antialiased; in the second a pixel is the ray through its centre, for depth and object numbers.
+It needs Blender's package bpy, or Blender itself:
 
-Everything is made of code: meshes and procedural materials. One unit is a metre; x points right, y
-away from the cameras, z up. An object's number is that of its texture.
+    blender -b -P tools/reconstruction/scene.py -- FOLDER
+
+It writes the same scene to FOLDER/colour.blend and FOLDER/centres.blend. The first is antialiased.
+In the second, each pixel is the ray through its centre, for depth and object numbers.
+
+The scene is built only from code, with meshes and procedural materials. One unit is a metre. x
+points right, y away from the cameras, and z up. An object's number is that of its texture.
 """
 
 import sys
@@ -16,18 +19,18 @@ from pathlib import Path
 
 import bpy
 
-# By the numbers of the textures, strong, weak and none: how far their noise goes from the mean.
+# The contrast of each texture's noise around the mean.
 STRONG, WEAK, NONE = 1, 2, 3
 CONTRAST = {STRONG: 0.85, WEAK: 0.12, NONE: 0.0}
 WALL = 1.2  # y
-RAY = 0.01  # px, the width of the filter of pixels that are rays
+RAY = 0.01  # px, filter width at which a pixel is one ray
 
 STONE, CLAY, MOSS, SAND = (0.42, 0.38, 0.34), (0.5, 0.3, 0.2), (0.3, 0.4, 0.25), (0.5, 0.46, 0.38)
 PAPER = (0.7, 0.7, 0.7)
 
 
 def material(number, colour, scale):
-    """A matte material: fractal noise about a colour, as strong as the number of a texture says."""
+    """Return a matte material: fractal noise around a colour, with the contrast of a texture."""
     made = bpy.data.materials.new(f"texture {number}")
     made.use_nodes = True
     tree = made.node_tree
@@ -40,7 +43,7 @@ def material(number, colour, scale):
         noise.inputs[name].default_value = value
     ramp = tree.nodes.new("ShaderNodeValToRGB")
     sides = zip(ramp.color_ramp.elements, (0.3, 0.7), (-1, 1), strict=True)
-    for element, position, side in sides:  # of the noise, few places are beyond
+    for element, position, side in sides:  # little of the noise is outside 0.3 to 0.7
         element.position = position
         element.color = (*(c * (1 + side * CONTRAST[number]) for c in colour), 1)
     tree.links.new(places.outputs["Object"], noise.inputs["Vector"])
@@ -50,7 +53,7 @@ def material(number, colour, scale):
 
 
 def add(kind, number, colour, scale, location, size, turn=(0, 0, 0)):
-    """A mesh of a kind of Blender's, with a texture; sizes in m, turns in degrees."""
+    """Add one of Blender's primitive meshes with a texture; sizes in m, rotations in degrees."""
     options = {"subdivisions": 6} if kind == "ico_sphere" else {}
     getattr(bpy.ops.mesh, f"primitive_{kind}_add")(
         location=location, rotation=[radians(angle) for angle in turn], **options
@@ -64,7 +67,7 @@ def add(kind, number, colour, scale, location, size, turn=(0, 0, 0)):
 
 
 def rough(thing, depth, size):
-    """Give a mesh dents of a depth and a size, in m."""
+    """Displace a mesh by dents of a depth and a size, in m."""
     dents = thing.modifiers.new("dents", "DISPLACE")
     dents.texture = bpy.data.textures.new("dents", "CLOUDS")
     dents.texture.noise_scale, dents.strength = size, depth
@@ -72,7 +75,7 @@ def rough(thing, depth, size):
 
 
 def build():
-    """The scene: a wall in three parts, a floor, and before each part things of its texture."""
+    """Build the scene: a wall in three parts, a floor, and objects with the three textures."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     add("plane", STRONG, SAND, 22, (0, -1, 0), (12, 6, 0))
     add("plane", STRONG, STONE, 20, (-3.55, WALL, 2), (5.5, 8, 0), (90, 0, 0))

@@ -1,7 +1,8 @@
-"""Depth from a pair of rectified pictures by OpenCV's semi-global matching, and how true it is.
+"""Depth from a pair of rectified pictures by OpenCV's semi-global matching, and its accuracy.
 
-Hirschmüller 2008 ("Stereo processing by semiglobal matching and mutual information"), as OpenCV has
-it: five directions, Birchfield and Tomasi's cost, parameters as OpenCV's samples set them.
+The method is that of Hirschmüller 2008 ("Stereo processing by semiglobal matching and mutual
+information"). OpenCV's version has five directions and Birchfield and Tomasi's cost. The parameters
+are those of OpenCV's samples.
 """
 
 from collections.abc import Sequence
@@ -11,25 +12,25 @@ from itertools import pairwise
 import numpy as np
 
 from clpipe.base.types import Array, Doubles, Floats, Mask
-from tools.reconstruction.views import SAME, View, seen_from, visible
+from tools.reconstruction.views import SAME, View, projected, visible
 
-BLOCK = 5  # px, a side of the block whose costs are added up
-MARGIN = 5  # px of disparity that are searched beyond those of the scene, on either side
-STEP = 16  # OpenCV searches multiples of so many disparities, and returns 1/16 px
-UNIQUE = 10  # %, by which the best cost must be below the second
-CONSISTENT = 1  # px, how far the disparities of left and right may differ
-SPECKLE = (50, 2)  # px, px: smaller islands of disparities that differ by no more are removed
+BLOCK = 5  # px, side of the block over which costs are summed
+MARGIN = 5  # px of disparity that the search adds on either side of the scene's range
+STEP = 16  # OpenCV searches multiples of 16 disparities, and returns 1/16 px
+UNIQUE = 10  # %, margin of the best cost over the second
+CONSISTENT = 1  # px, largest difference of left and right disparities
+SPECKLE = (50, 2)  # smallest island that is kept, and its largest step of disparity, px
 
 
 @dataclass(frozen=True)
 class Score:
-    """What was found of the places that are seen by both views.
+    """The accuracy of depth at pixels that both views see.
 
     Args:
-        places: how many there are.
-        found: the share of them that has a depth.
-        complete: the share whose depth is off by less than :data:`scene_views.SAME` of it.
-        median, rms: of the errors of those found, m.
+        places: the number of such pixels.
+        found: the share of them with a depth.
+        complete: the share with an error below :data:`views.SAME` of the depth.
+        median, rms: errors of the depths found, m.
     """
 
     places: int
@@ -40,30 +41,30 @@ class Score:
 
 
 def pairs(views: Sequence[View]) -> list[tuple[int, int]]:
-    """The numbers of views that are neighbours in a row of cameras, left first.
+    """Return pairs of neighbours in a row of cameras, as numbers of views, left first.
 
     Raises:
-        ValueError: there are none.
+        ValueError: there are no such pairs.
     """
     placed = sorted((tuple((-v.r.T @ v.t).round(6)[[2, 0]]), n) for n, v in enumerate(views))
     found = [(a, b) for (at, a), (to, b) in pairwise(placed) if at[0] == to[0]]
     if not found:
-        raise ValueError("found no two cameras at the same height, side by side, to be matched")
+        raise ValueError("found no two cameras side by side at the same height")
     return found
 
 
 def true_disparities(left: View, right: View) -> Doubles:
-    """How far left of its place in the left picture each pixel's is in the right one, px."""
-    places, _ = seen_from(left, right)
+    """Return the disparity of each pixel of the left picture, px."""
+    places, _ = projected(left, right)
     return np.arange(left.depth.shape[1]) + 0.5 - places[..., 0]
 
 
 def match(left: Array, right: Array, lowest: float, highest: float) -> Floats:
-    """The disparities that OpenCV finds, px; NaN where it finds none.
+    """Compute disparities with OpenCV, px; NaN where it finds none.
 
     Args:
         left, right: (height, width, 3) uint8, of one size.
-        lowest, highest: those of the scene, px.
+        lowest, highest: the range of the scene's disparities, px.
     """
     import cv2
 
@@ -81,7 +82,7 @@ def match(left: Array, right: Array, lowest: float, highest: float) -> Floats:
         speckleRange=SPECKLE[1],
     )
     grey = [cv2.cvtColor(each, cv2.COLOR_RGB2GRAY) for each in (left, right)]
-    # It looks for partners of pixels of the left picture that have all disparities only.
+    # OpenCV matches only pixels for which all disparities are inside the picture.
     sides = (max(first + count, 0), max(-first, 0))
     wide = [cv2.copyMakeBorder(g, 0, 0, *sides, cv2.BORDER_REPLICATE) for g in grey]
     found = matcher.compute(*wide)[:, sides[0] : sides[0] + left.shape[1]].astype(np.float32) / STEP
@@ -89,7 +90,7 @@ def match(left: Array, right: Array, lowest: float, highest: float) -> Floats:
 
 
 def halved(image: Array) -> Array:
-    """The means of 2x2 pixels: uint8 or float, (height, width[, 3]), both even, to half of them."""
+    """Average 2x2 pixels of a uint8 or float image, (height, width[, 3]), with even sides."""
     is_whole = image.dtype == np.uint8
     wide = image.astype(np.uint16) if is_whole else image
     total = wide[::2, ::2] + wide[::2, 1::2] + wide[1::2, ::2] + wide[1::2, 1::2]
@@ -97,11 +98,11 @@ def halved(image: Array) -> Array:
 
 
 class Pair:
-    """Two views whose rows are the same, and what is true of the left one, at a resolution.
+    """A rectified pair of views, with the left view's ground truth at a resolution.
 
     Args:
         left, right: the views.
-        half: at half resolution, by 2x2 means.
+        half: whether to use half resolution, by 2x2 means.
     """
 
     def __init__(self, left: View, right: View, half: bool) -> None:
@@ -110,7 +111,7 @@ class Pair:
         self.half = half
         self.focal = float(left.k[0, 0] * np.linalg.norm(left.r.T @ left.t - right.r.T @ right.t))
         self.shift = float(left.k[0, 2] - right.k[0, 2])
-        if half:  # of whole cells on one surface
+        if half:  # only cells on one surface
             cells = depth.reshape(depth.shape[0] // 2, 2, depth.shape[1] // 2, 2)
             flat = cells.max((1, 3)) - cells.min((1, 3)) < SAME * cells.min((1, 3))
             self.seen = (halved(self.seen.astype(np.float32)) == 1) & flat
@@ -120,7 +121,7 @@ class Pair:
         self.range = float(disparity.min()) / (1 + half), float(disparity.max()) / (1 + half)
 
     def find(self, left: Array, right: Array) -> Floats:
-        """The depth that is found in pictures, (height, width, 3) uint8 in full resolution, m."""
+        """Find depth, m, in full-resolution pictures, (height, width, 3) uint8."""
         if self.half:
             left, right = halved(left), halved(right)
         disparity = match(left, right, *self.range) * (1 + self.half) - self.shift
@@ -129,7 +130,7 @@ class Pair:
 
 
 def score(found: Floats, depth: Floats, places: Mask) -> Score:
-    """Compare found depth, NaN where there is none, with the true one at some places."""
+    """Compare depth, NaN where none was found, with the ground truth at some pixels."""
     truth = depth[places].astype(np.float64)
     error = np.abs(found[places] - truth)
     is_found = np.isfinite(error)

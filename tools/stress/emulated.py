@@ -1,14 +1,13 @@
-"""PoCL, for portability.py, on CPUs that are not here, emulated by qemu-user.
+"""Runs PoCL on CPUs that qemu-user emulates, for portability.py.
 
-``clpipe run`` makes a small picture there, files to files, and NumPy makes it here: the raw must be
-the same, bit for bit. qemu's emulation (TCG) has AVX2 and no AVX-512. Linux's list of features,
-/proc/cpuinfo, is still that of the CPU that is here; glibc and LLVM ask the emulated one.
+``clpipe run`` makes a small picture on the emulated CPU, and NumPy makes it on the host. Both raws
+must be identical. The emulation of qemu (TCG) has AVX2 but no AVX-512. /proc/cpuinfo still
+lists the features of the host; glibc and LLVM query the emulated CPU.
 
-What an emulated program starts runs on the CPU that is here. The Python of each CPU is therefore a
-script that starts qemu, within a virtual environment of its own, so that the trial of runtimes,
-which clpipe starts with ``sys.executable``, is emulated too. The linker that PoCL starts need not
-be, but for arm64, where it is such a script as well. So nothing has to be registered with the
-kernel (binfmt_misc), and nothing on this machine changes.
+Programs that an emulated program starts run on the host CPU. clpipe tests runtimes in a process
+that it starts with ``sys.executable``. To emulate this process as well, the Python of each virtual
+environment is a script that starts qemu. On arm64, the linker that PoCL starts is such a script as
+well. So nothing has to be registered with the kernel (binfmt_misc), and the host does not change.
 """
 
 import json
@@ -35,7 +34,7 @@ RENDER = """if True:
     pixels = np.random.default_rng(0).random((21, 33, 3)) ** 2 * 1.4 - 0.05
     OpenEXR.File({}, {"RGB": pixels.astype(np.float16)}).write("render.exr")
 """
-# It tries the runtime, too, which takes longer than clpipe allows a real CPU.
+# This also tests the runtime, which takes longer than clpipe's limit for real CPUs.
 DEVICE = """if True:
     import json, platform
     from clpipe.engine import verdicts
@@ -56,32 +55,32 @@ COMPARE = """if True:
     same = one[1].dtype == two[1].dtype and one[1].tobytes() == two[1].tobytes()
     print(json.dumps([same, float(np.abs(one[0].astype(np.float32) - two[0]).max())]))
 """
-STEP = 1 / 255  # by which pictures may differ; only raws are bit for bit the same on all devices
+STEP = 1 / 255  # the largest difference of pictures; only raws are identical on all devices
 
 
 @dataclass(frozen=True, kw_only=True)
 class EmulatedCPU(Runtime):
     """PoCL on a CPU that qemu-user emulates.
 
-    ``wider`` is a target that needs more than the CPU has: the trial must end in SIGILL there, else
-    it would not be noticed here if clpipe chose one.
+    ``wider`` is a target that needs more than the CPU has. The test of the runtime must end in
+    SIGILL with it. This shows that a wrong target would be noticed.
     """
 
-    cpu: str  # as qemu's option -cpu
+    cpu: str  # value of qemu's option -cpu
     machine: str = "x86_64"
-    own: str = ""  # what PoCL takes it for; "" where it does not say
-    target: str = ""  # what it is to compile for, LLVM's name
+    own: str = ""  # PoCL's name of the CPU; "" if it gives none
+    target: str = ""  # LLVM's name of the expected compile target
     wider: str = ""
 
 
 def qemu(machine: str, work: Path) -> list[str]:
-    """The command that runs a program of another machine, less its CPU and the program."""
+    """Return the command that runs a program of another machine, without CPU and program."""
     emulator = debian_package("qemu-user-static", f"/qemu-{machine}-static")
     return [str(emulator), *(["-L", str(arm64_tree(work))] if machine == "aarch64" else [])]
 
 
 def arm64_tree(work: Path) -> Path:
-    """A Debian for arm64: Python, PoCL and a linker, unpacked but not set up, so nothing runs."""
+    """Return a Debian tree for arm64 with Python, PoCL and a linker, unpacked, not configured."""
     tree, part = work / "arm64/tree", work / "arm64/part"
     if not tree.exists():
         bootstrap = debian_package("debootstrap", "/debootstrap")
@@ -100,20 +99,20 @@ def arm64_tree(work: Path) -> Path:
 
 
 def arm64_pocl(work: Path) -> str:
-    """The whole path of that Debian's library, which looks for its files beside it.
+    """Return the full path of PoCL's library in that tree.
 
-    Its .icd has the bare name. The library would be found by that, but not its files: qemu looks
-    for them outside of the tree where a program only asks whether they are there (faccessat).
+    Debian's .icd file has only the library's name. With that name, the library does not find its
+    own files, because qemu resolves faccessat outside of the tree.
     """
     (library,) = arm64_tree(work).glob("usr/lib/aarch64-linux-gnu/libpocl.so.2.*")
     return str(library)
 
 
 def arm64_packages(work: Path, python: str) -> Path:
-    """The project, and the wheels for arm64 of the versions that the work folder's Python has.
+    """Install the project and its dependencies for arm64, in the versions of the work folder.
 
-    ``python`` is its version, as in 3.11. Pip cannot resolve for another machine, so dependencies
-    are listed here; those with a machine of their own in the marker are PoCL's wheel.
+    ``python`` is a version such as 3.11. Pip cannot resolve dependencies for another machine, so a
+    script lists them. It skips PoCL's wheel, whose marker names a machine.
     """
     listed = """if True:
         import re
@@ -142,8 +141,8 @@ def arm64_packages(work: Path, python: str) -> Path:
     return packages
 
 
-# What qemu is to be, what LLVM 14 within pip's PoCL takes that for, what clpipe is to compile for,
-# and a target that needs more than is there. "Without" is what a hypervisor masks, or qemu lacks.
+# Columns: name, qemu's CPU, its name by LLVM 14 in pip's PoCL, clpipe's expected target, and a
+# target that needs more. "Without": a hypervisor masks the feature, or qemu lacks it.
 HASWELL = "Haswell-noTSX,pcid=off,x2apic=off,tsc-deadline=off,invpcid=off"
 MASKED = f"{HASWELL},avx=off,avx2=off,fma=off,f16c=off"
 RAPTOR_LAKE = f"{HASWELL},model=183,clflushopt=on,sha-ni=on,x-force-features=on"
@@ -159,13 +158,13 @@ CPUS = (
 
 
 def emulated_cpu(name: str, cpu: str, own: str, target: str, wider: str) -> EmulatedCPU:
-    """Pip's PoCL on one of :data:`CPUS`.
+    """Return pip's PoCL on one of :data:`CPUS`.
 
-    Raptor Lake says that it has SHA, as LLVM goes by that. qemu may not have it, so OpenSSL is told
-    not to use it.
+    Raptor Lake reports SHA, because LLVM recognizes it by that. qemu may lack SHA, so the
+    environment disables it in OpenSSL.
     """
-    said = {"cpu": cpu, "own": own, "target": target, "wider": wider}
-    return EmulatedCPU(f"cpus: {name}", pip_pocl, "", {"OPENSSL_ia32cap": ":~0x20000000"}, **said)
+    values = {"cpu": cpu, "own": own, "target": target, "wider": wider}
+    return EmulatedCPU(f"cpus: {name}", pip_pocl, "", {"OPENSSL_ia32cap": ":~0x20000000"}, **values)
 
 
 EMULATED = (
@@ -175,16 +174,16 @@ EMULATED = (
 
 
 def script(path: Path, *command: str | Path) -> None:
-    """Write a program that is another one, with its arguments."""
+    """Write a shell script that runs a command with further arguments."""
     text = " ".join('"$0"' if part == "$0" else shlex.quote(str(part)) for part in command)
     path.write_text(f'#!/bin/sh\nexec {text} "$@"\n', "utf-8")
     path.chmod(0o755)
 
 
 def emulated_python(runtime: EmulatedCPU, work: Path, folder: Path) -> Path:
-    """The Python of a virtual environment that runs on a CPU, in the folder of a run.
+    """Create a virtual environment with an emulated Python in the folder of a run.
 
-    Python goes by the name that it was started with to find its environment and itself.
+    Python finds its environment by the name of its program.
     """
     venv = folder / "venv"
     program = venv / "bin/python"
@@ -208,46 +207,48 @@ def emulated_python(runtime: EmulatedCPU, work: Path, folder: Path) -> Path:
 
 
 def measure_emulated(runtime: EmulatedCPU, work: Path, row: list[str]) -> bool:
-    """Develop on an emulated CPU: fills the table's row in, and whether it passed."""
-    here = os.uname().machine
-    if runtime.machine == "x86_64" != here:
-        raise UnavailableError(f"it needs the packages of x86_64, and this machine is {here}")
+    """Develop on an emulated CPU, fill in its row of the table, and return whether it passed."""
+    host = os.uname().machine
+    if runtime.machine == "x86_64" != host:
+        raise UnavailableError(f"it needs the packages of x86_64, and this machine is {host}")
     run = Run(runtime, work)
-    run.python_says("render", "-c", RENDER)
-    run.python_says("expected", *DEVELOP, "--device", "numpy", "-o", "expected")
+    run.run_python("render", "-c", RENDER)
+    run.run_python("expected", *DEVELOP, "--device", "numpy", "-o", "expected")
     native, run.python = run.python, emulated_python(runtime, work, run.folder)
     run.environment["PATH"] = f"{run.python.parent}{os.pathsep}{os.environ['PATH']}"
-    machine, own, target, lanes, row[2], problem = pocl_there(run, "device")
+    machine, own, target, lanes, row[2], problem = pocl_of(run, "device")
     row[1] = " -> ".join(dict.fromkeys(name for name in (own, target) if name)) or machine
     row[1] += f", {lanes} lanes"
     if problem:
-        raise BrokenError(f"clpipe passes it over: {problem}")
+        raise BrokenError(f"clpipe skips it: {problem}")
     wrong = []
     if (machine, own, target) != (runtime.machine, runtime.own, runtime.target):
         expected = f"{runtime.machine}, {runtime.own or '-'} -> {runtime.target or '-'}"
         wrong.append(f"it is {machine}, {own or '-'} -> {target or '-'}; expected {expected}")
-    run.python_says("emulated", *DEVELOP, "--device", "pocl", "-o", "emulated")
+    run.run_python("emulated", *DEVELOP, "--device", "pocl", "-o", "emulated")
     run.python = native
-    raw, apart = json.loads(run.python_says("compare", "-c", COMPARE)[0])
-    row[3] = f"the raw is {'' if raw else 'NOT '}NumPy's, the picture differs by up to {apart:.2g}"
-    if apart > STEP:
+    same, difference = json.loads(run.run_python("compare", "-c", COMPARE)[0])
+    row[3] = (
+        f"the raw is {'' if same else 'NOT '}NumPy's, the picture differs by up to {difference:.2g}"
+    )
+    if difference > STEP:
         wrong.append(f"the picture may differ by {STEP:.2g}")
     if runtime.wider:
         run.python = run.folder / "venv/bin/python"
         run.environment["CLPIPE_CPU_TARGET"] = runtime.wider
-        *_, problem = pocl_there(run, "wider")
+        *_, problem = pocl_of(run, "wider")
         if "SIGILL" not in problem:
-            said = problem or "it works"
-            raise BrokenError(f"with {runtime.wider} it must end in SIGILL, yet: {said}")
-        row[3] += f"; {runtime.wider}: SIGILL, as it must"
+            result = problem or "it works"
+            raise BrokenError(f"with {runtime.wider} it must end in SIGILL, but: {result}")
+        row[3] += f"; {runtime.wider}: SIGILL, as expected"
     row[3] += "".join(f"; {text}" for text in wrong)
-    return raw and not wrong
+    return same and not wrong
 
 
-def pocl_there(run: Run, name: str) -> list[str]:
-    """What a run's Python says of PoCL: machine, own name, target, lanes, version, problem."""
-    printed, _ = run.python_says(name, "-c", DEVICE)
+def pocl_of(run: Run, name: str) -> list[str]:
+    """Return PoCL's record in a run: machine, own name, target, lanes, version, problem."""
+    printed, _ = run.run_python(name, "-c", DEVICE)
     found = json.loads(printed)
     if len(found) != 1:
-        raise BrokenError(f"{name}: it finds {len(found)} devices of PoCL; expected one")
+        raise BrokenError(f"{name}: found {len(found)} devices of PoCL; expected one")
     return found[0]

@@ -1,9 +1,9 @@
-/* Bad luck for one process, by LD_PRELOAD: what it writes below a folder fails, or is lost.
+/* Faults for one process, by LD_PRELOAD: its writes below a folder fail or are lost.
 
    FAULTS_DIR   the folder
-   FAULTS_AT    how many bytes are written below it before the fault
-   FAULTS_KIND  full: the disk is full from then on; eio: that one write fails; short: that one
-                write takes half of what it is given; kill: the process is killed
+   FAULTS_AT    the number of bytes written below it before the fault
+   FAULTS_KIND  full: the disk stays full; eio: one write fails; short: one write accepts half
+                of its data; kill: the process is killed
    FAULTS_LOG   a file that gets a line for each write, fsync and rename below the folder */
 
 #define _GNU_SOURCE

@@ -1,11 +1,12 @@
-"""Run batches under bad luck, go on with each, and compare all files with an undisturbed run's.
+"""Interrupt batches with faults, resume them, and compare all files with an undisturbed run.
 
     tools/run stress faults [--images N] [--repeats N] [--seed N] [--device SEL] [FAULT...]
 
-Each fault strikes a batch at a random moment, in a new output folder each time: pictures of three
-kinds with sidecars, or tars. What the summary called done must be there; then the same command goes
-on, and must make every file as the undisturbed run did, byte for byte, leave none of its own
-behind, and touch none of others. The exit status is 1 if anything was wrong. Needs a C compiler.
+Each trial has a new output directory, and its fault occurs at a random moment. A batch writes
+pictures of three kinds with sidecars, or tars. Every image that the summary counts as done must
+exist. Then the same command resumes. It must write every file of the undisturbed run, byte for
+byte, leave no temporary files, and change no foreign files. The exit status is 1 after any failure.
+The tool needs a C compiler.
 """
 
 import argparse
@@ -37,7 +38,7 @@ FOREIGN = {
     "pictures/other.jpg": b"\xff\xd8 somebody's",
     "z.json": b"{}",
 }
-WAYS = {
+KINDS = {
     "folder": ("--keep", "normalize", "--truth", "mosaic"),
     "tars": ("--webdataset", "7"),
 }
@@ -45,30 +46,30 @@ LIMIT = 600  # s, for one run
 
 
 class Trial:
-    """One batch in an output folder of its own, struck once and then continued."""
+    """A batch with its own output directory, disturbed once and then resumed."""
 
-    def __init__(self, place: Path, way: str, device: str, luck: random.Random) -> None:
+    def __init__(self, place: Path, output: str, device: str, rng: random.Random) -> None:
         self.place = place
-        self.luck = luck
+        self.rng = rng
         self.out = place / "out"
         self.log = place / "operations"
         self.out.mkdir(parents=True)
         for name, data in FOREIGN.items():
             (self.out / name).parent.mkdir(exist_ok=True)
             (self.out / name).write_bytes(data)
-        self.arguments = ["run", "in", "-o", str(self.out), "--device", device, *WAYS[way]]
-        self.said = ""
-        self.edited = ""  # the file that was edited, if one was
-        self.is_other = False  # whether another program has made what is there
-        self.limit: Callable[[], None] | None = None  # is called in the process before it runs
+        self.arguments = ["run", "in", "-o", str(self.out), "--device", device, *KINDS[output]]
+        self.stderr = ""
+        self.edited = ""  # the edited file, if there is one
+        self.is_other = False  # whether another program wrote the files
+        self.limit: Callable[[], None] | None = None  # called in the child before it starts
 
     def command(self, driver: str = "") -> list[str]:
-        """The command line; ``driver`` is the name of what is patched in the program."""
+        """Return the command line; ``driver`` names the part of the program that is patched."""
         start = ["-m", "tools.stress.faults", "--driver", driver] if driver else ["-m", "clpipe"]
         return [sys.executable, *start, *self.arguments]
 
     def start(self, driver: str = "", **environment: str) -> subprocess.Popen:
-        """Start the run, in the folder of the inputs."""
+        """Start the run in the folder of the inputs."""
         return subprocess.Popen(
             self.command(driver),
             cwd=self.place.parent,
@@ -80,18 +81,18 @@ class Trial:
         )
 
     def run(self, driver: str = "", **environment: str) -> int:
-        """Run it to its end; its exit status. What it prints is in ``said``."""
+        """Run to the end, set ``stderr``, and return the exit status."""
         process = self.start(driver, **environment)
         try:
-            _, self.said = process.communicate(timeout=LIMIT)
+            _, self.stderr = process.communicate(timeout=LIMIT)
         except subprocess.TimeoutExpired:
             process.kill()
-            raise AssertionError(f"it hung for {LIMIT} s") from None
+            raise AssertionError(f"the run hung for {LIMIT} s") from None
         return process.returncode
 
-    def struck(self, kind: str, whole: int) -> int:
-        """Run with a fault after a random number of the bytes that a whole run writes."""
-        at = self.luck.randrange(whole)
+    def run_with_fault(self, kind: str, size: int) -> int:
+        """Run with a fault at a random one of ``size`` bytes, and return the exit status."""
+        at = self.rng.randrange(size)
         return self.run(
             LD_PRELOAD=str(self.place.parent / "faults.so"),
             FAULTS_DIR=str(self.out),
@@ -102,75 +103,75 @@ class Trial:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """All files below a folder, but for logs and what was there before."""
+    """Read all files below a folder, except logs and foreign files."""
     found = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_file()}
     return {n: p.read_bytes() for n, p in found.items() if n != "run.jsonl" and n not in FOREIGN}
 
 
 def check_claims(trial: Trial, reference: dict[str, bytes]) -> None:
-    """See that what the summary calls done is there and right."""
+    """Check that images that the summary counts as done exist and are correct."""
     made = files(trial.out)
     for name, data in made.items():
         is_temporary = ".part" in name or name.startswith(".clpipe")
-        # Of tars that are not complete the content differs; each must be a whole tar.
+        # Tars of an unfinished run may have other members.
         if trial.is_other or is_temporary or name.endswith(".tar"):
             continue
         if name != trial.edited:
-            assert name in reference, f"made {name}, which no undisturbed run makes"
+            assert name in reference, f"wrote {name}, which the undisturbed run does not write"
             assert data == reference[name], f"{name} is damaged under its final name"
-    match = re.search(r"(\d+) of \d+ images? done", trial.said)
+    match = re.search(r"(\d+) of \d+ images? done", trial.stderr)
     if match and "tar" not in "".join(reference):
         sidecars = [
             n for n in made if n.endswith(".json") and ".truth" not in n and ".part" not in n
         ]
         assert int(match[1]) <= len(sidecars), (
-            f"says {match[0]}; {len(sidecars)} sidecars are there"
+            f"the summary says {match[0]}, but there are {len(sidecars)} sidecars"
         )
-    assert "Traceback" not in trial.said, trial.said
+    assert "Traceback" not in trial.stderr, trial.stderr
 
 
 def check_end(trial: Trial, reference: dict[str, bytes]) -> None:
-    """Go on, and see that the output is that of an undisturbed run."""
-    assert trial.run() == 0, f"going on failed: {trial.said[-600:]}"
+    """Resume, and check that the output equals that of an undisturbed run."""
+    assert trial.run() == 0, f"resuming failed: {trial.stderr[-600:]}"
     made = files(trial.out)
-    missing, more = sorted(reference.keys() - made.keys()), sorted(made.keys() - reference.keys())
+    missing, extra = sorted(reference.keys() - made.keys()), sorted(made.keys() - reference.keys())
     assert not missing, f"missing: {missing[:5]}"
-    assert not more, f"left behind: {more[:5]}"
+    assert not extra, f"not removed: {extra[:5]}"
     wrong = [name for name, data in reference.items() if made[name] != data]
     assert not wrong, f"different: {wrong[:5]}"
     for name, data in FOREIGN.items():
-        assert (trial.out / name).read_bytes() == data, f"{name} was touched"
+        assert (trial.out / name).read_bytes() == data, f"{name} was changed"
     log = (trial.out / "run.jsonl").read_text("utf-8")
     for line in log[log.rindex('{"event": "start"') :].splitlines():
         json.loads(line)
 
 
-def killed(trial: Trial, seconds: float, whole: int) -> None:
-    """SIGKILL at a random moment."""
+def kill(trial: Trial, seconds: float, total: int) -> None:
+    """Send SIGKILL at a random moment."""
     process = trial.start()
-    time.sleep(trial.luck.uniform(0.3, 1.1) * seconds)
+    time.sleep(trial.rng.uniform(0.3, 1.1) * seconds)
     process.send_signal(signal.SIGKILL)
-    _, trial.said = process.communicate()
+    _, trial.stderr = process.communicate()
 
 
-def stopped(trial: Trial, seconds: float, whole: int) -> None:
-    """SIGTERM, as schedulers send it."""
+def stop(trial: Trial, seconds: float, total: int) -> None:
+    """Send SIGTERM, like schedulers."""
     process = trial.start()
-    time.sleep(trial.luck.uniform(0.3, 1.1) * seconds)
+    time.sleep(trial.rng.uniform(0.3, 1.1) * seconds)
     process.send_signal(signal.SIGTERM)
-    _, trial.said = process.communicate(timeout=LIMIT)
+    _, trial.stderr = process.communicate(timeout=LIMIT)
 
 
-def fault(kind: str, trial: Trial, seconds: float, whole: int) -> None:
-    """A fault at a random byte: the disk is full, a write fails, or takes half."""
-    status = trial.struck(kind, whole)
-    assert status in (0, 1, 2), f"ended with {status}: {trial.said[-400:]}"
-    assert status == 0 or kind != "short", f"a short write is no error: {trial.said[-400:]}"
+def fault(kind: str, trial: Trial, seconds: float, total: int) -> None:
+    """Fault at a random byte: a full disk, a failed write or a short write."""
+    status = trial.run_with_fault(kind, total)
+    assert status in (0, 1, 2), f"ended with {status}: {trial.stderr[-400:]}"
+    assert status == 0 or kind != "short", f"a short write is not an error: {trial.stderr[-400:]}"
 
 
-def without_power(trial: Trial, seconds: float, whole: int) -> None:
-    """The power fails at a random byte: writes and renames since the last fsync are lost."""
-    trial.struck("kill", whole)
+def without_power(trial: Trial, seconds: float, total: int) -> None:
+    """Power failure at a random byte: writes and renames since the last fsync are lost."""
+    trial.run_with_fault("kill", total)
     unsynced: set[str] = set()
     renamed: dict[str, str] = {}
     for line in trial.log.read_text("utf-8", "surrogateescape").splitlines():
@@ -188,61 +189,61 @@ def without_power(trial: Trial, seconds: float, whole: int) -> None:
     for path in unsynced:
         if os.path.exists(path):
             size = os.path.getsize(path)
-            os.truncate(path, trial.luck.randrange(size + 1))
-            if trial.luck.random() < 0.5:  # its blocks were allocated, and not written
+            os.truncate(path, trial.rng.randrange(size + 1))
+            if trial.rng.random() < 0.5:  # its blocks were allocated but not written
                 os.truncate(path, 0)
                 os.truncate(path, size)
     for to, name in renamed.items():
-        if os.path.exists(to) and trial.luck.random() < 0.5:
+        if os.path.exists(to) and trial.rng.random() < 0.5:
             os.rename(to, name)
     for path in trial.out.rglob("*.json*"):  # a log may end in zeros, a sidecar must not
         assert path.name == "run.jsonl" or ".part." in path.name or path.read_bytes().strip(b"\0")
 
 
-def driven(driver: str, trial: Trial, seconds: float, whole: int) -> None:
-    """Something inside of the program fails once."""
-    status = trial.run(driver, FAULTS_COUNT=str(trial.luck.randrange(1, 20)))
-    assert status in (0, 1), f"ended with {status}: {trial.said[-400:]}"
+def driven(driver: str, trial: Trial, seconds: float, total: int) -> None:
+    """Make a part of the program fail once."""
+    status = trial.run(driver, FAULTS_COUNT=str(trial.rng.randrange(1, 20)))
+    assert status in (0, 1), f"ended with {status}: {trial.stderr[-400:]}"
 
 
-def two_at_once(trial: Trial, seconds: float, whole: int) -> None:
-    """Two runs into one folder: one of them is refused, or finds all done."""
+def two_at_once(trial: Trial, seconds: float, total: int) -> None:
+    """Two runs write into one directory: the second is rejected, or finds all images done."""
     both = [trial.start()]
-    time.sleep(trial.luck.uniform(0, 0.5) * seconds)
+    time.sleep(trial.rng.uniform(0, 0.5) * seconds)
     both.append(trial.start())
-    said = [process.communicate(timeout=LIMIT)[1] for process in both]
+    errors = [process.communicate(timeout=LIMIT)[1] for process in both]
     statuses = sorted(process.returncode for process in both)
-    assert statuses in ([0, 0], [0, 2]), f"{statuses}: {said}"
-    trial.said = said[0] if both[0].returncode == 0 else said[1]
+    assert statuses in ([0, 0], [0, 2]), f"{statuses}: {errors}"
+    trial.stderr = errors[0] if both[0].returncode == 0 else errors[1]
 
 
-def edited(trial: Trial, seconds: float, whole: int) -> None:
-    """When all is done a sidecar is edited, of which its readers must make no traceback."""
-    assert trial.run() == 0, trial.said
-    luck = trial.luck
+def edited(trial: Trial, seconds: float, total: int) -> None:
+    """Edit a sidecar of a finished batch; commands that read it must not show a traceback."""
+    assert trial.run() == 0, trial.stderr
+    rng = trial.rng
     own = [path for path in trial.out.rglob("*.json") if path.name not in FOREIGN]
-    place = luck.choice(sorted(own or trial.out.rglob("*.tar")))
+    place = rng.choice(sorted(own or trial.out.rglob("*.tar")))
     data, start = place.read_bytes(), 0
     size = len(data)
     if not own:
         with tarfile.open(place) as tar:
-            member = luck.choice([each for each in tar if each.name.endswith(".json")])
+            member = rng.choice([each for each in tar if each.name.endswith(".json")])
         start, size = member.offset_data, member.size
     text = data[start : start + size]
-    at = luck.randrange(size)
+    at = rng.randrange(size)
     edits = [
-        text[:at] + bytes([text[at] ^ 1 << luck.randrange(8)]) + text[at + 1 :],
-        (text[:at] + luck.randbytes(20) + text[at + 20 :])[:size],
+        text[:at] + bytes([text[at] ^ 1 << rng.randrange(8)]) + text[at + 1 :],
+        (text[:at] + rng.randbytes(20) + text[at + 20 :])[:size],
         text[:at] + bytes(size - at),
         text[:at] + text[at:].translate(bytes.maketrans(b"0123456789", b"1234567890")),
         text[:at] + text[at:][::-1],
     ]
-    if own:  # the places of a tar's members would move
-        edits += [text[:at], text[:at] + luck.randbytes(20) + text[at:], text.replace(b": ", b":")]
-    place.write_bytes(data[:start] + luck.choice(edits) + data[start + size :])
+    if own:  # offsets of a tar's members would change
+        edits += [text[:at], text[:at] + rng.randbytes(20) + text[at:], text.replace(b": ", b":")]
+    place.write_bytes(data[:start] + rng.choice(edits) + data[start + size :])
     trial.edited = place.relative_to(trial.out).as_posix()
     for command in (["poses", trial.out], ["replay", place, "-o", trial.place / "again"]):
-        told = subprocess.run(
+        result = subprocess.run(
             [sys.executable, "-m", "clpipe", *command],
             cwd=trial.place.parent,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
@@ -251,34 +252,36 @@ def edited(trial: Trial, seconds: float, whole: int) -> None:
             text=True,
             check=False,
         )
-        assert told.returncode in (0, 2), f"ended with {told.returncode}: {told.stderr[-400:]}"
-        assert "Traceback" not in told.stderr, told.stderr
+        assert result.returncode in (0, 2), (
+            f"ended with {result.returncode}: {result.stderr[-400:]}"
+        )
+        assert "Traceback" not in result.stderr, result.stderr
 
 
-def with_damaged_cache(trial: Trial, seconds: float, whole: int) -> None:
-    """What is kept of kernels, verdicts and the program is cut, emptied or changed at random."""
-    luck, cache = trial.luck, trial.place.parent / "cache"  # that of all trials of this fault
+def with_damaged_cache(trial: Trial, seconds: float, total: int) -> None:
+    """Truncate, empty or change cached kernels, verdicts and program files at random."""
+    rng, cache = trial.rng, trial.place.parent / "cache"  # shared by all trials of this fault
     if not cache.exists():
-        assert trial.run(CLPIPE_CACHE_DIR=str(cache)) == 0, trial.said
+        assert trial.run(CLPIPE_CACHE_DIR=str(cache)) == 0, trial.stderr
         shutil.rmtree(trial.out)
         trial.out.mkdir()
         for name, data in FOREIGN.items():
             (trial.out / name).parent.mkdir(exist_ok=True)
             (trial.out / name).write_bytes(data)
-    kept = sorted(p for p in cache.rglob("*") if p.is_file() and p.stat().st_size)
-    for path in luck.sample(kept, luck.randint(1, len(kept))):
+    cached = sorted(p for p in cache.rglob("*") if p.is_file() and p.stat().st_size)
+    for path in rng.sample(cached, rng.randint(1, len(cached))):
         data = bytearray(path.read_bytes())
-        at = luck.randrange(len(data))
-        data[at] ^= 1 << luck.randrange(8)
-        path.write_bytes(luck.choice([data, data[:at], data[:at] + luck.randbytes(9), b""]))
+        at = rng.randrange(len(data))
+        data[at] ^= 1 << rng.randrange(8)
+        path.write_bytes(rng.choice([data, data[:at], data[:at] + rng.randbytes(9), b""]))
     status = trial.run(CLPIPE_CACHE_DIR=str(cache))
-    assert status == 0, f"ended with {status}: {trial.said[-400:]}"
-    said = [line for line in trial.said.splitlines() if line.startswith("clpipe: ")]
-    assert len(said) <= 1, said
+    assert status == 0, f"ended with {status}: {trial.stderr[-400:]}"
+    messages = [line for line in trial.stderr.splitlines() if line.startswith("clpipe: ")]
+    assert len(messages) <= 1, messages
 
 
-def by_another_program(trial: Trial, seconds: float, whole: int) -> None:
-    """A program with another quantizer begins, is killed at times, and ours goes on."""
+def by_another_program(trial: Trial, seconds: float, total: int) -> None:
+    """A program with another quantizer starts the batch, may be killed, and clpipe resumes."""
     other = trial.place / "program"
     for folder in ("clpipe", "kernels"):
         shutil.copytree(ROOT / folder, other / folder)
@@ -291,16 +294,16 @@ def by_another_program(trial: Trial, seconds: float, whole: int) -> None:
         (other / name).write_text(text.replace(was, now), "utf-8")
     trial.is_other = True
     process = trial.start(PYTHONPATH=str(other))
-    if trial.luck.random() < 0.5:
-        time.sleep(trial.luck.uniform(0.5, 1.2) * seconds)
+    if trial.rng.random() < 0.5:
+        time.sleep(trial.rng.uniform(0.5, 1.2) * seconds)
         process.kill()
-    _, trial.said = process.communicate(timeout=LIMIT)
+    _, trial.stderr = process.communicate(timeout=LIMIT)
 
 
-def short_of_memory(trial: Trial, seconds: float, whole: int) -> None:
-    """Little memory, in a control group or an address space, and a large image among the others."""
-    size = trial.luck.randrange(130, 1300) << 20
-    group = memory_group(size) if trial.luck.random() < 0.5 else None
+def short_of_memory(trial: Trial, seconds: float, total: int) -> None:
+    """Limit the memory by a control group or the address space, and add a large image."""
+    size = trial.rng.randrange(130, 1300) << 20
+    group = memory_group(size) if trial.rng.random() < 0.5 else None
 
     def limit() -> None:
         if group:
@@ -309,15 +312,15 @@ def short_of_memory(trial: Trial, seconds: float, whole: int) -> None:
             resource.setrlimit(resource.RLIMIT_AS, (size, size))
 
     large, made = trial.place.parent / "large.exr", trial.place.parent / "large"
-    is_folder = "--webdataset" not in trial.arguments  # another image would change the tars
+    is_folder = "--webdataset" not in trial.arguments  # tars would change with another image
     if is_folder and not made.exists():
         from clpipe.images.write import write_exr
 
         write_exr(large, np.full((4000, 6000, 3), 0.2, np.float32), "RGB", {}, half=True)
-        alone = Trial(made, "folder", "", trial.luck)
-        alone.arguments = [str(large) if x == "in" else x for x in trial.arguments]
-        alone.arguments[alone.arguments.index("-o") + 1] = str(alone.out)
-        assert alone.run() == 0, alone.said
+        single = Trial(made, "folder", "", trial.rng)
+        single.arguments = [str(large) if x == "in" else x for x in trial.arguments]
+        single.arguments[single.arguments.index("-o") + 1] = str(single.out)
+        assert single.run() == 0, single.stderr
     if is_folder:
         trial.arguments.insert(2, str(large))
     trial.limit = limit
@@ -325,22 +328,24 @@ def short_of_memory(trial: Trial, seconds: float, whole: int) -> None:
     trial.limit = None
     if group:
         group.rmdir()
-    assert status in (0, 1, 3), f"in {size >> 20} MiB it ended with {status}: {trial.said[-400:]}"
+    assert status in (0, 1, 3), f"in {size >> 20} MiB it ended with {status}: {trial.stderr[-400:]}"
     if is_folder:
         trial.arguments.remove(str(large))
         of_large = {path for path in trial.out.rglob("large.*") if ".part" not in path.name}
         if status == 0 or of_large:
             expected = {p.name: p.read_bytes() for p in (made / "out").rglob("large.*")}
             found = {p.name: p.read_bytes() for p in of_large}
-            assert found == expected, f"of the large image there are {sorted(found)}"
+            assert found == expected, f"files of the large image: {sorted(found)}"
         elif status == 1:
-            assert re.search(r"large\.exr: it takes about .* are left by", trial.said), trial.said
+            assert re.search(r"large\.exr: it takes about .* are left by", trial.stderr), (
+                trial.stderr
+            )
         for path in of_large:
             path.unlink()
 
 
 def memory_group(size: int) -> Path | None:
-    """A new control group of so much memory; None where none can be made."""
+    """Create a control group with a memory limit; return None if this is not possible."""
     from clpipe.base.control_groups import group_folders
 
     for parent, is_first_version in group_folders("memory", Path("/")):
@@ -358,8 +363,8 @@ def memory_group(size: int) -> Path | None:
 
 
 FAULTS: dict[str, Callable[[Trial, float, int], None]] = {
-    "kill": killed,
-    "stop": stopped,
+    "kill": kill,
+    "stop": stop,
     "full": functools.partial(fault, "full"),
     "eio": functools.partial(fault, "eio"),
     "short": functools.partial(fault, "short"),
@@ -376,7 +381,7 @@ FAULTS: dict[str, Callable[[Trial, float, int], None]] = {
 
 
 def drive(name: str, arguments: list[str]) -> None:
-    """Run the program with one thing in it that fails once, or a clock that jumps."""
+    """Run the program with a part that fails once, or with a clock that jumps."""
     left = int(os.environ["FAULTS_COUNT"])
 
     def failing(real: Callable, error: Exception) -> Callable:
@@ -403,14 +408,14 @@ def drive(name: str, arguments: list[str]) -> None:
         ImageLoader.read = failing(ImageLoader.read, ZeroDivisionError("of a decoder"))
     else:
         real = time.time
-        luck = random.Random(left)
-        time.time = lambda: real() + luck.choice((-1e8, -3600, 0, 3600, 1e8))
+        rng = random.Random(left)
+        time.time = lambda: real() + rng.choice((-1e8, -3600, 0, 3600, 1e8))
     sys.argv = ["clpipe", *arguments]
     runpy.run_module("clpipe", run_name="__main__")
 
 
 def prepare(folder: Path, count: int) -> None:
-    """Write the inputs and compile the faults."""
+    """Write the inputs, and compile faults.c."""
     from clpipe.images.write import write_exr
 
     pixels = np.random.default_rng(0).random((24, 32, 3)).astype(np.float32)
@@ -433,47 +438,53 @@ def prepare(folder: Path, count: int) -> None:
 
 
 def main() -> int:
-    """Strike each way of each fault so many times."""
+    """Run the trials of each fault, and print the results."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--images", type=int, default=200)
     parser.add_argument("--repeats", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="0")
-    parser.add_argument("faults", nargs="*", metavar="FAULT", help=f"of {', '.join(FAULTS)}")
+    parser.add_argument(
+        "faults", nargs="*", metavar="FAULT", help=f"the choices are {', '.join(FAULTS)}"
+    )
     options = parser.parse_args()
     bad = 0
     with tempfile.TemporaryDirectory(prefix="clpipe-faults-") as name:
         folder = Path(name).resolve()
         prepare(folder, options.images)
         references, seconds = {}, {}
-        for way in WAYS:
-            trial = Trial(folder / way, way, options.device, random.Random(0))
-            assert trial.run() == 0, trial.said
-            references[way] = files(trial.out)
+        for output in KINDS:
+            trial = Trial(folder / output, output, options.device, random.Random(0))
+            assert trial.run() == 0, trial.stderr
+            references[output] = files(trial.out)
             shutil.rmtree(trial.out)
             trial.out.mkdir()
             began = time.perf_counter()
-            assert trial.run() == 0, trial.said
-            seconds[way] = time.perf_counter() - began
-            assert files(trial.out) == references[way], "two undisturbed runs differ"
+            assert trial.run() == 0, trial.stderr
+            seconds[output] = time.perf_counter() - began
+            assert files(trial.out) == references[output], "two undisturbed runs differ"
         for fault_ in options.faults or FAULTS:
             counts: Counter[str] = Counter()
             for number in range(options.repeats):
-                way = list(WAYS)[number % len(WAYS)]
-                luck = random.Random(f"{options.seed} {fault_} {number}")
-                trial = Trial(folder / f"{fault_}{number}", way, options.device, luck)
+                output = list(KINDS)[number % len(KINDS)]
+                rng = random.Random(f"{options.seed} {fault_} {number}")
+                trial = Trial(folder / f"{fault_}{number}", output, options.device, rng)
                 try:
-                    FAULTS[fault_](trial, seconds[way], sum(map(len, references[way].values())))
-                    done = len(files(trial.out)) / len(references[way])
-                    check_claims(trial, references[way])
-                    check_end(trial, references[way])
-                    counts["not begun" if not done else "all" if done >= 1 else "in between"] += 1
+                    FAULTS[fault_](
+                        trial, seconds[output], sum(map(len, references[output].values()))
+                    )
+                    done = len(files(trial.out)) / len(references[output])
+                    check_claims(trial, references[output])
+                    check_end(trial, references[output])
+                    counts["none" if not done else "all" if done >= 1 else "some"] += 1
                 except (AssertionError, OSError, subprocess.SubprocessError) as error:
                     bad += 1
-                    print(f"{fault_} {number} ({way}): {error}", flush=True)
+                    print(f"{fault_} {number} ({output}): {error}", flush=True)
                 shutil.rmtree(trial.place)
-            struck = ", ".join(f"{n} {what}" for what, n in sorted(counts.items()))
-            print(f"{fault_}: {options.repeats} times; files then: {struck}", flush=True)
+            states = ", ".join(f"{n} {state}" for state, n in sorted(counts.items()))
+            print(
+                f"{fault_}: {options.repeats} trials; files after the fault: {states}", flush=True
+            )
     return bool(bad)
 
 

@@ -1,10 +1,10 @@
-"""Read mutated files: each is read or clearly refused, without traceback, crash or much memory.
+"""Read mutated files. Each must be read or rejected without traceback, crash or much memory.
 
     tools/run stress fuzz [--cases N] [--seed N] [--keep FOLDER] [FILE...]
 
-Every reader of the package is tried, by the ending of a file's name; without files, small ones of
-each kind are made first. Cases run in a process of their own, which is started again after a crash
-or a hang; what went wrong is printed, and its file kept. The exit status is 1 if anything did.
+The tool tries every reader of the package that fits a file's extension. Without FILE, it makes
+small files of each kind. Cases run in a separate process, which restarts after a crash or a hang.
+The tool prints each failure, and --keep stores its file. The exit status is 1 after any failure.
 """
 
 import argparse
@@ -26,10 +26,10 @@ from functools import cache, partial
 from pathlib import Path
 
 CPU_SECONDS = 5.0  # for one case
-SECONDS = 60.0  # for one case that does nothing, as it may wait for other processes to end
+SECONDS = 60.0  # elapsed time for one case, which may wait for other processes
 MEMORY = 3 * 2**30  # bytes of address space; libraries take the first half of a GiB
 MAX_PIXELS = 1_000_000
-# Threads and their heaps take address space on machines with many cores.
+# On machines with many cores, threads and their heaps use much address space.
 LIMITS = {"OPENBLAS_NUM_THREADS": "1", "OPENIMAGEIO_THREADS": "1", "MALLOC_ARENA_MAX": "1"}
 LIMITS["PYTHONWARNINGS"] = "error"
 NUMBERS = (0, 1, 2, 255, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 10**9, 0x7FC00000)
@@ -38,7 +38,7 @@ TEXTS = (".toml", ".csv", ".cube", ".jsonl", ".json", ".c")
 
 
 def mutated(data: bytes, random_: random.Random, text: bool) -> bytes:
-    """A file with one to eight changes, most of them near its beginning, where a header is."""
+    """Apply one to eight changes, most of them in the header at the beginning of the file."""
     out = bytearray(data)
     for _ in range(random_.choice((1, 1, 2, 3, 8))):
         reach = len(out) if text else min(len(out), random_.choice((700, 700, 5000, len(out))))
@@ -66,7 +66,7 @@ def mutated(data: bytes, random_: random.Random, text: bool) -> bytes:
 
 
 def case(number: int, seed: int, files: list[Path], folder: Path) -> Path:
-    """The mutated file of a case."""
+    """Write the mutated file of a case, and return its path."""
     random_ = random.Random(f"{seed} {number}")
     source = random_.choice(files)
     path = folder / f"case{number}{source.suffix}"
@@ -75,8 +75,8 @@ def case(number: int, seed: int, files: list[Path], folder: Path) -> Path:
 
 
 @cache
-def ways(suffix: str) -> tuple[Callable[[Path], object], ...]:
-    """The readers of files with an ending."""
+def readers(suffix: str) -> tuple[Callable[[Path], object], ...]:
+    """Return the readers of files with an extension."""
     from clpipe.analysis.calibration.frames import FrameOverrides, read_frame
     from clpipe.analysis.emva.series import read_series
     from clpipe.analysis.noise_models.read import import_camera
@@ -97,15 +97,15 @@ def ways(suffix: str) -> tuple[Callable[[Path], object], ...]:
     from clpipe.inputs.poses import with_views
     from clpipe.outputs.sidecar import read_sidecar
 
-    def entering(**options: object) -> Callable[[Path], object]:
+    def loading(**options: object) -> Callable[[Path], object]:
         loader = ImageLoader(Request.from_options(max_pixels=MAX_PIXELS, **options))
 
-        def enter(path: Path) -> object:
+        def load(path: Path) -> object:
             job = Job(path, path.name)
             loader.first_chain([job])
             return loader.enter(job, loader.read(job))
 
-        return enter
+        return load
 
     def frame(path: Path) -> object:
         return read_frame(path, FrameOverrides()).read()
@@ -131,9 +131,9 @@ def ways(suffix: str) -> tuple[Callable[[Path], object], ...]:
     curve = setting("tone_curve", "file", "path")
     inverse_curve = setting("inverse_tone_curve", "file", "path")
     by_ending = {
-        **dict.fromkeys((".dng", ".nef", ".cr2", ".kdc"), (entering(), frame, noise_model)),
+        **dict.fromkeys((".dng", ".nef", ".cr2", ".kdc"), (loading(), frame, noise_model)),
         ".c": (noise_model,),
-        ".raw": (entering(values={"dump": "24x16:uint16le"}),),
+        ".raw": (loading(values={"dump": "24x16:uint16le"}),),
         ".toml": (
             lambda path: make_chain(load_settings(str(path)).drawn("key")),
             lambda path: load_camera(str(path)),
@@ -149,26 +149,26 @@ def ways(suffix: str) -> tuple[Callable[[Path], object], ...]:
         ".txt": (read_series,),
     }
     images = (
-        *(entering(), entering(transfer="srgb"), entering(config="unprocess")),
-        *(entering(start_at=step) for step in ("normalize", "demosaic", "gamma")),
+        *(loading(), loading(transfer="srgb"), loading(config="unprocess")),
+        *(loading(start_at=step) for step in ("normalize", "demosaic", "gamma")),
         *(load_picture, frame, read_attributes, layers),
     )
     return by_ending.get(suffix, images)
 
 
 def attempt(path: Path) -> str:
-    """Read a file in every way there is: "read" where one of them can, else "refused"."""
+    """Try all readers of a file; return "read" if one succeeds, otherwise "rejected"."""
     from clpipe.base.errors import ClpipeError
 
     outcomes = []
-    for way in ways(path.suffix.lower()):
+    for reader in readers(path.suffix.lower()):
         try:
-            way(path)
+            reader(path)
             outcomes.append("read")
-        except FileNotFoundError:  # of a sidecar that is cut off, which counts as missing
-            outcomes.append("refused")
+        except FileNotFoundError:  # a truncated sidecar counts as missing
+            outcomes.append("rejected")
         except ClpipeError as error:
-            outcomes.append("refused")
+            outcomes.append("rejected")
             text = str(error)
             assert text.isprintable(), repr(text)
             assert len(text) < 5000, text
@@ -177,7 +177,7 @@ def attempt(path: Path) -> str:
 
 
 def series_text() -> str:
-    """The text of a series for EMVA 1288."""
+    """Return the text of a series for EMVA 1288."""
     lines = ["# a", "v 3.1", "n 12 640 480"]
     for number in range(1, 10):
         for exposure in (f"b {number} {number}0,5", f"d {number}"):
@@ -186,7 +186,7 @@ def series_text() -> str:
 
 
 def make_seeds(folder: Path) -> list[Path]:
-    """Small files of every kind that is read."""
+    """Write small files of every kind that clpipe reads."""
     import numpy as np
     import OpenImageIO as oiio
 
@@ -268,74 +268,74 @@ def make_seeds(folder: Path) -> list[Path]:
 
 
 def work(numbers: range, seed: int, files: list[Path], folder: Path) -> None:
-    """Do cases, and say in a file how each begins and ends."""
+    """Run cases, and write the start and result of each to a file."""
     faulthandler.enable()
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    with (folder / "said").open("w", buffering=1, encoding="utf-8") as said:
+    with (folder / "progress").open("w", buffering=1, encoding="utf-8") as progress:
         for number in numbers:
             path = case(number, seed, files, folder)
-            said.write(f"begin {number}\n")
+            progress.write(f"begin {number}\n")
             try:
-                said.write(f"end {attempt(path)}\n")
+                progress.write(f"end {attempt(path)}\n")
             except Exception:
-                said.write("end traceback\n")
+                progress.write("end traceback\n")
                 print(f"case {number}", file=sys.stderr)
                 traceback.print_exc()
             path.unlink()
 
 
 def main() -> int:
-    """Run the cases and count what became of them."""
+    """Run the cases, and count their results."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("files", nargs="*", type=Path)
     parser.add_argument("--cases", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--keep", type=Path, help="where the files that went wrong are kept")
+    parser.add_argument("--keep", type=Path, help="a folder for files that cause failures")
     parser.add_argument("--from", dest="first", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.first is not None:
-        work(range(asked.first, asked.cases), asked.seed, asked.files, asked.folder)
+    options = parser.parse_args()
+    if options.first is not None:
+        work(range(options.first, options.cases), options.seed, options.files, options.folder)
         return 0
     counts: Counter[str] = Counter()
     bad: list[tuple[int, str]] = []
     with tempfile.TemporaryDirectory() as name, tempfile.TemporaryDirectory() as seeds:
-        asked.files = asked.files or make_seeds(Path(seeds))
+        options.files = options.files or make_seeds(Path(seeds))
         folder, number = Path(name), 0
-        while number < asked.cases:
-            number, ended = supervise(asked, folder, number, counts)
+        while number < options.cases:
+            number, ended = supervise(options, folder, number, counts)
             bad += ended
         for which, how in bad:
-            path = case(which, asked.seed, asked.files, folder)
+            path = case(which, options.seed, options.files, folder)
             print(f"case {which}{path.suffix}: {how}")
-            if asked.keep:
-                asked.keep.mkdir(parents=True, exist_ok=True)
-                shutil.copy(path, asked.keep)
+            if options.keep:
+                options.keep.mkdir(parents=True, exist_ok=True)
+                shutil.copy(path, options.keep)
     print(", ".join(f"{count} {how}" for how, count in sorted(counts.items())))
     return 1 if bad else 0
 
 
 def cpu_seconds(process: int) -> float:
-    """The processor time that a process has used."""
+    """Return the CPU time that a process has used."""
     fields = Path(f"/proc/{process}/stat").read_text("utf-8").rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def supervise(
-    asked: argparse.Namespace, folder: Path, first: int, counts: Counter[str]
+    options: argparse.Namespace, folder: Path, first: int, counts: Counter[str]
 ) -> tuple[int, list[tuple[int, str]]]:
-    """Do cases in a process until it is done, crashes or hangs; the next case, and what was bad."""
-    said = folder / "said"
-    options = [f"--cases={asked.cases}", f"--seed={asked.seed}", f"--from={first}"]
-    command = [sys.executable, "-m", "tools.stress.fuzz", *options, f"--folder={folder}"]
-    command += map(str, asked.files)
+    """Run cases in a process until it ends or hangs; return the next case and the failures."""
+    progress = folder / "progress"
+    arguments = [f"--cases={options.cases}", f"--seed={options.seed}", f"--from={first}"]
+    command = [sys.executable, "-m", "tools.stress.fuzz", *arguments, f"--folder={folder}"]
+    command += map(str, options.files)
     number, bad, at = first, [], 0
-    said.write_text("", "utf-8")
+    progress.write_text("", "utf-8")
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | LIMITS) as child:
         since, used = time.monotonic(), 0.0
         while True:
             done = child.poll() is not None
-            lines = said.read_text("utf-8").split("\n")[:-1]
+            lines = progress.read_text("utf-8").split("\n")[:-1]
             for line in lines[at:]:
                 word, value = line.split()
                 if word == "begin":

@@ -1,22 +1,27 @@
-"""Compile the kernels of the usual chains for GPUs that are not here, and print what came of it.
+"""Compile the kernels of common chains for GPUs, without having the GPUs, and print figures.
 
     tools/run stress gpu_compile [--only TEXT] [--target NAME ...]
 
-The chains: the default and the paper's development, the raw with every source of noise, and each
-method of each stage alone. The targets: NVIDIA sm_80 and sm_90, AMD gfx1030 and gfx1100, Intel DG2.
-What a compiler is missing for is said and left out:
+The chains are the default and the paper's development, the raw with every source of noise, and each
+method of each stage by itself. The targets are NVIDIA sm_80 and sm_90, AMD gfx1030 and gfx1100, and
+Intel DG2. The tool names and skips targets without a compiler. To install the compilers:
 
     apt-get install clang-19 libclc-19                         # NVIDIA and AMD
     pip install nvidia-cuda-nvcc-cu12 nvidia-cuda-nvdisasm     # NVIDIA: ptxas, nvdisasm
     apt-get install intel-opencl-icd                           # Intel: ocloc
 
-Columns: registers of a work item (of Intel: of a thread), bytes that spill from them, bytes of
-private memory (spills included, but on Intel), occupancy as registers and work-groups allow (of
-Intel: work items of a thread), instructions of the whole text, those a pixel away from the edges
-(a loop's count once), and fused multiply-adds of floats.
+The columns are:
 
-The exit status is 1 if a kernel does not compile, spills more than ALLOWED says, or if one that
-makes the raw has a fused multiply-add: the raw's bits must be the same on every device.
+- registers: per work item (Intel: per thread).
+- spilled B: bytes that spill from registers.
+- private B: bytes of private memory. They include spills, except on Intel.
+- occupancy: the limit by registers and work-groups (Intel: work items per thread).
+- instructions: in the whole kernel.
+- a pixel: instructions per pixel away from the edges; those in a loop count once.
+- fused: fused multiply-adds of floats.
+
+The exit status is 1 if a kernel does not compile, or spills more than ALLOWED. It is also 1 if a
+kernel of the raw has a fused multiply-add, because the raw must be identical on every device.
 """
 
 import argparse
@@ -46,8 +51,8 @@ from clpipe.engine.work_items import columns_of
 from clpipe.reference.cfa import PATTERNS
 from clpipe.stage import variant_label, variants
 
-ALLOWED: dict[str, int] = {}  # bytes that a launch may spill, on any target; others none
-RAW = "raw: "  # begins the names of the chains from a render to its raw
+ALLOWED: dict[str, int] = {}  # bytes that a launch may spill on any target; 0 for all others
+RAW = "raw: "  # prefix of the names of chains from a render to its raw
 OPENCL = "-x cl -cl-std=CL1.2 -O3 -w -S -Xclang -fdeclare-opencl-builtins"
 OPENCL += " -Xclang -finclude-default-header -Xclang -mlink-builtin-bitcode -Xclang"
 NEAR_EDGE = "INLINE bool near_edge(site at, uint rows, extent e) {"
@@ -57,12 +62,12 @@ INTEL_FUSED = r"(?m)^(?:\(.*?\))?\s*mad .*:f\b"
 
 
 class MissingError(Exception):
-    """A compiler that is not installed; the message says which."""
+    """A compiler is not installed. The message names it."""
 
 
 @dataclass(frozen=True)
 class Compiled:
-    """What a compiler made of a kernel."""
+    """Figures of a compiled kernel."""
 
     registers: int
     spilled: int  # bytes
@@ -74,23 +79,23 @@ class Compiled:
 
 @dataclass(frozen=True)
 class Job:
-    """A kernel that is compiled, and the first chain that has it."""
+    """A kernel to compile, and the first chain that contains it."""
 
     chain: str
     kernel: Kernel
 
     @property
     def pixels(self) -> int:
-        """Pixels of a work item; 0 where it has none."""
+        """Pixels per work item; 0 if work items have no pixels."""
         launch = self.kernel.launch
         return launch.rows * columns_of(launch, 1) if isinstance(launch, Launch) else 0
 
 
 def tool(name: str) -> str:
-    """The path of a program: on the PATH, or of a package that pip installed.
+    """Return the path of a program, from PATH or from a pip package of NVIDIA.
 
     Raises:
-        MissingError: it is not there.
+        MissingError: the program is not installed.
     """
     packages = Path(sysconfig.get_path("purelib"), "nvidia").glob(f"*/bin/{name}")
     found = shutil.which(name) or next(map(str, packages), None)
@@ -100,7 +105,7 @@ def tool(name: str) -> str:
 
 
 def clang() -> str:
-    """The newest clang; distributions put the version into its name."""
+    """Return the newest clang. Distributions add the version to its name."""
     for name in ("clang", *(f"clang-{version}" for version in range(25, 14, -1))):
         if found := shutil.which(name):
             return found
@@ -108,7 +113,7 @@ def clang() -> str:
 
 
 def builtins(name: str) -> Path:
-    """OpenCL's built-in functions for a target, of libclc."""
+    """Return libclc's file of OpenCL's built-in functions for a target."""
     for folder in ("/usr/lib/clc", "/usr/share/clc", "/usr/local/share/clc"):
         if (path := Path(folder, name)).exists():
             return path
@@ -116,10 +121,10 @@ def builtins(name: str) -> Path:
 
 
 def output_of(*command: str | Path, **variables: str) -> str:
-    """What a compiler prints.
+    """Run a compiler, and return its output.
 
     Raises:
-        CalledProcessError: it fails; ``stdout`` has the message.
+        CalledProcessError: the compiler failed; ``stdout`` contains the message.
     """
     return subprocess.run(
         command,
@@ -132,32 +137,32 @@ def output_of(*command: str | Path, **variables: str) -> str:
 
 
 def number_in(text: str, pattern: str) -> int:
-    """The number that a pattern finds; 0 where it finds nothing."""
+    """Return the number that a pattern finds; 0 if it finds nothing."""
     found = re.search(pattern, text)
     return int(found[1]) if found else 0
 
 
 def for_nvidia(arch: str, source: Path) -> Compiled:
-    """A kernel by clang and ptxas."""
+    """Compile a kernel with clang and ptxas."""
     ptx, cubin = source.with_suffix(".ptx"), source.with_suffix(".cubin")
     library = builtins("nvptx64--nvidiacl.bc")
     assembler, disassembler = tool("ptxas"), tool("nvdisasm")
-    # The library lacks what NVIDIA's own has for native_exp2.
+    # libclc has no native_exp2 for NVIDIA; this is the intrinsic of NVIDIA's own library.
     exp2 = "-Dnative_exp2=__nvvm_ex2_approx_ftz_f"
     target = ("-target", "nvptx64-nvidia-nvcl", f"-march={arch}", exp2)
     output_of(clang(), *target, *OPENCL.split(), library, "-o", ptx, source)
-    said = output_of(assembler, f"-arch={arch}", "-v", "-o", cubin, ptx)
+    log = output_of(assembler, f"-arch={arch}", "-v", "-o", cubin, ptx)
     text = output_of(disassembler, "-c", cubin)
-    registers = number_in(said, r"Used (\d+) registers")
-    # A multiprocessor has room for 32 groups, 64 warps and 65536 registers, of which a warp takes
-    # 256 at a time.
+    registers = number_in(log, r"Used (\d+) registers")
+    # A multiprocessor can hold 32 groups, 64 warps and 65536 registers, allocated to warps in units
+    # of 256.
     group = -(-number_in(source.read_text("utf-8"), r"reqd_work_group_size\((\d+)") // 32)
     warps = 65536 // (-(-registers * 32 // 256) * 256)
     warps = min(warps // group, 64 // group, 32) * group
     return Compiled(
         registers,
-        number_in(said, r"(\d+) bytes spill stores"),
-        number_in(said, r"(\d+) bytes stack frame"),
+        number_in(log, r"(\d+) bytes spill stores"),
+        number_in(log, r"(\d+) bytes stack frame"),
         f"{warps / 64:.0%}",
         len(re.findall(r"(?m)^\s*/\*[0-9a-f]+\*/\s+(?!NOP)", text)),
         len(re.findall(NVIDIA_FUSED, text)),
@@ -165,7 +170,7 @@ def for_nvidia(arch: str, source: Path) -> Compiled:
 
 
 def for_amd(arch: str, source: Path) -> Compiled:
-    """A kernel by clang."""
+    """Compile a kernel with clang."""
     assembly = source.with_suffix(".s")
     library = builtins("amdgcn--amdhsa.bc")
     target = ("-target", "amdgcn-amd-amdhsa", f"-mcpu={arch}", "-nogpulib")
@@ -182,7 +187,7 @@ def for_amd(arch: str, source: Path) -> Compiled:
 
 
 def for_intel(arch: str, source: Path) -> Compiled:
-    """A kernel by Intel's compiler, which is asked for its assembly."""
+    """Compile a kernel with Intel's compiler, which also writes its assembly."""
     folder = source.with_suffix(".d")
     options = ("-options", "-cl-std=CL1.2", "-internal_options", "-cl-intel-allow-zebin")
     output_of(
@@ -214,7 +219,7 @@ TARGETS: dict[str, Callable[[Path], Compiled]] = {
 
 
 def chains() -> Iterator[tuple[str, Chain]]:
-    """The chains and their names."""
+    """Yield the names and chains."""
     names = list(all_stages())
     until_raw = tuple(names[: names.index("quantize") + 1])
     for noise in all_stages()["sensor_noise"].by_name:
@@ -233,7 +238,7 @@ def chains() -> Iterator[tuple[str, Chain]]:
 
 
 def jobs(only: str) -> list[Job]:
-    """The kernels of the chains with a text in their names, each once."""
+    """Return the distinct kernels of chains whose names contain a text."""
     found: dict[str, Job] = {}
     for name, chain in chains():
         if only in name:
@@ -245,7 +250,7 @@ def jobs(only: str) -> list[Job]:
 
 
 def compiled(job: Job, target: str, folder: Path) -> tuple[Compiled, int]:
-    """What a target's compiler makes of a kernel, and its instructions without code for edges."""
+    """Compile a kernel for a target; also count its instructions without code for edges."""
     whole, inside = (folder / f"{target}-{job.kernel.name}-{name}.cl" for name in ("", "inside"))
     source = job.kernel.source
     assert NEAR_EDGE in source
@@ -257,15 +262,15 @@ def compiled(job: Job, target: str, folder: Path) -> tuple[Compiled, int]:
     return result, TARGETS[target](inside).instructions
 
 
-def wrong_with(job: Job, result: Compiled) -> str:
-    """What a kernel may not do and does, or nothing."""
+def violation(job: Job, result: Compiled) -> str:
+    """Return the requirement that a kernel violates, or an empty text."""
     if result.spilled > ALLOWED.get(job.kernel.launch.name, 0):
         return "SPILLS"
     return "FUSED" if job.chain.startswith(RAW) and result.fused else ""
 
 
 def row(job: Job, target: str, folder: Path) -> tuple[list[str], bool]:
-    """The row of a kernel, and whether all is well with it.
+    """Return the row of a kernel, and whether it meets all requirements.
 
     Raises:
         MissingError: a compiler is not installed.
@@ -274,9 +279,9 @@ def row(job: Job, target: str, folder: Path) -> tuple[list[str], bool]:
     try:
         result, inside = compiled(job, target, folder)
     except subprocess.CalledProcessError as error:
-        said = error.stdout.strip().splitlines() or ["it said nothing"]
-        return [*name, *[""] * 7, f"does not compile: {said[-1]}"], False
-    wrong = wrong_with(job, result)
+        lines = error.stdout.strip().splitlines() or ["it printed nothing"]
+        return [*name, *[""] * 7, f"does not compile: {lines[-1]}"], False
+    wrong = violation(job, result)
     numbers = [result.registers, result.spilled, result.private, result.occupancy]
     numbers += [result.instructions, inside // job.pixels if job.pixels else "-", result.fused]
     return [*name, *map(str, numbers), wrong], not wrong
@@ -288,7 +293,7 @@ HEADINGS += ["instructions", "a pixel", "fused", ""]
 
 def show(target: str, rows: list[list[str]], wrong: int) -> None:
     """Print the table of a target."""
-    print(f"{target}: {len(rows)} kernels, {wrong} not as they should be")
+    print(f"{target}: {len(rows)} kernels, {wrong} with violations")
     table = [HEADINGS, *rows]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     for texts in table:
@@ -298,26 +303,28 @@ def show(target: str, rows: list[list[str]], wrong: int) -> None:
 
 
 def main() -> int:
-    """Compile, print a table for each target."""
+    """Compile the kernels, and print a table for each target."""
     parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
-    parser.add_argument("--only", default="", metavar="TEXT", help="chains with TEXT in their name")
+    parser.add_argument(
+        "--only", default="", metavar="TEXT", help="compile only chains with TEXT in their name"
+    )
     parser.add_argument("--target", action="append", choices=TARGETS, help="may be repeated")
     options = parser.parse_args()
     kernels = jobs(options.only)
-    well: list[bool] = []
+    passed: list[bool] = []
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count()) as threads:
         for target in options.target or TARGETS:
             compile_ = partial(row, target=target, folder=Path(folder))
             try:
                 rows = list(threads.map(compile_, kernels))
             except MissingError as error:
-                print(f"{target}: left out, there is {error}\n")
+                print(f"{target}: skipped, there is {error}\n")
                 continue
-            well += [good for _, good in rows]
+            passed += [good for _, good in rows]
             show(target, [texts for texts, _ in rows], sum(not good for _, good in rows))
-    if not well:
-        print("gpu_compile: nothing was compiled", file=sys.stderr)
-    return 0 if well and all(well) else 1
+    if not passed:
+        print("gpu_compile: no target has a compiler", file=sys.stderr)
+    return 0 if passed and all(passed) else 1
 
 
 if __name__ == "__main__":

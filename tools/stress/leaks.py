@@ -1,10 +1,11 @@
-"""Put thousands of small images through one process and print what it holds every 1,000.
+"""Develop thousands of small images in one process, and print its resources after every 1,000.
 
-Images have many sizes and are half, float, mosaics and kept; some are damaged or too large, some go
-through in tiles; outputs are JPEG, EXR and DNG. Half of them go through ``clpipe run``, half
-through one ``clpipe.Pipeline``. Memory, file descriptors, threads and OpenCL objects must stay
-flat: the exit status is 1 where the second half of the run holds much more at its end than at its
-beginning.
+Images have many sizes, and are half or float, renders or mosaics. Some are damaged, too large or
+processed in tiles. Outputs are JPEG, EXR and DNG. ``clpipe run`` develops half of the images, and
+one ``clpipe.Pipeline`` the other half.
+
+Memory, file descriptors, threads and OpenCL objects must not grow. The exit status is 1 if the
+process has clearly more of them at the end than after the first half.
 """
 
 import argparse
@@ -26,7 +27,7 @@ import clpipe
 from clpipe.commands.main import main as command
 from clpipe.images.write import write_exr
 
-BATCH = 1000  # images between two lines
+BATCH = 1000  # images per line of the table
 SIZES = ((8, 8), (17, 40), (64, 64), (90, 31), (1, 9), (33, 120))  # height, width
 COUNTED = ("Context", "CommandQueue", "Program", "Kernel", "Buffer")
 RUNS: dict[str, list[str]] = {
@@ -40,7 +41,7 @@ alive: Counter[str] = Counter()
 
 
 def count_objects() -> None:
-    """Have pyopencl's objects count themselves, from creation to destruction."""
+    """Make pyopencl's objects count themselves, from creation to destruction."""
     for name in COUNTED:
         base = getattr(cl, name)
 
@@ -57,7 +58,7 @@ def count_objects() -> None:
 
 
 def write_sources(folder: Path) -> None:
-    """Two folders of links to a few files: renders, and mosaics that enter in the middle."""
+    """Write two folders of links to a few files: renders, and mosaics for --start-at."""
     random = np.random.default_rng(0)
     for name, channels in (("renders", "RGB"), ("mosaics", "Y")):
         files = folder / f"{name} files"
@@ -78,7 +79,7 @@ def write_sources(folder: Path) -> None:
 
 
 def run(folder: Path, name: str, options: list[str]) -> None:
-    """A thousand images through ``clpipe run``."""
+    """Develop a thousand images with ``clpipe run``."""
     inputs = folder / ("mosaics" if name == "kept" else "renders")
     arguments = ["run", str(inputs), "-o", str(folder / "out"), "--max-pixels", "30000", *options]
     with open(os.devnull, "w", encoding="utf-8") as nowhere, contextlib.redirect_stderr(nowhere):
@@ -94,7 +95,7 @@ def run(folder: Path, name: str, options: list[str]) -> None:
 
 
 def process(pipeline: clpipe.Pipeline, number: int) -> None:
-    """A thousand images through a Pipeline."""
+    """Develop a thousand images with a Pipeline."""
     random = np.random.default_rng(number)
     for i in range(BATCH):
         image = random.random((*SIZES[i % len(SIZES)], 3)).astype((np.float16, np.float32)[i % 2])
@@ -104,8 +105,8 @@ def process(pipeline: clpipe.Pipeline, number: int) -> None:
         pipeline.process(image, str(i), **({"iso": 100 + i} if i % 3 == 0 else {}))
 
 
-def held() -> dict[str, int]:
-    """What this process holds: memory in KiB, and numbers of things."""
+def resources() -> dict[str, int]:
+    """Return the memory of this process in KiB, and the numbers of its objects."""
     gc.collect()
     status = Path("/proc/self/status").read_text("utf-8")
     return {
@@ -119,7 +120,7 @@ def held() -> dict[str, int]:
 
 
 def main() -> int:
-    """Run, print the table, compare."""
+    """Develop the images, and print the table."""
     parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
     parser.add_argument("--images", type=int, default=20_000, metavar="N")
     options = parser.parse_args()
@@ -136,12 +137,12 @@ def main() -> int:
                 process(pipeline, number)
             else:
                 run(folder, kind, RUNS[kind])
-            rows.append(held())
+            rows.append(resources())
             if number == 0:
                 print("images  what     ", "  ".join(rows[0]))
             cells = (str(n).rjust(len(k)) for k, n in rows[-1].items())
             print(f"{(number + 1) * BATCH:6}  {kind:9}", "  ".join(cells), flush=True)
-    half = rows[len(rows) // 2 - 1]  # every kind of run has been there by then
+    half = rows[len(rows) // 2 - 1]  # after every kind of run
     grown = [k for k, n in rows[-1].items() if n > half[k] * 1.05 + 2]
     print(f"grown since the middle: {', '.join(grown) or 'nothing'}")
     return 1 if grown else 0

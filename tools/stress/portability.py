@@ -1,14 +1,17 @@
-"""Run clpipe on every OpenCL runtime, and with PoCL on every kind of CPU, that Debian can offer.
+"""Run clpipe on every OpenCL runtime for Debian, and with PoCL on emulated CPUs.
 
-Installs PoCL from pip and from Debian, Intel's CPU runtime, Mesa's rusticl on llvmpipe and
-Oclgrind, an emulator that reports invalid memory accesses and data races, and runs ``clpipe check``
-on each. Then ``clpipe run`` on CPUs that qemu-user emulates: pip's PoCL on those of x86-64 (--only
-cpus; two to three minutes each), and Debian's on arm64 (--only arm64; 1 GB is installed in the work
-folder). Debian's packages need root.
+The tool installs these runtimes, and runs ``clpipe check`` on each: PoCL from pip and from Debian,
+Intel's CPU runtime, Mesa's rusticl on llvmpipe, and Oclgrind. Oclgrind is an emulator that reports
+invalid memory accesses and data races. Debian's packages need root.
 
-Prints a table. The exit status is 0 only if at least one runtime could be run and all that could
-passed. All files go to the work folder and serve again next time; what each run printed is in
-WORK/runs.
+Then the tool runs ``clpipe run`` on CPUs that qemu-user emulates:
+
+- x86-64 with pip's PoCL (--only cpus; two to three minutes each)
+- arm64 with Debian's PoCL (--only arm64; installs 1 GB into the work folder)
+
+It prints a table. The exit status is 0 if at least one runtime could run and all of those passed.
+All files are in the work folder, and later runs reuse them. WORK/runs contains the output of each
+run.
 """
 
 import argparse
@@ -35,7 +38,7 @@ DEVICES = """if True:
     from clpipe.engine.discovery import find_devices
     print(json.dumps([[d.platform, d.name, d.driver, d.problem] for d in find_devices()]))
 """
-# A write past a buffer and a data race: Oclgrind must report them, else its silence means nothing.
+# A write past a buffer and a data race. Oclgrind must report both; otherwise it detects nothing.
 PLANTED = """if True:
     import sys, pyopencl as cl
     device = [d for p in cl.get_platforms() for d in p.get_devices()][int(sys.argv[1])]
@@ -48,22 +51,22 @@ PLANTED = """if True:
 
 
 def debian_pocl(work: Path) -> str:
-    """What Debian's .icd says."""
+    """Return the text of Debian's .icd file."""
     return debian_package("pocl-opencl-icd", ".icd").read_text("utf-8")
 
 
 def oclgrind(work: Path) -> str:
-    """The library: the program that wraps it misses the loader within pyopencl."""
+    """Return the library. Oclgrind's wrapper program does not affect the loader within pyopencl."""
     return str(debian_package("oclgrind", "-icd.so"))
 
 
 def intel(work: Path) -> None:
-    """Nothing: clpipe finds it, as with the extra ``intel``."""
+    """Install the extra ``intel``; clpipe finds the runtime without an .icd file."""
     pip_install(work / "venv", f"{ROOT}[intel]")
 
 
 def rusticl(work: Path) -> str:
-    """What Debian's .icd says."""
+    """Return the text of Debian's .icd file."""
     return debian_package("mesa-opencl-icd", "rusticl.icd").read_text("utf-8")
 
 
@@ -82,33 +85,33 @@ RUNTIMES = (
 
 
 def measure(runtime: Runtime, work: Path, row: list[str]) -> bool:
-    """Run a runtime: fills the table's row in, and whether it passed."""
+    """Check a runtime, fill in its row of the table, and return whether it passed."""
     run = Run(runtime, work)
-    devices = json.loads(run.python_says("devices", "-c", DEVICES)[0])
-    found = [i for i, d in enumerate(devices) if runtime.known_by in f"{d[0]} {d[2]}"]
+    devices = json.loads(run.run_python("devices", "-c", DEVICES)[0])
+    found = [i for i, d in enumerate(devices) if runtime.marker in f"{d[0]} {d[2]}"]
     if not found:
-        raise UnavailableError(f"no device of its own, only {[d[1] for d in devices]}")
+        raise UnavailableError(f"found none of its devices, only {[d[1] for d in devices]}")
     number = str(found[0])
     _, row[1], row[2], problem = devices[found[0]]
     if problem:
-        raise UnavailableError(f"clpipe passes it over: {problem}")
+        raise UnavailableError(f"clpipe skips it: {problem}")
     if runtime.planted:
-        run.python_says("planted", "-c", PLANTED, number)
+        run.run_python("planted", "-c", PLANTED, number)
         if not run.log.exists() or runtime.planted not in run.log.read_text("utf-8"):
-            raise BrokenError("it does not report errors that were planted")
+            raise BrokenError("it does not report the planted errors")
         run.log.unlink()
     small = ["--small"] if runtime.planted else []
     check = ("-m", "clpipe", "check", "--json", "--device", number, *small)
-    printed, said = run.python_says("check", *check)
+    printed, errors = run.run_python("check", *check)
     try:
         checks = json.loads(printed)["checks"]
     except ValueError:
-        raise BrokenError(f"check: what it printed is no report: {printed[:60]!r}") from None
+        raise BrokenError(f"check: expected a report, found {printed[:60]!r}") from None
     failed = [c for c in checks if not c["passed"]]
     row[3] = f"{len(checks) - len(failed)} passed, {len(failed)} failed"
     row[3] += "".join(f"; {c['stage']} {c['method']} off by {c['largest']:.2g}" for c in failed)
-    # Misused calls go to stderr; pyopencl asks clGetDeviceInfo for newer values and takes a no.
-    calls = re.findall(r"^\s*Function: (\w+)", said, re.MULTILINE)
+    # Misused calls go to stderr. pyopencl queries new values by clGetDeviceInfo and handles errors.
+    calls = re.findall(r"^\s*Function: (\w+)", errors, re.MULTILINE)
     wrong = [f"misuse of {call}" for call in calls if call != "clGetDeviceInfo"]
     if run.log.exists():
         wrong += [line for line in run.log.read_text("utf-8").splitlines() if line.strip()]
@@ -118,11 +121,14 @@ def measure(runtime: Runtime, work: Path, row: list[str]) -> bool:
 
 
 def main() -> int:
-    """Install, run, print the table."""
+    """Install and check the runtimes, and print the table."""
     parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
     parser.add_argument("--work", type=Path, default=ROOT / "build/portability", metavar="DIR")
     parser.add_argument(
-        "--only", default="", metavar="TEXT", help="those with TEXT in the name, as in cpus"
+        "--only",
+        default="",
+        metavar="TEXT",
+        help="run only runtimes with TEXT in their name, such as cpus",
     )
     options = parser.parse_args()
     work: Path = options.work.resolve()
@@ -143,7 +149,7 @@ def main() -> int:
             else:
                 passed.append(measure(runtime, work, row))
         except UnavailableError as error:
-            row[3] = f"not run: {error}"
+            row[3] = f"skipped: {error}"
         except BrokenError as error:
             row[3] = f"BROKEN: {error}"
             passed.append(False)

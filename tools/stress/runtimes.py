@@ -1,4 +1,4 @@
-"""What portability.py installs and runs OpenCL runtimes with."""
+"""Helpers of portability.py that install and run OpenCL runtimes."""
 
 import contextlib
 import os
@@ -12,36 +12,36 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-LIMIT = 1800  # seconds a runtime; race detection takes the longest
+LIMIT = 1800  # seconds for each runtime; race detection takes the longest
 FOREIGN = ("OCL", "OPENCL_", "POCL_", "PYOPENCL_", "CL_", "CLPIPE_", "RUSTICL_", "MESA_", "PYTHON")
 FOREIGN += ("LD_LIBRARY",)
 
 
 class UnavailableError(Exception):
-    """A runtime cannot be run here; the message says why."""
+    """A runtime cannot run on this machine. The message states the reason."""
 
 
 class BrokenError(Exception):
-    """A run that crashed, hung or said nothing that makes sense; the message says which."""
+    """A run crashed, hung or printed nonsense. The message states which."""
 
 
 @dataclass(frozen=True)
 class Runtime:
     """An OpenCL runtime.
 
-    ``install`` takes the work folder and returns the text of an .icd that alone is to be seen; None
-    where clpipe is to find the runtime by itself.
+    ``install`` receives the work folder. It returns the text of the only .icd file that the run
+    may see, or None if clpipe finds the runtime by itself.
     """
 
     name: str
     install: Callable[[Path], str | None]
-    known_by: str  # in its platform's name or its driver's version
-    environment: dict[str, str] = field(default_factory=dict)  # RUN is the folder of the run
-    planted: str = ""  # what an emulator says about planted errors
+    marker: str  # a text in the platform's name or the driver's version
+    environment: dict[str, str] = field(default_factory=dict)  # RUN/ becomes the folder of the run
+    planted: str = ""  # the emulator's message about planted errors
 
 
 def output_of(*command: str | Path) -> str:
-    """What a command of the installation prints."""
+    """Run a command of the installation, and return its standard output."""
     variables = {"DEBIAN_FRONTEND": "noninteractive", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
     environment = os.environ | variables
     try:
@@ -49,14 +49,14 @@ def output_of(*command: str | Path) -> str:
     except OSError as error:
         raise UnavailableError(f"{command[0]}: {error.strerror}") from None
     if done.returncode:
-        said = (done.stderr.strip() or done.stdout.strip() or "it said nothing").splitlines()
-        errors = [line for line in said if re.match(r"\s*(E:|\w*Error:)", line, re.IGNORECASE)]
-        raise UnavailableError(f"{Path(command[0]).name}: {(errors or said)[-1].strip()}")
+        lines = (done.stderr.strip() or done.stdout.strip() or "it printed nothing").splitlines()
+        errors = [line for line in lines if re.match(r"\s*(E:|\w*Error:)", line, re.IGNORECASE)]
+        raise UnavailableError(f"{Path(command[0]).name}: {(errors or lines)[-1].strip()}")
     return done.stdout
 
 
 def debian_package(package: str, ending: str) -> Path:
-    """A file of a Debian package, which is installed if it is not there."""
+    """Return a file of a Debian package, after installing the package if necessary."""
     try:
         listed = output_of("dpkg", "-L", package)
     except UnavailableError:
@@ -69,21 +69,21 @@ def debian_package(package: str, ending: str) -> Path:
 
 
 def pip_install(venv: Path, *requirements: str | Path) -> None:
-    """Put packages into a virtual environment, which is made if it is not there."""
+    """Install packages into a virtual environment, after creating it if necessary."""
     if not (venv / "bin/pip").exists():
         output_of(sys.executable, "-m", "venv", venv)
     output_of(venv / "bin/python", "-m", "pip", "install", "-q", *requirements)
 
 
 def pip_pocl(work: Path) -> str:
-    """Nothing: it came with the project and pyopencl always loads it. It needs a linker, though."""
+    """Install a linker for the PoCL that came with the project; pyopencl loads it without .icd."""
     if not shutil.which("ld"):
         debian_package("binutils", "/ld")
     return ""
 
 
 class Run:
-    """A runtime's run: a fresh folder, and the programs run there, all within the time limit."""
+    """A run of a runtime: an empty folder for its programs, which share one time limit."""
 
     def __init__(self, runtime: Runtime, work: Path) -> None:
         self.python = work / "venv/bin/python"
@@ -104,11 +104,11 @@ class Run:
             self.environment[name] = value.replace("RUN/", f"{self.folder}/")
         self.end = time.monotonic() + LIMIT
 
-    def python_says(self, name: str, *arguments: str) -> tuple[str, str]:
-        """Standard output and error of a Python program, which are kept in files too.
+    def run_python(self, name: str, *arguments: str) -> tuple[str, str]:
+        """Run Python, and return standard output and error. Files NAME.out and NAME.err keep them.
 
         Raises:
-            BrokenError: it hung, crashed or ended in an error.
+            BrokenError: the program hung, crashed or failed.
         """
         out, err = self.folder / f"{name}.out", self.folder / f"{name}.err"
         with out.open("w", encoding="utf-8") as stdout, err.open("w", encoding="utf-8") as stderr:
@@ -124,18 +124,18 @@ class Run:
             try:
                 status = process.wait(self.end - time.monotonic())
             except subprocess.TimeoutExpired:
-                raise BrokenError(f"{name}: not done after {LIMIT} s") from None
+                raise BrokenError(f"{name} did not end within {LIMIT} s") from None
             finally:
                 with contextlib.suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGKILL)  # what it left running too
+                    os.killpg(process.pid, signal.SIGKILL)  # also its child processes
                 process.wait()
-        printed, said = (
+        printed, errors = (
             out.read_text("utf-8", errors="replace"),
             err.read_text("utf-8", errors="replace"),
         )
         if status < 0:
             raise BrokenError(f"{name}: crashed, {signal.Signals(-status).name}")
         if status and not printed.strip():  # a failed check prints its report
-            last = (said.strip() or "it said nothing").splitlines()[-1]
+            last = (errors.strip() or "it printed nothing").splitlines()[-1]
             raise BrokenError(f"{name}: exit status {status}: {last}")
-        return printed, said
+        return printed, errors

@@ -1,4 +1,4 @@
-"""How near denoised pictures come to their truth, as numbers and as crops to look at."""
+"""Compares denoised pictures with their ground truth, in figures and crops."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,35 +10,35 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from torch.nn import functional
 
-CROP = 160  # px, of a picture
-LABEL = 14  # px, over crops
-NOISY = "noisy"  # what was not denoised
+CROP = 160  # px, side of a crop
+LABEL = 14  # px, height of a label
+NOISY = "noisy"  # the pictures before denoising
 
 
 @dataclass(frozen=True)
 class Score:
-    """How near pictures come to their truths: PSNR in dB and SSIM, (seed, picture) each."""
+    """PSNR in dB and SSIM of pictures, (seed, picture) each."""
 
     psnr: np.ndarray
     ssim: np.ndarray
 
     def record(self) -> dict[str, list[list[float]]]:
-        """The scores as JSON values."""
+        """Return the scores as JSON values."""
         return {"psnr": self.psnr.tolist(), "ssim": self.ssim.tolist()}
 
 
 def scores(images: Sequence[Sequence[Tensor]], truths: Sequence[Tensor]) -> Score:
-    """The scores of pictures, of each seed."""
+    """Compute the scores of pictures for each seed."""
     each = [[(psnr(i, t), ssim(i, t)) for i, t in zip(own, truths, strict=True)] for own in images]
     return Score(*np.moveaxis(np.array(each), 2, 0))
 
 
 def table(found: Mapping[str, Score], more: Mapping[str, Mapping[str, str]]) -> str:
-    """Scores as Markdown: means over pictures, of each seed, and how often the first regime wins.
+    """Format scores as Markdown: means over pictures, by seed, and wins of the first regime.
 
     Args:
-        found: by regime.
-        more: further columns by their headings, each by regime.
+        found: scores by regime.
+        more: further columns by heading, each by regime.
     """
     first = next(name for name in found if name != NOISY)
     headings = ["trained on", "PSNR, dB", "of each seed", "SSIM", f"{first} wins", *more]
@@ -59,12 +59,12 @@ def table(found: Mapping[str, Score], more: Mapping[str, Mapping[str, str]]) -> 
 
 
 def psnr(image: Tensor, truth: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB; 1 is the peak."""
+    """Return the peak signal-to-noise ratio in dB, with a peak of 1."""
     return -10 * torch.log10((image - truth).square().mean()).item()
 
 
 def ssim(image: Tensor, truth: Tensor) -> float:
-    """Structural similarity (Wang et al., 2004), Gaussian window of 11 px, mean over channels."""
+    """Return the structural similarity (Wang et al., 2004; Gaussian window of 11 px), a mean."""
     offsets = torch.arange(-5, 6)
     row = torch.exp(-(offsets**2) / (2 * 1.5**2))
     window = (row[:, None] * row / row.sum() ** 2)[None, None]
@@ -77,7 +77,7 @@ def ssim(image: Tensor, truth: Tensor) -> float:
 
 
 def corner(truth: Tensor) -> tuple[int, int]:
-    """Row and column of the crop with the most detail: neither flat nor dark."""
+    """Return row and column of the crop with the most detail."""
     luma = truth.mean(0)
     step = CROP // 2
     rows, columns = (range(0, max(side - CROP, 0) + 1, step) for side in luma.shape)
@@ -86,12 +86,13 @@ def corner(truth: Tensor) -> tuple[int, int]:
 
 
 def draw_crops(rows: Sequence[Sequence[tuple[str, Tensor]]], path: Path, scale: int = 2) -> None:
-    """Write crops of pictures beside each other, one scene in each row, each with a label.
+    """Write labelled crops of pictures side by side, with a row for each scene.
 
     Args:
-        rows: of each scene, labels and pictures (3, height, width), 0 to 1; the last is the truth.
-        path: of the PNG.
-        scale: how many pixels one becomes, each way.
+        rows: labels and pictures of each scene, (3, height, width), 0 to 1. The last picture is the
+            ground truth.
+        path: the PNG.
+        scale: the enlargement.
     """
     side = CROP * scale
     across = max(map(len, rows))

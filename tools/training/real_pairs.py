@@ -8,7 +8,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 
 @dataclass(frozen=True)
 class RealPair:
-    """A camera's picture, and the mean of many of its scene."""
+    """A camera's picture, and the mean of many pictures of the same scene."""
 
     name: str
     camera: str  # the name without the scene's number
@@ -17,10 +17,10 @@ class RealPair:
 
 
 def find_pairs(folder: Path) -> list[RealPair]:
-    """The pairs of a folder: NAME_real.png and NAME_mean.png, or JPEG or TIFF.
+    """Find the pairs of a folder: NAME_real.png and NAME_mean.png, or JPEG or TIFF.
 
     Raises:
-        SystemExit: there is none, or a picture has no mean.
+        SystemExit: the folder has no pair, or a picture has no mean.
     """
     found = []
     for real in sorted(folder.glob("*_real.*")):
@@ -29,8 +29,8 @@ def find_pairs(folder: Path) -> list[RealPair]:
         name = real.stem.removesuffix("_real")
         mean = real.with_name(f"{name}_mean{real.suffix}")
         if not mean.exists():
-            raise SystemExit(f"error: {real} has no {mean.name} beside it")
+            raise SystemExit(f"error: {real} has no {mean.name} next to it")
         found.append(RealPair(name, name.rstrip("0123456789").rstrip("_"), real, mean))
     if not found:
-        raise SystemExit(f"error: {folder}: no NAME_real.png with its NAME_mean.png")
+        raise SystemExit(f"error: {folder} has no pairs NAME_real.png and NAME_mean.png")
     return found

@@ -1,4 +1,4 @@
-"""A small denoiser, and what trains it."""
+"""A small denoising network, and its training."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -7,27 +7,27 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-WIDTHS = (16, 32, 64)  # channels of the levels
+WIDTHS = (16, 32, 64)  # channels at each level
 MULTIPLE = 2 ** (len(WIDTHS) - 1)
-SCALE = 16  # noise is a few hundredths, and networks learn faster from numbers near 1
-RATE = 2e-3  # the highest, of Adam
+SCALE = 16  # noise is a few hundredths; networks learn faster from numbers near 1
+RATE = 2e-3  # Adam's highest learning rate
 
 
 class UNet(nn.Module):
-    """A U-Net (Ronneberger et al., 2015) of three levels that finds noise, and takes it away."""
+    """A U-Net (Ronneberger et al., 2015) of three levels that predicts noise and subtracts it."""
 
     def __init__(self, channels: int):
         super().__init__()
         self.down = nn.ModuleList(_block(*ends) for ends in pairwise([channels, *WIDTHS]))
         self.up = nn.ModuleList(_block(fine + coarse, fine) for fine, coarse in pairwise(WIDTHS))
         self.last = nn.Conv2d(WIDTHS[0], channels, 1)
-        nn.init.zeros_(self.last.weight)  # it begins as the identity
+        nn.init.zeros_(self.last.weight)  # initially the identity
         assert self.last.bias is not None
         nn.init.zeros_(self.last.bias)
         self.to(memory_format=torch.channels_last)  # twice as fast on a CPU
 
     def forward(self, noisy: Tensor) -> Tensor:
-        """Images without noise, (n, channels, h, w); h and w are multiples of MULTIPLE."""
+        """Denoise images, (n, channels, h, w); h and w are multiples of MULTIPLE."""
         x = ((noisy - 0.5) * SCALE).contiguous(memory_format=torch.channels_last)
         levels = [self.down[0](x)]
         for down in self.down[1:]:
@@ -51,21 +51,22 @@ def train(
     seed: int,
     loss_of: Callable[[Tensor, Tensor], Tensor] = functional.l1_loss,
 ) -> UNet:
-    """A network that has seen some batches.
+    """Train a network.
 
     Args:
-        batch: noisy and clean images, (n, channels, h, w), drawn with a generator.
-        channels: of an image.
-        steps: how many batches.
-        seed: of the first weights, and of what is drawn.
+        batch: returns noisy and clean images, (n, channels, h, w), from a random generator.
+        channels: the channels of an image.
+        steps: the number of batches.
+        seed: the seed of the initial weights and the batches.
+        loss_of: the loss, from denoised and clean images.
     """
     torch.manual_seed(seed)
-    drawn = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
     network = UNet(channels)
     optimizer = torch.optim.Adam(network.parameters())
     rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, steps)
     for _ in range(steps):
-        noisy, clean = batch(drawn)
+        noisy, clean = batch(generator)
         loss = loss_of(network(noisy), clean)
         optimizer.zero_grad()
         loss.backward()
@@ -76,7 +77,7 @@ def train(
 
 @torch.no_grad()
 def denoised(network: nn.Module, noisy: Tensor) -> Tensor:
-    """An image (channels, height, width) of any size, denoised."""
+    """Denoise an image, (channels, height, width), of any size."""
     height, width = noisy.shape[-2:]
     edge = (0, -width % MULTIPLE, 0, -height % MULTIPLE)
     result: Tensor = network(functional.pad(noisy[None], edge, mode="replicate"))

@@ -1,8 +1,8 @@
-"""Puts each render through a camera: Blender's linear picture, developed by clpipe.
+"""Develops each render of Blender with clpipe's camera simulation.
 
-OpenCL never runs in Blender's process: handlers write the Render Result as linear EXR, and
-``clpipe run`` develops it in another one. While Blender renders in the background of its window,
-handlers run in the thread that renders; pictures are loaded by a timer, in the main thread.
+OpenCL never runs in Blender's process. Handlers write the Render Result as linear EXR, and
+``clpipe run`` develops it in another process. When Blender renders from its window, handlers run in
+the render thread. A timer loads the pictures in the main thread.
 """
 
 import json
@@ -22,9 +22,9 @@ from .development import Development, DevelopmentError, Render, Settings
 
 CHOICES = json.loads(Path(__file__).with_name("choices.json").read_text("utf-8"))
 IMAGE = "clpipe"  # the image that shows the latest picture
-FOLDER = "clpipe"  # of the pictures, beside the render's own files
-LINEAR = "linear"  # of the linear renders, in it
-SPACE = "Linear Rec.709"  # what clpipe takes an EXR to be in
+FOLDER = "clpipe"  # for the pictures, next to the render's own files
+LINEAR = "linear"  # for the linear renders, in FOLDER
+SPACE = "Linear Rec.709"  # the colour space that clpipe expects of an EXR
 EXR = {
     "file_format": "OPEN_EXR",
     "color_mode": "RGB",
@@ -32,10 +32,10 @@ EXR = {
     "exr_codec": "ZIP",
     "color_management": "OVERRIDE",
 }
-SECONDS = 0.25  # between two looks at what has been developed
+SECONDS = 0.25  # between two checks for developed pictures
 
-# Attributes in an EXR that differ each time: the date, and the time and memory that it took.
-PASSING = re.compile(rb"(?:Date|RenderTime|Memory|cycles\.[^\0]*_time)\0string\0(.{4})", re.DOTALL)
+# EXR attributes that differ in each render: the date, the render time and the memory used.
+VOLATILE = re.compile(rb"(?:Date|RenderTime|Memory|cycles\.[^\0]*_time)\0string\0(.{4})", re.DOTALL)
 
 development = Development()
 
@@ -45,19 +45,19 @@ class ClpipeSettings(bpy.types.PropertyGroup):
 
     enabled: BoolProperty(
         name="Develop Renders",
-        description="Put each rendered frame through a camera, and write what it makes of it",
+        description="Simulate a camera for each rendered frame, and write the developed picture",
         options=set(),
     )
     camera: StringProperty(
         name="Camera",
-        description="A camera by name, or the path of a profile; empty is the camera of the look",
+        description="The name of a camera or the path of a profile. Empty: the camera of the look",
         search=lambda _self, _context, _text: list(CHOICES["cameras"].items()),
         search_options={"SUGGESTION"},
         options=set(),
     )
     look: StringProperty(
         name="Look",
-        description="How the raw is developed: a configuration by name, or the path of one",
+        description="The name or path of a configuration, which develops the raw",
         default=CHOICES["look"],
         search=lambda _self, _context, _text: CHOICES["looks"],
         search_options={"SUGGESTION"},
@@ -65,16 +65,16 @@ class ClpipeSettings(bpy.types.PropertyGroup):
     )
     iso: IntProperty(
         name="ISO",
-        description="Noise and denoising follow from it",
+        description="Sets the strength of noise and denoising",
         default=CHOICES["iso"],
         min=1,
         options=set(),
     )
     seed: IntProperty(
-        name="Seed", description="Of the noise", default=CHOICES["seed"], min=0, options=set()
+        name="Seed", description="Seed of the noise", default=CHOICES["seed"], min=0, options=set()
     )
     keep_raw: BoolProperty(
-        name="Keep Raw", description="Write the camera's raw, too, as DNG", options=set()
+        name="Keep Raw", description="Also write the camera's raw as DNG", options=set()
     )
 
 
@@ -86,8 +86,8 @@ def settings_of(scene: Any) -> Settings:
 
 
 @contextmanager
-def changed(thing: Any, values: Mapping[str, Any]) -> Iterator[None]:
-    """Let something of Blender's have other values for a while."""
+def temporary(thing: Any, values: Mapping[str, Any]) -> Iterator[None]:
+    """Set attributes of a Blender object temporarily."""
     before = {name: getattr(thing, name) for name in values}
     try:
         for name, value in values.items():
@@ -100,16 +100,16 @@ def changed(thing: Any, values: Mapping[str, Any]) -> Iterator[None]:
 
 @contextmanager
 def linear_exr(scene: Any) -> Iterator[None]:
-    """Let a scene write half EXR in linear Rec. 709, whatever it writes else.
+    """Make a scene write half EXR in linear Rec. 709, independently of its own output settings.
 
     Raises:
-        DevelopmentError: a colour configuration of the user's own lacks that space.
+        DevelopmentError: the user's colour configuration has no such space.
     """
     image = scene.render.image_settings
     space = image.linear_colorspace_settings
     own = {"name": space.name} if image.color_management == "OVERRIDE" else {}
     media = {"media_type": "IMAGE"} if hasattr(image, "media_type") else {}  # from Blender 5.0 on
-    with changed(image, media | EXR), changed(space, own):
+    with temporary(image, media | EXR), temporary(space, own):
         try:
             space.name = SPACE
         except TypeError:
@@ -118,11 +118,11 @@ def linear_exr(scene: Any) -> Iterator[None]:
         yield
 
 
-def forget_passing(path: Path) -> None:
-    """Zero what differs each time in an EXR's header: noise belongs to the bytes of the file."""
+def zero_volatile(path: Path) -> None:
+    """Zero attributes that differ in each render, because noise depends on the file's bytes."""
     with path.open("r+b") as file:
         head = bytearray(file.read(2**16))
-        for found in PASSING.finditer(bytes(head)):
+        for found in VOLATILE.finditer(bytes(head)):
             end = found.end() + int.from_bytes(found[1], "little")
             head[found.end() : end] = re.sub(rb"\d", b"0", head[found.end() : end])
         file.seek(0)
@@ -130,22 +130,24 @@ def forget_passing(path: Path) -> None:
 
 
 def save_linear(scene: Any) -> Render:
-    """Write the Render Result of a scene's frame as FOLDER/linear/NAME.exr, and say what it is.
+    """Write the Render Result of a scene's frame as FOLDER/linear/NAME.exr, and return it.
 
     Raises:
         DevelopmentError: it has several views, or cannot be written.
     """
     if scene.render.use_multiview:
-        raise DevelopmentError("a render with several views is not developed; turn Stereoscopy off")
+        raise DevelopmentError(
+            "clpipe cannot develop a render with several views; turn Stereoscopy off"
+        )
     with linear_exr(scene):
         own = Path(os.path.abspath(scene.render.frame_path(frame=scene.frame_current)))
         folder = own.parent / FOLDER
         path = folder / LINEAR / f"{own.name.removesuffix('.exr')}.exr"
-        unfinished = path.with_name(f".{path.name}")  # clpipe may still read the one before
+        unfinished = path.with_name(f".{path.name}")  # clpipe may still be reading the previous one
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             bpy.data.images["Render Result"].save_render(str(unfinished), scene=scene)
-            forget_passing(unfinished)
+            zero_volatile(unfinished)
             unfinished.replace(path)
         except OSError as error:
             raise DevelopmentError(f"{error.filename}: {error.strerror}") from None
@@ -175,13 +177,13 @@ def show(picture: Path | None) -> None:
 
 @persistent
 def begin(_scene: Any, *_: Any) -> None:
-    """Before a still or an animation."""
+    """Clear the message before a still or an animation."""
     development.message = ""
 
 
 @persistent
-def take(scene: Any, *_: Any) -> None:
-    """After each frame."""
+def add_frame(scene: Any, *_: Any) -> None:
+    """Add each rendered frame to the queue."""
     if not scene.clpipe.enabled:
         return
     try:
@@ -194,13 +196,13 @@ def take(scene: Any, *_: Any) -> None:
 
 @persistent
 def end(_scene: Any, *_: Any) -> None:
-    """After a still or an animation, or what there is of it."""
-    if bpy.app.background:  # no timer runs, and Blender may quit now
+    """Finish after a still or an animation, also if it was cancelled."""
+    if bpy.app.background:  # no timer runs, and Blender may quit at once
         show(development.finish())
 
 
-def look_after() -> float:
-    """Show what has been developed; the seconds until the next time."""
+def check_progress() -> float:
+    """Show developed pictures, and return the seconds until the next check."""
     busy = len(development)
     show(development.poll())
     if busy != len(development):
@@ -211,14 +213,14 @@ def look_after() -> float:
     return SECONDS
 
 
-class RENDER_PT_clpipe(bpy.types.Panel):  # noqa: N801 - Blender's way to name a panel
-    """The panel, in the properties of the output."""
+class RENDER_PT_clpipe(bpy.types.Panel):  # noqa: N801 - Blender's naming convention
+    """The panel in the output properties."""
 
     bl_label = "Camera Development"
     bl_space_type = "PROPERTIES"
     bl_region_type = "WINDOW"
     bl_context = "output"
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - as Blender's own panels
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - like Blender's own panels
 
     def draw_header(self, context: Any) -> None:
         self.layout.prop(context.scene.clpipe, "enabled", text="")
@@ -237,7 +239,7 @@ class RENDER_PT_clpipe(bpy.types.Panel):  # noqa: N801 - Blender's way to name a
         if development.message:
             column = layout.column(align=True)
             column.alert = True
-            width = context.region.width // 8  # a letter has about as many pixels
+            width = context.region.width // 8  # a letter is about 8 pixels wide
             for number, line in enumerate(textwrap.wrap(development.message, max(width, 20))):
                 column.label(text=line, icon="BLANK1" if number else "ERROR")
 
@@ -245,27 +247,27 @@ class RENDER_PT_clpipe(bpy.types.Panel):  # noqa: N801 - Blender's way to name a
 CLASSES = (ClpipeSettings, RENDER_PT_clpipe)
 HANDLERS = {
     "render_init": begin,
-    "render_post": take,
+    "render_post": add_frame,
     "render_complete": end,
     "render_cancel": end,
 }
 
 
 def register() -> None:
-    """Called when the extension is enabled."""
+    """Register the classes and handlers when the extension is enabled."""
     for each in CLASSES:
         bpy.utils.register_class(each)
     bpy.types.Scene.clpipe = PointerProperty(type=ClpipeSettings)
     for name, handler in HANDLERS.items():
         getattr(bpy.app.handlers, name).append(handler)
     if not bpy.app.background:
-        bpy.app.timers.register(look_after, persistent=True)
+        bpy.app.timers.register(check_progress, persistent=True)
 
 
 def unregister() -> None:
-    """Called when it is disabled, and when Blender quits: what waits is developed before."""
-    if bpy.app.timers.is_registered(look_after):
-        bpy.app.timers.unregister(look_after)
+    """Develop waiting renders and unregister, when the extension is disabled or Blender quits."""
+    if bpy.app.timers.is_registered(check_progress):
+        bpy.app.timers.unregister(check_progress)
     development.finish()
     for name, handler in HANDLERS.items():
         getattr(bpy.app.handlers, name).remove(handler)

@@ -1,4 +1,4 @@
-"""Develops linear renders by ``clpipe run``, in a process of its own; without bpy."""
+"""Develops linear renders with ``clpipe run`` in a separate process, without bpy."""
 
 import importlib.util
 import os
@@ -14,19 +14,19 @@ PRIVATE = Path(__file__).with_name("private")  # packages that Blender has in ot
 
 
 class DevelopmentError(Exception):
-    """A picture cannot be made; the message is for the user."""
+    """A picture cannot be made. The message is shown to the user."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the panel says.
+    """The settings of the panel.
 
     Args:
-        camera: name or profile; "" is the look's own.
+        camera: name or path of a profile; "" for the camera of the look.
         look: name or path of a configuration.
         iso: the ISO.
         seed: of the noise.
-        keep_raw: write the raw, too, as DNG.
+        keep_raw: also write the raw as DNG.
     """
 
     camera: str
@@ -36,7 +36,7 @@ class Settings:
     keep_raw: bool
 
     def options(self) -> list[str]:
-        """These settings as options of ``clpipe run``."""
+        """Return the settings as options of ``clpipe run``."""
         options = ["--config", self.look, "--iso", str(self.iso), "--seed", str(self.seed)]
         if self.camera:
             options += ["--camera", self.camera]
@@ -47,33 +47,32 @@ class Settings:
 
 @dataclass(frozen=True)
 class Render:
-    """A linear render that is to be developed.
+    """A linear render to develop.
 
     Args:
-        path: its EXR.
-        folder: where NAME.jpg is written.
-        settings: how it is developed.
+        path: the EXR.
+        folder: the output directory of NAME.jpg.
+        settings: settings of the development.
     """
 
     path: Path
     folder: Path
     settings: Settings
 
-    def goes_with(self, other: "Render") -> bool:
-        """Whether one command develops both."""
+    def shares_command(self, other: "Render") -> bool:
+        """Return whether one command can develop both renders."""
         return (self.folder, self.settings) == (other.folder, other.settings)
 
     @property
     def picture(self) -> Path:
-        """What is made of it."""
+        """The path of the developed picture."""
         return self.folder / f"{self.path.name.removesuffix('.exr')}.jpg"
 
 
 def command(renders: list[Render]) -> list[str]:
-    """What develops renders that go together.
+    """Return the command that develops renders with the same folder and settings.
 
-    Python leaves out the user's own packages and, as a module of a folder that is called clpipe,
-    what lies in the working directory.
+    The options keep the user's own packages and modules of the working directory off Python's path.
     """
     first = renders[0]
     inputs = [str(render.path) for render in renders]
@@ -82,7 +81,7 @@ def command(renders: list[Render]) -> list[str]:
 
 
 def environment() -> dict[str, str]:
-    """The environment in which Python finds clpipe, and what it needs.
+    """Return the environment in which Python finds clpipe and its dependencies.
 
     Raises:
         DevelopmentError: clpipe is not installed.
@@ -95,34 +94,37 @@ def environment() -> dict[str, str]:
 
 
 class Development:
-    """Renders that wait, and the process that develops those before them.
+    """A queue of renders, and the process that develops the first of them.
 
-    Renders may be added in one thread, and all else done in another one.
+    One thread may add renders while another one calls the other methods.
     """
 
     def __init__(self) -> None:
-        self.message = ""  # why a picture was not made; the first of them
+        self.message = ""  # the first error
         self._waiting: deque[Render] = deque()
-        self._renders: list[Render] = []  # those of the process
+        self._renders: list[Render] = []  # in the running process
         self._process: subprocess.Popen[bytes] | None = None
-        self._said: IO[bytes]
+        self._stderr: IO[bytes]
 
     def __len__(self) -> int:
         return len(self._waiting) + len(self._renders)
 
     def add(self, render: Render) -> None:
-        """Let a render wait for its turn."""
+        """Add a render to the queue."""
         self._waiting.append(render)
 
     def fail(self, message: str) -> None:
-        """Keep why a picture was not made, and print it."""
+        """Store the first error, and print every one."""
         self.message = self.message or message
         print(f"clpipe: {message}", file=sys.stderr)
 
     def poll(self) -> Path | None:
-        """Go on, without waiting: the latest picture of a process that has ended, if it made all.
+        """Start the next process if none runs, without blocking.
 
-        All renders that wait are developed together, as far as their settings are the same.
+        One process develops all waiting renders up to the first with other settings.
+
+        Returns:
+            The latest picture of a process that has succeeded since the last call, or None.
         """
         picture = None
         if self._process and self._process.poll() is not None:
@@ -132,7 +134,7 @@ class Development:
         return picture
 
     def finish(self) -> Path | None:
-        """Wait until nothing is left; the latest picture."""
+        """Wait until the queue is empty, and return the latest picture."""
         picture = self.poll()
         while self._process:
             self._process.wait()
@@ -141,32 +143,32 @@ class Development:
 
     def _begin(self) -> None:
         first = self._waiting[0]
-        while self._waiting and self._waiting[0].goes_with(first):
+        while self._waiting and self._waiting[0].shares_command(first):
             self._renders.append(self._waiting.popleft())
         self._renders = [*dict.fromkeys(self._renders)]  # a frame may have been rendered twice
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the process
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the process
         try:
             self._process = subprocess.Popen(
                 command(self._renders),
                 env=environment(),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                stderr=self._said,
+                stderr=self._stderr,
             )
         except (DevelopmentError, OSError) as error:
-            self._said.close()
+            self._stderr.close()
             self._renders = []
             self.fail(str(error))
 
     def _end(self) -> Path | None:
         assert self._process
         status, renders = self._process.returncode, self._renders
-        self._said.seek(0)
-        with self._said:
-            lines = self._said.read().decode(errors="replace").splitlines()
+        self._stderr.seek(0)
+        with self._stderr:
+            lines = self._stderr.read().decode(errors="replace").splitlines()
         self._process, self._renders = None, []
         if status == 0:
             return renders[-1].picture
-        said = [line.removeprefix("clpipe: ") for line in lines if line.startswith("clpipe: ")]
-        self.fail("; ".join(said or lines[-1:] or [f"clpipe ended with status {status}"]))
+        errors = [line.removeprefix("clpipe: ") for line in lines if line.startswith("clpipe: ")]
+        self.fail("; ".join(errors or lines[-1:] or [f"clpipe ended with status {status}"]))
         return None

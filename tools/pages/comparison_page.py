@@ -1,4 +1,4 @@
-"""What tools print and draw where developments are compared: Markdown tables, sheets of crops."""
+"""Markdown tables and sheets of crops that compare developments."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -8,10 +8,10 @@ from PIL import Image, ImageDraw, ImageFont
 from clpipe.analysis.crops import HEIGHT, WIDTH, Place, choose_places
 from clpipe.base.types import Array
 
-SCALE = 4  # of crops
+SCALE = 4  # enlargement of crops
 GAP, HEAD, SIDE = 6, 24, 150  # px: between crops, above and left of them
 
-# The columns of a signature as a table has them: heading, attribute, format.
+# The columns of a signature in tables: heading, attribute, format.
 COLUMNS = (
     ("rms", "rms", ".1f"),
     ("kurtosis", "kurtosis", ".1f"),
@@ -27,12 +27,12 @@ COLUMNS = (
 
 
 def cells(record: Mapping[str, float]) -> list[str]:
-    """The columns of a signature as texts."""
+    """Format the columns of a signature."""
     return [format(record[name], form) if name in record else "" for _, name, form in COLUMNS]
 
 
 def markdown(heads: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
-    """A table.
+    """Format a table.
 
     >>> print(markdown(["a", "b"], [["1", "2"]]))
     | a | b |
@@ -43,21 +43,21 @@ def markdown(heads: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
     return "\n".join([first, "|---" * len(heads) + "|", *others])
 
 
-def telling_places(picture: Array) -> list[Place]:
-    """Where a crop shows most: the most saturated place, and the richest in detail.
+def significant_places(picture: Array) -> list[Place]:
+    """Choose two places for crops: the most saturated one, and the one with the most detail.
 
     Args:
-        picture: without noise, (height, width, 3) of 0 to 255.
+        picture: without noise, (height, width, 3), 0 to 255.
     """
     return choose_places(("saturated", "textured"), picture.astype(np.float32) / np.float32(255))
 
 
 def sheet(columns: Sequence[str], rows: Mapping[str, Sequence[Array]]) -> Image.Image:
-    """Crops at 400 %: a row of them for each caption, a column for each development.
+    """Draw crops at 400 %, with a row for each caption and a column for each development.
 
     Args:
-        columns: their captions.
-        rows: caption -> as many crops, (height, width, 3) uint8, all of one size.
+        columns: captions of the columns.
+        rows: from a caption to one crop per column, (height, width, 3) uint8, all of one size.
     """
     height, width = (side * SCALE for side in (HEIGHT, WIDTH))
     size = SIDE + len(columns) * (width + GAP), HEAD + len(rows) * (height + GAP)

@@ -1,4 +1,4 @@
-"""What tells patches of noise apart: scale-free statistics, a linear judge, and distances."""
+"""Separates patches of noise: scale-free statistics, a linear classifier, and distances."""
 
 from collections.abc import Mapping, Sequence
 
@@ -9,13 +9,13 @@ from clpipe.base.types import Doubles, Mask
 
 PATCH = 48  # px
 RIDGE, SHRINKAGE = 1.0, 0.1
-TINY = 1e-6  # levels, of noise that is none
+TINY = 1e-6  # levels; avoids division by 0 where there is no noise
 
-Judged = Mapping[str, Doubles]  # statistics of patches, (patch, statistic), by camera
+Statistics = Mapping[str, Doubles]  # (patch, statistic), by camera
 
 
 def statistics(noise: Doubles, level: Doubles) -> dict[str, float]:
-    """The statistics of a patch; those of colour begin with "colour"."""
+    """Return the statistics of a patch. Names of colour statistics start with "colour"."""
     y = noise @ LUMA
     planes = {"Y": y, "Cb": noise[..., 2] - y, "Cr": noise[..., 0] - y}
     found: dict[str, float] = {}
@@ -35,7 +35,7 @@ def statistics(noise: Doubles, level: Doubles) -> dict[str, float]:
 
 
 def of_plane(noise: Doubles, level: Doubles) -> dict[str, float]:
-    """The statistics of one plane of a patch, (48, 48), whose mean is 0."""
+    """Return the statistics of one plane of a patch, (48, 48), whose mean is 0."""
     sigma = max(float(noise.std()), TINY)
     z = noise / sigma
     found = {f"{k} right": (z[:, k:] * z[:, :-k]).mean() for k in range(1, 7)}
@@ -59,26 +59,26 @@ def of_plane(noise: Doubles, level: Doubles) -> dict[str, float]:
 
 
 def contrast(noise: Doubles, mask: Mask) -> float:
-    """How much stronger noise is in some places than in the others; 0 where all are alike."""
+    """Return the log ratio of noise inside and outside a mask; 0 if either part is empty."""
     some = mask.any() and not mask.all()
     return ratio(noise[mask].std(), noise[~mask].std()) if some else 0.0
 
 
 def ratio(one: float, two: float) -> float:
-    """The logarithm of a ratio of sizes."""
+    """Return the logarithm of a ratio of positive numbers."""
     return float(np.log((one + TINY) / (two + TINY)))
 
 
 def over_white(plane: Doubles, mask: Mask, size: int) -> float:
-    """The variance of means of ``size`` x ``size`` pixels over that of independent noise's.
+    """Return the variance of ``size`` x ``size`` block means, relative to independent noise.
 
-    It is 1 for independent noise, and more for coarse noise. Blocks of which a tenth or more does
-    not count are left out, and what does not count is no part of the others' means.
+    The value is 1 for independent noise, and larger for coarse noise. Means include only pixels of
+    the mask. Blocks with a tenth or more of their pixels outside the mask are excluded.
 
     Args:
         plane: (frame, height, width).
-        mask: the pixels that count.
-        size: of the blocks, px.
+        mask: the pixels to include.
+        size: the side of a block, px.
 
     >>> noise = np.random.default_rng(0).normal(size=(1, 512, 512))
     >>> 0.8 < over_white(noise, np.ones((512, 512), bool), 16) < 1.2
@@ -96,7 +96,7 @@ def over_white(plane: Doubles, mask: Mask, size: int) -> float:
 
 
 def regression(x: Doubles, y: Doubles) -> Doubles:
-    """Weights of a logistic regression with a ridge, by Newton's method; last, the constant's."""
+    """Fit a ridge logistic regression by Newton's method; the last weight is the constant."""
     x = np.c_[x, np.ones(len(x))]
     ridge = RIDGE * np.eye(x.shape[1])
     ridge[-1, -1] = 1e-6
@@ -112,15 +112,15 @@ def regression(x: Doubles, y: Doubles) -> Doubles:
 
 
 def auc(real: Doubles, made: Doubles) -> float:
-    """The chance that a real patch has the larger score."""
+    """Return the probability that a real patch has the larger score."""
     order = np.argsort(np.argsort(np.r_[real, made]))
     return float(
         (order[: len(real)].sum() - len(real) * (len(real) - 1) / 2) / (len(real) * len(made))
     )
 
 
-def told(real: Judged, made: Judged, camera: str) -> float:
-    """The AUC on one camera of a judge that was trained on the others."""
+def held_out_auc(real: Statistics, made: Statistics, camera: str) -> float:
+    """Return the AUC on one camera of a classifier that was trained on the others."""
     others = [name for name in real if name != camera]
     if not others:
         return float("nan")
@@ -136,7 +136,7 @@ def told(real: Judged, made: Judged, camera: str) -> float:
 
 
 def distance(one: Doubles, two: Doubles, kept: Sequence[int]) -> float:
-    """The Mahalanobis distance of mean statistics, with the covariance of patches, pooled."""
+    """Return the Mahalanobis distance of mean statistics, with the pooled covariance of patches."""
     one, two = one[:, kept], two[:, kept]
     covariance = (np.cov(one.T) * len(one) + np.cov(two.T) * len(two)) / (len(one) + len(two))
     scale = np.sqrt(np.diag(covariance)) + 1e-9

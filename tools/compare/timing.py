@@ -1,4 +1,4 @@
-"""Timing in turns: what runs at the same time on a machine then slows down all alike."""
+"""Interleaved timing, so that other load on the machine slows all candidates down alike."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -10,8 +10,10 @@ import numpy as np
 Work = Callable[[], object]
 
 
-def in_turns(works: Mapping[str, Work], repeat: int, before: Work = int) -> dict[str, list[float]]:
-    """How long each work takes, in s, in each of so many turns; ``before`` is not counted."""
+def interleaved(
+    works: Mapping[str, Work], repeat: int, before: Work = int
+) -> dict[str, list[float]]:
+    """Time each work once per round, in s. ``before`` runs before each work and is not timed."""
     seconds: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(repeat):
         for name, work in works.items():
@@ -24,12 +26,12 @@ def in_turns(works: Mapping[str, Work], repeat: int, before: Work = int) -> dict
 
 @dataclass(frozen=True)
 class Comparison:
-    """One work done by clpipe and by others, in turns.
+    """The times of one work by clpipe and by other programs.
 
     Args:
-        work: what was done.
-        megapixels: in a turn.
-        ours, theirs: seconds of each turn; theirs by name.
+        work: a description.
+        megapixels: processed in a round.
+        ours, theirs: seconds of each round; theirs by name.
     """
 
     work: str
@@ -38,17 +40,17 @@ class Comparison:
     theirs: Mapping[str, Sequence[float]]
 
     def speed(self, seconds: Sequence[float]) -> float:
-        """The median speed, MP/s."""
+        """Return the median speed, MP/s."""
         return self.megapixels / float(np.median(seconds))
 
     def ratios(self, name: str) -> tuple[float, float, float]:
-        """How many times faster clpipe is: the quartiles of the turns, the median second."""
+        """Return the speed-up of clpipe over the rounds: lower quartile, median, upper quartile."""
         ratios = np.asarray(self.theirs[name]) / np.asarray(self.ours)
         low, median, high = np.percentile(ratios, (25, 50, 75))
         return float(low), float(median), float(high)
 
     def cells(self) -> list[str]:
-        """A table's row: the work, clpipe's speed, and of each other its speed and ratios."""
+        """Return a table row: the work, clpipe's speed, and each other's speed and ratios."""
         cells = [self.work, format_speed(self.speed(self.ours))]
         for name, seconds in self.theirs.items():
             low, median, high = self.ratios(name)
@@ -56,7 +58,7 @@ class Comparison:
         return cells
 
     def record(self) -> dict[str, Any]:
-        """The comparison as JSON values."""
+        """Return the comparison as JSON values."""
         others = {
             name: {"mp_per_s": self.speed(seconds), "ratio_quartiles": self.ratios(name)}
             for name, seconds in self.theirs.items()
@@ -65,7 +67,7 @@ class Comparison:
 
 
 def format_speed(speed: float) -> str:
-    """A speed in MP/s, to three digits.
+    """Format a speed in MP/s with three digits.
 
     >>> format_speed(0.0765), format_speed(23.45), format_speed(1234.5)
     ('0.0765', '23.4', '1234')
