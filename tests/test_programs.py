@@ -177,7 +177,7 @@ def test_who_watches_is_told_how_far_compiling_is(device):
 
 
 def test_compiling_is_a_step_of_the_live_display(monkeypatch):
-    monkeypatch.setattr(progress, "SOON", -1.0)
+    monkeypatch.setattr(progress, "COMPILE_DELAY", -1.0)
     console = Console(file=io.StringIO(), force_terminal=True, width=80, color_system=None)
     run = SimpleNamespace(summary=Summary(6), writer=None, where=Where(Path("out")))
     with progress.Reporter(run, console) as reporter:

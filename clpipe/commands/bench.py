@@ -132,7 +132,7 @@ def bench(
 
 
 def batch_row(speed: BatchSpeed) -> tuple[str, ...]:
-    """Return the row of one load."""
+    """Return the table row of one batch."""
     return (
         f"{speed.images} of {speed.width}x{speed.height}",
         f"{speed.megapixels_per_second:.1f}",

@@ -63,17 +63,17 @@ def plan(as_json: bool, as_toml: bool, source: str | None, **options: Any) -> No
     )
 
 
-def launch_named(plan: Plan, wanted: str) -> AnyLaunch:
+def launch_named(plan: Plan, name_or_number: str) -> AnyLaunch:
     """Return the launch of a plan with a number, from 1, or a name.
 
     Raises:
         RequestError: there is no such launch.
     """
     for number, launch in enumerate(plan.launches, 1):
-        if wanted in (str(number), launch.name):
+        if name_or_number in (str(number), launch.name):
             return launch
     names = (f"{number} {launch.name}" for number, launch in enumerate(plan.launches, 1))
-    raise RequestError(f"--source: {one_of('launch', wanted, names)}")
+    raise RequestError(f"--source: {one_of('launch', name_or_number, names)}")
 
 
 def plan_rows(plan: Plan) -> list[tuple[str, ...]]:

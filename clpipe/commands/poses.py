@@ -34,7 +34,7 @@ def poses(folder: Path, as_json: bool) -> None:
     if not written.files:
         reasons = "; ".join(written.left_out) or "there is no sidecar of a picture"
         raise RequestError(
-            f"{folder}: the intrinsics of no picture are known: {reasons}; run with --poses FILE, "
+            f"{folder}: no picture has known intrinsics: {reasons}; run with --poses FILE, "
             "or set render.focal_length and render.sensor_width, or render.fx"
         )
     if as_json:
