@@ -453,7 +453,7 @@ def test_the_disk_is_full(clpipe, renders, monkeypatch):
     def fail_to_write(path, spec, pixels):
         count.append(path)
         if len(count) > 2:
-            monkeypatch.setattr(output_folders, "LEAST_FREE", 2**62)  # more than any disk has
+            monkeypatch.setattr(output_folders, "MIN_FREE", 2**62)  # more than any disk has
             raise ImageError(f"{path}: cannot be written: the disk is full")
         return real(path, spec, pixels)
 

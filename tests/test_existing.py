@@ -13,7 +13,7 @@ from clpipe.batch.run_log import read_log
 from clpipe.chain.formats import EVERY_FORMAT, ending_of
 from clpipe.images.whole import is_whole
 from clpipe.outputs.existing import is_marked
-from clpipe.outputs.sidecar import outputs_in
+from clpipe.outputs.sidecar import output_entries
 from tests.conftest import reseal
 
 RUN = ("-o", "out", "--device", "numpy", "--keep", "normalize", "--truth", "mosaic")
@@ -186,7 +186,7 @@ def test_copied_moved_and_dated_elsewhere_it_is_done_still(again, tmp_path):
 @pytest.mark.parametrize("value", [None, {}, ["a.jpg"], [{"name": "../a.jpg"}], [{"name": 1}]])
 def test_a_sidecar_with_a_list_that_is_none_counts_for_nothing(again, value):
     values = json.loads(Path("out/a.json").read_text())
-    assert set(outputs_in(values)) == {"a.jpg", "a.normalize.exr"}
+    assert set(output_entries(values)) == {"a.jpg", "a.normalize.exr"}
     reseal(Path("out/a.json"), {**values, "outputs": value})
     assert "a.jpg" in again()
 

@@ -279,7 +279,7 @@ def test_the_disk_is_full(clpipe, renders, when):
         def write(path, pixels, tags):
             count.append(path)
             if len(count) > 5:
-                patch.setattr(output_folders, "LEAST_FREE", 2**62)  # more than any disk has
+                patch.setattr(output_folders, "MIN_FREE", 2**62)  # more than any disk has
                 full(path)
             return real(path, pixels, tags)
 

@@ -127,7 +127,7 @@ class Developers:
             most = TOGETHER if is_small else self.most
             for recipe in state.recipes:
                 # Baselines take their noise from the renditions before them.
-                while asked and (len(asked) >= most or recipe.spread):
+                while asked and (len(asked) >= most or recipe.matcher):
                     self._put(small)
                     asked.popleft().written.exception()
                 orders.append(Order(state, recipe))

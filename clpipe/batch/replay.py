@@ -15,7 +15,7 @@ from clpipe.chain.rendition import BASELINES, TRUTHS, Rendition
 from clpipe.chain.request import Request
 from clpipe.inputs.find import Job
 from clpipe.inputs.manifest import check_output_name
-from clpipe.outputs.sidecar import SidecarError, inputs_in, outputs_in, read_sidecar
+from clpipe.outputs.sidecar import SidecarError, input_entries, output_entries, read_sidecar
 
 CODE = (".py", ".cl")  # the endings of files that are run
 
@@ -63,7 +63,7 @@ class Replay:
 
 def digests_in(values: Mapping[str, Any]) -> dict[str, str]:
     """The SHA-256 of the files that a sidecar's values list, by their names."""
-    return {name: str(each["sha256"]) for name, each in outputs_in(values).items()}
+    return {name: str(each["sha256"]) for name, each in output_entries(values).items()}
 
 
 def short(value: str) -> str:
@@ -115,7 +115,7 @@ def replay_of(
     try:
         replay = _replay(values, inputs, max_pixels)
         files = {str(name): str(digest) for name, digest in values["request"]["files"].items()}
-        of = inputs_in(values, replay.job.paths)
+        of = input_entries(values, replay.job.paths)
         files |= {str(path): str(was["sha256"]) for path, was in of}
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise RequestError(f"{path}: it is damaged: {error}") from None

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 from clpipe.batch.outcome import Outcome
 from clpipe.chain.rendition import Rendition
 from clpipe.inputs.find import Job
-from clpipe.outputs.existing import Found, Redo, find
+from clpipe.outputs.existing import ExistingFiles, Redo, find_existing
 from clpipe.outputs.writer import OutputWriter
 
 
@@ -60,18 +60,18 @@ class Folder:
         self.writer = writer
         self.redo = redo
 
-    def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> Found:
+    def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> ExistingFiles:
         """Return what exists of a rendition. The threads of an executor call it at the same time.
 
         Args:
             job: the image.
             rendition: one of its pictures.
-            request: the record of what is asked for, see :meth:`OutputWriter.record_of`.
+            request: the record of what is asked for, see :meth:`OutputWriter.request_record`.
 
         Raises:
             ImageError: a file with the name of an output was not written by clpipe.
         """
-        return find(self.writer.files(job, rendition), job, request, self.redo.verifies)
+        return find_existing(self.writer.files(job, rendition), job, request, self.redo.verifies)
 
     def receive(self, executor: Executor, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
         """Let an executor do the jobs, and yield their outcomes.

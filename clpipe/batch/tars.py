@@ -14,7 +14,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.reading import TEXT_BYTES, check_regular
 from clpipe.inputs.find import Job
 from clpipe.outputs.folder import remove_unfinished
-from clpipe.outputs.sidecar import SIDECAR, SidecarError, is_sidecar, values_in
+from clpipe.outputs.sidecar import SIDECAR, SidecarError, is_sidecar, parse_sidecar
 
 STAGING = ".clpipe."  # prefix of the directory that holds a tar's pictures until it is packed
 
@@ -161,7 +161,7 @@ class Members:
         try:
             with open(self._path, "rb") as file:
                 file.seek(start)
-                return values_in(file.read(min(size, TEXT_BYTES)), name) or {}
+                return parse_sidecar(file.read(min(size, TEXT_BYTES)), name) or {}
         except (OSError, SidecarError):
             return {}
 

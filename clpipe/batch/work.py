@@ -29,8 +29,8 @@ from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.runner import Result, Runner, submit_together
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.existing import Found, Redo
-from clpipe.outputs.patches import every_patch
+from clpipe.outputs.existing import ExistingFiles, Redo
+from clpipe.outputs.patches import all_patches
 from clpipe.outputs.recipes import Recipe, recipes
 from clpipe.outputs.record import intrinsics_of, picture_record
 from clpipe.outputs.sidecar import SIDECAR, write_sidecar
@@ -167,10 +167,10 @@ class ImageWorker:
         if redo is Redo.ALL:
             return self.writer.needed(state.job, renditions)
         found = {
-            each: self._sink.found(state.job, each, self.writer.record_of(state.request, each))
+            each: self._sink.found(state.job, each, self.writer.request_record(state.request, each))
             for each in renditions
         }
-        state.old = sum(there is Found.OLD for there in found.values())
+        state.old = sum(there is ExistingFiles.OLD for there in found.values())
         missing = [each for each, there in found.items() if not redo.keeps(there)]
         return self.writer.needed(state.job, missing)
 
@@ -196,7 +196,7 @@ class ImageWorker:
         intrinsics_of(loaded.chain, loaded.source)  # raises if they are impossible
         if patches := self.writer.patches:
             height, width = loaded.source.pixels.shape[:2]
-            state.patches = every_patch(patches, loaded.chain, width, height, job.key)
+            state.patches = all_patches(patches, loaded.chain, width, height, job.key)
         if any(map(self.writer.carries, renditions)):
             upright = self.writer.picture_orientation(loaded.source, loaded.chain)
             state.aovs = state.loader.aovs(job, loaded, 1 if patches else upright)
@@ -209,11 +209,11 @@ class ImageWorker:
     @staticmethod
     def measured(state: JobState, recipe: Recipe) -> Recipe:
         """Return a recipe with its noise, if that follows from the results of earlier recipes."""
-        if not recipe.spread:
+        if not recipe.matcher:
             return recipe
-        method, estimates = recipe.spread.method(recipe.rendition.role)
+        method, estimates = recipe.matcher.method(recipe.rendition.role)
         chain = with_noise(recipe.chain, method)
-        known = replace(recipe, chain=chain, spread=None, estimates=estimates)
+        known = replace(recipe, chain=chain, matcher=None, estimates=estimates)
         state.recipes[state.recipes.index(recipe)] = known
         return known
 
@@ -275,8 +275,8 @@ class ImageWorker:
         result = self._tried(state, wait) if wait else None
         state.note("device", start)
         if result and result.final is not None:
-            for spread in {each.spread for each in state.recipes if each.spread}:
-                spread.take(recipe.rendition, result.final)
+            for matcher in {each.matcher for each in state.recipes if each.matcher}:
+                matcher.take(recipe.rendition, result.final)
         if result and recipe.estimates:
             result.estimates[recipe.chain.steps[-1].name] = dict(recipe.estimates)
         name = threading.current_thread().name
@@ -367,7 +367,7 @@ class ImageWorker:
         path = writer.path(job, SIDECAR, recipe.rendition)
         record = picture_record(
             job,
-            writer.record_of(state.request, recipe.rendition),
+            writer.request_record(state.request, recipe.rendition),
             state.stamps,
             recipe,
             device,

@@ -16,7 +16,7 @@ from clpipe.engine.codegen import write_kernel
 from clpipe.engine.ir import AnyLaunch, Launch, Lines, Plan, reads_of
 from clpipe.engine.plan import make_plan
 from clpipe.engine.traffic import bytes_per_pixel, launch_bytes
-from clpipe.outputs.recipes import results_of
+from clpipe.outputs.recipes import required_results
 
 LANES = 8  # vector lanes of the CPU for which sources and bytes are printed
 
@@ -47,7 +47,7 @@ def plan(as_json: bool, as_toml: bool, source: str | None, **options: Any) -> No
         return
     chain = request.chain()
     request = request.with_outputs(chain)
-    keep, encode, final = results_of(chain, request.formats, request.keep)
+    keep, encode, final = required_results(chain, request.formats, request.keep)
     plan = make_plan(chain, half=True, keep=keep, encode=encode, final=final)
     if source is not None:
         click.echo(write_kernel(plan, launch_named(plan, source), LANES).source, nl=False)

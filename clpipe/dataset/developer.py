@@ -20,7 +20,7 @@ from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result, Runner, submit_together
 from clpipe.images.read import SourceImage
-from clpipe.outputs.patches import Patch, Patches, facts_of, variance_at, variance_steps
+from clpipe.outputs.patches import Patch, Patches, metadata_of, variance_at, variance_steps
 from clpipe.stage import Kind
 
 Sample = dict[str, Any]
@@ -214,7 +214,7 @@ class Developer:
                 self._sample(order.chain, raws, results, patch, noise, itemgetter(i))
                 for i, patch in enumerate(order.patches)
             ]
-        facts = facts_of(order.chain).items()
+        facts = metadata_of(order.chain).items()
         for sample in samples:
             sample |= {name: v.copy() if isinstance(v, np.ndarray) else v for name, v in facts}
         return samples
@@ -247,21 +247,21 @@ class Developer:
         arrays = self._spec.arrays
         pattern = chain.filters.pattern
 
-        def turned(image: Array) -> Array:
-            return patch.turned(part(image)) if patch else image
+        def orient(image: Array) -> Array:
+            return patch.orient(part(image)) if patch else image
 
         sample: Sample = {}
         for name in ("image", "truth") if self._spec.truth else ("image",):
             result, prefix = results[name], "" if name == "image" else f"{name}."
             for step, image in result.kept.items():
                 if step in self._spec.keep:
-                    sample[prefix + step] = arrays.ordered(turned(image))
-            sample[name] = arrays.picture(turned(result.image), chain.result)
+                    sample[prefix + step] = arrays.ordered(orient(image))
+            sample[name] = arrays.picture(orient(result.image), chain.result)
             if arrays.raw:
-                sample[f"{prefix}raw"] = arrays.mosaic(turned(result.kept[raws[name]]), pattern)
+                sample[f"{prefix}raw"] = arrays.mosaic(orient(result.kept[raws[name]]), pattern)
         if noise:
             variance = variance_at(noise, part(results["signal"].image), patch)
-            variance = patch.turned(variance) if patch else variance
+            variance = patch.orient(variance) if patch else variance
             sample["variance"] = arrays.variance(variance, pattern)
         if patch:
             sample |= {"place": np.array([patch.left, patch.top]), "turn": patch.orientation}

@@ -95,7 +95,7 @@ class SampleLoader:
             return self.patches.per_image
         with self._errors_of(job):
             loaded, _ = self.read(SampleBatch(job, epoch, ()))
-            return self.patches.cutting(loaded.chain, *loaded.source.pixels.shape[1::-1]).count
+            return self.patches.layout(loaded.chain, *loaded.source.pixels.shape[1::-1]).count
 
     def read(self, batch: SampleBatch) -> tuple[LoadedImage, Sample]:
         """Read an image and its layers, which are warped like its picture."""
@@ -159,8 +159,8 @@ class SampleLoader:
         patches: list[Patch] = []
         with self._errors_of(job):
             if self.patches:
-                cutting = self.patches.cutting(chain, *pixels.shape[1::-1])
-                patches = cutting.cut(batch.numbers, job.key, batch.epoch)
+                layout = self.patches.layout(chain, *pixels.shape[1::-1])
+                patches = layout.patches_for(batch.numbers, job.key, batch.epoch)
             else:
                 self._spec.arrays.check_size(*chain.size(*pixels.shape[1::-1]))
         key = noise_key(chain.settings, loaded.key, batch.epoch)
@@ -180,7 +180,7 @@ class SampleLoader:
         arrays, facts = self._spec.arrays, self._facts(batch, loaded)
         for i, sample in enumerate(samples):
             for name, layer in carried.items():
-                sample[name] = arrays.ordered(patches[i].cut_out(layer) if patches else layer)
+                sample[name] = arrays.ordered(patches[i].crop(layer) if patches else layer)
             sample.update(facts)
         return samples
 

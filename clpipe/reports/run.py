@@ -14,7 +14,7 @@ from clpipe.batch.run_log import read_log
 from clpipe.batch.tars import DAMAGED
 from clpipe.chain.keys import KEYS as SINGLE
 from clpipe.chain.rendition import Rendition
-from clpipe.outputs.sidecar import SIDECAR, SidecarError, outputs_in, values_in
+from clpipe.outputs.sidecar import SIDECAR, SidecarError, output_entries, parse_sidecar
 
 TAR = ".tar"
 # The values of sidecars to keep. There may be hundreds of thousands of sidecars.
@@ -249,7 +249,7 @@ def _made(
         beside: the files of the directory by name.
     """
     try:
-        record = values_in(data, _joined(below, name))
+        record = parse_sidecar(data, _joined(below, name))
     except SidecarError as error:
         run.problems.append(str(error))
         return
@@ -264,7 +264,7 @@ def _made(
         run.problems.append(f"{_joined(below, name)}: is damaged, or of another version")
         return
     files = {}
-    for file, said in outputs_in(record).items():
+    for file, said in output_entries(record).items():
         label = _joined(below, file)
         there = beside.get(file, Blob("", label, {}))
         files[file.removeprefix(f"{stem}.")] = Blob(

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from clpipe.chain.rendition import NOISY, Rendition
 from clpipe.outputs.carried import carried_files
-from clpipe.outputs.sidecar import SidecarError, outputs_in, sidecar_files, values_at
+from clpipe.outputs.sidecar import SidecarError, output_entries, sidecar_files, values_at
 
 PICTURE = "picture"
 SERIES = re.compile(r"(?:[^/]+/)?iso[0-9.e+]+(?=/)|")  # the folder of a camera and an ISO
@@ -120,7 +120,7 @@ def _member(
     files: dict[str, str] = {}
     noisy: Mapping[str, Any] | None = None
     for suffix, (path, values) in sorted(renditions.items()):
-        first, *_ = outputs_in(values)
+        first, *_ = output_entries(values)
         place = path.parent.relative_to(folder)
         if not (path.parent / first).exists():
             continue
