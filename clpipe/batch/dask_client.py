@@ -133,10 +133,10 @@ class Cluster:
 
     def _probe(self, jobs: Sequence[Job]) -> None:
         """Check that all workers have one environment, and see the same files as this machine."""
-        takes = ImageLoader(self._spec.request).raw.takes
+        is_raw = ImageLoader(self._spec.request).raw.is_raw
         # As in first_chain(), the chain of a raw is compiled only if all inputs are raws.
         able = [job for job in jobs if not job.problem] or jobs
-        first = next((job for job in able if not takes(job.path)), able[0])
+        first = next((job for job in able if not is_raw(job.path)), able[0])
         spec = replace(self._spec, first=first)
         size = first.path.stat().st_size if first.path.is_file() else None
         probe = spec.where.output / f".clpipe.{spec.run}"

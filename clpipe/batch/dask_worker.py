@@ -60,7 +60,9 @@ class DaskSpec(RunSpec):
         """Return a job with absolute names of files."""
         values = from_folder(self.folder, job.values)
         first, *others = (self.folder / path for path in job.paths)
-        return replace(job, path=first, subframes=tuple(others), values=values, written=job.input)
+        return replace(
+            job, path=first, subframes=tuple(others), values=values, as_written=job.input
+        )
 
 
 def as_written(outcome: Outcome) -> Outcome:

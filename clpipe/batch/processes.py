@@ -311,7 +311,7 @@ class Processes:
         if not self._processes:
             self._processes.append(self._start(process.seat.number))
         text = f"killed the process that took it, {DEATHS} times; the last one {_ended(status)}"
-        return [Outcome(job, FAILED, error=f"{job.shown}: {text}") for job in given_up]
+        return [Outcome(job, FAILED, error=f"{job.display_name}: {text}") for job in given_up]
 
     def _tell_to_stop(self) -> None:
         for process in self._processes:

@@ -59,7 +59,7 @@ class Summary:
             self.megapixels += outcome.megapixels
             self.much_clipped += outcome.clipped >= MUCH
             if outcome.clipped > self.most_clipped[0]:
-                self.most_clipped = outcome.clipped, outcome.job.shown
+                self.most_clipped = outcome.clipped, outcome.job.display_name
         if outcome.error:
             self.failures.append(outcome.error)
         if outcome.reason:
@@ -167,7 +167,7 @@ class RunLog:
             "image",
             outcome.began,
             {
-                "input": job.shown,
+                "input": job.display_name,
                 "name": job.key,
                 "stem": job.stem,
                 "status": outcome.status,

@@ -36,7 +36,7 @@ from clpipe.images.read import PICTURE_SUFFIXES
 from clpipe.inputs.find import Job, Shard, find_jobs
 from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
-from clpipe.inputs.poses import with_views
+from clpipe.inputs.poses import assign_views
 from clpipe.inputs.series import Series
 from clpipe.outputs.existing import pictures_without_input
 from clpipe.outputs.folder import output_folder, remove_unfinished
@@ -83,12 +83,12 @@ class Images:
         if not jobs:
             found = find_jobs(self.inputs, output, loader.endings(), self.exclude)
             jobs = loader.exposures(found)
-        jobs = with_views(jobs, self.poses, loader.settings.render, loader.request.truth_at)
+        jobs = assign_views(jobs, self.poses, loader.settings.render, loader.request.truth_at)
         jobs = self.series.jobs(jobs, loader.settings)
         if self.per_tar:
-            tars = self.shard.take(cut(jobs, self.per_tar, output))
+            tars = self.shard.select(cut(jobs, self.per_tar, output))
             return [job for tar in tars for job in tar.jobs], tars
-        return self.shard.take(jobs), []
+        return self.shard.select(jobs), []
 
 
 class Run:
@@ -201,7 +201,9 @@ class Run:
             if self._is_stopped:
                 executor.stop()
             stack.enter_context(output_folder(where.output, images.shard))
-            folders = images.series.under(where.output) if images.poses and images.is_whole else []
+            folders = (
+                images.series.folders_in(where.output) if images.poses and images.is_whole else []
+            )
             if folders:
                 from clpipe.outputs.camera_files import check_camera_files
 

@@ -143,7 +143,7 @@ class ImageWorker:
                 else:
                     state.status = SKIPPED
             except (ImageError, RequestError, MemoryError) as error:
-                if state.loader.is_left_out(job, error):
+                if state.loader.is_skipped(job, error):
                     state.status = LEFT_OUT
                     state.reason = str(error) if isinstance(error, NoPictureError) else ""
                 else:
@@ -199,9 +199,11 @@ class ImageWorker:
             state.patches = all_patches(patches, loaded.chain, width, height, job.key)
         if any(map(self.writer.carries, renditions)):
             upright = self.writer.picture_orientation(loaded.source, loaded.chain)
-            state.aovs = state.loader.aovs(job, loaded, 1 if patches else upright)
+            state.carried_layers = state.loader.carried_layers(
+                job, loaded, 1 if patches else upright
+            )
             if patches and patches.augment:
-                state.aovs.check_turns()
+                state.carried_layers.check_no_vectors()
         state.source = loaded.source
         state.recipes = recipes(renditions, loaded.chain, loaded.key)
         state.unwritten = len(state.recipes)
@@ -331,7 +333,7 @@ class ImageWorker:
             try:
                 self.fail(state, error)
             except OutputError as reason:
-                state.error, failure = f"{state.job.shown}: {reason}", reason
+                state.error, failure = f"{state.job.display_name}: {reason}", reason
         if failure:
             raise failure
 
@@ -359,7 +361,7 @@ class ImageWorker:
         assert state.source
         carried = None
         if writer.carries(recipe.rendition):
-            carried, state.aovs = state.aovs, None
+            carried, state.carried_layers = state.carried_layers, None
         files = writer.write(job, recipe, state.source, result, carried, state.patches)
         clipped = None if recipe.noise else clipped_share(result, recipe.chain)
         if recipe.chain.source is not Kind.DISPLAY:  # photographs are clipped already

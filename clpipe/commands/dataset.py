@@ -37,7 +37,7 @@ from clpipe.commands.options import (
     quiet_option,
 )
 from clpipe.commands.progress import Reporter, follow, print_line
-from clpipe.inputs.around import wide_of
+from clpipe.inputs.panoramas import wide_lens_of
 from clpipe.inputs.series import Series, split_series
 from clpipe.reference.panorama import CUBE
 from clpipe.reference.projection import seen_faces
@@ -223,7 +223,7 @@ def cube_faces(request: Request, resolution: tuple[int, int] | None) -> dict[str
         RequestError: a face is not square.
         ImageError: the lens is impossible.
     """
-    projection = projection_of(request.chain()) if wide_of(request.settings()) else None
+    projection = projection_of(request.chain()) if wide_lens_of(request.settings()) else None
     if projection is None:
         return None
     side, names = seen_faces(projection.lens)

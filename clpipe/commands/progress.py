@@ -131,7 +131,7 @@ class Reporter:
             return
         for warning in outcome.warnings if outcome.status == DONE else ():
             if not self._warnings[warning]:
-                self.print(f"clpipe: {outcome.job.shown}: warning: {warning}")
+                self.print(f"clpipe: {outcome.job.display_name}: warning: {warning}")
             self._warnings[warning] += 1
         if self._bar and self._several:
             self._show(self._progress_text())
@@ -140,7 +140,7 @@ class Reporter:
                 self._last_line = time.perf_counter()
                 self.print(self._progress_text(with_count=True))
         elif outcome.status == DONE:
-            self.print(f"{outcome.job.shown} -> {self._files(outcome)}")
+            self.print(f"{outcome.job.display_name} -> {self._files(outcome)}")
 
     def _files(self, outcome: Outcome) -> str:
         first, *others = self._writer.renditions_of(outcome.job)

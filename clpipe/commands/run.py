@@ -15,7 +15,7 @@ from clpipe.chain.options import OPTIONS
 from clpipe.commands.chain_options import SETTINGS, options, out_option, set_option, settings_in
 from clpipe.commands.options import EXISTING, GroupedCommand, json_lines_option, quiet_option
 from clpipe.commands.progress import follow, print_line
-from clpipe.inputs.annotations import Annotations, parsed
+from clpipe.inputs.annotations import Annotations, read_json
 from clpipe.inputs.bop import is_by_image, read_bop
 from clpipe.inputs.coco import read_coco
 from clpipe.inputs.kitti import read_kitti
@@ -61,7 +61,7 @@ def run(annotations: Path | None, quiet: bool, json_lines: bool, **options: Any)
     render_annotations = read_annotations(annotations, batch.images) if annotations else None
     follow(batch, batch.outcomes(batch.jobs), quiet or json_lines)
     if render_annotations and not batch.summary.interrupted:
-        for folder in batch.images.series.under(batch.where.output):
+        for folder in batch.images.series.folders_in(batch.where.output):
             for line in write_annotations(folder, render_annotations):
                 click.echo(line, err=True)
     sys.exit(batch.summary.exit_status)
@@ -81,5 +81,5 @@ def read_annotations(path: Path, images: Images) -> Annotations:
         )
     if path.is_dir():
         return read_kitti(path)
-    values = parsed(path)
+    values = read_json(path)
     return read_bop(path) if is_by_image(values) else read_coco(path, values)

@@ -56,7 +56,7 @@ def jobs_of(
         log.warning("%s", note)
     owners: dict[str, Job] = {}
     for job in jobs:
-        if job.listed and not job.path.exists():  # files of directories exist
+        if job.named_by_user and not job.path.exists():  # files of directories exist
             raise RequestError(f"{job.label}: there is no such file or folder")
         other = owners.setdefault(job.key, job)
         if other is not job:
@@ -65,7 +65,7 @@ def jobs_of(
                 "same draws. Name the directory that contains both"
             )
     with ThreadPoolExecutor() as threads:
-        opens = list(threads.map(loader.opens, jobs))
+        opens = list(threads.map(loader.has_readable_header, jobs))
     damaged = [job for job, is_whole in zip(jobs, opens, strict=True) if not is_whole]
     if not damaged:
         return jobs

@@ -106,11 +106,11 @@ class SampleLoader:
             loader = self._loader.for_job(job, batch.draw_key)
             loaded = loader.enter(job, self._source(job, loader))
             if loaded and loader.request.carry:
-                along = loader.aovs(job, loaded)
+                along = loader.carried_layers(job, loaded)
                 named = {**along.arrays(), VALID: along.valid}
                 carried = {f"carried.{name}": array for name, array in named.items()}
                 if self.patches and self.patches.augment:
-                    along.check_turns()
+                    along.check_no_vectors()
         except (ImageError, RequestError, MemoryError) as error:
             raise ImageError(loader.error_text(job, error)) from None
         if loaded is None:
@@ -127,7 +127,7 @@ class SampleLoader:
         """Return the image of a job, from the cache unless sub-frames are combined."""
         if loader.shutter(job):  # which may be drawn
             return loader.read(job)
-        overscan = not loader.raw.takes(job.path) and loader.reads_overscan
+        overscan = not loader.raw.is_raw(job.path) and loader.reads_overscan
         key = job.key, stamp_of(job.path), overscan
         return self.renders.get(key, lambda: loader.read(job))
 

@@ -57,9 +57,9 @@ class Explorer:
     """
 
     def __init__(self, jobs: Sequence[Job], request: Request, device: Device | None) -> None:
-        if listed := next((job for job in jobs if job.place), None):
+        if listed := next((job for job in jobs if job.location), None):
             raise RequestError(
-                f"{listed.place}: rows of a manifest may have their own settings. Name the "
+                f"{listed.location}: rows of a manifest may have their own settings. Name the "
                 "images or their directories instead"
             )
         self.jobs = tuple(jobs)

@@ -51,7 +51,7 @@ def inputs_of(jobs: Sequence[Job]) -> list[Path]:
     """Return the inputs of images. For a single file, this is its directory."""
     if len(jobs) == 1:
         return [root_of(jobs[0])]
-    return list(dict.fromkeys(job.path if job.listed else root_of(job) for job in jobs))
+    return list(dict.fromkeys(job.path if job.named_by_user else root_of(job) for job in jobs))
 
 
 def root_of(job: Job) -> Path:

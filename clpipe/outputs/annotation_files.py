@@ -135,7 +135,7 @@ def _kitti_line(label: KittiObject, mapping: PixelMapping) -> str:
     if warped is None:
         return ""
     (x, y, width, height), shown = warped
-    fields = list(label.words)
+    fields = list(label.fields)
     if label.truncated >= 0:
         fields[1] = f"{1 - (1 - label.truncated) * shown:.2f}"
     # KITTI's coordinates count from the centre of the first pixel, so the last one is width - 1.
@@ -235,9 +235,9 @@ class _WarpedObject:
                 counts[kind] = int(before.sum()), int(warped.sum())
                 self.info[box] = _bounding_box(warped)
             elif box in original.info and original.info[box] != EMPTY_BOX:
-                found = warp_box(original.info[box], mapping)
-                self.info[box] = [round(v) for v in found[0]] if found else EMPTY_BOX
-                shares.append(found[1] if found else 0.0)
+                warped_box = warp_box(original.info[box], mapping)
+                self.info[box] = [round(v) for v in warped_box[0]] if warped_box else EMPTY_BOX
+                shares.append(warped_box[1] if warped_box else 0.0)
         self.is_in_picture = (
             any(n for _, n in counts.values()) if counts else any(shares) or not shares
         )
@@ -287,10 +287,10 @@ def _picture_camera(matrix: Sequence[float] | Array, mapping: PixelMapping) -> I
     """
     fx, fy, cx, cy = (float(matrix[i]) for i in CAMERA_MATRIX)
     before = Intrinsics(mapping.width, mapping.height, fx, fy, cx + CENTRE, cy + CENTRE)
-    found = mapping.camera(before)
-    if found is None:
+    camera = mapping.camera(before)
+    if camera is None:
         raise ImageError("the intrinsics of the picture are not known")
-    return replace(simplest_model(found), cx=found.cx - CENTRE, cy=found.cy - CENTRE)
+    return replace(simplest_model(camera), cx=camera.cx - CENTRE, cy=camera.cy - CENTRE)
 
 
 def _camera_matrix(camera: Intrinsics) -> Any:

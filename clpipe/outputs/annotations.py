@@ -18,7 +18,7 @@ from clpipe.chain.request import Request
 from clpipe.images.claims import display_size
 from clpipe.images.tags import FLIPS
 from clpipe.inputs.annotations import Annotations
-from clpipe.inputs.poses import Views, stem_of
+from clpipe.inputs.poses import ViewIndex, stem_of
 from clpipe.inputs.render_cameras import View
 from clpipe.outputs.annotation_files import annotation_writer
 from clpipe.outputs.annotation_warp import PixelMapping
@@ -48,7 +48,7 @@ def write_annotations(folder: Path, annotations: Annotations) -> list[str]:
     Raises:
         ImageError: a file cannot be written.
     """
-    views = Views([View(each.name, {"render": each}) for each in annotations.renders])
+    views = ViewIndex([View(each.name, {"render": each}) for each in annotations.renders])
     writer = annotation_writer(annotations)
     lines: list[str] = []
     sidecars = list(_sidecars(folder))

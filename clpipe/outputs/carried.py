@@ -12,14 +12,14 @@ from clpipe.base.types import Array
 from clpipe.chain.carry import VALID
 from clpipe.images.attributes import PREFIX
 from clpipe.images.write import write_grey_png, write_planes
-from clpipe.inputs.carry import Aovs
+from clpipe.inputs.carry import CarriedLayers
 from clpipe.inputs.companions import CARRIED
 from clpipe.outputs.sidecar import output_entries
 
 MILLIMETRES_PER_METRE = 1000
 
 
-def write_carried(path: Path, carried: Aovs, layer: str = "") -> Stored:
+def write_carried(path: Path, carried: CarriedLayers, layer: str = "") -> Stored:
     """Write all carried layers as an EXR, or one layer (depth in metres, or labels) as a PNG.
 
     The EXR contains the channels of all layers in their types, and the channel :data:`VALID`.

@@ -15,7 +15,7 @@ from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import FLIPS, orientation_of
-from clpipe.inputs.carry import Aovs
+from clpipe.inputs.carry import CarriedLayers
 from clpipe.inputs.find import Job
 from clpipe.inputs.raw import RawImage
 from clpipe.outputs.motion import motion_records
@@ -69,7 +69,7 @@ def picture_record(
     result: Result,
     outputs: Mapping[Path, Stored],
     clipped: float | None,
-    carried: Aovs | None = None,
+    carried: CarriedLayers | None = None,
     patches: Sequence[Patch] = (),
 ) -> dict[str, Any]:
     """Return everything that is needed to recompute the files of a rendition, as JSON values.

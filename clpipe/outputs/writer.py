@@ -18,7 +18,7 @@ from clpipe.images.dng import write_dng
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import Tags, from_attributes, orientation_of, upright
 from clpipe.images.write import JPEG_MAX_SIDE, write_display, write_exr, write_npy
-from clpipe.inputs.carry import Aovs
+from clpipe.inputs.carry import CarriedLayers
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import attributes_of
 from clpipe.outputs.carried import write_carried
@@ -85,7 +85,7 @@ class OutputWriter(OutputPlan):
         recipe: Recipe,
         source: SourceImage,
         result: Result,
-        carried: Aovs | None = None,
+        carried: CarriedLayers | None = None,
         patches: Sequence[Patch] = (),
     ) -> dict[Path, Stored]:
         """Write the images of one rendition, or of patches of it.
@@ -114,7 +114,7 @@ class OutputWriter(OutputPlan):
             outputs |= self._write(job, recipe, source, part, number)
         if carried:
             for number, patch in numbered(patches):
-                layers = carried.changed(patch.crop) if patch else carried
+                layers = carried.map_arrays(patch.crop) if patch else carried
                 for layer, ending in self.carried_suffixes(recipe.rendition).items():
                     path = self.path(job, ending, patch=number)
                     outputs[path] = write_carried(path, layers, layer)

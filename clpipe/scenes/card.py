@@ -11,7 +11,7 @@ from clpipe.base.about import __version__
 from clpipe.base.files import write_new
 from clpipe.chain.rendition import Rendition
 from clpipe.images.sheet import SHOWN, contact_sheet
-from clpipe.inputs.carry_around import DISTANCE
+from clpipe.inputs.carry_panorama import DISTANCE
 from clpipe.outputs.camera_files import FILES, write_camera_files
 from clpipe.scenes.members import PICTURE, Member, members_of, splits_of
 from clpipe.scenes.record import RECORD

@@ -55,8 +55,8 @@ class Source:
         for name in self.names:
             files = [Path(folder) / f"{name}_{face}.exr" for face in self.faces]
             first, *others = files or [Path(folder) / f"{name}.exr"]
-            found = Job(first, f"{name}.exr", listed=False)
-            jobs.append(replace(found, subframes=tuple(others), around=bool(files)))
+            found = Job(first, f"{name}.exr", named_by_user=False)
+            jobs.append(replace(found, subframes=tuple(others), is_panorama=bool(files)))
         return jobs or None
 
     def stop(self) -> None:

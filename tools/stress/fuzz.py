@@ -94,7 +94,7 @@ def ways(suffix: str) -> tuple[Callable[[Path], object], ...]:
     from clpipe.inputs.find import Job
     from clpipe.inputs.loader import ImageLoader
     from clpipe.inputs.manifest import check_rows, read_manifest
-    from clpipe.inputs.poses import with_views
+    from clpipe.inputs.poses import assign_views
     from clpipe.outputs.sidecar import read_sidecar
 
     def entering(**options: object) -> Callable[[Path], object]:
@@ -124,7 +124,7 @@ def ways(suffix: str) -> tuple[Callable[[Path], object], ...]:
         return check_rows(read_manifest(path), settings_from({}))
 
     def poses(path: Path) -> object:
-        return with_views([Job(Path("a.exr"), "a.exr")], path, RenderCamera())
+        return assign_views([Job(Path("a.exr"), "a.exr")], path, RenderCamera())
 
     noise_model = partial(import_camera, camera=None, output=None)
     report = setting("picture_noise", "intensity_dependent", "measured")
