@@ -231,17 +231,17 @@ def test_pictures_of_inputs_that_are_gone_are_counted(clpipe, write_exr):
     run = ("-o", "out", "--device", "numpy")
     clpipe("run", "other", *run)
     clpipe("run", "in", *run, "--truth", "clean")
-    there = "not there any more"
+    there = "no longer exist"
     Path("other/d.exr").unlink()
     assert there not in clpipe("run", "in", *run).stderr  # that is not looked at
     Path("in/b.exr").unlink()
     said = clpipe("run", "in", *run, "--truth", "clean").stderr
-    assert said.endswith("\n2 pictures in out are of inputs that are not there any more\n")
+    assert said.endswith("\n2 pictures in out are of inputs that no longer exist\n")
     Path("in/sub/c.exr").unlink()
     for given in ("in", "./in/", "in/*.exr", "in/a.exr"):
         count = 4 if given in ("in", "./in/") else 2  # b and its truth; so with c
         told = clpipe("run", given, *run).stderr
-        assert f"\n{count} pictures in out are of inputs that are {there}" in told
+        assert f"\n{count} pictures in out are of inputs that {there}" in told
     for option in (("--quiet",), ("--shard", "1/2"), ("--json-lines",)):
         assert there not in clpipe("run", "in", *run, *option).output
 

@@ -32,7 +32,7 @@ from clpipe.outputs.writer import OutputWriter
 # The bytes of a member: a file, an offset and size in the old tar, or the bytes themselves.
 Source = Path | tuple[int, int] | bytes
 
-COPIED = 1 << 20  # bytes that are copied at a time; tarfile's 16 KiB take three times as long
+COPY_BYTES = 1 << 20  # bytes that are copied at a time; tarfile's 16 KiB take three times as long
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,9 @@ class Packer:
     def _member(self, job: Job, rendition: Rendition) -> str:
         """Return the name of a rendition's sidecar in the tar."""
         folder = OF_PATCHES if self._writer.patches else ""
-        return folder + self._packed_as(self._writer.path(job, SIDECAR, rendition))
+        return folder + self._member_name(self._writer.path(job, SIDECAR, rendition))
 
-    def _packed_as(self, path: Path) -> str:
+    def _member_name(self, path: Path) -> str:
         return path.relative_to(self.tar.staging).as_posix()
 
     def found(
@@ -91,9 +91,9 @@ class Packer:
         found = match_sidecar(values, job, request, redo.verifies)
         if found is ExistingFiles.NOTHING:
             return found
-        beside = PurePosixPath(member.removeprefix(OF_PATCHES))
-        files = {str(beside.with_name(n)): was for n, was in listed.items()}
-        if any(self._old.sha256(file) != was["sha256"] for file, was in files.items()):
+        sidecar_path = PurePosixPath(member.removeprefix(OF_PATCHES))
+        files = {str(sidecar_path.with_name(n)): entry for n, entry in listed.items()}
+        if any(self._old.sha256(file) != entry["sha256"] for file, entry in files.items()):
             return ExistingFiles.NOTHING
         if redo.keeps(found):
             self._reused[member] = list(files)
@@ -148,11 +148,11 @@ class Packer:
             member = self._member(job, rendition)
             if files := self._reused.get(member):
                 for file in (*files, member):
-                    yield file, self._old.places[file]
+                    yield file, self._old.locations[file]
                 continue
             sidecar = self._writer.path(job, SIDECAR, rendition)
             for path in (sidecar.with_name(n) for n in output_entries(read_sidecar(sidecar))):
-                yield self._packed_as(path), path
+                yield self._member_name(path), path
             yield member, sidecar
 
     def _by_patch(
@@ -184,7 +184,7 @@ class Packer:
                 mode="w",
                 format=tarfile.GNU_FORMAT,
                 encoding="utf-8",
-                copybufsize=COPIED,
+                copybufsize=COPY_BYTES,
             ) as tar,
         ):
             for name, source in members:
@@ -244,15 +244,15 @@ class Tars(Folder):
         packing: Future[None] | None = None
         with ThreadPoolExecutor(1, "pack") as pool:
             for outcome in executor.run(jobs):
-                place = self._folders[outcome.job.stem]
-                packer = self._packers[place]
+                folder = self._folders[outcome.job.stem]
+                packer = self._packers[folder]
                 is_last = packer.add(outcome)
                 yield packer.packed(outcome)
                 if is_last:
                     if packing:
                         packing.result()
                     packing = pool.submit(self.pack, packer)
-                    del self._packers[place]
+                    del self._packers[folder]
             if packing:
                 packing.result()
 

@@ -12,9 +12,9 @@ from rich.console import Console
 
 from clpipe.base.errors import RequestError
 from clpipe.base.files import check_folder
+from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.run_log import Summary
 from clpipe.batch.session import Images, Run
-from clpipe.batch.where import Where
 from clpipe.chain.keys import CODE
 from clpipe.chain.options import OPTIONS, TRUTH
 from clpipe.chain.panorama import projection_of
@@ -282,9 +282,9 @@ def develop(
         ClpipeError: the run cannot continue.
     """
     jobs = renders.jobs() or ()
-    images = Images(renders.inputs, poses=renders.poses, series=series, found=jobs)
-    where = Where(output, () if selector is None else (selector,))
-    run = Run(request, images, where, arguments=sys.argv[1:], echo=echo)
+    images = Images(renders.inputs, poses=renders.poses, series=series, known_jobs=jobs)
+    execution = ExecutionOptions(output, () if selector is None else (selector,))
+    run = Run(request, images, execution, arguments=sys.argv[1:], echo=echo)
     reporter = Reporter(run, Console(stderr=True), quiet)
     show = (lambda text: None) if quiet else reporter.print
 

@@ -85,7 +85,7 @@ class Reporter:
         self._writer = run.writer
         self._console = console
         self._quiet = quiet
-        self._keeps_old = run.where.redo is Redo.MISSING
+        self._keeps_old = run.execution.redo is Redo.MISSING
         self._several = summary.total > 1
         self._last_line = self._start = time.perf_counter()
         self._bar: Progress | None = None

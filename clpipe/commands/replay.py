@@ -6,9 +6,9 @@ from pathlib import Path
 import click
 
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.replay import replay_of
 from clpipe.batch.session import Images, Run
-from clpipe.batch.where import Where
 from clpipe.chain.keys import CODE
 from clpipe.commands.chain_options import device_option, options, out_option
 from clpipe.commands.options import EXISTING, Command, json_option, quiet_option
@@ -48,9 +48,11 @@ def replay(
     """
     original = replay_of(sidecar, [image] if image else [], max_pixels, stage_files)
     selectors = () if selector is None else (selector,)
-    where = Where(output, selectors, memory)
+    execution = ExecutionOptions(output, selectors, memory)
     try:
-        run = Run(original.request, Images(found=[original.job]), where, arguments=sys.argv[1:])
+        run = Run(
+            original.request, Images(known_jobs=[original.job]), execution, arguments=sys.argv[1:]
+        )
     except RequestError as error:
         raise RequestError(f"{sidecar}: {error}") from None
     follow(run, run.outcomes(run.jobs), quiet or as_json)

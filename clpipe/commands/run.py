@@ -61,7 +61,7 @@ def run(annotations: Path | None, quiet: bool, json_lines: bool, **options: Any)
     render_annotations = read_annotations(annotations, batch.images) if annotations else None
     follow(batch, batch.outcomes(batch.jobs), quiet or json_lines)
     if render_annotations and not batch.summary.interrupted:
-        for folder in batch.images.series.folders_in(batch.where.output):
+        for folder in batch.images.series.folders_in(batch.execution.output):
             for line in write_annotations(folder, render_annotations):
                 click.echo(line, err=True)
     sys.exit(batch.summary.exit_status)

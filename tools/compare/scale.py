@@ -24,8 +24,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from clpipe.base.processors import available_processors
-from clpipe.batch.bench import Load, bench_batch, write_renders
-from clpipe.batch.processes import usual_processes
+from clpipe.batch.bench import Workload, bench_batch, write_renders
+from clpipe.batch.processes import default_processes
 from clpipe.chain.request import Request
 from clpipe.engine.device import open_device
 from clpipe.images.claims import plain_claim
@@ -86,7 +86,7 @@ def cost_of(folder: Path, images: int, processes: int) -> Cost:
     return Cost(own, 0.0, elapsed) if processes == 1 else Cost(others, own, elapsed)
 
 
-def locked(load: Load) -> float:
+def locked(workload: Workload) -> float:
     """For how many ms of an image a process holds the interpreter's lock, at most.
 
     It is the CPU time of all threads outside of decoding, hashing, kernels, encoding and writing,
@@ -94,7 +94,7 @@ def locked(load: Load) -> float:
     """
     device = open_device(None)
     assert device
-    return bench_batch(device, Request.from_options(), load).cpu_ms["Python"]
+    return bench_batch(device, Request.from_options(), workload).cpu_ms["Python"]
 
 
 def modelled(cost: Cost, lock: float, processors: int, processes: int) -> float:
@@ -125,15 +125,15 @@ def main() -> None:
         width, height = map(int, text.split("x"))
         with tempfile.TemporaryDirectory(prefix="clpipe-scale-") as name:
             folder = Path(name)
-            write_renders(folder / "in", Load(asked.images, width, height))
+            write_renders(folder / "in", Workload(asked.images, width, height))
             run(folder, FEW, 1)  # kernels are compiled, files read
-            lock = locked(Load(asked.images, width, height))
+            lock = locked(Workload(asked.images, width, height))
             costs = {count: cost_of(folder, asked.images, count) for count in COUNTS}
         for count, cost in costs.items():
             numbers = f"{cost.cpu:.2f} | {cost.handing:.2f} | {1e3 / cost.elapsed:.0f}"
             print(f"| {text} | {lock:.2f} | {count} | {numbers} |", flush=True)
         claim = plain_claim(width, height)
-        usual = usual_processes(10**6, claim, asked.processors)
+        usual = default_processes(10**6, claim, asked.processors)
         alone = modelled(costs[1], lock, asked.processors, 1)
         shared = modelled(costs[here if here in costs else 2], lock, asked.processors, usual)
         models.append(f"| {text} | {alone:.0f} | {usual} | {shared:.0f} |")

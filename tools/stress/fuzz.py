@@ -82,7 +82,7 @@ def ways(suffix: str) -> tuple[Callable[[Path], object], ...]:
     from clpipe.analysis.noise_models.read import import_camera
     from clpipe.analysis.pictures import load_picture
     from clpipe.batch.replay import replay_of
-    from clpipe.batch.tars import Members, is_own
+    from clpipe.batch.tars import Members, is_clpipe_tar
     from clpipe.camera.profile import load_camera
     from clpipe.chain.files import load_settings
     from clpipe.chain.making import make_chain
@@ -112,7 +112,7 @@ def ways(suffix: str) -> tuple[Callable[[Path], object], ...]:
 
     def members(path: Path) -> object:
         tar = Members(path)
-        return [tar.sidecar(name) for name in tar.places], is_own(path)
+        return [tar.sidecar(name) for name in tar.places], is_clpipe_tar(path)
 
     def layers(path: Path) -> object:
         return [read_layer(path, layer, MAX_PIXELS) for layer in find_layers(path)[:8]]
