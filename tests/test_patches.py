@@ -270,7 +270,7 @@ def test_decoded_renders_are_kept_while_they_fit(renders, write_exr, monkeypatch
         made.__getitems__(order[:2])
         for i in order[2:]:
             made[i]
-        assert made._loader.renders.taken <= 2**20
+        assert made._loader.renders.size_in_bytes <= 2**20
         return "".join(name[1] for name in read)
 
     one = 48 * 64 * 6  # bytes, half
@@ -367,7 +367,10 @@ def test_what_is_refused(renders):
         ({"dtype": "int8"}, "unknown dtype 'int8'.*; allowed: float16, float32, uint16"),
         ({"dtype": "half float"}, "unknown dtype 'half float'"),
         ({"dtype": "uint16", **mosaic}, "dtype uint16: .* the chain ends in mosaic"),
-        ({"dtype": "float16", "until": "quantize"}, "dtype float16: it cannot hold DN exactly"),
+        (
+            {"dtype": "float16", "until": "quantize"},
+            "dtype float16: the chain ends in DN, which this type cannot hold exactly",
+        ),
         ({"raw": "bayer"}, "found raw 'bayer'; expected .*'packed', 'mosaic'"),
         ({"raw": "mosaic", "until": "exposure"}, "makes no raw in DN. Add the stage quantize"),
         ({"raw": "mosaic", "dtype": "float32", "until": "quantize"}, "ends in DN, at quantize"),
