@@ -43,10 +43,16 @@ from clpipe.reference.panorama import CUBE
 from clpipe.reference.projection import seen_faces
 from clpipe.reference.wide import MODELS
 from clpipe.scenes.blender import Rendering
-from clpipe.scenes.card import About, write_card
-from clpipe.scenes.record import keep_said
+from clpipe.scenes.card import CardContents, write_card
+from clpipe.scenes.record import store_credits
 from clpipe.scenes.source import NOTE, RENDERS, UNIT, Source, from_folder, from_scene
-from clpipe.scenes.view_request import PATHS, asked_views, parse_box, parse_frames, parse_resolution
+from clpipe.scenes.view_request import (
+    PATHS,
+    parse_box,
+    parse_frames,
+    parse_resolution,
+    requested_views,
+)
 from clpipe.stage import StageRole
 
 # Options that apply only to a scene.
@@ -188,7 +194,7 @@ def dataset(
             reject_render_options()
             renders = from_folder(source, output, poses)
         request = replace(request, carry=request.carry or renders.layers)
-        attribution = keep_said(output, attribution)
+        attribution = store_credits(output, attribution)
         echo = print_line if json_lines else None
         quiet |= json_lines
         summary = develop(renders, request, output, series, selector, quiet, attribution, echo)
@@ -207,7 +213,7 @@ def rendering_from(
     """
     rendering = dict(options)
     named = {name: rendering.pop(name) for name in VIEW_OPTIONS}
-    views = asked_views(**named, poses=poses, seed=seed)
+    views = requested_views(**named, poses=poses, seed=seed)
     # Blender has another working directory.
     return Rendering(scene.absolute(), (output / RENDERS).absolute(), views, **rendering, seed=seed)
 
@@ -295,11 +301,11 @@ def develop(
         run.stop()
         renders.stop()
 
-    outcomes = run.outcomes(renders.as_rendered(run.jobs, show))
+    outcomes = run.outcomes(renders.jobs_when_rendered(run.jobs, show))
     follow(run, outcomes, quiet, reporter, stop)
     if not run.summary.interrupted:
         unit = renders.about.get(UNIT, "as in the renders")
-        about = About(
+        about = CardContents(
             renders.about, attribution["licence"], attribution["author"], unit, sys.argv[1:]
         )
         written = write_card(output, RENDERS, about)

@@ -76,7 +76,7 @@ class SampleLoader:
         self._warned: set[str] = set()
 
     def __getstate__(self) -> Mapping[str, Any]:
-        return {**self.__dict__, "_opened": None}  # a device stays with its process
+        return {**self.__dict__, "_open_developer": None}  # a device stays with its process
 
     def drain(self) -> None:
         """Wait for all samples whose development was started."""
