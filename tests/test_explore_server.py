@@ -23,7 +23,7 @@ from tests.held import GUARD
 pytest.importorskip("starlette", reason="needs Starlette, in the extra explore")
 
 from clpipe.explorer import timeout
-from clpipe.explorer.server import Server, in_json
+from clpipe.explorer.server import Server, json_response
 from clpipe.explorer.view import View
 from tests.test_explore import NOISY, explorer_of
 
@@ -191,7 +191,7 @@ def test_a_question_may_take_longer_to_answer_than_to_ask(explorer, monkeypatch)
 
     def answering(self, question):
         cancelled.extend(limit.cancelled() for limit in limits)
-        return in_json({})
+        return json_response({})
 
     monkeypatch.setattr(timeout, "REQUEST_TIMEOUT", GUARD)
     monkeypatch.setattr(asyncio.BaseEventLoop, "call_later", noted)
