@@ -12,7 +12,7 @@ from clpipe.commands import bench as bench_command
 
 @pytest.fixture
 def short(monkeypatch):
-    monkeypatch.setattr(bench_command, "loads", lambda: (Workload(6, 32, 24), Workload(5, 40, 17)))
+    monkeypatch.setattr(bench_command, "workloads", lambda: (Workload(6, 32, 24), Workload(5, 40, 17)))
 
 
 def test_cpu_time_by_step_is_that_of_the_process(clpipe, short, monkeypatch):

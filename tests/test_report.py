@@ -254,7 +254,7 @@ def test_what_was_drawn_is_drawn_and_what_follows_is_folded(renders, tmp_path):
 
 
 def test_a_report_that_takes_long_says_where_it_is(out, monkeypatch):
-    monkeypatch.setattr("clpipe.commands.progress.EVERY", 0)
+    monkeypatch.setattr("clpipe.commands.progress.LINE_INTERVAL", 0)
     said = clpipe("report", out)
     for text in ("sidecars", "noise of raw mosaics", "thumbnail 2 of 3", "comparison 1 of 3"):
         assert f"{text}\n" in said
