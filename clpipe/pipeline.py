@@ -78,23 +78,23 @@ class Pipeline(ReadOnly):
         **settings: "Unpack[Keywords]",
     ) -> None:
         self._settings = overlay(load_settings(*several(config)), plain(settings))
-        self._ends = start_at, until
+        self._chain_range = start_at, until
         self._numbers = itertools.count()
         self._lock = threading.Lock()  # lets one thread use the device at a time
         chain = self._chain(self._settings)
         kept = chain.select(several(keep))
         encode = chain.result is Kind.DISPLAY
-        on = open_device(None if device is None else str(device))
-        self._runner = Runner(chain, on, kept, encode=encode, final=not encode)
+        opened_device = open_device(None if device is None else str(device))
+        self._runner = Runner(chain, opened_device, kept, encode=encode, final=not encode)
 
     def _chain(self, settings: Settings) -> Chain:
-        start_at, until = self._ends
+        start_at, until = self._chain_range
         return make_chain(settings, start_at=start_at, until=until)
 
     def __repr__(self) -> str:
         device = self._runner.device
-        where = device.info.label if device else "numpy"
-        return f"Pipeline({self._settings.label}, {self.chain.label}, on {where})"
+        device_name = device.info.label if device else "numpy"
+        return f"Pipeline({self._settings.label}, {self.chain.label}, on {device_name})"
 
     @property
     def chain(self) -> Chain:
@@ -164,17 +164,17 @@ class Pipeline(ReadOnly):
         margins = margins_of_array(overscan, checked)
 
         def depth_of(chain: Chain, width: int, height: int, kept: Margins) -> Depth:
-            given = None if depth is None else as_array(depth, "depth")
-            cropped = given if given is None or kept else margins.cropped(given)
+            depth_map = None if depth is None else as_array(depth, "depth")
+            cropped = depth_map if depth_map is None or kept else margins.cropped(depth_map)
             return depth_of_array(cropped, width, height)
 
-        own = enter(runner.chain, checked, margins, depth_of)
-        if depth is not None and own.depth is None:
-            unread = "no step reads the depth. Set defocus.method=thin_lens to use it"
-            warnings.warn(f"{key}: {unread}", stacklevel=2)
-        for warning in own.warnings:
+        entered = enter(runner.chain, checked, margins, depth_of)
+        if depth is not None and entered.depth is None:
+            message = "no step reads the depth. Set defocus.method=thin_lens to use it"
+            warnings.warn(f"{key}: {message}", stacklevel=2)
+        for warning in entered.warnings:
             warnings.warn(f"{key}: {warning}", stacklevel=2)
-        chain, pixels = own.chain, own.pixels
+        chain, pixels = entered.chain, entered.pixels
         runner = runner if chain is runner.chain else runner.for_chain(chain)
         own_key = image_key(key, "" if chain.settings.noise_key else digest_of(pixels))
         with self._lock:
@@ -234,17 +234,18 @@ class Pipeline(ReadOnly):
             raise ImageError(f"found {pixels.shape[2]} channels; {kind} has {least} or more")
         vectors = vectors_of("", ("",) * pixels.shape[2]) if kind == "flow" else ()
         margins = margins_of_array(overscan, layer)
-        own = enter(self._runner_for(key, settings).chain, pixels, margins)
-        along = Layer(kind, own.pixels, vectors=vectors)
-        (moved,), valid = warp([along], own.chain.geometry, *own.pixels.shape[1::-1])
-        return moved if layer.ndim == 3 else moved[..., 0], valid
+        entered = enter(self._runner_for(key, settings).chain, pixels, margins)
+        source_layer = Layer(kind, entered.pixels, vectors=vectors)
+        size = entered.pixels.shape[1::-1]
+        (warped,), valid = warp([source_layer], entered.chain.geometry, *size)
+        return warped if layer.ndim == 3 else warped[..., 0], valid
 
     def _runner_for(self, key: str, settings: Mapping[str, Any]) -> Runner:
         """Return the runner of an image, with its own draws and settings."""
-        own = overlay(self._settings, plain(settings)) if settings else self._settings
+        image_settings = overlay(self._settings, plain(settings)) if settings else self._settings
         return (
-            self._runner.for_chain(self._chain(own.drawn(key)))
-            if settings or own.draws
+            self._runner.for_chain(self._chain(image_settings.drawn(key)))
+            if settings or image_settings.draws
             else self._runner
         )
 
@@ -268,8 +269,8 @@ class Pipeline(ReadOnly):
         """
         for item in images:
             image, arguments = item if isinstance(item, tuple) else (item, {})
-            named = {"key": arguments} if isinstance(arguments, str) else arguments
-            yield self.process(image, **{"key": str(next(self._numbers)), **named})
+            keywords = {"key": arguments} if isinstance(arguments, str) else arguments
+            yield self.process(image, **{"key": str(next(self._numbers)), **keywords})
 
 
 def digest_of(image: Array) -> str:

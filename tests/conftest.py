@@ -32,7 +32,7 @@ from clpipe.engine.runner import Result, Runner
 from clpipe.images.write import write_exr as write_file
 from clpipe.inputs.find import Job, find_jobs
 from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.sidecar import SEAL, sealed
+from clpipe.outputs.sidecar import DIGEST_KEY, sidecar_bytes
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
@@ -140,8 +140,10 @@ def noise_report(*sigmas: float, **changes: Any) -> dict[str, Any]:
 
 
 def reseal(path: Path, values: Mapping[str, Any]) -> None:
-    """Write a sidecar with forged values and a valid digest."""
-    path.write_bytes(sealed({key: value for key, value in values.items() if key != SEAL}))
+    """Write a sidecar with values of one's own and the digest that fits them, as a forger can."""
+    path.write_bytes(
+        sidecar_bytes({key: value for key, value in values.items() if key != DIGEST_KEY})
+    )
 
 
 def worker_of(folder: Path, out: str = "out", **options: Any) -> tuple[ImageWorker, list[Job]]:

@@ -14,7 +14,7 @@ import OpenEXR
 MARK = "@clpipe "
 
 
-def tell(event, **values):
+def send_event(event, **values):
     print(MARK + json.dumps({"event": event, **values}), flush=True)
 
 
@@ -27,11 +27,11 @@ def names(views):
 
 
 def camera(name, width, height):
-    place = float(name[-3:])
+    matrix = float(name[-3:])
     return {
         **{"file": f"{name}.exr", "width": width, "height": height},
         "K": [[40.0, 0.0, width / 2], [0.0, 40.0, height / 2], [0.0, 0.0, 1.0]],
-        **{"R": np.eye(3).tolist(), "t": [place, 0.0, 2.0]},
+        **{"R": np.eye(3).tolist(), "t": [matrix, 0.0, 2.0]},
     }
 
 
@@ -59,25 +59,25 @@ def main():
         scene = file.read().strip()
     print("Blender 4.9.9 (fake)")
     if scene.startswith("refuse: "):
-        tell("refused", message=scene.removeprefix("refuse: "))
+        send_event("refused", message=scene.removeprefix("refuse: "))
         sys.exit(1)
     width, height = request["resolution"] or (24, 16)
     cameras = [camera(name, width, height) for name in names(request["views"])]
     objects = {"1": ["floor"], "2": ["ball", "ball.001"]}
     layers = ["Depth", "Normal", "IndexOB"]
     notes = ["3 of 9 places see too little"] if scene == "a maze" else []
-    facts = {"objects": objects, "layers": layers, "unit_metres": 0.1, "notes": notes}
-    tell("scene", blender="4.9.9", views=cameras, **facts)
+    said = {"objects": objects, "layers": layers, "unit_metres": 0.1, "notes": notes}
+    send_event("scene", blender="4.9.9", views=cameras, **said)
     for number, each in enumerate(cameras):
         if scene == f"die after {number}":
             print("Segmentation fault (not really)")
             sys.exit(11)
         path = os.path.join(request["folder"], each["file"])
-        began = time.perf_counter()
+        start = time.perf_counter()
         if is_new := not os.path.exists(path):
             render(path, each["file"].removesuffix(".exr"), width, height)
-        seconds = (time.perf_counter() - began) if is_new else 0.0
-        tell("rendered", name=each["file"].removesuffix(".exr"), seconds=seconds)
+        seconds = (time.perf_counter() - start) if is_new else 0.0
+        send_event("rendered", name=each["file"].removesuffix(".exr"), seconds=seconds)
 
 
 if __name__ == "__main__":

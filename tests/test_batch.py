@@ -203,7 +203,7 @@ def test_devices_develop_at_the_same_time(renders, tmp_path, monkeypatch):
 def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, monkeypatch):
     renders(30)
     (tmp_path / "out").mkdir()
-    monkeypatch.setattr("clpipe.batch.threads.COMMITTED", 2)
+    monkeypatch.setattr("clpipe.batch.threads.MAX_COMMIT", 2)
     worker, jobs = worker_of(tmp_path)
     batch = Batch(worker, [None], threads=2)
     decode, decoded = ImageWorker.decode, []
@@ -334,9 +334,9 @@ def test_a_trace_is_not_held_in_memory(tmp_path):
             trace.add(outcome)
         assert tracemalloc.get_traced_memory()[0] < before + 20_000
         tracemalloc.stop()
-        (beside,) = tmp_path.iterdir()
+        (extra_images,) = tmp_path.iterdir()
         # What a killed process leaves can be read: the array needs no end.
-        text = beside.read_text().rpartition(",\n")[0] + "]}"
+        text = extra_images.read_text().rpartition(",\n")[0] + "]}"
         assert len(json.loads(text)["traceEvents"]) > 100
     events = json.loads((tmp_path / "t.json").read_text())["traceEvents"]
     assert len(events) == 1 + 3 * 700
@@ -453,7 +453,7 @@ def test_the_disk_is_full(clpipe, renders, monkeypatch):
     def fail_to_write(path, spec, pixels):
         count.append(path)
         if len(count) > 2:
-            monkeypatch.setattr(output_folders, "LEAST_FREE", 2**62)  # more than any disk has
+            monkeypatch.setattr(output_folders, "MIN_FREE", 2**62)  # more than any disk has
             raise ImageError(f"{path}: cannot be written: the disk is full")
         return real(path, spec, pixels)
 
@@ -620,11 +620,11 @@ def test_a_sidecar_whose_picture_cannot_be_the_same(clpipe, renders, monkeypatch
     assert "unexpected extra argument" in refused("in/r000.exr", "in/r001.exr")
     Path("in/r000.exr").rename("moved.exr")
     assert "in/r000.exr: cannot be read" in refused()
-    assert "in/r001.exr: has changed since" in refused("in/r001.exr")
+    assert "in/r001.exr: this file has changed" in refused("in/r001.exr")
     clpipe("replay", "out/r000.json", "moved.exr", "-o", "b")
     assert Path("b/r000.jpg").read_bytes() == Path("out/r000.jpg").read_bytes()
     Path("mine.toml").write_text(Path("mine.toml").read_text() + "\n")
-    assert "mine.toml: has changed since" in refused("moved.exr")
+    assert "mine.toml: this file has changed" in refused("moved.exr")
     for module in (record, replay):
         monkeypatch.setattr(module, "__version__", "9.9.9")
     assert "it is of clpipe 0" in refused("moved.exr")

@@ -5,14 +5,16 @@ import json
 import pytest
 
 from clpipe.batch import bench as bench_batch
-from clpipe.batch.bench import Load
+from clpipe.batch.bench import Workload
 from clpipe.chain.request import Request
 from clpipe.commands import bench as bench_command
 
 
 @pytest.fixture
 def short(monkeypatch):
-    monkeypatch.setattr(bench_command, "loads", lambda: (Load(6, 32, 24), Load(5, 40, 17)))
+    monkeypatch.setattr(
+        bench_command, "workloads", lambda: (Workload(6, 32, 24), Workload(5, 40, 17))
+    )
 
 
 def test_cpu_time_by_step_is_that_of_the_process(clpipe, short, monkeypatch):
@@ -48,5 +50,5 @@ def test_images_are_of_the_kind_that_the_chain_starts_on(clpipe, short, options)
 
 def test_it_leaves_no_files(device, tmp_path, monkeypatch):
     monkeypatch.setattr(bench_batch.tempfile, "tempdir", str(tmp_path))
-    bench_batch.bench_batch(device, Request.from_options(), Load(5, 24, 16))
+    bench_batch.bench_batch(device, Request.from_options(), Workload(5, 24, 16))
     assert not list(tmp_path.iterdir())

@@ -472,15 +472,15 @@ def test_json_lines_are_those_of_the_log(small, clpipe):
 
 
 def test_many_images_have_a_line_every_so_often(small, clpipe, monkeypatch):
-    monkeypatch.setattr("clpipe.commands.progress.FEW", 1)
-    monkeypatch.setattr("clpipe.commands.progress.EVERY", 0)
+    monkeypatch.setattr("clpipe.commands.progress.MAX_LINES", 1)
+    monkeypatch.setattr("clpipe.commands.progress.LINE_INTERVAL", 0)
     more = "--iso", "100,200,400"
-    stderr = clpipe("run", small, "-o", "out", "--device", "numpy", *more).stderr
-    assert re.search(r"^1 of 3 images; [\d.]+ MP/s; decode .*; about [\d.]+ s left$", stderr, re.M)
-    assert "3 of 3 images done" in stderr and "->" not in stderr
-    monkeypatch.setattr("clpipe.commands.progress.EVERY", 60)
-    stderr = clpipe("run", small, "-o", "again", "--device", "numpy", *more).stderr
-    assert "of 3 images;" not in stderr
+    said = clpipe("run", small, "-o", "out", "--device", "numpy", *more).stderr
+    assert re.search(r"^1 of 3 images; [\d.]+ MP/s; decode .*; about [\d.]+ s left$", said, re.M)
+    assert "3 of 3 images done" in said and "->" not in said
+    monkeypatch.setattr("clpipe.commands.progress.LINE_INTERVAL", 60)
+    said = clpipe("run", small, "-o", "again", "--device", "numpy", *more).stderr
+    assert "of 3 images;" not in said
 
 
 @pytest.mark.parametrize("name", ["run", "dataset"])

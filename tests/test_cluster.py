@@ -24,11 +24,11 @@ from clpipe.batch.dask_worker import (
     DaskSpec,
     WorkerEnvironment,
     probe_worker,
-    share_of,
+    share_on_machine,
     worker_environment,
 )
+from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.run_log import RunLog
-from clpipe.batch.where import Where
 from clpipe.chain.request import ResolvedRequest
 from clpipe.commands.progress import Reporter
 from clpipe.engine.device import open_devices
@@ -57,7 +57,7 @@ def workers():
 
 @pytest.fixture
 def address(workers, monkeypatch):
-    for limit in ("TIMEOUT", "PATIENCE", "LONG"):
+    for limit in ("CONNECT_TIMEOUT", "WORKER_TIMEOUT", "LONG_CHUNK"):
         monkeypatch.setattr(cluster, limit, GUARD)  # a busy machine takes its time
     workers.wait_for_workers(2, timeout=GUARD)
     return workers.scheduler.address
@@ -293,7 +293,7 @@ def test_a_worker_of_another_make_that_comes_later(clpipe, renders, address, mon
 
 
 def test_a_trace_is_told_by_one_clock(clpipe, renders, address):
-    began = time.perf_counter()
+    start = time.perf_counter()
     options = ("--device", "numpy", "--until", "quantize", "--trace", "t.json")
     clpipe("run", "in/f00.exr", "in/f01.exr", "-o", "out", "--dask", address, *options)
     events = json.loads(Path("t.json").read_text())["traceEvents"]
@@ -301,16 +301,18 @@ def test_a_trace_is_told_by_one_clock(clpipe, renders, address):
     assert threads and all(name.startswith("tcp://") for name in threads)
     ends = [e["ts"] + e["dur"] for e in events if e["ph"] == "X"]
     # Another clock would be hours away: how long this machine has been on, or the time of day.
-    minutes, took = 300e6, 1e6 * (time.perf_counter() - began)
+    minutes, took = 300e6, 1e6 * (time.perf_counter() - start)
     assert len(ends) == 6 and -minutes < min(ends) <= max(ends) < took + minutes
 
 
 def test_a_worker_sees_the_same_files(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "probe").touch()
-    where, first = Where(Path("out"), ("numpy",)), Job(Path("a.exr"), "a.exr")
-    spec = DaskSpec(ResolvedRequest(formats=("jpg",)), where, first, tmp_path).anchored()
-    spec = replace(spec, first=spec.anchored_job(first))
+    execution, first = ExecutionOptions(Path("out"), ("numpy",)), Job(Path("a.exr"), "a.exr")
+    spec = DaskSpec(
+        ResolvedRequest(formats=("jpg",)), execution, first, tmp_path
+    ).with_absolute_paths()
+    spec = replace(spec, first=spec.absolute_job(first))
     assert probe_worker(spec, "probe", None).startswith("does not see the output directory")
     (tmp_path / "probe").rename(tmp_path / "out" / "probe")
     assert probe_worker(spec, "probe", 3) == f"does not see the input {tmp_path / 'a.exr'}"
@@ -366,8 +368,8 @@ def test_workers_of_a_machine_share_its_devices(device):
     assert shared(2) == [[1, 3], [2]]
     assert shared(3, gpus[::-1]) == [[1], [2], [3]]  # as dask-cuda turns them round
     assert shared(5) == [[1], [2], [3], [1], [2]]
-    assert share_of("inproc://10.0.0.1/7/1", ["inproc://10.0.0.1/7/2"]) == (0, 1)
-    assert share_of("tcp://[::1]:9", ["tcp://[::1]:8"]) == (1, 2)
+    assert share_on_machine("inproc://10.0.0.1/7/1", ["inproc://10.0.0.1/7/2"]) == (0, 1)
+    assert share_on_machine("tcp://[::1]:9", ["tcp://[::1]:8"]) == (1, 2)
 
 
 def test_what_processes_share_is_for_all_of_them(monkeypatch):
@@ -385,7 +387,7 @@ def test_an_environment_names_driver_and_libraries(device):
 
 @pytest.mark.slow
 def test_a_scheduler_that_cannot_be_reached(clpipe, renders, monkeypatch):
-    monkeypatch.setattr(cluster, "TIMEOUT", 0.4)
+    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 0.4)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
         for address in (f"tcp://127.0.0.1:{port}", "tcp://127.0.0.1:1", "nonsense", ""):
@@ -399,7 +401,7 @@ def test_a_scheduler_without_workers(clpipe, renders, monkeypatch):
     def too_late(self, count, timeout):
         raise TimeoutError
 
-    monkeypatch.setattr(cluster, "TIMEOUT", GUARD)
+    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", GUARD)
     monkeypatch.setattr(Client, "wait_for_workers", too_late)
     with LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0", processes=False) as empty:
         address = empty.scheduler_address

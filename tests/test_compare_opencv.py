@@ -5,7 +5,7 @@ from argparse import ArgumentTypeError
 import numpy as np
 import pytest
 
-from clpipe.batch.bench import Load
+from clpipe.batch.bench import Workload
 from clpipe.chain.request import Request
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding
 from tools.compare import methods as other_methods
@@ -42,7 +42,7 @@ def test_ratios_are_computed_within_a_round():
 @pytest.mark.parametrize("text", ["6000", "0x4", "ax4", "5x4", "2x4x6"])
 def test_a_size_is_two_even_numbers(text):
     assert tool.size_of("6000x4000") == (6000, 4000)
-    assert tool.load_of("3x6x4") == Load(3, 6, 4)
+    assert tool.load_of("3x6x4") == Workload(3, 6, 4)
     with pytest.raises(ArgumentTypeError, match=f"^found '{text}'; "):
         tool.size_of(text)
 
@@ -120,7 +120,7 @@ def test_threads_draw_different_noise(script):
 
 
 def test_both_make_the_same_files(script, device, tmp_path):
-    files = tool.Files(device, Load(3, 32, 16), tmp_path)
+    files = tool.Files(device, Workload(3, 32, 16), tmp_path)
     encodings = []
     for work in (files.clpipe, lambda: files.opencv(bands=False), lambda: files.opencv(bands=True)):
         files.clear()

@@ -62,7 +62,7 @@ def test_the_example_sink_works(tmp_path, monkeypatch):
     """Pictures are in the archive after a run, and a second run skips them."""
     example: dict[str, Any] = {}
     exec(next(block.text for block in blocks(PAGE) if block.language == "python"), example)
-    monkeypatch.setattr(Run, "sink", lambda run: example["Zip"](run.writer, run.where.redo))
+    monkeypatch.setattr(Run, "sink", lambda run: example["Zip"](run.writer, run.execution.redo))
     for status in ("done", "skipped"):
         run = clpipe.run(STILL_LIFE, tmp_path / "out", processes=2)
         assert [outcome.status for outcome in run] == [status]

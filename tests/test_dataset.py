@@ -16,8 +16,8 @@ from PIL import Image
 
 import clpipe as api
 from clpipe.base.errors import DeviceError, ImageError, RequestError
-from clpipe.dataset import ahead
-from clpipe.dataset.renders import SharedRenders
+from clpipe.dataset import prefetch
+from clpipe.dataset.render_cache import RenderCache
 from clpipe.dataset.samples import SampleLoader
 from clpipe.engine.runner import is_planar
 from clpipe.images.read import SourceImage
@@ -190,7 +190,7 @@ def test_samples_of_a_batch_go_through_together_and_are_the_same(renders, monkey
     in_order = list(samples)
     for number, one in zip(numbers, alone, strict=True):
         same(in_order[number], one)
-    monkeypatch.setattr(ahead, "MOST_PIXELS", 300)  # two patches
+    monkeypatch.setattr(prefetch, "MAX_PIXELS", 300)  # two patches
     launches.clear()
     for one, two in zip(samples.__getitems__(numbers), alone, strict=True):
         same(one, two)
@@ -286,7 +286,7 @@ def test_a_worker_that_is_forked_says_so_and_does_not_hang(dataset):
 def test_it_pickles_before_and_after_it_was_used(dataset):
     before = pickle.dumps(dataset)
     one = dataset[1]
-    assert dataset._loader._opened.process == os.getpid()
+    assert dataset._loader._open_developer.process == os.getpid()
     for data in (before, pickle.dumps(dataset)):
         same(pickle.loads(data)[1], one)
 
@@ -320,7 +320,7 @@ def test_copies_in_other_processes_read_what_one_has_decoded(renders, monkeypatc
 def test_a_render_in_planes_stays_in_planes(tmp_path):
     planes = np.arange(24, dtype=np.float16).reshape(3, 2, 4)
     image = SourceImage(planes.transpose(1, 2, 0), "", "", (), {})
-    kept = SharedRenders(1000)
+    kept = RenderCache(1000)
     found = [kept.get("a", lambda: image).pixels, pickle.loads(pickle.dumps(kept)).get("a", None)]
     for pixels in (found[0], found[1].pixels):
         assert is_planar(pixels) and np.array_equal(pixels, image.pixels)

@@ -13,7 +13,7 @@ from clpipe.batch.run_log import read_log
 from clpipe.chain.formats import EVERY_FORMAT, ending_of
 from clpipe.images.whole import is_whole
 from clpipe.outputs.existing import is_marked
-from clpipe.outputs.sidecar import outputs_in
+from clpipe.outputs.sidecar import output_entries
 from tests.conftest import reseal
 
 RUN = ("-o", "out", "--device", "numpy", "--keep", "normalize", "--truth", "mosaic")
@@ -186,7 +186,7 @@ def test_copied_moved_and_dated_elsewhere_it_is_done_still(again, tmp_path):
 @pytest.mark.parametrize("value", [None, {}, ["a.jpg"], [{"name": "../a.jpg"}], [{"name": 1}]])
 def test_a_sidecar_with_a_list_that_is_none_counts_for_nothing(again, value):
     values = json.loads(Path("out/a.json").read_text())
-    assert set(outputs_in(values)) == {"a.jpg", "a.normalize.exr"}
+    assert set(output_entries(values)) == {"a.jpg", "a.normalize.exr"}
     reseal(Path("out/a.json"), {**values, "outputs": value})
     assert "a.jpg" in again()
 
@@ -231,17 +231,17 @@ def test_pictures_of_inputs_that_are_gone_are_counted(clpipe, write_exr):
     run = ("-o", "out", "--device", "numpy")
     clpipe("run", "other", *run)
     clpipe("run", "in", *run, "--truth", "clean")
-    there = "not there any more"
+    there = "no longer exist"
     Path("other/d.exr").unlink()
     assert there not in clpipe("run", "in", *run).stderr  # that is not looked at
     Path("in/b.exr").unlink()
-    stderr = clpipe("run", "in", *run, "--truth", "clean").stderr
-    assert stderr.endswith("\n2 pictures in out are of inputs that are not there any more\n")
+    said = clpipe("run", "in", *run, "--truth", "clean").stderr
+    assert said.endswith("\n2 pictures in out are of inputs that no longer exist\n")
     Path("in/sub/c.exr").unlink()
     for given in ("in", "./in/", "in/*.exr", "in/a.exr"):
         count = 4 if given in ("in", "./in/") else 2  # b and its truth; so with c
-        messages = clpipe("run", given, *run).stderr
-        assert f"\n{count} pictures in out are of inputs that are {there}" in messages
+        told = clpipe("run", given, *run).stderr
+        assert f"\n{count} pictures in out are of inputs that {there}" in told
     for option in (("--quiet",), ("--shard", "1/2"), ("--json-lines",)):
         assert there not in clpipe("run", "in", *run, *option).output
 

@@ -170,7 +170,7 @@ def test_views_are_stages_and_truths_and_their_values(explorer):
 def test_what_was_made_is_kept_as_far_as_memory_goes(explorer, monkeypatch):
     numbers = [explorer.develop(0, {"seed": n}, View()).facts["number"] for n in range(5)]
     assert [explorer.sample(number).facts["seed"] for number in numbers] == [0, 1, 2, 3, 4]
-    monkeypatch.setattr("clpipe.explorer.explorer.KEPT", 0)
+    monkeypatch.setattr("clpipe.explorer.explorer.MAX_RESULT_BYTES", 0)
     explorer.develop(0, {"seed": 5}, View())
     assert explorer.sample(numbers[-2]).facts["seed"] == 3
     with pytest.raises(RequestError, match="no longer kept"):

@@ -22,8 +22,8 @@ from tests.held import GUARD
 
 pytest.importorskip("starlette", reason="needs Starlette, in the extra explore")
 
-from clpipe.explorer import patience
-from clpipe.explorer.server import Server, in_json
+from clpipe.explorer import timeout
+from clpipe.explorer.server import Server, json_response
 from clpipe.explorer.view import View
 from tests.test_explore import NOISY, explorer_of
 
@@ -165,16 +165,16 @@ def test_a_connection_that_asks_nothing_whole_is_not_held(served, monkeypatch):
     def until_closed(connection):
         return b"".join(iter(lambda: connection.recv(1 << 16), b""))
 
-    monkeypatch.setattr(patience, "PATIENCE", 0.1)
+    monkeypatch.setattr(timeout, "REQUEST_TIMEOUT", 0.1)
     for sent in (b"", head, whole[:-1]):
         with socket.create_connection((parts.hostname, parts.port), timeout=GUARD) as slow:
             slow.sendall(sent)
             assert until_closed(slow) == b""
-    monkeypatch.setattr(patience, "PATIENCE", GUARD)
+    monkeypatch.setattr(timeout, "REQUEST_TIMEOUT", GUARD)
     with socket.create_connection((parts.hostname, parts.port), timeout=GUARD) as slow:
         slow.sendall(whole)
         assert b" 200 " in slow.recv(20)
-        monkeypatch.setattr(patience, "PATIENCE", 0.1)
+        monkeypatch.setattr(timeout, "REQUEST_TIMEOUT", 0.1)
         with suppress(ConnectionError):  # uvicorn closes connections on which nothing comes
             slow.sendall(head)
             until_closed(slow)
@@ -191,9 +191,9 @@ def test_a_question_may_take_longer_to_answer_than_to_ask(explorer, monkeypatch)
 
     def answering(self, question):
         cancelled.extend(limit.cancelled() for limit in limits)
-        return in_json({})
+        return json_response({})
 
-    monkeypatch.setattr(patience, "PATIENCE", GUARD)
+    monkeypatch.setattr(timeout, "REQUEST_TIMEOUT", GUARD)
     monkeypatch.setattr(asyncio.BaseEventLoop, "call_later", noted)
     monkeypatch.setattr(Server, "_start", answering)
     with serving(explorer) as address:

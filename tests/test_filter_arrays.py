@@ -22,9 +22,9 @@ from clpipe.images.dng import write_dng
 from clpipe.images.raw import read_facts, read_raw
 from clpipe.images.read import read_image
 from clpipe.images.tags import Tags
-from clpipe.outputs.annotated import Way
+from clpipe.outputs.annotation_warp import PixelMapping
 from clpipe.outputs.negative import dng_of
-from clpipe.outputs.patches import facts_of
+from clpipe.outputs.patches import metadata_of
 from clpipe.pipeline import Pipeline
 from clpipe.reference.carried import Layer, warp
 from clpipe.reference.cfa import PATTERNS
@@ -382,7 +382,7 @@ def test_an_array_that_no_dng_holds(clpipe, array):
     options = ("--set", "mosaic.method=array", "--set", f"mosaic.array={array}")
     result = clpipe("run", STILL_LIFE, "-o", "out", "--format", "dng", *options, status=2)
     assert NO_DNG[array] in result.stderr
-    assert "cfa" in facts_of(on(array)) or array == "RGGB-IR"
+    assert "cfa" in metadata_of(on(array)) or array == "RGGB-IR"
 
 
 @pytest.mark.parametrize("array", [each for each in NAMED if each not in (*NO_DNG, "polarised")])
@@ -528,10 +528,12 @@ def test_places_follow_the_cells_that_are_binned(array, factor, size):
     assert (camera.width, camera.height) == (width // factor, height // down)
     found = camera.fx, camera.fy, camera.cx, camera.cy
     assert found == pytest.approx((90 / factor, 90 / down, 48.5 / factor, height / 2 / down))
-    way = Way(chain.geometry, width, height, NO_MARGINS, (columns, rows))
-    assert way.places([[31.7, 1.3]]) == pytest.approx(np.array([[31.7 / factor, 1.3 / down]]))
+    mapping = PixelMapping(chain.geometry, width, height, NO_MARGINS, (columns, rows))
+    assert mapping.map_points([[31.7, 1.3]]) == pytest.approx(
+        np.array([[31.7 / factor, 1.3 / down]])
+    )
     corner = [[float(columns * factor), float(rows * down)]]  # the last one that is not cut off
-    assert way.places(corner).tolist() == [[columns, rows]]
+    assert mapping.map_points(corner).tolist() == [[columns, rows]]
 
 
 def test_exif_tells_of_the_pixels_that_are_left(clpipe, write_exr):

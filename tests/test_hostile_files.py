@@ -20,7 +20,7 @@ from clpipe.base.errors import ClpipeError, ImageError, RequestError
 from clpipe.base.files import sha256_of
 from clpipe.base.reading import unchanged
 from clpipe.batch.replay import replay_of
-from clpipe.batch.tars import Members, is_own
+from clpipe.batch.tars import Members, is_clpipe_tar
 from clpipe.camera.profile import load_camera
 from clpipe.chain.files import load_config
 from clpipe.chain.isos import check_cameras
@@ -332,9 +332,9 @@ TARS = {
 def test_a_damaged_tar_is_nobodys_and_holds_nothing(tmp_path, data):
     path = tmp_path / "000000.tar"
     path.write_bytes(data)
-    assert not is_own(path)
+    assert not is_clpipe_tar(path)
     members = Members(path)
-    assert not any(members.sidecar(name) for name in members.places)
+    assert not any(members.sidecar(name) for name in members.locations)
 
 
 def test_a_pipe_in_the_output_folder_does_not_make_a_run_wait(clpipe, write_exr):

@@ -91,7 +91,7 @@ def test_a_jsonl(manifest, tmp_path):
         {"camera": {"choice": ["sony-a7r2", "canon-5d2"]}},
     ]
     assert [(row.name, row.frames) for row in rows] == [("", None), ("b.\u2028x", 2), ("", None)]
-    assert [row.place[-5:] for row in rows] == ["row 1", "row 3", "row 4"]
+    assert [row.location[-5:] for row in rows] == ["row 1", "row 3", "row 4"]
     check_rows(rows, DEFAULT)
 
 
@@ -187,7 +187,10 @@ def test_rows_lie_over_settings(manifest):
         ("path\n..\n", "row 2: path: found '..', but expected the path of an image"),
         ("path\na\0b\n", "row 2: path: found .*not contain NUL"),
         (b"path\na.exr\n\xff.exr\n", "frames.csv, line 3: this is not UTF-8"),
-        ("path,frames\na.exr,0\n", "row 2: frames: found 0, but it is a whole number from 1 to 1"),
+        (
+            "path,frames\na.exr,0\n",
+            "row 2: frames: found 0, but expected a whole number from 1 to 1",
+        ),
         ("path,frames\na.exr,2.5\n", "row 2: frames: found 2.5"),
         ("path,frames\na.exr,true\n", "row 2: frames: found True"),
         ("path\nx/a.exr\nb.exr\nx/a.exr\n", "row 4: .*same outputs as row 2, x/a; .*called name"),

@@ -42,7 +42,7 @@ from clpipe.analysis.signature import flat_places, luma
 from clpipe.chain.files import load_config, load_settings
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings, overlay
-from clpipe.commands.match import Follower
+from clpipe.commands.match import SearchProgress
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding, through_jpeg
 from clpipe.pipeline import Pipeline
 from tests.conftest import DATA, ROOT, run_cli
@@ -192,7 +192,7 @@ def ambiguous(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick", "ambiguous")
 def test_the_table(burst, clpipe, monkeypatch, tmp_path):
-    monkeypatch.setattr("clpipe.commands.match.EVERY", 0.0)
+    monkeypatch.setattr("clpipe.commands.match.LINE_INTERVAL", 0.0)
     frames = saved(tmp_path, **{f"{k}": frame for k, frame in enumerate(burst[:3])})
     words = [*frames, "-o", tmp_path / "a.toml", "--iso", 3200, "--device", "numpy"]
     result = clpipe("match", *words)
@@ -262,7 +262,9 @@ def candidate(cost):
 def test_a_terminal_has_a_bar_with_the_share_and_the_time_left(burst, tmp_path):
     scenes = load_scenes(saved(tmp_path, a=burst[0], b=burst[1]), [])
     terminal = io.StringIO()
-    with Follower(tmp_path / "a.toml", Console(file=terminal, force_terminal=True)) as follower:
+    with SearchProgress(
+        tmp_path / "a.toml", Console(file=terminal, force_terminal=True)
+    ) as follower:
         follower.advanced(0.0, candidate(2.0), scenes)
         follower.advanced(0.25, best := candidate(1.5), scenes)
         first = (tmp_path / "a.toml").stat().st_ino
@@ -288,13 +290,13 @@ def quick(monkeypatch):
 def test_stopped_it_ends_with_the_best_so_far(clpipe, burst, tmp_path, monkeypatch):
     frames = saved(tmp_path, **{f"{k}": frame for k, frame in enumerate(burst[:3])})
     words = ["match", *frames, "-o", tmp_path / "a.toml", "--iso", 3200, "--device", "numpy"]
-    advanced = Follower.advanced
+    advanced = SearchProgress.advanced
 
     def stopped(self, *state):
         advanced(self, *state)
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(Follower, "advanced", stopped)
+    monkeypatch.setattr(SearchProgress, "advanced", stopped)
     result = clpipe(*words, status=130)
     assert (
         f"stopped: wrote {tmp_path / 'a.toml'}, the best result after 0% of the search"
@@ -302,7 +304,7 @@ def test_stopped_it_ends_with_the_best_so_far(clpipe, burst, tmp_path, monkeypat
     )
     assert load_settings(str(tmp_path / "a.toml")).parameters["denoise"]["method"] == "mean"
     (tmp_path / "a.toml").unlink()
-    monkeypatch.setattr(Follower, "is_stopping", True)
+    monkeypatch.setattr(SearchProgress, "is_stopping", True)
     assert (
         "the search has no result yet, so nothing was written" in clpipe(*words, status=130).stderr
     )

@@ -13,7 +13,7 @@ from clpipe.base import memory
 from clpipe.base.errors import DeviceError, ImageError, RequestError
 from clpipe.base.memory import Left
 from clpipe.batch import memory_budget
-from clpipe.batch.memory_budget import LEAST, STARTING, MemoryBudget, needed
+from clpipe.batch.memory_budget import COMPILE_MEMORY, MIN_DEVICE_MEMORY, MemoryBudget, needed
 from clpipe.batch.threads import Batch
 from clpipe.engine.discovery import find_devices
 from clpipe.images.claims import claim_of
@@ -119,17 +119,17 @@ def test_for_a_large_image_devices_hold_little():
     budget.release("fits")
     assert not device.limits
     budget.acquire("large", 200 * MIB)
-    assert device.limits == [LEAST]
+    assert device.limits == [MIN_DEVICE_MEMORY]
     assert dropped
     budget.release("large")
     assert device.memory == 150 * MIB
     with pytest.raises(ImageError, match=r"268\.0 MiB are left"):
         budget.acquire("too large", 280 * MIB)
-    assert device.limits == [LEAST]  # it would not have helped
+    assert device.limits == [MIN_DEVICE_MEMORY]  # it would not have helped
 
 
 def test_what_was_taken_before_may_be_freed_late(clock):
-    freed = memory_budget.PATIENCE / 2  # s
+    freed = memory_budget.WAIT_SECONDS / 2  # s
     budget = MemoryBudget(
         None, (), left=lambda: Left((60 if 0 < clock[0] < freed else 200) * MIB, "")
     )
@@ -141,7 +141,9 @@ def test_what_was_taken_before_may_be_freed_late(clock):
 
 
 def test_large_images_wait_for_the_compiler():
-    budget = MemoryBudget(None, (SharingDevice(0),), left=lambda: Left(STARTING + 100 * MIB, ""))
+    budget = MemoryBudget(
+        None, (SharingDevice(0),), left=lambda: Left(COMPILE_MEMORY + 100 * MIB, "")
+    )
     budget.acquire("small", 10 * MIB)
     budget.release("small")
     large = Entering(budget, "large", 150 * MIB)
@@ -164,7 +166,7 @@ def test_small_images_are_not_slowed_by_measuring(clock):
     for number in range(100):
         budget.acquire(str(number), MIB)
     assert len(count) == 1
-    clock[0] += 2 * memory_budget.LASTS
+    clock[0] += 2 * memory_budget.MEASUREMENT_SECONDS
     budget.acquire("later", MIB)
     assert len(count) == 2
 

@@ -18,7 +18,7 @@ from clpipe.engine.flow import Flow
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Runner
 from clpipe.images.tags import FLIPS, upright
-from clpipe.outputs.patches import Cutting, first_place
+from clpipe.outputs.patches import PatchLayout, first_aligned_position
 from clpipe.reference.cfa import PATTERNS
 from tests.conftest import same_samples as same
 
@@ -54,7 +54,7 @@ def check_against_whole(whole, patches):
             assert image.flags.c_contiguous and image.flags.writeable
             assert np.shares_memory(np.from_dlpack(image), image)
         assert images.keys() == arrays(whole).keys()
-        shift = first_place(whole["cfa"], turn, size)
+        shift = first_aligned_position(whole["cfa"], turn, size)
         assert (left % 2, top % 2) == shift
         turns.add(turn)
     return turns
@@ -94,7 +94,7 @@ def test_each_pattern_and_the_variance(renders, pattern):
 def test_turned_patches_have_the_pattern(size):
     for pattern, turn in itertools.product(PATTERNS, FLIPS):
         cell = np.array(list(pattern)).reshape(2, 2)
-        x, y = first_place(pattern, turn, size)
+        x, y = first_aligned_position(pattern, turn, size)
         turned = upright(np.tile(cell, (6, 6))[y : y + size, x : x + size], turn)
         assert (turned == np.tile(cell, (6, 6))[:size, :size]).all()
 
@@ -109,14 +109,14 @@ def test_packed_planes():
 
 
 def test_places_are_everywhere_and_fit():
-    cutting = Cutting(api.Patches(8, augment=True), 21, 16, "RGGB", 0)
-    patches = cutting.cut(range(400), "key")
+    layout = PatchLayout(api.Patches(8, augment=True), 21, 16, "RGGB", 0)
+    patches = layout.patches_for(range(400), "key")
     assert {p.left for p in patches} == set(range(14)) and {p.top for p in patches} == set(range(9))
-    assert cutting.cut([7], "key") == patches[7:8] != cutting.cut([7], "other")
-    for edge in (cutting, Cutting(api.Patches(16, augment=True), 16, 16, "RGGB", 0)):
-        for patch in edge.cut(range(50), "key"):
+    assert layout.patches_for([7], "key") == patches[7:8] != layout.patches_for([7], "other")
+    for edge in (layout, PatchLayout(api.Patches(16, augment=True), 16, 16, "RGGB", 0)):
+        for patch in edge.patches_for(range(50), "key"):
             assert patch.left + patch.size <= edge.width and patch.top + patch.size <= edge.height
-    plain = Cutting(api.Patches(8), 21, 16, "RGGB", 0).cut(range(50), "key")
+    plain = PatchLayout(api.Patches(8), 21, 16, "RGGB", 0).patches_for(range(50), "key")
     assert {(p.left % 2, p.top % 2, p.orientation) for p in plain} == {(0, 0, 1)}
 
 
@@ -153,22 +153,22 @@ def test_a_patch_with_draws_of_its_own_is_of_the_picture_with_these(renders):
 
 @pytest.mark.parametrize("augment", [False, True])
 def test_a_grid_covers_the_picture(augment):
-    cutting = Cutting(api.Patches(8, "grid", augment), 37, 24, "RGGB", 0)
+    layout = PatchLayout(api.Patches(8, "grid", augment), 37, 24, "RGGB", 0)
     covered = np.zeros((24, 37), int)
-    for patch in cutting.cut(range(cutting.count), "key"):
-        place = first_place("RGGB", patch.orientation, 8)
-        assert (patch.left % 2, patch.top % 2) == place
+    for patch in layout.patches_for(range(layout.count), "key"):
+        position = first_aligned_position("RGGB", patch.orientation, 8)
+        assert (patch.left % 2, patch.top % 2) == position
         covered[patch.top : patch.top + 8, patch.left : patch.left + 8] += 1
-    assert cutting.count == 15
+    assert layout.count == 15
     assert augment or (covered[:, :36].all() and not covered[:, 36].any())
 
 
 def test_a_grid_over_images_of_several_sizes(renders):
     grid = api.Dataset(renders, device="numpy", patch=api.Patches(16, "grid"), until="mosaic")
     assert len(grid) == 12 + 3 * 4 + 12
-    places = [(s["key"], *s["place"]) for s in grid]
-    assert len(set(places)) == len(grid)
-    assert places[23] == ("r1.exr", 40, 24)  # where 57x41 ends, at an even place
+    positions = [(s["key"], *s["place"]) for s in grid]
+    assert len(set(positions)) == len(grid)
+    assert positions[23] == ("r1.exr", 40, 24)  # where 57x41 ends, at an even place
 
 
 def test_samples_do_not_depend_on_order_shards_and_epochs(renders):
@@ -186,10 +186,10 @@ def test_samples_do_not_depend_on_order_shards_and_epochs(renders):
     later = api.Dataset(renders, iso=ISO, patch=api.Patches(16, 3), epoch=1)
     for one, two in zip(later, listed[9:], strict=True):
         same(one, two)
-    places = [tuple(s["place"]) for s in listed]
-    assert len(set(places)) > 12 and places[:9] != places[9:]
+    positions = [tuple(s["place"]) for s in listed]
+    assert len(set(positions)) > 12 and positions[:9] != positions[9:]
     other = api.Dataset(renders, iso=ISO, patch=api.Patches(16, 3), seed=1)
-    assert [tuple(s["place"]) for s in other] != places[:9]
+    assert [tuple(s["place"]) for s in other] != positions[:9]
 
 
 @pytest.mark.parametrize("patches", [0, 2, 5])
@@ -270,7 +270,7 @@ def test_decoded_renders_are_kept_while_they_fit(renders, write_exr, monkeypatch
         made.__getitems__(order[:2])
         for i in order[2:]:
             made[i]
-        assert made._loader.renders.taken <= 2**20
+        assert made._loader.renders.size_in_bytes <= 2**20
         return "".join(name[1] for name in read)
 
     one = 48 * 64 * 6  # bytes, half
@@ -367,7 +367,10 @@ def test_what_is_refused(renders):
         ({"dtype": "int8"}, "unknown dtype 'int8'.*; allowed: float16, float32, uint16"),
         ({"dtype": "half float"}, "unknown dtype 'half float'"),
         ({"dtype": "uint16", **mosaic}, "dtype uint16: .* the chain ends in mosaic"),
-        ({"dtype": "float16", "until": "quantize"}, "dtype float16: it cannot hold DN exactly"),
+        (
+            {"dtype": "float16", "until": "quantize"},
+            "dtype float16: the chain ends in DN, which this type cannot hold exactly",
+        ),
         ({"raw": "bayer"}, "found raw 'bayer'; expected .*'packed', 'mosaic'"),
         ({"raw": "mosaic", "until": "exposure"}, "makes no raw in DN. Add the stage quantize"),
         ({"raw": "mosaic", "dtype": "float32", "until": "quantize"}, "ends in DN, at quantize"),

@@ -14,7 +14,7 @@ import pytest
 import clpipe as package
 from clpipe.base.errors import DeviceError, RequestError
 from clpipe.batch import processes
-from clpipe.batch.local_worker import Seat
+from clpipe.batch.local_worker import ProcessConfig
 from clpipe.batch.run_log import read_log
 from clpipe.batch.spec import RunSpec
 from tests.conftest import ROOT, contents, statuses, written
@@ -194,7 +194,7 @@ ImageWorker.decode = lambda *arguments: os._exit(9)
 def test_processes_that_all_die_end_the_run(renders, monkeypatch):
     renders(20)
     monkeypatch.setattr(processes, "START", f"exec({ALWAYS!r}); {processes.START}")
-    monkeypatch.setattr(processes, "FUTILE", 4)
+    monkeypatch.setattr(processes, "MAX_FRUITLESS", 4)
     with pytest.raises(DeviceError, match=r"4 processes in a row ended before .* with status 9"):
         list(package.run("in", "out", processes=2, device="numpy"))
 
@@ -213,7 +213,7 @@ def test_a_process_whose_run_has_gone_ends_silently(renders, monkeypatch, gone):
     ours, theirs = multiprocessing.Pipe()
     if gone.startswith("after"):
         run = package.run("in", "out", device="numpy")
-        ours.send((RunSpec(run._request, run.where, run.jobs[0]), Seat(0, 1, 1)))
+        ours.send((RunSpec(run._request, run.execution, run.jobs[0]), ProcessConfig(0, 1, 1)))
     ours.close()
     ended = subprocess.run(
         [sys.executable, "-c", f"import sys; {processes.START}", str(theirs.fileno())],

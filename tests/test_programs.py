@@ -13,8 +13,8 @@ import pytest
 from rich.console import Console
 
 from clpipe.base.errors import DeviceError
+from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.run_log import Summary
-from clpipe.batch.where import Where
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.commands import progress
@@ -177,9 +177,9 @@ def test_who_watches_is_told_how_far_compiling_is(device):
 
 
 def test_compiling_is_a_step_of_the_live_display(monkeypatch):
-    monkeypatch.setattr(progress, "SOON", -1.0)
+    monkeypatch.setattr(progress, "COMPILE_DELAY", -1.0)
     console = Console(file=io.StringIO(), force_terminal=True, width=80, color_system=None)
-    run = SimpleNamespace(summary=Summary(6), writer=None, where=Where(Path("out")))
+    run = SimpleNamespace(summary=Summary(6), writer=None, execution=ExecutionOptions(Path("out")))
     with progress.Reporter(run, console) as reporter:
         programs.tell_watchers(2, 7)
         (task,) = reporter._bar.tasks

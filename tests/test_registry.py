@@ -176,7 +176,7 @@ NO_STAGES = {
     ("inputs/kept.py", "sensor_noise"),
     ("explorer/view.py", "mosaic"),
     ("inputs/render_cameras.py", "distortion"),
-    ("outputs/photographs.py", "distortion"),
+    ("outputs/output_pictures.py", "distortion"),
 }
 
 

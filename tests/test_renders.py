@@ -311,4 +311,4 @@ def test_renders_in_whole_numbers_with_a_stated_transfer(tmp_path, ending, trans
 def test_a_transfer_is_that_of_a_render(tmp_path):
     (tmp_path / "a.png").touch()
     command = ("run", tmp_path, "-o", "out", "--transfer", "srgb", "-c", "unprocess")
-    assert "--transfer: it is for renders" in run_cli(*command, status=2).output
+    assert "--transfer: this option is only for renders" in run_cli(*command, status=2).output

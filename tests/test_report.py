@@ -16,8 +16,8 @@ from PIL import Image
 from clpipe.chain.rendition import FIRST
 from clpipe.images.write import write_exr as write
 from clpipe.reports.figures import last_failures, sessions
+from clpipe.reports.images import Budget, compared_image, places_of
 from clpipe.reports.run import read_run
-from clpipe.reports.shown import Budget, large, places_of
 from tests.conftest import cli_output as clpipe
 from tests.conftest import reseal
 
@@ -93,8 +93,8 @@ def made(renders):
 
 @pytest.fixture(autouse=True)
 def few_drawings(monkeypatch):
-    """Draw the noise of one picture only, because this is slow."""
-    monkeypatch.setattr("clpipe.reports.page.DRAWN", 1)
+    """The noise of one picture is drawn: that is what takes long."""
+    monkeypatch.setattr("clpipe.reports.page.MAX_PLOTS", 1)
 
 
 @pytest.fixture
@@ -254,10 +254,10 @@ def test_what_was_drawn_is_drawn_and_what_follows_is_folded(renders, tmp_path):
 
 
 def test_a_report_that_takes_long_says_where_it_is(out, monkeypatch):
-    monkeypatch.setattr("clpipe.commands.progress.EVERY", 0)
-    result = clpipe("report", out)
+    monkeypatch.setattr("clpipe.commands.progress.LINE_INTERVAL", 0)
+    said = clpipe("report", out)
     for text in ("sidecars", "noise of raw mosaics", "thumbnail 2 of 3", "comparison 1 of 3"):
-        assert f"{text}\n" in result
+        assert f"{text}\n" in said
 
 
 def test_tars_and_series_are_read(renders, tmp_path):
@@ -281,8 +281,8 @@ def test_tars_and_series_are_read(renders, tmp_path):
 
 
 def test_of_a_large_picture_the_page_has_all_reduced_and_crops_as_they_are(out, monkeypatch):
-    monkeypatch.setattr("clpipe.reports.shown.LARGE", 4_000)
-    monkeypatch.setattr("clpipe.reports.shown.CROP", (60, 40))
+    monkeypatch.setattr("clpipe.reports.images.MAX_COMPARED_PIXELS", 4_000)
+    monkeypatch.setattr("clpipe.reports.images.CROP", (60, 40))
     page = report(out)
     shown = next(each for each in page.data["look-data"] if each["name"] == "a")
     picture = pixels_of((out / "a.jpg").read_bytes())
@@ -419,7 +419,7 @@ def test_each_exposure_of_a_bracket_is_a_picture_of_its_own(renders, tmp_path):
     clpipe("run", renders / "a.exr", "-o", tmp_path / "out", *NUMPY, *bracket)
     run = read_run(tmp_path / "out")
     assert [made.name for made in run.pictures] == ["a.ev+1.frame0", "a.ev-1.frame0"]
-    shown = large([run], [""], run.pictures[1], Budget(1 << 24), [])
+    shown = compared_image([run], [""], run.pictures[1], Budget(1 << 24), [])
     assert [view["label"] for view in shown.views] == ["image", "truth", "truth_clean"]
 
 

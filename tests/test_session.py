@@ -63,13 +63,13 @@ def test_what_cannot_be_is_refused_at_once(renders):
         ({"frames": "2"}, "found frames '2'; expected a whole number or None"),
         (
             {"layer": "a", "stages": ["normalize", "demosaic"], "start_at": "normalize"},
-            "--layer: it is for renders",
+            "--layer: this option is only for renders",
         ),
         ({"nosuch": 1}, "nosuch"),
     ):
         with pytest.raises(RequestError, match=message):
             package.run("in", "out", **{**DEVICE, **options})
-    with pytest.raises(RequestError, match="output: it is empty; name a directory"):
+    with pytest.raises(RequestError, match="output: found an empty path; name a directory"):
         package.run("in", "", **DEVICE)
     with pytest.raises(RequestError, match="the name of a picture"):
         package.run("in", "out.jpg", **DEVICE)
@@ -111,4 +111,4 @@ def test_a_draw_of_the_iso_and_what_there_is_to_say_behind_a_run(renders):
     Path("in/a.exr").unlink()
     made = package.run("in", "out", **drawn, **DEVICE)
     list(made)
-    assert made.notes == ["1 picture in out is of inputs that are not there any more"]
+    assert made.notes == ["1 picture in out is of inputs that no longer exist"]

@@ -14,10 +14,16 @@ import pytest
 
 from clpipe.base.errors import ImageError
 from clpipe.batch.run_log import read_log
-from clpipe.outputs.sidecar import SEAL, SidecarError, read_sidecar, sealed, values_in
+from clpipe.outputs.sidecar import (
+    DIGEST_KEY,
+    SidecarError,
+    parse_sidecar,
+    read_sidecar,
+    sidecar_bytes,
+)
 from tests.conftest import reseal
 
-CHANGED = f"this sidecar was changed after clpipe wrote it (its {SEAL} does not match)"
+CHANGED = f"this sidecar was changed after clpipe wrote it (its {DIGEST_KEY} does not match)"
 CAMERA = ("--set", "render.fx=30", "--set", "render.fy=30")
 
 
@@ -56,7 +62,7 @@ def without_beginning(path: Path) -> None:
 
 def without_seal(path: Path) -> None:
     values = json.loads(path.read_text())
-    del values[SEAL]
+    del values[DIGEST_KEY]
     path.write_text(json.dumps(values, indent=2))
 
 
@@ -66,8 +72,8 @@ EDITS = [edit_intrinsics, lay_out_anew, cut_off, without_beginning, without_seal
 def test_the_digest_is_that_of_the_lines_before(made):
     last = Path("out/a.json").read_text().splitlines()[-2]
     before = subprocess.run(["head", "-n", "-2", "out/a.json"], capture_output=True, check=True)
-    assert last == f'  "{SEAL}": "{hashlib.sha256(before.stdout).hexdigest()}"'
-    assert read_sidecar(Path("out/a.json"))[SEAL] in last
+    assert last == f'  "{DIGEST_KEY}": "{hashlib.sha256(before.stdout).hexdigest()}"'
+    assert read_sidecar(Path("out/a.json"))[DIGEST_KEY] in last
 
 
 @pytest.mark.parametrize("edit", EDITS)
@@ -91,8 +97,10 @@ def test_an_edited_sidecar_is_a_missing_one(made, clpipe, edit):
 
 
 def test_every_byte_counts():
-    whole = sealed({"clpipe": "0.1.0", "input": "a.exr", "stages": [{"name": "x"}], "iso": 100})
-    assert values_in(whole, "a.json")["iso"] == 100
+    whole = sidecar_bytes(
+        {"clpipe": "0.1.0", "input": "a.exr", "stages": [{"name": "x"}], "iso": 100}
+    )
+    assert parse_sidecar(whole, "a.json")["iso"] == 100
     for place in range(len(whole)):
         for data in (
             whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :],
@@ -104,18 +112,21 @@ def test_every_byte_counts():
             if data == whole:
                 continue
             with pytest.raises(SidecarError, match=r"a\.json: this sidecar was changed after"):
-                values_in(data, "a.json")
+                parse_sidecar(data, "a.json")
 
 
 def test_file_names_that_are_not_utf_8():
-    assert values_in(sealed({"clpipe": "0", "input": "\udcff"}), "a.json")["input"] == "\udcff"
+    assert (
+        parse_sidecar(sidecar_bytes({"clpipe": "0", "input": "\udcff"}), "a.json")["input"]
+        == "\udcff"
+    )
     with pytest.raises(SidecarError):
-        values_in(sealed({"clpipe": "0", "input": "\ud800"}), "a.json")
+        parse_sidecar(sidecar_bytes({"clpipe": "0", "input": "\ud800"}), "a.json")
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[1, 2]", '{"a": "clpipe"}', "no JSON", "\0" * 50])
 def test_what_others_wrote_is_no_sidecar(tmp_path, text):
-    assert values_in(text.encode(), "a.json") is None
+    assert parse_sidecar(text.encode(), "a.json") is None
     path = tmp_path / "a.json"
     path.write_text(text)
     expected = ImageError if text.strip("\0") else FileNotFoundError

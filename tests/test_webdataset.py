@@ -15,7 +15,7 @@ import clpipe as api
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.batch import tar_sink
 from clpipe.batch.run_log import read_log
-from clpipe.batch.tars import cut
+from clpipe.batch.tars import split_into_tars
 from clpipe.inputs.find import Job
 from clpipe.outputs import folder as output_folders
 from clpipe.outputs import writer
@@ -209,9 +209,9 @@ def test_two_names_of_one_key():
     with pytest.raises(
         RequestError, match=r"in/a\.b\.exr and in/a_b\.exr would both be the sample"
     ):
-        cut(jobs, 1, OUT)
+        split_into_tars(jobs, 1, OUT)
     with pytest.raises(RequestError, match="skips it"):
-        cut([Job(Path("in/__x__/a.exr"), "__x__/a.exr")], 1, OUT)
+        split_into_tars([Job(Path("in/__x__/a.exr"), "__x__/a.exr")], 1, OUT)
 
 
 def test_a_name_longer_than_ustar_holds(clpipe, write_exr):
@@ -279,7 +279,7 @@ def test_the_disk_is_full(clpipe, renders, when):
         def write(path, pixels, tags):
             count.append(path)
             if len(count) > 5:
-                patch.setattr(output_folders, "LEAST_FREE", 2**62)  # more than any disk has
+                patch.setattr(output_folders, "MIN_FREE", 2**62)  # more than any disk has
                 full(path)
             return real(path, pixels, tags)
 
@@ -435,7 +435,7 @@ def test_the_variance_of_patches(clpipe, renders):
             ("--patch", 12, "--patches-per-image", "grit"),
             "found 'grit'; expected a whole number from 1 to 9999, or grid",
         ),
-        (("--augment",), "--augment: it needs patches; add --patch SIZE"),
+        (("--augment",), "--augment: this option needs patches; add --patch SIZE"),
     ],
 )
 def test_patches_that_cannot_be(clpipe, renders, options, message):

@@ -49,7 +49,7 @@ def check_request(loader: ImageLoader, jobs: Sequence[Job]) -> None:
             use ``exposure.method=auto``.
     """
     for job in jobs:
-        if loader.raw.takes(job.path):
+        if loader.raw.is_raw(job.path):
             raise RequestError(f"{job.label}: this is a raw, whose exposure is fixed; give renders")
     loader.check(jobs)
     for each in {id(one): one for one in map(loader.for_job, jobs)}.values():
@@ -124,7 +124,7 @@ def _rows(folder: Path, exposure: Exposure) -> Iterator[Row]:
     if exposure.headroom != Auto.model_fields["headroom"].default:
         own["headroom"] = exposure.headroom
     values = {**job.values, EXPOSURE: own}
-    yield Row(job.path, job.key, name, values, job.frames, job.place)
+    yield Row(job.path, job.key, name, values, job.frames, job.location)
     for path in job.subframes:
         other = f"{name}.{path.stem}" if name else ""
-        yield Row(path, "", other, values, job.frames, job.place)
+        yield Row(path, "", other, values, job.frames, job.location)

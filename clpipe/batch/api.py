@@ -11,8 +11,8 @@ from clpipe.base.text import several
 from clpipe.base.types import plain
 from clpipe.base.urls import path_of
 from clpipe.base.validation import typed
+from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.session import Images, Run
-from clpipe.batch.where import Where
 from clpipe.chain.formats import format_named
 from clpipe.chain.options import OPTIONS, PER_IMAGE, Moments, RedoName, Transfer, check_option
 from clpipe.chain.rendition import parse_bracket
@@ -22,8 +22,8 @@ from clpipe.inputs.series import split_series
 from clpipe.outputs.existing import Redo
 from clpipe.outputs.patches import Patches
 
-# How values are converted before a run gets them.
-CONVERT: dict[str, Callable[[Any], Any]] = {
+# Conversions of option values.
+CONVERTERS: dict[str, Callable[[Any], Any]] = {
     "output": lambda output: path_of(str(output)),
     "format": lambda names: tuple(map(format_named, names)),
     "bracket": parse_bracket,
@@ -33,10 +33,10 @@ CONVERT: dict[str, Callable[[Any], Any]] = {
     "memory": lambda size: parse_size(str(size)),
     "trace": Path,
 }
-# Options that fields of Request, Images and Where have other names for.
-FIELDS = {"format": "formats", "webdataset": "per_tar", "device": "devices", "jobs": "threads"}
+# Options whose fields in Request, Images and ExecutionOptions have other names.
+FIELD_NAMES = {"format": "formats", "webdataset": "per_tar", "device": "devices", "jobs": "threads"}
 
-Texts = str | Path | Sequence[str | Path]  # one, or several
+Texts = str | Path | Sequence[str | Path]  # one or several
 
 
 @typed
@@ -74,10 +74,11 @@ def run(
     trace: str | Path | None = None,
     **settings: Any,
 ) -> Run:
-    """Put images through a chain and write the results, like ``clpipe run``.
+    """Process images with a chain and write the results, like ``clpipe run``.
 
-    Where several values are allowed, one will do. ``camera`` and ``iso`` may also be draws, such as
-    ``{"log_uniform": [100, 6400]}``. ``patch`` may also be ``Patches(128, per_image=4)``.
+    Arguments that accept several values also accept a single one. ``camera`` and ``iso`` may be
+    random draws, such as ``{"log_uniform": [100, 6400]}``. ``patch`` may be
+    ``Patches(128, per_image=4)``.
 
     >>> import tempfile
     >>> import OpenImageIO as oiio
@@ -188,37 +189,43 @@ def run_of(
     arguments: Sequence[str] = (),
     echo: Callable[[bytes], None] | None = None,
 ) -> Run:
-    """The run that options describe. :func:`run` and the command ``clpipe run`` both call this.
+    """Return the run for options. :func:`run` and the command ``clpipe run`` both call this.
 
     Args:
-        options: values by the names of :data:`OPTIONS`, as :func:`run` takes them. An ISO and a
-            bracket may be texts with commas. None is an option that is not set.
+        options: arguments of :func:`run`, by the names of :data:`OPTIONS`. An ISO and a bracket may
+            be texts with commas. None is an option that is not set.
         settings: values of a configuration file, nested.
         arguments, echo: as for :class:`Run`.
 
     Raises:
         RequestError: as for :func:`run`.
     """
-    given = {name: value for name, value in options.items() if value is not None}
-    if not str(given["output"]):
-        raise RequestError("output: it is empty; name a directory")
-    own = {name: given.pop(name) for name in ("camera", "iso") if name in given}
-    series, values = split_series(plain({**settings, **own}))
-    for name, value in given.items():
-        listed = several(value) if OPTIONS[name].type_ is list else value
-        given[name] = CONVERT[name](listed) if name in CONVERT else listed
-        check_option(name, given[name])
-    if "patch" in given:
-        given.setdefault("patches_per_image", PER_IMAGE)
-    elif lost := [name for name in ("patches_per_image", "augment") if given.get(name)]:
-        raise RequestError(f"--{lost[0].replace('_', '-')}: it needs patches; add --patch SIZE")
-    dask = given.pop("dask", None)
-    given = {FIELDS.get(name, name): value for name, value in given.items()}
-    where = Where(**_fields_of(Where, given))
-    images = Images(**_fields_of(Images, given), series=series)
-    return Run(Request.from_options(values=values, **given), images, where, dask, arguments, echo)
+    set_options = {name: value for name, value in options.items() if value is not None}
+    if not str(set_options["output"]):
+        raise RequestError("output: found an empty path; name a directory")
+    series_options = {
+        name: set_options.pop(name) for name in ("camera", "iso") if name in set_options
+    }
+    series, values = split_series(plain({**settings, **series_options}))
+    for name, value in set_options.items():
+        converted = several(value) if OPTIONS[name].type_ is list else value
+        set_options[name] = CONVERTERS[name](converted) if name in CONVERTERS else converted
+        check_option(name, set_options[name])
+    if "patch" in set_options:
+        set_options.setdefault("patches_per_image", PER_IMAGE)
+    elif ignored := [name for name in ("patches_per_image", "augment") if set_options.get(name)]:
+        raise RequestError(
+            f"--{ignored[0].replace('_', '-')}: this option needs patches; add --patch SIZE"
+        )
+    dask = set_options.pop("dask", None)
+    set_options = {FIELD_NAMES.get(name, name): value for name, value in set_options.items()}
+    execution = ExecutionOptions(**_fields_of(ExecutionOptions, set_options))
+    images = Images(**_fields_of(Images, set_options), series=series)
+    return Run(
+        Request.from_options(values=values, **set_options), images, execution, dask, arguments, echo
+    )
 
 
-def _fields_of(class_: type[Where | Images], values: dict[str, Any]) -> dict[str, Any]:
-    """Take the fields of a class from values."""
+def _fields_of(class_: type[ExecutionOptions | Images], values: dict[str, Any]) -> dict[str, Any]:
+    """Remove the values of a dataclass's fields from a dictionary, and return them."""
     return {each.name: values.pop(each.name) for each in fields(class_) if each.name in values}

@@ -1,4 +1,4 @@
-"""Benchmark of whole batches: how fast they are, and what their CPU time goes into."""
+"""Benchmark of whole batches: their speed, and the CPU time of each step."""
 
 import shutil
 import tempfile
@@ -32,17 +32,17 @@ from clpipe.stage import Kind
 
 TRANSFERS = ("upload", "download")
 
-# What CPU time goes into, in the order of the work; "Python" is all that is not within another.
+# Steps that take CPU time, in order. "Python" is the time outside all other steps.
 CPU_STEPS = (
     *("decode", "convert", "hash", "upload", "kernels", "download", "encode", "write"),
     "Python",
 )
 
-DISTINCT = 4  # renders; the others are links to them
+DISTINCT_RENDERS = 4  # other renders are links to these
 
 
 @dataclass(frozen=True)
-class Load:
+class Workload:
     """A number of images of one size in pixels."""
 
     images: int
@@ -50,21 +50,21 @@ class Load:
     height: int
 
 
-def loads() -> tuple[Load, ...]:
-    """The loads of ``clpipe bench --batch``: patches, frames and photographs."""
-    return Load(1000, 512, 512), Load(200, 1920, 1080), Load(20, 6000, 4000)
+def workloads() -> tuple[Workload, ...]:
+    """Return the workloads of ``clpipe bench --batch``: patches, frames and photographs."""
+    return Workload(1000, 512, 512), Workload(200, 1920, 1080), Workload(20, 6000, 4000)
 
 
 @dataclass(frozen=True)
 class BatchSpeed:
-    """The speed of one load.
+    """The speed of one workload.
 
     Args:
-        images, width, height: the load.
-        seconds: how long its images take.
-        cpu_ms: the CPU time of an image, by step, see :data:`CPU_STEPS`.
-        processors: how many there are for the process.
-        peak_mib: the most memory that the process held; None outside Linux.
+        images, width, height: the workload.
+        seconds: the time that its images take.
+        cpu_ms: the CPU time per image in ms, by step, see :data:`CPU_STEPS`.
+        processors: the number of processors that the process may use.
+        peak_mib: the peak memory of the process in MiB; None outside Linux.
     """
 
     images: int
@@ -77,34 +77,34 @@ class BatchSpeed:
 
     @property
     def busy(self) -> float:
-        """The share of the processors' time that the steps explain; 1 is no time unexplained."""
+        """The share of the processors' time that the steps account for, 0 to 1."""
         return sum(self.cpu_ms.values()) * self.images / 1e3 / (self.seconds * self.processors)
 
     @property
     def megapixels_per_second(self) -> float:
-        """The speed of the batch."""
+        """The speed of the batch, in megapixels per second."""
         return self.images * self.width * self.height / 1e6 / self.seconds
 
     def record(self) -> dict[str, Any]:
-        """The speeds and their ratios as JSON values."""
+        """Return the speeds and their ratios as JSON values."""
         return asdict(self) | {"busy": self.busy, "mp_per_s": self.megapixels_per_second}
 
 
-def bench_batch(device: Device, request: Request, load: Load) -> BatchSpeed:
-    """Time one load: half EXR in, JPEG out, and the CPU time of each step.
+def bench_batch(device: Device, request: Request, workload: Workload) -> BatchSpeed:
+    """Time one workload from half-float EXR to JPEG, with the CPU time of each step.
 
-    The time of a step is measured by the clocks of the threads that do it. On a CPU, the driver's
-    threads run kernels and transfers. Their time is the process's time less that of our threads. It
-    is divided between kernels, which take all compute units, and transfers, which take one.
-    "Python" is the time of our threads outside all steps.
+    Thread clocks measure the time of a step. On a CPU, the driver's threads run kernels and
+    transfers. Their time is the process's time minus that of our threads. It is divided between
+    kernels, which use all compute units, and transfers, which use one. "Python" is the time of our
+    threads outside all steps.
 
-    The files lie in a temporary folder while it lasts.
+    The files are in a temporary folder.
     """
     with tempfile.TemporaryDirectory(prefix="clpipe-bench-") as name:
         folder = Path(name)
         chain = request.chain()
-        picture = input_of(chain, load.width, load.height)
-        write_images(folder / "in", load, picture, chain.source)
+        picture = input_of(chain, workload.width, workload.height)
+        write_images(folder / "in", workload, picture, chain.source)
         loader = ImageLoader(request)
         jobs = find_jobs([str(folder / "in")], folder / "out")
         resolved = replace(request, formats=("jpg",)).with_outputs(chain)
@@ -115,9 +115,9 @@ def bench_batch(device: Device, request: Request, load: Load) -> BatchSpeed:
             (folder / "out").mkdir()
             return Batch(ImageWorker(loader, Folder(writer), chain, trace=True), [device])
 
-        # A few first, so that nothing is compiled and no file is cold in what is timed.
-        list(batch().run(jobs[: 2 * DISTINCT]))
-        forget_peak_memory()
+        # A short batch first, so that kernels are compiled and files are cached before the timing.
+        list(batch().run(jobs[: 2 * DISTINCT_RENDERS]))
+        reset_peak_memory()
         timed = batch()
         start = time.perf_counter()
         with CpuTimes() as times, CpuTimer("Python"):
@@ -132,18 +132,18 @@ def bench_batch(device: Device, request: Request, load: Load) -> BatchSpeed:
     for step, share in driver_shares(spans, device.info.compute_units).items():
         cpu[step] += share * times.elsewhere
     return BatchSpeed(
-        load.images,
-        load.width,
-        load.height,
+        workload.images,
+        workload.width,
+        workload.height,
         seconds=seconds,
-        cpu_ms={step: cpu[step] / load.images * 1e3 for step in CPU_STEPS},
+        cpu_ms={step: cpu[step] / workload.images * 1e3 for step in CPU_STEPS},
         processors=available_processors(),
         peak_mib=None if peak is None else peak / 2**20,
     )
 
 
 def driver_shares(spans: Iterable[Span], compute_units: int) -> dict[str, float]:
-    """How the CPU time of a driver is shared out between transfers and kernels; the sum is 1.
+    """Return the shares of transfers and kernels in the CPU time of a driver. The sum is 1.
 
     >>> spans = [Span("upload", "", 0, 1.0), Span("demosaic", "", 0, 2.0)]
     >>> driver_shares(spans, compute_units=2)
@@ -158,32 +158,34 @@ def driver_shares(spans: Iterable[Span], compute_units: int) -> dict[str, float]
     return {name: each / total for name, each in work.items()}
 
 
-def forget_peak_memory() -> None:
+def reset_peak_memory() -> None:
     """Reset the peak of this process's memory (Linux, proc(5): clear_refs)."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", "utf-8")
 
 
-def write_renders(folder: Path, load: Load) -> None:
-    """Write a folder of renders in half floats, as :func:`write_images`."""
-    write_images(folder, load, scene(load.width, load.height), Kind.RGB)
+def write_renders(folder: Path, workload: Workload) -> None:
+    """Write a folder of renders in half floats, see :func:`write_images`."""
+    write_images(folder, workload, scene(workload.width, workload.height), Kind.RGB)
 
 
-def write_images(folder: Path, load: Load, picture: Array, kind: Kind) -> None:
-    """Write a folder of images like one: :data:`DISTINCT` files, and links to them.
+def write_images(folder: Path, workload: Workload, picture: Array, kind: Kind) -> None:
+    """Write a folder of variants of an image: :data:`DISTINCT_RENDERS` files, and links to them.
 
-    They are copies where links cannot be made, as on Windows by most users.
+    If links are not allowed, as for most users of Windows, the files are copied.
     """
     folder.mkdir()
     attributes = {} if kind is Kind.RGB else {"kind": kind.label}
-    digits = len(str(load.images - 1))
-    for i in range(load.images):
+    digits = len(str(workload.images - 1))
+    for i in range(workload.images):
         path = folder / f"{i:0{digits}}.exr"
-        if i < DISTINCT:
-            rolled = np.roll(picture, 37 * i, axis=1)
-            write_exr(path, rolled, kind.channels, attributes, half=picture.dtype == np.float16)
+        if i < DISTINCT_RENDERS:
+            shifted_picture = np.roll(picture, 37 * i, axis=1)
+            write_exr(
+                path, shifted_picture, kind.channels, attributes, half=picture.dtype == np.float16
+            )
         else:
-            first = f"{i % DISTINCT:0{digits}}.exr"
+            first = f"{i % DISTINCT_RENDERS:0{digits}}.exr"
             try:
                 path.symlink_to(first)
             except OSError:

@@ -36,15 +36,18 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.folder import remove_unfinished
 
-TIMEOUT = 10.0  # s, for the scheduler to answer and for its first worker
+CONNECT_TIMEOUT = 10.0  # s, for the scheduler to answer and for its first worker
 
-PATIENCE = 60.0  # s without any worker; nannies and job queues start new ones
+WORKER_TIMEOUT = 60.0  # s without any worker; nannies and job queues start new ones
 
 RETRIES = 2  # of a chunk that ended with an unexpected error
 
-FIRST, LARGEST = 4, 64  # images in a chunk
+FIRST_CHUNK, MAX_CHUNK = 4, 64  # images in a chunk
 
-SHORT, LONG = 15.0, 60.0  # s; chunks grow after a shorter one, and shrink after a longer one
+SHORT_CHUNK, LONG_CHUNK = (
+    15.0,
+    60.0,
+)  # s; chunks grow after a shorter one, and shrink after a longer one
 
 
 @contextlib.contextmanager
@@ -60,15 +63,15 @@ def connected(address: str, spec: DaskSpec) -> Iterator["Cluster"]:
 
     try:
         asyncio.run(_reach(address))
-        client = Client(address, timeout=TIMEOUT, name="clpipe", set_as_default=False)
+        client = Client(address, timeout=CONNECT_TIMEOUT, name="clpipe", set_as_default=False)
     except (OSError, ValueError) as error:
         raise RequestError(
-            f"--dask: no Dask scheduler answers at {address!r} within {TIMEOUT:g} s"
+            f"--dask: no Dask scheduler answers at {address!r} within {CONNECT_TIMEOUT:g} s"
             f"{f' ({error})' * bool(str(error))}; expected its tcp://HOST:PORT"
         ) from None
     try:
         with contextlib.suppress(TimeoutError):
-            client.wait_for_workers(1, timeout=TIMEOUT)
+            client.wait_for_workers(1, timeout=CONNECT_TIMEOUT)
         if not client.nthreads():
             raise RequestError(
                 f"--dask: the scheduler at {address} has no workers; start some: "
@@ -87,16 +90,18 @@ def connected(address: str, spec: DaskSpec) -> Iterator["Cluster"]:
 
 
 async def _reach(address: str) -> None:
-    """Connect to a scheduler, with a limit. A Client waits for ever for a port that is silent.
+    """Connect to a scheduler within a time limit. A Client would wait forever for a silent port.
 
     Raises:
-        OSError, ValueError: no scheduler answers there, or it is no address.
+        OSError, ValueError: no scheduler answers, or the address is not valid.
     """
     from distributed import Security
     from distributed.comm import connect
 
     security = Security().get_connection_args("client")
-    comm = await asyncio.wait_for(connect(address, timeout=TIMEOUT, **security), TIMEOUT)
+    comm = await asyncio.wait_for(
+        connect(address, timeout=CONNECT_TIMEOUT, **security), CONNECT_TIMEOUT
+    )
     await comm.close()
 
 
@@ -106,11 +111,11 @@ class Cluster:
     def __init__(self, client: Any, address: str, spec: DaskSpec) -> None:
         self._client = client
         self._address = address
-        self._spec = spec.anchored()
+        self._spec = spec.with_absolute_paths()
         self.is_stopping = False
         self._finished: queue.SimpleQueue[Any] = queue.SimpleQueue()  # futures; None: stop
         self._running: dict[Any, tuple[list[Job], bool]] = {}  # chunks, and whether each runs alone
-        self._seen = time.monotonic()  # when there was a worker last
+        self._last_worker_time = time.monotonic()  # when there was a worker last
 
     def stop(self) -> None:
         """Begin no more images, and finish those in flight. A signal handler may call it."""
@@ -127,19 +132,19 @@ class Cluster:
             OutputError: nothing more can be written.
             ClusterError: the scheduler or all workers are gone.
         """
-        anchored = list(map(self._spec.anchored_job, jobs))
-        self._probe(anchored)
-        return self._outcomes(anchored)
+        with_absolute_paths = list(map(self._spec.absolute_job, jobs))
+        self._probe(with_absolute_paths)
+        return self._outcomes(with_absolute_paths)
 
     def _probe(self, jobs: Sequence[Job]) -> None:
         """Check that all workers have one environment, and see the same files as this machine."""
-        takes = ImageLoader(self._spec.request).raw.takes
+        is_raw = ImageLoader(self._spec.request).raw.is_raw
         # As in first_chain(), the chain of a raw is compiled only if all inputs are raws.
-        able = [job for job in jobs if not job.problem] or jobs
-        first = next((job for job in able if not takes(job.path)), able[0])
+        usable = [job for job in jobs if not job.problem] or jobs
+        first = next((job for job in usable if not is_raw(job.path)), usable[0])
         spec = replace(self._spec, first=first)
         size = first.path.stat().st_size if first.path.is_file() else None
-        probe = spec.where.output / f".clpipe.{spec.run}"
+        probe = spec.execution.output / f".clpipe.{spec.run}"
         try:
             probe.touch()
             environments = self._client.run(probe_worker, spec, probe.name, size, on_error="return")
@@ -147,7 +152,7 @@ class Cluster:
             with contextlib.suppress(OSError):
                 probe.unlink()
         if not environments:
-            raise self._gone()
+            raise self._lost_cluster()
         for worker, environment in environments.items():
             if not isinstance(environment, WorkerEnvironment):
                 raise RequestError(f"--dask: worker {worker}: {environment}")
@@ -159,7 +164,7 @@ class Cluster:
         failure: ClpipeError | None = None
         try:
             while self._running or (chunks and not self.is_stopping):
-                self._hand_out(chunks)
+                self._submit_chunks(chunks)
                 try:
                     future = self._finished.get(timeout=1)
                 except queue.Empty:
@@ -169,9 +174,9 @@ class Cluster:
                     continue
                 report = self._report(future, chunks)
                 chunks.took(report.seconds)
-                here = time.perf_counter() - time.time()
+                clock_offset = time.perf_counter() - time.time()
                 for outcome in report.outcomes:
-                    yield shifted(outcome, here)
+                    yield shifted(outcome, clock_offset)
                 if report.error:
                     failure = failure or report.error
                     self._halt()
@@ -179,11 +184,11 @@ class Cluster:
             self._finish()
             raise
         patches = self._spec.request.patch is not None
-        remove_unfinished(self._spec.where.output, jobs, patches)  # by workers that died
+        remove_unfinished(self._spec.execution.output, jobs, patches)  # by workers that died
         if failure:
             raise failure
 
-    def _hand_out(self, chunks: "_Chunks") -> None:
+    def _submit_chunks(self, chunks: "_Chunks") -> None:
         """Submit chunks until there are as many as workers.
 
         Dask chooses the worker. A chunk that is bound to one would wait for ever if it dies.
@@ -194,14 +199,14 @@ class Cluster:
         try:
             addresses = tuple(sorted(self._client.nthreads()))
         except (OSError, ValueError, RuntimeError):
-            raise self._gone() from None
+            raise self._lost_cluster() from None
         self._spec = replace(self._spec, workers=addresses)
         if workers := len(addresses):
-            self._seen = time.monotonic()
-        elif time.monotonic() - self._seen > PATIENCE:
+            self._last_worker_time = time.monotonic()
+        elif time.monotonic() - self._last_worker_time > WORKER_TIMEOUT:
             raise ClusterError(
-                f"--dask: the scheduler at {self._address} has had no workers for {PATIENCE:g} s; "
-                "what is finished is there, and the same command goes on"
+                f"--dask: the scheduler at {self._address} has had no workers for "
+                f"{WORKER_TIMEOUT:g} s; finished pictures are kept, and the same command resumes"
             )
         while chunks.jobs and len(self._running) < workers and not self.is_stopping:
             self._submit(chunks.cut(workers))
@@ -227,12 +232,12 @@ class Cluster:
         except KilledWorker as error:
             if not alone:
                 chunks.suspects += chunk  # another chunk on these workers may be to blame
-                return ChunkReport((), LONG)
+                return ChunkReport((), LONG_CHUNK)
             deaths = f"{error.allowed_failures + 1} in all, the last one {_worker_name(error)}"
             return _failed(chunk, f"killed the worker that took it, {deaths}")
         except Exception as error:
             if future.status in ("cancelled", "lost"):
-                raise self._gone() from None
+                raise self._lost_cluster() from None
             return _failed(chunk, f"on a worker: {type(error).__name__}: {error}")
         finally:
             future.release()  # otherwise Dask repeats it if its worker dies
@@ -248,12 +253,12 @@ class Cluster:
 
         self._halt()
         with self._client.as_current(), contextlib.suppress(TimeoutError):
-            wait(list(self._running), timeout=LONG)
+            wait(list(self._running), timeout=LONG_CHUNK)
 
-    def _gone(self) -> ClusterError:
+    def _lost_cluster(self) -> ClusterError:
         return ClusterError(
             f"--dask: the scheduler at {self._address} or its workers have gone; "
-            "what is finished is there, and the same command goes on"
+            "finished pictures are kept, and the same command resumes"
         )
 
 
@@ -276,7 +281,7 @@ class _Chunks:
 
     jobs: deque[Job]
     suspects: deque[Job] = field(default_factory=deque)
-    size: int = FIRST
+    size: int = FIRST_CHUNK
 
     def __bool__(self) -> bool:
         return bool(self.jobs or self.suspects)
@@ -288,15 +293,15 @@ class _Chunks:
 
     def took(self, seconds: float) -> None:
         """Adapt the size of chunks to the seconds that one took."""
-        if seconds < SHORT:
-            self.size = min(2 * self.size, LARGEST)
-        elif seconds > LONG:
+        if seconds < SHORT_CHUNK:
+            self.size = min(2 * self.size, MAX_CHUNK)
+        elif seconds > LONG_CHUNK:
             self.size = max(self.size // 2, 1)
 
 
 def _failed(chunk: Sequence[Job], reason: str) -> ChunkReport:
     failed = (Outcome(job, FAILED, error=f"{job.path}: {reason}") for job in chunk)
-    return ChunkReport(list(map(as_written, failed)), LONG)
+    return ChunkReport(list(map(as_written, failed)), LONG_CHUNK)
 
 
 def _worker_name(error: Any) -> str:

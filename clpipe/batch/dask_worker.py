@@ -44,23 +44,25 @@ class DaskSpec(RunSpec):
     workers: tuple[str, ...] = ()
     environment: "WorkerEnvironment | None" = None
 
-    def anchored(self) -> "DaskSpec":
+    def with_absolute_paths(self) -> "DaskSpec":
         """Return the description with absolute names of files, for workers in other directories."""
-        folder, asked = self.folder, self.request
+        folder, request_ = self.folder, self.request
         request = replace(
-            asked,
-            config=None if asked.config is None else from_folder(folder, asked.config),
-            options=from_folder(folder, asked.options),
-            image=from_folder(folder, asked.image),
+            request_,
+            config=None if request_.config is None else from_folder(folder, request_.config),
+            options=from_folder(folder, request_.options),
+            image=from_folder(folder, request_.image),
         )
-        where = replace(self.where, output=folder / self.where.output)
-        return replace(self, request=request, where=where)
+        execution = replace(self.execution, output=folder / self.execution.output)
+        return replace(self, request=request, execution=execution)
 
-    def anchored_job(self, job: Job) -> Job:
+    def absolute_job(self, job: Job) -> Job:
         """Return a job with absolute names of files."""
         values = from_folder(self.folder, job.values)
         first, *others = (self.folder / path for path in job.paths)
-        return replace(job, path=first, subframes=tuple(others), values=values, written=job.input)
+        return replace(
+            job, path=first, subframes=tuple(others), values=values, as_written=job.input
+        )
 
 
 def as_written(outcome: Outcome) -> Outcome:
@@ -75,7 +77,7 @@ def as_written(outcome: Outcome) -> Outcome:
 
 @dataclass(frozen=True)
 class WorkerEnvironment:
-    """Everything that a picture's bytes depend on. It must be equal on all workers of a run."""
+    """The software and devices that a picture's bytes depend on; equal on all workers of a run."""
 
     version: str
     program: str
@@ -107,17 +109,17 @@ def _devices(
     return open_devices(selectors, memory, share) or [None]
 
 
-def share_of(worker: str, workers: Collection[str]) -> tuple[int, int]:
+def share_on_machine(worker: str, workers: Collection[str]) -> tuple[int, int]:
     """Return a worker's number among those of its machine, from 0, and how many these are.
 
-    >>> share_of("tcp://b:2", ["tcp://b:1", "tcp://a:1", "tcp://b:3", "tcp://b:2"])
+    >>> share_on_machine("tcp://b:2", ["tcp://b:1", "tcp://a:1", "tcp://b:3", "tcp://b:2"])
     (1, 3)
     """
     scheme_and_host, _, port = worker.rpartition(":")
     if not port.isdecimal():  # within one process
         return 0, 1
-    beside = sorted({worker, *(w for w in workers if w.rpartition(":")[0] == scheme_and_host)})
-    return beside.index(worker), len(beside)
+    neighbours = sorted({worker, *(w for w in workers if w.rpartition(":")[0] == scheme_and_host)})
+    return neighbours.index(worker), len(neighbours)
 
 
 def close_devices() -> None:
@@ -160,10 +162,10 @@ def probe_worker(spec: DaskSpec, probe: str, size: int | None) -> WorkerEnvironm
         size: the size of the first input, in bytes. None if the client cannot see it.
     """
     try:
-        environment = worker_environment(spec.where.devices)
+        environment = worker_environment(spec.execution.devices)
     except ClpipeError as error:
         return str(error)
-    path, output = spec.first.path, spec.where.output
+    path, output = spec.first.path, spec.execution.output
     if not (output / probe).exists():
         return f"does not see the output directory {output}"
     if reason := write_problem(output):
@@ -184,31 +186,31 @@ def run_chunk(spec: DaskSpec, jobs: Sequence[Job]) -> ChunkReport:
         task = worker.state.tasks.get(key)
         return task is None or task.state == "cancelled"
 
-    began = time.perf_counter()
+    start = time.perf_counter()
     outcomes: list[Outcome] = []
     error = None
     with _one_chunk:
         try:
-            environment = worker_environment(spec.where.devices)
+            environment = worker_environment(spec.execution.devices)
             if environment != spec.environment:
                 check_same_environment(
                     {"the others": spec.environment, worker.address: environment}
                 )
-            share = share_of(worker.address, spec.workers)
-            devices = _devices(spec.where.devices, spec.where.memory, share)
+            share = share_on_machine(worker.address, spec.workers)
+            devices = _devices(spec.execution.devices, spec.execution.memory, share)
             batch = _batches[spec.run] = spec.batch(devices, worker.state.nthreads, share[1])
             if spec.run in _halted:
                 batch.stop()
-            since = time.time() - time.perf_counter()
+            clock_offset = time.time() - time.perf_counter()
             for outcome in batch.run(jobs):
-                outcomes.append(shifted(as_written(outcome), since, f"{worker.address} "))
+                outcomes.append(shifted(as_written(outcome), clock_offset, f"{worker.address} "))
                 if is_abandoned():  # by the process that started the run
                     batch.stop()
         except ClpipeError as problem:
             error = problem
         finally:
             _batches.pop(spec.run, None)
-    return ChunkReport(outcomes, time.perf_counter() - began, error)
+    return ChunkReport(outcomes, time.perf_counter() - start, error)
 
 
 def halt(run: str) -> None:
@@ -224,11 +226,11 @@ def check_same_environment(environments: Mapping[str, Any]) -> None:
     Raises:
         RequestError: they differ.
     """
-    for what in ("version", "device", "libraries"):
-        check_same(what, {worker: getattr(e, what) for worker, e in environments.items()})
+    for aspect in ("version", "device", "libraries"):
+        check_same(aspect, {worker: getattr(e, aspect) for worker, e in environments.items()})
 
 
-def check_same(what: str, values: Mapping[str, str]) -> None:
+def check_same(aspect: str, values: Mapping[str, str]) -> None:
     """Check that a value is the same on all workers.
 
     Args:
@@ -242,14 +244,16 @@ def check_same(what: str, values: Mapping[str, str]) -> None:
     for worker, value in values.items():
         workers.setdefault(value, []).append(worker)
     if len(workers) > 1:
-        each = "; ".join(f"{value} on {_some(names)}" for value, names in workers.items())
-        raise RequestError(f"--dask: workers differ in their {what}, and so would bits: {each}")
+        each = "; ".join(f"{value} on {_first_names(names)}" for value, names in workers.items())
+        raise RequestError(
+            f"--dask: workers differ in their {aspect}, so their pictures may differ: {each}"
+        )
 
 
-def _some(names: Collection[str]) -> str:
+def _first_names(names: Collection[str]) -> str:
     """List the first names, and the number of others.
 
-    >>> _some("abcdef")
+    >>> _first_names("abcdef")
     'a, b, c, d and 2 more'
     """
     some = ", ".join(list(names)[:4])

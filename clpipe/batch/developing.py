@@ -19,19 +19,19 @@ from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.outputs.recipes import Recipe
 
-TOGETHER = 16  # most small images that share launches
+MAX_STACK = 16  # small images that share launches
 
 log = logging.getLogger(__name__)
 
 
 @dataclass
-class Order:
-    """A rendition that a device shall make.
+class RenditionTask:
+    """A rendition that a device is to compute.
 
     Args:
-        state: its job.
-        recipe: how it is made.
-        written: resolves to its files; to None if it fails, and to an error if no device is left.
+        state: the state of its job.
+        recipe: its recipe.
+        written: resolves to its files, to None if it fails, or to an error if no device is left.
     """
 
     state: JobState
@@ -45,7 +45,7 @@ class Order:
 
 
 # Groups of orders that were started together, each with a function that waits for its result.
-Started = deque[deque[tuple[Order, Callable[[], Result | None]]]]
+Started = deque[deque[tuple[RenditionTask, Callable[[], Result | None]]]]
 
 
 def no_result() -> None:
@@ -79,19 +79,21 @@ class Developers:
         fail: Callable[[BaseException], None],
     ) -> None:
         self.devices = devices
-        self.most = threads + len(devices)  # renditions of one image that are in flight at a time
+        self.max_in_flight = threads + len(
+            devices
+        )  # renditions of one image that are in flight at a time
         self._worker = worker
         self._budget = budget
-        self._tell = compiled
+        self._on_compiled = compiled
         self._fail = fail
-        self._orders: queue.SimpleQueue[list[Order] | None] = (
+        self._tasks: queue.SimpleQueue[list[RenditionTask] | None] = (
             queue.SimpleQueue()
         )  # small ones together
         self._encoders = ThreadPoolExecutor(threads, "encode")
         self._is_needed = threading.Event()  # set by the first image to be made, and at the end
         self._is_closing = False
         self._usable = len(devices)
-        self._counting = threading.Lock()  # guards the number of usable devices
+        self._usable_lock = threading.Lock()  # guards the number of usable devices
 
     @property
     def is_needed(self) -> bool:
@@ -107,7 +109,7 @@ class Developers:
         self._is_closing = True
         self._is_needed.set()
         for _ in self.devices:
-            self._orders.put(None)
+            self._tasks.put(None)
         self._encoders.shutdown()
 
     def is_small(self, state: JobState) -> bool:
@@ -115,73 +117,75 @@ class Developers:
         size = state.source.pixels.shape[1::-1] if state.source else (0, 0)
         return all(each is not None and each.stacks(*size) for each in self.devices)
 
-    def order(self, states: Sequence[JobState]) -> list[list[Order]]:
-        """Make all renditions of jobs, some at a time, and wait. Returns them by job."""
-        made: list[list[Order]] = [[] for _ in states]
-        asked: deque[Order] = deque()
-        small: list[Order] = []
-        for state, orders in zip(states, made, strict=True):
+    def develop(self, states: Sequence[JobState]) -> list[list[RenditionTask]]:
+        """Compute all renditions of jobs, some at a time, and return them by job when finished."""
+        tasks_by_state: list[list[RenditionTask]] = [[] for _ in states]
+        pending: deque[RenditionTask] = deque()
+        small: list[RenditionTask] = []
+        for state, tasks in zip(states, tasks_by_state, strict=True):
             is_small = self.is_small(state)
             if not is_small:
                 self._put(small)
-            most = TOGETHER if is_small else self.most
+            limit = MAX_STACK if is_small else self.max_in_flight
             for recipe in state.recipes:
                 # Baselines take their noise from the renditions before them.
-                while asked and (len(asked) >= most or recipe.spread):
+                while pending and (len(pending) >= limit or recipe.matcher):
                     self._put(small)
-                    asked.popleft().written.exception()
-                orders.append(Order(state, recipe))
-                asked.append(orders[-1])
-                small.append(orders[-1])
+                    pending.popleft().written.exception()
+                tasks.append(RenditionTask(state, recipe))
+                pending.append(tasks[-1])
+                small.append(tasks[-1])
                 if not is_small:
                     self._put(small)
         self._put(small)
-        for order in reversed(asked):  # the last one first, so as to wait once
-            order.written.exception()
-        return made
+        for task in reversed(pending):  # the last one first, so as to wait once
+            task.written.exception()
+        return tasks_by_state
 
-    def _put(self, orders: list[Order]) -> None:
+    def _put(self, tasks: list[RenditionTask]) -> None:
         """Queue orders, if there are any, and empty the list."""
-        if orders:
-            self._orders.put(orders.copy())
-            orders.clear()
+        if tasks:
+            self._tasks.put(tasks.copy())
+            tasks.clear()
 
     def develop_all(self, device: Device | None) -> None:
         """Develop orders until there are no more, or the device fails."""
         self._is_needed.wait()  # a run that skips all images compiles nothing
         if self._is_closing:
             return
-        asked: list[Order] = []
+        pending: list[RenditionTask] = []
         started: Started = deque()
         try:
             try:
                 runners = self._worker.runners(device)
-                self._tell()
+                self._on_compiled()
             finally:
                 self._budget.device_ready()
-            while asked := self._taken(started, device):
+            while pending := self._next_tasks(started, device):
                 if len(started) >= depth_of(device):
                     self._finish(started, device)
-                started.append(self._started(asked, runners))
-                asked = []
+                started.append(self._start_tasks(pending, runners))
+                pending = []
         except BaseException as error:
-            left = [order for stack in started for order, _ in stack]
-            with self._counting:
+            unfinished = [task for stack in started for task, _ in stack]
+            with self._usable_lock:
                 self._usable -= 1
                 is_last = not self._usable
             if isinstance(error, DeviceError) and not is_last:
                 log.warning("%s; the other devices go on", error)
-                for order in (*left, *asked):
-                    self._orders.put([order])
+                for task in (*unfinished, *pending):
+                    self._tasks.put([task])
                 return
             self._fail(error)
-            for order in chain(left, asked, chain.from_iterable(iter(self._orders.get, None))):
-                order.written.set_exception(error)
+            for task in chain(
+                unfinished, pending, chain.from_iterable(iter(self._tasks.get, None))
+            ):
+                task.written.set_exception(error)
         finally:
             if device:
                 device.drain()
 
-    def _taken(self, started: Started, device: Device | None) -> list[Order]:
+    def _next_tasks(self, started: Started, device: Device | None) -> list[RenditionTask]:
         """Return the next orders: one, several small ones, or none at the end.
 
         While no order is queued, those that were started are finished.
@@ -189,58 +193,58 @@ class Developers:
         Raises:
             DeviceError: the device cannot be used any more.
         """
-        taken: list[Order] = []
+        taken: list[RenditionTask] = []
         is_waiting = not started
-        while len(taken) < TOGETHER:
+        while len(taken) < MAX_STACK:
             try:
-                orders = self._orders.get(is_waiting)
+                tasks = self._tasks.get(is_waiting)
             except queue.Empty:
                 if taken:
                     break
                 self._finish(started, device)
                 is_waiting = not started
                 continue
-            if orders is None:
+            if tasks is None:
                 if taken:
-                    self._orders.put(None)  # for the next call
+                    self._tasks.put(None)  # for the next call
                     break
                 while started:
                     self._finish(started, device)
                 return []
-            taken += orders
+            taken += tasks
             is_waiting = False
-            if not self.is_small(orders[-1].state):
+            if not self.is_small(tasks[-1].state):
                 break
         return taken
 
-    def _started(
-        self, orders: Sequence[Order], runners: Runners
-    ) -> deque[tuple[Order, Callable[[], Result | None]]]:
+    def _start_tasks(
+        self, tasks: Sequence[RenditionTask], runners: Runners
+    ) -> deque[tuple[RenditionTask, Callable[[], Result | None]]]:
         """Start orders together.
 
         Raises:
             DeviceError: the device cannot be used any more.
         """
-        waits: list[Callable[[], Result | None]] = [no_result for _ in orders]
-        asked = []
-        for place, order in enumerate(orders):
-            state = order.state
+        finishers: list[Callable[[], Result | None]] = [no_result for _ in tasks]
+        pending = []
+        for place, task in enumerate(tasks):
+            state = task.state
             try:
                 if not state.error:
-                    order.recipe = self._worker.measured(state, order.recipe)
-                    asked.append((place, (state, order.recipe, runners.of(order.recipe))))
+                    task.recipe = self._worker.with_matched_noise(state, task.recipe)
+                    pending.append((place, (state, task.recipe, runners.of(task.recipe))))
             except BaseException as error:
                 state.error = failure_text(state.job, error)
         try:
-            begun = self._worker.start([each for _, each in asked])
-            for (place, _), finish in zip(asked, begun, strict=True):
-                waits[place] = finish
+            finish_functions = self._worker.start([each for _, each in pending])
+            for (place, _), finish in zip(pending, finish_functions, strict=True):
+                finishers[place] = finish
         except DeviceError:
             raise
         except BaseException as error:
-            for _, (state, *_) in asked:
+            for _, (state, *_) in pending:
                 state.error = failure_text(state.job, error)
-        return deque(zip(orders, waits, strict=True))
+        return deque(zip(tasks, finishers, strict=True))
 
     def _finish(self, started: Started, device: Device | None) -> None:
         """Wait for the oldest group of orders, and hand the results to the encoders.
@@ -250,29 +254,29 @@ class Developers:
         """
         stack = started[0]
         while stack:
-            order, finish = stack[0]
+            task, finish = stack[0]
             result = None
             try:
                 result = finish()
             except DeviceError:
                 raise
             except BaseException as error:
-                order.state.error = failure_text(order.state.job, error)
+                task.state.error = failure_text(task.state.job, error)
             if result:
-                self._encoders.submit(self._encode, order, result, device)
+                self._encoders.submit(self._encode, task, result, device)
             else:
-                order.written.set_result(None)
+                task.written.set_result(None)
             stack.popleft()
         started.popleft()
 
-    def _encode(self, order: Order, result: Result, device: Device | None) -> None:
+    def _encode(self, task: RenditionTask, result: Result, device: Device | None) -> None:
         written = None
         try:
             with CpuTimer("Python"):
-                written = self._worker.encode(order.state, order.recipe, result, device)
+                written = self._worker.encode(task.state, task.recipe, result, device)
         except OutputError as error:
-            order.state.error = failure_text(order.state.job, error)
+            task.state.error = failure_text(task.state.job, error)
             self._fail(error)
         except BaseException as error:  # no image may end a thread
-            order.state.error = failure_text(order.state.job, error)
-        order.written.set_result(written)
+            task.state.error = failure_text(task.state.job, error)
+        task.written.set_result(written)

@@ -1,4 +1,4 @@
-"""Ctrl-C and a scheduler's SIGTERM: one lets images in flight be finished, two stop at once."""
+"""Handles Ctrl-C and SIGTERM: the first finishes images in flight, the second stops at once."""
 
 import contextlib
 import os
@@ -12,18 +12,15 @@ from clpipe.base.files import remove_temporary_files
 from clpipe.outputs.folder import release_folders
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-
-INTERRUPTED = 130
+INTERRUPTED = 130  # the exit status
 
 
 @contextlib.contextmanager
 def interruptible(stop: Callable[[], None]) -> Iterator[None]:
-    """Call ``stop`` at the first signal; at the second, end the process.
+    """Call ``stop`` at the first signal, and end the process at the second.
 
-    The process then leaves no half-written file and no lock file.
-
-    Signals only come to the main thread; in any other this does nothing.
+    The process then leaves no half-written file and no lock file. In threads other than the main
+    thread, which do not receive signals, this does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -40,7 +37,7 @@ def interruptible(stop: Callable[[], None]) -> Iterator[None]:
         stop()
         # Not print(): the signal may have interrupted one.
         with contextlib.suppress(OSError):
-            os.write(sys.stderr.fileno(), b"\nfinishing what is begun; again to stop now\n")
+            os.write(sys.stderr.fileno(), b"\nfinishing images in progress; repeat to stop now\n")
 
     before = {number: signal.signal(number, handle) for number in SIGNALS}
     try:

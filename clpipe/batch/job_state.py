@@ -13,7 +13,7 @@ import numpy as np
 from clpipe.base.errors import ClpipeError
 from clpipe.batch.outcome import DONE, FAILED, Outcome, Span
 from clpipe.images.read import SourceImage
-from clpipe.inputs.carry import Aovs
+from clpipe.inputs.carry import CarriedLayers
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.patches import Patch
@@ -39,7 +39,7 @@ class JobState:
     error: str = ""
     reason: str = ""
     outputs: list[str] = field(default_factory=list)
-    aovs: Aovs | None = None  # carried layers, until they are written
+    carried_layers: CarriedLayers | None = None  # carried layers, until they are written
     clipped: float = 0.0  # the largest share of clipped pixels of its renditions
     patches: list[Patch] = field(default_factory=list)  # that are written instead of pictures
     old: int = 0  # existing renditions that another version of the program made
@@ -92,5 +92,5 @@ def failure_text(job: Job, error: BaseException) -> str:
         reason = str(error)
     else:
         reason = f"unexpected {type(error).__name__}: {error}".removesuffix(": ")
-    log.debug("%s: %s", job.shown, reason, exc_info=error)
-    return f"{job.shown}: {reason.replace(str(job.path), job.shown)}"
+    log.debug("%s: %s", job.display_name, reason, exc_info=error)
+    return f"{job.display_name}: {reason.replace(str(job.path), job.display_name)}"

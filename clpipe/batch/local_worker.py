@@ -25,11 +25,11 @@ from clpipe.batch.spec import RunSpec
 from clpipe.batch.threads import Batch, Jobs
 from clpipe.engine.device import Device, open_devices
 
-SOON = 0.005  # s for which outcomes are collected into one message
+COLLECT_SECONDS = 0.005  # s for which outcomes are collected into one message
 
 
 @dataclass(frozen=True)
-class Seat:
+class ProcessConfig:
     """One process's part of a run.
 
     Args:
@@ -37,15 +37,15 @@ class Seat:
         of: the number of processes.
         threads: the number of threads if the run does not set it.
         processors: the processors that it is bound to. () binds it to none.
-        in_turn: whether a single thread makes the images, see :mod:`clpipe.batch.threads`.
+        sequential: whether a single thread makes the images, see :mod:`clpipe.batch.threads`.
         level: the lowest level that is logged.
     """
 
     number: int
-    of: int
+    count: int
     threads: int
     processors: tuple[int, ...] = ()
-    in_turn: bool = False
+    sequential: bool = False
     level: int = logging.INFO
 
 
@@ -53,14 +53,14 @@ def main(file: int) -> None:
     """Work for the run at the other end of a connection, given by its file descriptor."""
     pipe = _PipeToRun(Connection(file))
     gc.freeze()  # imported modules stay, so the collector need not visit them
-    spec, seat = pipe.receive()
-    if seat.processors:
-        stay_on(seat.processors)
+    spec, config = pipe.receive()
+    if config.processors:
+        stay_on(config.processors)
     logger = logging.getLogger("clpipe")
-    logger.setLevel(seat.level)
+    logger.setLevel(config.level)
     logger.addHandler(_Forwarder(pipe))
     try:
-        _work(pipe, spec, seat)
+        _work(pipe, spec, config)
     except ClpipeError as error:
         pipe.send("failed", error)
     pipe.send("end")
@@ -87,65 +87,67 @@ class _PipeToRun:
             with self._sending:
                 self._connection.send(message)
         except OSError:
-            _abandon()
+            _exit_at_once()
 
     def receive(self) -> Any:
         """Return the next message. Only one thread may call it at a time."""
         try:
             return self._connection.recv()
         except (EOFError, OSError):
-            _abandon()
+            _exit_at_once()
 
 
-def _abandon() -> NoReturn:
+def _exit_at_once() -> NoReturn:
     """End this process without finishing its images."""
     remove_temporary_files()
     _leave(1)
 
 
-def _work(pipe: _PipeToRun, spec: RunSpec, seat: Seat) -> None:
+def _work(pipe: _PipeToRun, spec: RunSpec, config: ProcessConfig) -> None:
     """Do the jobs that arrive, and send their outcomes.
 
     Raises:
         ClpipeError: the process cannot continue.
     """
-    where = spec.where
-    share = seat.number, seat.of
-    devices: list[Device | None] = [*open_devices(where.devices, where.memory, share)] or [None]
+    execution = spec.execution
+    share = config.number, config.count
+    devices: list[Device | None] = [*open_devices(execution.devices, execution.memory, share)] or [
+        None
+    ]
     pipe.send("ready")
     jobs: Jobs = queue.SimpleQueue()
-    in_flight = 1 if seat.in_turn and len(devices) == 1 else None
+    in_flight = 1 if config.sequential and len(devices) == 1 else None
     batch = spec.batch(
-        devices, seat.threads, seat.of, in_flight, compiled=lambda: pipe.send("compiled")
+        devices, config.threads, config.count, in_flight, compiled=lambda: pipe.send("compiled")
     )
     threading.Thread(target=_listen, args=(pipe, jobs, batch), daemon=True).start()
     finished: queue.SimpleQueue[Outcome | None] = queue.SimpleQueue()
-    teller = threading.Thread(target=_tell, args=(pipe, finished))
-    teller.start()
+    sender = threading.Thread(target=_send_outcomes, args=(pipe, finished))
+    sender.start()
     try:
         for outcome in batch.run(jobs):
             finished.put(outcome)
     finally:
         finished.put(None)
-        teller.join()
+        sender.join()
 
 
 def _listen(pipe: _PipeToRun, jobs: Jobs, batch: Batch) -> None:
     """Receive jobs until the end or a stop."""
     while True:
-        what, *values = pipe.receive()
-        for job in values[0] if what == "jobs" else ():
+        kind, *values = pipe.receive()
+        for job in values[0] if kind == "jobs" else ():
             jobs.put(job)
-        if what == "stop":
+        if kind == "stop":
             batch.stop()
-        if what != "jobs":
+        if kind != "jobs":
             jobs.put(None)
 
 
-def _tell(pipe: _PipeToRun, finished: "queue.SimpleQueue[Outcome | None]") -> None:
+def _send_outcomes(pipe: _PipeToRun, finished: "queue.SimpleQueue[Outcome | None]") -> None:
     """Send outcomes, several in each message."""
     for first in iter(finished.get, None):
-        time.sleep(SOON)
+        time.sleep(COLLECT_SECONDS)
         outcomes = [first, *_waiting(finished)]
         pipe.send("outcomes", [each for each in outcomes if each])
         if None in outcomes:

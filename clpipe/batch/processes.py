@@ -1,10 +1,10 @@
 """Processes on this machine that share a run, each with its part of the processors and devices.
 
-One Python process makes a few hundred small images a second at most, however many processors there
-are, because its threads share the interpreter's lock. So a run has several processes if that pays.
-This process holds the output directory and the log, distributes jobs, and collects outcomes. Each
-of the others runs a :class:`clpipe.batch.threads.Batch`. If one dies, its jobs go to the others,
-which see from the sidecars what is finished.
+One Python process computes at most a few hundred small images per second on any number of
+processors, because its threads share the interpreter's lock. A run therefore has several processes
+if they save time. This process holds the output directory and the log, distributes jobs, and
+collects outcomes. Each of the others runs a :class:`clpipe.batch.threads.Batch`. If one dies, the
+others get its jobs. Sidecars show which of these are finished.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ from clpipe.base.memory import available_memory
 from clpipe.base.processors import available_processors
 from clpipe.base.system import blocked_signals, processor_numbers
 from clpipe.batch.interrupt import SIGNALS
-from clpipe.batch.local_worker import Seat
+from clpipe.batch.local_worker import ProcessConfig
 from clpipe.batch.outcome import FAILED, Outcome
 from clpipe.batch.spec import RunSpec, shifted
 from clpipe.images.claims import Claim
@@ -37,15 +37,15 @@ log = logging.getLogger(__name__)
 
 # The model of an image's CPU time from which the number of processes follows
 # (docs/performance.md): ms under the interpreter's lock, ms in all, and ms for each megapixel.
-LOCKED, OF_IMAGE, OF_MEGAPIXEL = 2.0, 3.0, 25.0
-SHARE = 0.5  # of a process's time that the lock may be held before threads wait for it
-WORTH = 1200  # ms of work for which a process pays; to start one takes 600
-SMALL = 2.5  # megapixels up to which reading and developing need not overlap
-ROOM = 400 << 20  # bytes for each process
+LOCKED_MS, IMAGE_MS, MEGAPIXEL_MS = 2.0, 3.0, 25.0
+MAX_LOCK_SHARE = 0.5  # threads wait for the lock if it is held for more of a process's time
+MIN_WORK_MS = 1200  # ms of work that justify a process; starting one takes 600
+SMALL_MEGAPIXELS = 2.5  # up to this size, reading and developing need not overlap
+PROCESS_MEMORY = 400 << 20  # bytes for each process
 
-AHEAD, LEAST = 64, 12  # most jobs that a process holds, and small ones towards the end
-DEATHS = 3  # of processes that held a job before it fails, or of processes that only started
-FUTILE = 20  # deaths in a row without an outcome before the run fails
+MAX_QUEUED, MIN_QUEUED = 64, 12  # jobs that a process holds: at most, and towards the end
+MAX_DEATHS = 3  # deaths of processes after which their job fails, or during their start the run
+MAX_FRUITLESS = 20  # deaths in a row without an outcome after which the run fails
 
 PROGRAM = (
     "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "
@@ -56,8 +56,8 @@ START = "from clpipe.batch.local_worker import main; main(int(sys.argv[1]))"
 THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")  # up to PoCL 3.1, and from 4 on
 
 
-def usual_processes(images: int, claim: Claim, processors: int) -> int:
-    """Return how many processes a run has by default.
+def default_processes(images: int, claim: Claim, processors: int) -> int:
+    """Return the default number of processes of a run.
 
     Args:
         images: the number of images.
@@ -65,24 +65,28 @@ def usual_processes(images: int, claim: Claim, processors: int) -> int:
         processors: the number of available processors.
 
     >>> small, large = Claim(512, 512, 0, 0), Claim(6000, 4000, 0, 0)
-    >>> [usual_processes(100_000, small, n) for n in (1, 2, 4)]
+    >>> [default_processes(100_000, small, n) for n in (1, 2, 4)]
     [1, 2, 4]
-    >>> usual_processes(200, small, 4), usual_processes(10_000, large, 64)
+    >>> default_processes(200, small, 4), default_processes(10_000, large, 64)
     (1, 1)
     """
-    each = OF_IMAGE + OF_MEGAPIXEL * claim.megapixels
+    image_ms = IMAGE_MS + MEGAPIXEL_MS * claim.megapixels
     # The number of processors that the threads of one process keep busy.
-    fed = 1.0 if claim.megapixels <= SMALL else max(each / LOCKED * SHARE, 1.0)
+    busy = (
+        1.0
+        if claim.megapixels <= SMALL_MEGAPIXELS
+        else max(image_ms / LOCKED_MS * MAX_LOCK_SHARE, 1.0)
+    )
     free = available_memory()
-    fit = processors if free is None else free // ROOM
-    return max(min(int(processors / fed), int(images * each / WORTH), fit), 1)
+    fit = processors if free is None else free // PROCESS_MEMORY
+    return max(min(int(processors / busy), int(images * image_ms / MIN_WORK_MS), fit), 1)
 
 
 @dataclass
 class _Process:
     """The parent's view of one process."""
 
-    seat: Seat
+    config: ProcessConfig
     popen: "subprocess.Popen[bytes]"
     connection: Connection
     listener: threading.Thread = field(default_factory=threading.Thread)
@@ -110,17 +114,17 @@ class Processes:
     def __init__(self, spec: RunSpec, count: int, claim: Claim) -> None:
         self._spec = spec
         self._count = count
-        self._is_small = claim.megapixels <= SMALL
+        self._is_small = claim.megapixels <= SMALL_MEGAPIXELS
         self._messages: queue.SimpleQueue[tuple[_Process | None, tuple[object, ...]]]
         self._messages = queue.SimpleQueue()
         self._processes: list[_Process] = []
-        self._left: deque[Job] = deque()
+        self._remaining: deque[Job] = deque()
         self._suspects: deque[Job] = deque()  # held by a process that died; tried alone at the end
         self._deaths: Counter[str] = Counter()  # of processes that held a job, by its stem
-        self._has_worked = False  # whether one has compiled the kernels, which are cached
-        self._still_born = 0  # processes in a row that died before they were ready
-        self._futile = 0  # processes that died since the last outcome
-        self._said: set[str] = set()
+        self._is_compiled = False  # whether one has compiled the kernels, which are cached
+        self._early_deaths = 0  # processes in a row that died before they were ready
+        self._fruitless_deaths = 0  # processes that died since the last outcome
+        self._logged: set[str] = set()
         self._failure: ClpipeError | None = None
         self.is_stopping = False
 
@@ -136,11 +140,11 @@ class Processes:
             DeviceError: there is no usable device, or a kernel does not compile.
             OutputError: nothing more can be written.
         """
-        every = list(jobs)
-        self._left = deque(every)
+        all_jobs = list(jobs)
+        self._remaining = deque(all_jobs)
         try:
-            wanted = min(self._count, max(len(every), 1))
-            for number in range(wanted):
+            count = min(self._count, max(len(all_jobs), 1))
+            for number in range(count):
                 try:
                     self._processes.append(self._start(number))
                 except RequestError:
@@ -148,18 +152,20 @@ class Processes:
                         raise
                     self._count = number  # the system allows no more
                     break
-            self._hand_out()
+            self._distribute_jobs()
             while not self._is_finished:
                 process, message = self._messages.get()
                 if process is None:
-                    self._tell_to_stop()
+                    self._stop_processes()
                 else:
-                    yield from self._heard(process, message)
-                    self._hand_out()
+                    yield from self._handle(process, message)
+                    self._distribute_jobs()
         finally:
             self._end()
             patches = self._spec.request.patch is not None
-            remove_unfinished(self._spec.where.output, every, patches)  # by processes that died
+            remove_unfinished(
+                self._spec.execution.output, all_jobs, patches
+            )  # by processes that died
         if self._failure:
             raise self._failure
 
@@ -169,7 +175,7 @@ class Processes:
             return False
         if self.is_stopping:
             return not self._processes
-        return not self._left and not self._suspects
+        return not self._remaining and not self._suspects
 
     def _start(self, number: int) -> _Process:
         """Start one of the processes.
@@ -177,22 +183,29 @@ class Processes:
         Raises:
             RequestError: the system refuses.
         """
-        every, count = processor_numbers(), self._count
+        available, count = processor_numbers(), self._count
         share = max(available_processors() // count, 1)
-        own: tuple[int, ...] = ()
-        if len(every) == available_processors() >= count:
-            own = tuple(every[number * len(every) // count : (number + 1) * len(every) // count])
-            share = len(own)
-        in_turn = share == 1 and self._is_small
-        seat = Seat(
-            number, count, share, own, in_turn, logging.getLogger("clpipe").getEffectiveLevel()
+        own_processors: tuple[int, ...] = ()
+        if len(available) == available_processors() >= count:
+            own_processors = tuple(
+                available[number * len(available) // count : (number + 1) * len(available) // count]
+            )
+            share = len(own_processors)
+        sequential = share == 1 and self._is_small
+        config = ProcessConfig(
+            number,
+            count,
+            share,
+            own_processors,
+            sequential,
+            logging.getLogger("clpipe").getEffectiveLevel(),
         )
         limits = {name: os.environ.get(name, str(share)) for name in THREADS}
         program = PROGRAM.format(path=json.dumps(sys.path), start=START)
         try:
-            ours, theirs = multiprocessing.Pipe()
-            with blocked_signals(SIGNALS), theirs:
-                file = theirs.fileno()
+            parent_end, child_end = multiprocessing.Pipe()
+            with blocked_signals(SIGNALS), child_end:
+                file = child_end.fileno()
                 popen = subprocess.Popen(  # noqa: S603 - this program
                     # -P: no module comes from the working directory.
                     [sys.executable, "-P", "-c", program, str(file)],
@@ -206,8 +219,8 @@ class Processes:
                 f"--processes: {self._count}: no process can be started ({error.strerror}); ask "
                 "for fewer"
             ) from None
-        process = _Process(seat, popen, ours)
-        self._send(process, self._spec, seat)
+        process = _Process(config, popen, parent_end)
+        self._send(process, self._spec, config)
         process.listener = threading.Thread(target=self._listen, args=(process,), daemon=True)
         process.listener.start()
         return process
@@ -225,32 +238,32 @@ class Processes:
         with contextlib.suppress(OSError):
             process.connection.send(message)
 
-    def _heard(self, process: _Process, message: tuple[object, ...]) -> Iterable[Outcome]:
+    def _handle(self, process: _Process, message: tuple[object, ...]) -> Iterable[Outcome]:
         """Handle a message from a process, and return the outcomes that follow from it."""
         match message:
             case ("ready",):
-                process.is_ready, self._still_born = True, 0
+                process.is_ready, self._early_deaths = True, 0
             case ("compiled",):
-                self._has_worked = True
+                self._is_compiled = True
             case ("outcomes", list(outcomes)):
-                self._has_worked, self._futile = True, 0
+                self._is_compiled, self._fruitless_deaths = True, 0
                 for outcome in outcomes:
                     del process.jobs[outcome.job.stem]
                 process.is_alone &= bool(process.jobs)
-                return [shifted(each, 0.0, f"{process.seat.number} ") for each in outcomes]
+                return [shifted(outcome, 0.0, f"{process.config.number} ") for outcome in outcomes]
             case ("log", int(level), str(text)):
-                if text not in self._said:  # every process logs it
-                    self._said.add(text)
+                if text not in self._logged:  # every process logs it
+                    self._logged.add(text)
                     log.log(level, "%s", text)
             case ("failed", ClpipeError() as error):
                 self._failure = self._failure or error
                 process.jobs.clear()
                 self.stop()
             case ("end",) | ("gone",):
-                return self._lost(process) if process in self._processes else ()
+                return self._handle_death(process) if process in self._processes else ()
         return ()
 
-    def _hand_out(self) -> None:
+    def _distribute_jobs(self) -> None:
         """Give each process its next jobs, and replace processes that died.
 
         Raises:
@@ -258,30 +271,30 @@ class Processes:
         """
         if self.is_stopping:
             return
-        while len(self._processes) < self._count and self._left and self._has_worked:
-            taken = {process.seat.number for process in self._processes}
+        while len(self._processes) < self._count and self._remaining and self._is_compiled:
+            taken = {process.config.number for process in self._processes}
             self._processes.append(self._start(min({*range(self._count)} - taken)))
         # The first process compiles the kernels and caches them for the others.
-        for process in self._processes if self._has_worked else self._processes[:1]:
+        for process in self._processes if self._is_compiled else self._processes[:1]:
             if process.is_alone:
                 continue
-            threads = self._spec.where.threads or process.seat.threads
-            least = LEAST if process.seat.in_turn else threads + 3
-            most = max(min(AHEAD, len(self._left) // (2 * self._count)), least)
-            if len(process.jobs) > most // 2:  # a message for one or two jobs does not pay
+            threads = self._spec.execution.threads or process.config.threads
+            min_queued = MIN_QUEUED if process.config.sequential else threads + 3
+            max_queued = max(min(MAX_QUEUED, len(self._remaining) // (2 * self._count)), min_queued)
+            if len(process.jobs) > max_queued // 2:  # a message for one or two jobs does not pay
                 continue
-            count = min(most - len(process.jobs), len(self._left))
+            count = min(max_queued - len(process.jobs), len(self._remaining))
             if not count and self._suspects and not process.jobs:
                 process.is_alone = True
                 self._give(process, [self._suspects.popleft()])
             elif count:
-                self._give(process, [self._left.popleft() for _ in range(count)])
+                self._give(process, [self._remaining.popleft() for _ in range(count)])
 
     def _give(self, process: _Process, jobs: Sequence[Job]) -> None:
         process.jobs |= {job.stem: job for job in jobs}
         self._send(process, "jobs", jobs)
 
-    def _lost(self, process: _Process) -> Iterable[Outcome]:
+    def _handle_death(self, process: _Process) -> Iterable[Outcome]:
         """Handle the end of a process: others get its jobs. Returns the outcomes of failed jobs.
 
         Raises:
@@ -289,31 +302,32 @@ class Processes:
         """
         self._processes.remove(process)
         status = process.close()
-        was_alone, jobs = process.is_alone, list(process.jobs.values())
+        was_testing_one, jobs = process.is_alone, list(process.jobs.values())
         process.jobs.clear()
         if self.is_stopping:
             return []
-        self._still_born += not process.is_ready
-        self._futile += 1
-        log.warning("a process ended %s; its %d images go to others", _ended(status), len(jobs))
-        if self._still_born >= DEATHS or self._futile >= FUTILE:
-            count, before = FUTILE, "made an image"
-            if self._still_born >= DEATHS:
-                count, before = DEATHS, "opened a device"
+        self._early_deaths += not process.is_ready
+        self._fruitless_deaths += 1
+        log.warning("a process ended %s; its %d images go to others", _exit_text(status), len(jobs))
+        if self._early_deaths >= MAX_DEATHS or self._fruitless_deaths >= MAX_FRUITLESS:
+            count, milestone = MAX_FRUITLESS, "made an image"
+            if self._early_deaths >= MAX_DEATHS:
+                count, milestone = MAX_DEATHS, "opened a device"
             raise DeviceError(
-                f"--processes: {count} processes in a row ended before they had {before}, "
-                f"the last one {_ended(status)}; --processes 1 does without"
+                f"--processes: {count} processes in a row ended before they had {milestone}, "
+                f"the last one {_exit_text(status)}; --processes 1 does without"
             )
         for job in jobs:
             self._deaths[job.stem] += 1
-        given_up = [job for job in jobs if was_alone and self._deaths[job.stem] >= DEATHS]
+        given_up = [job for job in jobs if was_testing_one and self._deaths[job.stem] >= MAX_DEATHS]
         self._suspects.extend(job for job in jobs if job not in given_up)
         if not self._processes:
-            self._processes.append(self._start(process.seat.number))
-        text = f"killed the process that took it, {DEATHS} times; the last one {_ended(status)}"
-        return [Outcome(job, FAILED, error=f"{job.shown}: {text}") for job in given_up]
+            self._processes.append(self._start(process.config.number))
+        end = _exit_text(status)
+        text = f"killed the process that took it, {MAX_DEATHS} times; the last one {end}"
+        return [Outcome(job, FAILED, error=f"{job.display_name}: {text}") for job in given_up]
 
-    def _tell_to_stop(self) -> None:
+    def _stop_processes(self) -> None:
         for process in self._processes:
             self._send(process, "stop")
 
@@ -326,13 +340,13 @@ class Processes:
         while not self._messages.empty():  # errors and log lines that came last
             process_, message = self._messages.get()
             if process_ and message[0] in ("failed", "log"):
-                self._heard(process_, message)
+                self._handle(process_, message)
 
 
-def _ended(status: int) -> str:
+def _exit_text(status: int) -> str:
     """Describe how a process ended, from its exit status.
 
-    >>> _ended(-9), _ended(1)
+    >>> _exit_text(-9), _exit_text(1)
     ('by signal 9', 'with status 1')
     """
     return f"by signal {-status}" if status < 0 else f"with status {status}"

@@ -1,4 +1,4 @@
-"""Makes a picture again from its sidecar: the same bytes, or a reason why not."""
+"""Recomputes a picture from its sidecar, and explains differences in its bytes."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -15,76 +15,79 @@ from clpipe.chain.rendition import BASELINES, TRUTHS, Rendition
 from clpipe.chain.request import Request
 from clpipe.inputs.find import Job
 from clpipe.inputs.manifest import check_output_name
-from clpipe.outputs.sidecar import SidecarError, inputs_in, outputs_in, read_sidecar
+from clpipe.outputs.sidecar import SidecarError, input_entries, output_entries, read_sidecar
 
-CODE = (".py", ".cl")  # the endings of files that are run
+CODE = (".py", ".cl")  # extensions of files that contain code
 
 
 @dataclass(frozen=True)
 class Replay:
-    """One picture to make again.
+    """A picture to recompute.
 
     Args:
         request: the request in the sidecar.
-        job: the image, and the rendition of it.
-        made: what the sidecar says of the program, the device and the versions of libraries.
-        outputs: the SHA-256 of the files that it lists, by their names.
+        job: the image with the rendition.
+        environment: the program, device and library versions that the sidecar states.
+        outputs: the SHA-256 of the files that the sidecar lists, by name.
     """
 
     request: Request
     job: Job
-    made: Mapping[str, str]
+    environment: Mapping[str, str]
     outputs: Mapping[str, str]
 
     def comparison(self, sidecar: Path) -> tuple[bool, str]:
-        """Whether the picture's bytes are the same, and in words, with what differs if not.
+        """Return whether the picture's bytes are the same, and a text that names differences.
 
-        ``sidecar`` is that of the picture that was made again.
+        Args:
+            sidecar: the sidecar of the recomputed picture.
 
         Raises:
-            ImageError: there is none, or it is damaged.
+            ImageError: the sidecar is missing or damaged.
         """
         try:
             values = read_sidecar(sidecar)
         except FileNotFoundError:
-            raise ImageError(f"{sidecar}: it is not there any more") from None
-        made, now = digests_in(values), surroundings_in(values)
-        others = sorted(n for n in {*self.outputs, *made} if self.outputs.get(n) != made.get(n))
-        if not others:
+            raise ImageError(f"{sidecar}: this sidecar no longer exists") from None
+        environment, current = digests_in(values), environment_in(values)
+        differing = sorted(
+            n for n in {*self.outputs, *environment} if self.outputs.get(n) != environment.get(n)
+        )
+        if not differing:
             return True, "the same bytes"
         changed = [
-            f"{what} {short(was) or 'unknown'} (now {short(now.get(what, '')) or 'unknown'})"
-            for what, was in self.made.items()
-            if was != now.get(what)
+            f"{key} {shorten(old) or 'unknown'} (now {shorten(current.get(key, '')) or 'unknown'})"
+            for key, old in self.environment.items()
+            if old != current.get(key)
         ]
-        why = f"made with {', '.join(changed)}" if changed else "by the same program and device"
-        return False, f"other bytes ({', '.join(others)}): {why}"
+        reason = f"made with {', '.join(changed)}" if changed else "by the same program and device"
+        return False, f"other bytes ({', '.join(differing)}): {reason}"
 
 
 def digests_in(values: Mapping[str, Any]) -> dict[str, str]:
-    """The SHA-256 of the files that a sidecar's values list, by their names."""
-    return {name: str(each["sha256"]) for name, each in outputs_in(values).items()}
+    """Return the SHA-256 of the files that a sidecar's values list, by name."""
+    return {name: str(each["sha256"]) for name, each in output_entries(values).items()}
 
 
-def short(value: str) -> str:
+def shorten(value: str) -> str:
     """Shorten a digest for people; return other values unchanged."""
     return value[:12] if re.fullmatch("[0-9a-f]{64}", value) else value
 
 
-def surroundings_in(values: Mapping[str, Any]) -> dict[str, str]:
+def environment_in(values: Mapping[str, Any]) -> dict[str, str]:
     """Return what a picture's bytes depend on besides the request, by name, from a sidecar.
 
     Raises:
         KeyError, TypeError, AttributeError: they are damaged.
     """
     versions = {name: str(version) for name, version in values["versions"].items()}
-    return {"program": str(values["program"]), **flat(values["device"]), **versions}
+    return {"program": str(values["program"]), **device_values(values["device"]), **versions}
 
 
-def flat(device: Mapping[str, Any]) -> dict[str, str]:
-    """The values of a sidecar's device, by names that a reader understands.
+def device_values(device: Mapping[str, Any]) -> dict[str, str]:
+    """Return the values of a sidecar's device with descriptive names.
 
-    >>> flat({"name": "RTX 5090", "lanes": 1})
+    >>> device_values({"name": "RTX 5090", "lanes": 1})
     {'device name': 'RTX 5090', 'device lanes': '1'}
     """
     return {f"device {key}": str(value) for key, value in device.items()}
@@ -96,18 +99,18 @@ def replay_of(
     max_pixels: int | None,
     stage_files: Sequence[Path] = (),
 ) -> Replay:
-    """What is to be made again, by its sidecar.
+    """Return the picture to recompute for a sidecar.
 
     Args:
-        path: of the sidecar.
-        inputs: where its input is now; none means, where it was.
+        path: the sidecar.
+        inputs: the current path of the picture's input; empty if it has not moved.
         max_pixels: as for :class:`~clpipe.chain.request.Request`.
-        stage_files: code that may be run. Files that only a sidecar names are not run.
+        stage_files: stage files that may be run. Files that only the sidecar names are not run.
 
     Raises:
-        RequestError: it is no sidecar, or one of another version. Or the input or a file that was
-            used (a camera profile, a curve) is missing or has changed. Or it was made with stage
-            files that are not among these.
+        RequestError: the file is not a sidecar, or was written by another version. The input or a
+            file that was used (a camera profile, a curve) is missing or has changed. The picture
+            was made with other stage files.
     """
     if len(inputs) > 1:
         raise RequestError(f"{path}: it has one input; found {len(inputs)}")
@@ -115,8 +118,8 @@ def replay_of(
     try:
         replay = _replay(values, inputs, max_pixels)
         files = {str(name): str(digest) for name, digest in values["request"]["files"].items()}
-        of = inputs_in(values, replay.job.paths)
-        files |= {str(path): str(was["sha256"]) for path, was in of}
+        inputs_of_job = input_entries(values, replay.job.paths)
+        files |= {str(path): str(expected["sha256"]) for path, expected in inputs_of_job}
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise RequestError(f"{path}: it is damaged: {error}") from None
     code = {name: files.pop(name) for name in list(files) if Path(name).suffix in CODE}
@@ -132,10 +135,10 @@ def replay_of(
 
 
 def _values(path: Path) -> Mapping[str, Any]:
-    """The values of a sidecar of this version.
+    """Return the values of a sidecar of this version.
 
     Raises:
-        RequestError: it is none.
+        RequestError: the file is not a sidecar, or was written by another version.
     """
     try:
         values = read_sidecar(path)
@@ -157,10 +160,10 @@ def _values(path: Path) -> Mapping[str, Any]:
 
 
 def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int | None) -> Replay:
-    """The replay of a sidecar's values.
+    """Return the picture to recompute for the values of a sidecar.
 
     Raises:
-        RequestError, KeyError, TypeError, ValueError, AttributeError: they are damaged.
+        RequestError, KeyError, TypeError, ValueError, AttributeError: the values are damaged.
     """
     name, rendition = str(values["name"]), Rendition.from_record(values)
     check_output_name(name)
@@ -176,54 +179,54 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
         baselines=(rendition.role,) if rendition.role in BASELINES else (),
     )
     path = inputs[0] if inputs else fetch(path_of(str(values["input"])))
-    others = tuple(path.parent / str(each["file"]) for each in values.get("subframes", ())[1:])
+    differing = tuple(path.parent / str(each["file"]) for each in values.get("subframes", ())[1:])
     job = Job(
         path,
         request.image_name,
         name,
         values=request.image,
         renditions=(rendition,),
-        subframes=others,
+        subframes=differing,
     )
-    return Replay(request, job, surroundings_in(values), digests_in(values))
+    return Replay(request, job, environment_in(values), digests_in(values))
 
 
 def _check_code(path: Path, code: Mapping[str, str], stage_files: Sequence[Path]) -> None:
-    """See that the code of a sidecar is that of stage files which the user named.
+    """Check that the user named all stage files of a sidecar.
 
     Args:
-        path: of the sidecar, for messages.
-        code: the SHA-256 of each file of code, by its name.
-        stage_files: those that the user named; only they are loaded.
+        path: the sidecar, for messages.
+        code: the SHA-256 of each file with code, by name.
+        stage_files: the files that the user named. Only these are loaded.
 
     Raises:
-        RequestError: a file is not among them.
+        RequestError: a file is missing in them, or has changed.
     """
     trusted = digests(map(str, code_files(stage_files))).values()
-    for name, was in code.items():
-        if was not in trusted:
+    for name, expected in code.items():
+        if expected not in trusted:
             raise RequestError(
-                f"{path}: was made with {name} (SHA-256 {was[:12]}...), and a sidecar runs no "
+                f"{path}: was made with {name} (SHA-256 {expected[:12]}...), and a sidecar runs no "
                 "code; where you trust that file, name it: --stage-file FILE.py"
             )
 
 
 def _check_files(path: Path, files: Mapping[str, str]) -> None:
-    """See that files are what they were.
+    """Check that files have not changed.
 
     Args:
-        path: of the sidecar, for messages.
-        files: the SHA-256 of each, by its name.
+        path: the sidecar, for messages.
+        files: the expected SHA-256 of each file, by name.
 
     Raises:
-        RequestError: one cannot be read, or has changed.
+        RequestError: a file cannot be read, or has changed.
     """
-    for name, was in files.items():
-        now = digests([name]).get(name)
-        if now is None:
+    for name, expected in files.items():
+        current = digests([name]).get(name)
+        if current is None:
             raise RequestError(f"{path}: {name}: cannot be read, and was used")
-        if now != was:
+        if current != expected:
             raise RequestError(
-                f"{path}: {name}: has changed since (SHA-256 {now[:12]}..., was {was[:12]}...), so "
-                "the picture would be another one"
+                f"{path}: {name}: this file has changed (SHA-256 {current[:12]}..., was "
+                f"{expected[:12]}...), so the picture would differ"
             )

@@ -59,7 +59,7 @@ class Summary:
             self.megapixels += outcome.megapixels
             self.much_clipped += outcome.clipped >= MUCH
             if outcome.clipped > self.most_clipped[0]:
-                self.most_clipped = outcome.clipped, outcome.job.shown
+                self.most_clipped = outcome.clipped, outcome.job.display_name
         if outcome.error:
             self.failures.append(outcome.error)
         if outcome.reason:
@@ -75,8 +75,8 @@ class Summary:
     @property
     def exit_status(self) -> int:
         """The exit status of a command: 130 after an interruption, 1 if something is missing."""
-        is_fruitless = self.counts[LEFT_OUT] > 0 == self.counts[DONE] + self.counts[SKIPPED]
-        return INTERRUPTED if self.interrupted else int(bool(self.failures or is_fruitless))
+        has_no_result = self.counts[LEFT_OUT] > 0 == self.counts[DONE] + self.counts[SKIPPED]
+        return INTERRUPTED if self.interrupted else int(bool(self.failures or has_no_result))
 
     @property
     def elapsed(self) -> float:
@@ -89,8 +89,8 @@ class Summary:
         >>> Summary(1, seconds={"decode": 1.0, "device": 2.0, "encode": 1.0}).shares()
         'decode 25 %, device 50 %, encode 25 %'
         """
-        whole = sum(self.seconds.values()) or 1.0
-        return ", ".join(f"{s} {100 * t / whole:.0f} %" for s, t in self.seconds.items())
+        total = sum(self.seconds.values()) or 1.0
+        return ", ".join(f"{s} {100 * t / total:.0f} %" for s, t in self.seconds.items())
 
     def record(self) -> dict[str, Any]:
         """Return the counts as JSON values."""
@@ -107,8 +107,8 @@ class Summary:
 
 
 def _line(event: str, at: float, values: Mapping[str, Any]) -> bytes:
-    moment = datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds")
-    return (json.dumps({"event": event, "at": moment, **values}) + "\n").encode()
+    time_text = datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds")
+    return (json.dumps({"event": event, "at": time_text, **values}) + "\n").encode()
 
 
 class RunLog:
@@ -131,7 +131,7 @@ class RunLog:
     def _write(self, line: bytes) -> None:
         try:
             if self._file is None:
-                self._file = self._opened()
+                self._file = self._open()
                 line = self._start + line
             _append(self._file, line)
         except OSError as error:
@@ -139,7 +139,7 @@ class RunLog:
         if self._echo:
             self._echo(line)
 
-    def _opened(self) -> int:
+    def _open(self) -> int:
         """Open the file after its last whole line.
 
         Raises:
@@ -167,7 +167,7 @@ class RunLog:
             "image",
             outcome.began,
             {
-                "input": job.shown,
+                "input": job.display_name,
                 "name": job.key,
                 "stem": job.stem,
                 "status": outcome.status,

@@ -46,9 +46,9 @@ class Runners:
             if chain is recipe.chain:
                 return runner
         runner = self._writer.runner(recipe, self._device)
-        alike = self._by_results.setdefault((runner.keep, runner.encode, runner.final), runner)
-        if alike is not runner:
-            runner = alike.for_chain(recipe.chain)  # shares the plans
+        existing = self._by_results.setdefault((runner.keep, runner.encode, runner.final), runner)
+        if existing is not runner:
+            runner = existing.for_chain(recipe.chain)  # shares the plans
         self._latest.insert(1, (recipe.chain, runner))
         del self._latest[4:]
         return runner

@@ -17,17 +17,17 @@ from clpipe.base.errors import OutputError, RequestError
 from clpipe.base.files import check_folder, discard
 from clpipe.base.processors import available_processors
 from clpipe.base.urls import upload, url_of
+from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.outcome import Outcome
-from clpipe.batch.processes import Processes, usual_processes
+from clpipe.batch.processes import Processes, default_processes
 from clpipe.batch.remote_tars import RemoteTars
 from clpipe.batch.run_log import RunLog, Summary, log_name
 from clpipe.batch.sinks import Executor, Folder
 from clpipe.batch.spec import RunSpec
 from clpipe.batch.tar_sink import Tars
-from clpipe.batch.tars import Tar, cut
+from clpipe.batch.tars import Tar, split_into_tars
 from clpipe.batch.threads import Batch
 from clpipe.batch.trace import Trace, check_trace
-from clpipe.batch.where import Where
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.isos import draw_note
 from clpipe.chain.request import Request
@@ -36,7 +36,7 @@ from clpipe.images.read import PICTURE_SUFFIXES
 from clpipe.inputs.find import Job, Shard, find_jobs
 from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
-from clpipe.inputs.poses import with_views
+from clpipe.inputs.poses import assign_views
 from clpipe.inputs.series import Series
 from clpipe.outputs.existing import pictures_without_input
 from clpipe.outputs.folder import output_folder, remove_unfinished
@@ -66,7 +66,7 @@ class Images:
     series: Series = field(default_factory=Series)
     shard: Shard = field(default_factory=Shard)
     per_tar: int | None = None
-    found: Sequence[Job] = ()
+    known_jobs: Sequence[Job] = ()
 
     @property
     def is_whole(self) -> bool:
@@ -79,16 +79,16 @@ class Images:
         Raises:
             RequestError: an input, a camera or an ISO does not exist, or two outputs have one name.
         """
-        jobs = self.found
+        jobs = self.known_jobs
         if not jobs:
-            found = find_jobs(self.inputs, output, loader.endings(), self.exclude)
-            jobs = loader.exposures(found)
-        jobs = with_views(jobs, self.poses, loader.settings.render, loader.request.truth_at)
+            known_jobs = find_jobs(self.inputs, output, loader.endings(), self.exclude)
+            jobs = loader.exposures(known_jobs)
+        jobs = assign_views(jobs, self.poses, loader.settings.render, loader.request.truth_at)
         jobs = self.series.jobs(jobs, loader.settings)
         if self.per_tar:
-            tars = self.shard.take(cut(jobs, self.per_tar, output))
+            tars = self.shard.select(split_into_tars(jobs, self.per_tar, output))
             return [job for tar in tars for job in tar.jobs], tars
-        return self.shard.take(jobs), []
+        return self.shard.select(jobs), []
 
 
 class Run:
@@ -134,16 +134,16 @@ class Run:
         self,
         request: Request,
         images: Images,
-        where: Where,
+        execution: ExecutionOptions,
         dask: str | None = None,
         arguments: Sequence[str] = (),
         echo: Callable[[bytes], None] | None = None,
     ) -> None:
         # In a checkout the version comes from git, which takes time; nothing waits for it here.
         threading.Thread(target=full_version, daemon=True).start()
-        check_output(where.output, images.per_tar)
-        check_processes(where, dask, images.per_tar)
-        self.where = where
+        check_output(execution.output, images.per_tar)
+        check_processes(execution, dask, images.per_tar)
+        self.execution = execution
         self.notes: list[str] = []
         self.images = images
         self._dask = dask
@@ -152,7 +152,7 @@ class Run:
         self._running: Executor | None = None
         self._is_stopped = False
         self._loader = ImageLoader(request)
-        self.jobs, self._tars = images.jobs(self._loader, where.output)
+        self.jobs, self._tars = images.jobs(self._loader, execution.output)
         self.summary = Summary(len(self.jobs))
         if not self.jobs:
             return
@@ -164,12 +164,12 @@ class Run:
             log.warning("%s", note)
         check_render_options(request, self._chain.source)
         self._request = request.with_outputs(self._chain)
-        self.writer = OutputWriter(where.output, self._request)
+        self.writer = OutputWriter(execution.output, self._request)
         self.writer.check(self._chain, self.jobs)
-        if where.trace:
-            check_trace(where.trace)
+        if execution.trace:
+            check_trace(execution.trace)
         if self._tars and dask is not None:
-            raise RequestError("--dask: it makes no tars; use --webdataset with --shard")
+            raise RequestError("--dask: Dask cannot write tars; use --webdataset with --shard")
 
     def __iter__(self) -> Iterator[Outcome]:
         return self.outcomes(self.jobs)
@@ -193,35 +193,39 @@ class Run:
         """
         if not self.jobs:
             return
-        images, where = self.images, self.where
+        images, execution = self.images, self.execution
         start = {"arguments": list(self._arguments), "images": len(self.jobs)}
         with ExitStack() as stack:
             sink = self.sink()
             executor = self._running = stack.enter_context(self._executor(sink, jobs))
             if self._is_stopped:
                 executor.stop()
-            stack.enter_context(output_folder(where.output, images.shard))
-            folders = images.series.under(where.output) if images.poses and images.is_whole else []
+            stack.enter_context(output_folder(execution.output, images.shard))
+            folders = (
+                images.series.folders_in(execution.output)
+                if images.poses and images.is_whole
+                else []
+            )
             if folders:
                 from clpipe.outputs.camera_files import check_camera_files
 
                 for folder in folders:
                     check_camera_files(folder)
-            trace = stack.enter_context(Trace(where.trace)) if where.trace else None
-            remove_unfinished(where.output, self.jobs, self._request.patch is not None)
-            if url := url_of(where.output):
-                stack.callback(discard, where.output)
+            trace = stack.enter_context(Trace(execution.trace)) if execution.trace else None
+            remove_unfinished(execution.output, self.jobs, self._request.patch is not None)
+            if url := url_of(execution.output):
+                stack.callback(discard, execution.output)
                 stack.callback(self._send_log, url)
-            run_log = RunLog(where.output / log_name(images.shard), start, self._echo)
+            run_log = RunLog(execution.output / log_name(images.shard), start, self._echo)
             stack.enter_context(closing(run_log))
             running = stack.enter_context(closing(sink.receive(executor, jobs)))
             self.summary.began = time.perf_counter()
-            yield from self._counted(running, run_log, trace)
-            self._look_behind(folders)
+            yield from self._log_outcomes(running, run_log, trace)
+            self._finish_folders(folders)
 
     def _send_log(self, url: str) -> None:
         """Upload the log next to the tars, under a unique name."""
-        path = self.where.output / log_name(self.images.shard)
+        path = self.execution.output / log_name(self.images.shard)
         if path.exists():
             began = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
             try:
@@ -229,7 +233,7 @@ class Run:
             except OutputError as error:  # it must not hide an error of the run
                 log.warning("%s; the log of this run is lost", error)
 
-    def _counted(
+    def _log_outcomes(
         self, running: Iterable[Outcome], log: RunLog, trace: Trace | None
     ) -> Iterator[Outcome]:
         """Count and log outcomes, and yield them.
@@ -257,7 +261,7 @@ class Run:
             if not unlogged:
                 log.end(self.summary)
 
-    def _look_behind(self, folders: Sequence[Path]) -> None:
+    def _finish_folders(self, folders: Sequence[Path]) -> None:
         """Write the camera files of a run's directories, and add notes."""
         if self.summary.interrupted:
             return
@@ -271,60 +275,62 @@ class Run:
         ):
             pictures, are = ("picture", "is") if count == 1 else ("pictures", "are")
             self.notes.append(
-                f"{count} {pictures} in {self.where.output} {are} of inputs that are not there any "
-                "more"
+                f"{count} {pictures} in {self.execution.output} {are} of inputs that no longer "
+                "exist"
             )
 
     def sink(self) -> Folder:
-        """Return where the pictures go: the output directory, tars in it, or tars at a URL.
+        """Return the sink of the pictures: the output directory, tars in it, or tars at a URL.
 
         Raises:
-            RequestError: the tars at the URL are not ours.
+            RequestError: clpipe did not write the tars at the URL.
         """
-        where = self.where
+        execution = self.execution
         if not self._tars:
-            return Folder(self.writer, where.redo)
-        kind = RemoteTars if url_of(where.output) else Tars
-        return kind(self.writer, where.redo, self._tars)
+            return Folder(self.writer, execution.redo)
+        kind = RemoteTars if url_of(execution.output) else Tars
+        return kind(self.writer, execution.redo, self._tars)
 
     def _executor(self, sink: Folder, jobs: Iterable[Job]) -> AbstractContextManager[Executor]:
-        """Return what does the jobs: threads or processes of this machine, or a cluster.
+        """Return the executor: threads or processes of this machine, or a cluster.
 
         Raises:
             RequestError: the cluster cannot be used.
             DeviceError: there is no usable device.
         """
-        where = self.where
+        execution = self.execution
         if self._dask is not None:
             from clpipe.batch.dask_client import connected
             from clpipe.batch.dask_worker import DaskSpec
 
-            return connected(self._dask, DaskSpec(self._request, where, self.jobs[0]))
+            return connected(self._dask, DaskSpec(self._request, execution, self.jobs[0]))
         # The size of the first image stands for all, because reading every header takes time.
         claim = self._loader.claim(self.jobs[0])
         if not sink.allows_processes:
             count = 1
-        elif where.processes:
-            count = where.processes
+        elif execution.processes:
+            count = execution.processes
         elif jobs is not self.jobs:  # a lazy iterable, whose length is unknown
             count = 1
         else:
-            count = usual_processes(len(self.jobs), claim, available_processors())
+            count = default_processes(len(self.jobs), claim, available_processors())
         if count > 1:
-            spec = RunSpec(self._request, where, self.jobs[0])
+            spec = RunSpec(self._request, execution, self.jobs[0])
             return nullcontext(Processes(spec, count, claim))
-        devices: list[Device | None] = [*open_devices(where.devices, where.memory)] or [None]
-        worker = ImageWorker(self._loader, sink, self._chain, where.trace is not None)
-        return nullcontext(Batch(worker, devices, where.threads))
+        devices: list[Device | None] = [*open_devices(execution.devices, execution.memory)] or [
+            None
+        ]
+        worker = ImageWorker(self._loader, sink, self._chain, execution.trace is not None)
+        return nullcontext(Batch(worker, devices, execution.threads))
 
 
-def check_processes(where: Where, dask: str | None, per_tar: int | None) -> None:
+def check_processes(execution: ExecutionOptions, dask: str | None, per_tar: int | None) -> None:
     """Check that the number of processes fits the way the run is done.
 
     Raises:
         RequestError: a cluster does the work, or tars are packed.
     """
-    if where.processes is None or where.processes == 1:
+    if execution.processes is None or execution.processes == 1:
         return
     if dask is not None:
         raise RequestError("--processes: with --dask the cluster's workers are the processes")
@@ -360,4 +366,6 @@ def check_render_options(request: Request, source: Kind) -> None:
     """
     for option, value in (("--layer", request.layer), ("--transfer", request.transfer)):
         if value is not None and source is not Kind.RGB:
-            raise RequestError(f"{option}: it is for renders, but the chain reads {source.label}")
+            raise RequestError(
+                f"{option}: this option is only for renders, but the chain reads {source.label}"
+            )

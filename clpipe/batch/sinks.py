@@ -1,4 +1,4 @@
-"""The interfaces of a run: executors make images, sinks receive them.
+"""The interfaces of a run: executors process images, and sinks receive the pictures.
 
 There are three executors: :class:`clpipe.batch.threads.Batch` (threads of this process),
 :class:`clpipe.batch.processes.Processes` (processes of this machine) and
@@ -13,12 +13,12 @@ from typing import Any, Protocol
 from clpipe.batch.outcome import Outcome
 from clpipe.chain.rendition import Rendition
 from clpipe.inputs.find import Job
-from clpipe.outputs.existing import Found, Redo, find
+from clpipe.outputs.existing import ExistingFiles, Redo, find_existing
 from clpipe.outputs.writer import OutputWriter
 
 
 class Executor(Protocol):
-    """Makes images. A job goes in, an outcome comes out; each executor runs once."""
+    """Processes jobs and yields their outcomes. Each executor runs once."""
 
     @property
     def is_stopping(self) -> bool:
@@ -46,12 +46,12 @@ class Folder:
 
     Args:
         writer: writes the files of a rendition.
-        redo: which existing pictures are made again.
+        redo: which existing pictures are recomputed.
 
     Attributes:
-        allows_processes: whether several processes may make its pictures. Processes look for
-            existing pictures in the output directory only, so a sink with another ``found`` says
-            False.
+        allows_processes: whether several processes may write its pictures. Processes search for
+            existing pictures in the output directory only, so a sink that overrides ``found`` sets
+            this to False.
     """
 
     allows_processes = True
@@ -60,18 +60,18 @@ class Folder:
         self.writer = writer
         self.redo = redo
 
-    def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> Found:
+    def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> ExistingFiles:
         """Return what exists of a rendition. The threads of an executor call it at the same time.
 
         Args:
             job: the image.
             rendition: one of its pictures.
-            request: the record of what is asked for, see :meth:`OutputWriter.record_of`.
+            request: the record of the request, see :meth:`OutputWriter.request_record`.
 
         Raises:
             ImageError: a file with the name of an output was not written by clpipe.
         """
-        return find(self.writer.files(job, rendition), job, request, self.redo.verifies)
+        return find_existing(self.writer.files(job, rendition), job, request, self.redo.verifies)
 
     def receive(self, executor: Executor, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
         """Let an executor do the jobs, and yield their outcomes.

@@ -4,11 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.memory_budget import default_budget
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.sinks import Folder
 from clpipe.batch.threads import Batch
-from clpipe.batch.where import Where
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.request import ResolvedRequest
 from clpipe.engine.device import Device
@@ -29,17 +29,17 @@ class RunSpec:
     """
 
     request: ResolvedRequest
-    where: Where
+    execution: ExecutionOptions
     first: Job
     folder: Path | None = None
 
     def worker(self) -> ImageWorker:
         """Return what does the work of each image."""
-        where = self.where
+        execution = self.execution
         loader = ImageLoader(self.request, self.folder)
-        sink = Folder(OutputWriter(where.output, self.request), where.redo)
+        sink = Folder(OutputWriter(execution.output, self.request), execution.redo)
         chain = loader.first_chain([self.first])
-        return ImageWorker(loader, sink, chain, where.trace is not None)
+        return ImageWorker(loader, sink, chain, execution.trace is not None)
 
     def batch(
         self,
@@ -57,7 +57,7 @@ class RunSpec:
             sharing: the number of processes that share the machine's memory.
             in_flight, compiled: as for :class:`~clpipe.batch.threads.Batch`.
         """
-        number = self.where.threads or threads
+        number = self.execution.threads or threads
         memory = default_budget(sharing)
         return Batch(self.worker(), devices, number, memory, in_flight, compiled)
 

@@ -23,16 +23,16 @@ from clpipe.batch.sinks import Executor, Folder
 from clpipe.batch.tars import OF_PATCHES, STAGING, Members, Tar, prepare
 from clpipe.chain.rendition import Rendition
 from clpipe.inputs.find import Job
-from clpipe.outputs.existing import Found, Redo, find, found_in
+from clpipe.outputs.existing import ExistingFiles, Redo, find_existing, match_sidecar
 from clpipe.outputs.folder import RESUMABLE
 from clpipe.outputs.record import patch_text
-from clpipe.outputs.sidecar import SIDECAR, outputs_in, read_sidecar
+from clpipe.outputs.sidecar import SIDECAR, output_entries, read_sidecar
 from clpipe.outputs.writer import OutputWriter
 
 # The bytes of a member: a file, an offset and size in the old tar, or the bytes themselves.
 Source = Path | tuple[int, int] | bytes
 
-COPIED = 1 << 20  # bytes that are copied at a time; tarfile's 16 KiB take three times as long
+COPY_BYTES = 1 << 20  # bytes that are copied at a time; tarfile's 16 KiB take three times as long
 
 
 @dataclass(frozen=True)
@@ -68,33 +68,33 @@ class Packer:
     def _member(self, job: Job, rendition: Rendition) -> str:
         """Return the name of a rendition's sidecar in the tar."""
         folder = OF_PATCHES if self._writer.patches else ""
-        return folder + self._packed_as(self._writer.path(job, SIDECAR, rendition))
+        return folder + self._member_name(self._writer.path(job, SIDECAR, rendition))
 
-    def _packed_as(self, path: Path) -> str:
+    def _member_name(self, path: Path) -> str:
         return path.relative_to(self.tar.staging).as_posix()
 
     def found(
         self, job: Job, rendition: Rendition, request: Mapping[str, Any], redo: Redo
-    ) -> Found:
+    ) -> ExistingFiles:
         """Return whether the tar holds a rendition of the same request. If so, it is reused.
 
         A tar does not say when its files were changed, so their SHA-256 is always compared.
-        Arguments as for :func:`clpipe.outputs.existing.find`.
+        Arguments as for :func:`clpipe.outputs.existing.find_existing`.
         """
         member = self._member(job, rendition)
         with self._lock:
             values = self._old.sidecar(member)
-        listed = outputs_in(values)
+        listed = output_entries(values)
         pictures = {path.name for path in self._writer.files(job, rendition).pictures}
         if not pictures <= listed.keys():
-            return Found.NOTHING
-        found = found_in(values, job, request, redo.verifies)
-        if found is Found.NOTHING:
+            return ExistingFiles.NOTHING
+        found = match_sidecar(values, job, request, redo.verifies)
+        if found is ExistingFiles.NOTHING:
             return found
-        beside = PurePosixPath(member.removeprefix(OF_PATCHES))
-        files = {str(beside.with_name(n)): was for n, was in listed.items()}
-        if any(self._old.sha256(file) != was["sha256"] for file, was in files.items()):
-            return Found.NOTHING
+        sidecar_path = PurePosixPath(member.removeprefix(OF_PATCHES))
+        files = {str(sidecar_path.with_name(n)): entry for n, entry in listed.items()}
+        if any(self._old.sha256(file) != entry["sha256"] for file, entry in files.items()):
+            return ExistingFiles.NOTHING
         if redo.keeps(found):
             self._reused[member] = list(files)
         return found
@@ -148,11 +148,11 @@ class Packer:
             member = self._member(job, rendition)
             if files := self._reused.get(member):
                 for file in (*files, member):
-                    yield file, self._old.places[file]
+                    yield file, self._old.locations[file]
                 continue
             sidecar = self._writer.path(job, SIDECAR, rendition)
-            for path in (sidecar.with_name(n) for n in outputs_in(read_sidecar(sidecar))):
-                yield self._packed_as(path), path
+            for path in (sidecar.with_name(n) for n in output_entries(read_sidecar(sidecar))):
+                yield self._member_name(path), path
             yield member, sidecar
 
     def _by_patch(
@@ -184,7 +184,7 @@ class Packer:
                 mode="w",
                 format=tarfile.GNU_FORMAT,
                 encoding="utf-8",
-                copybufsize=COPIED,
+                copybufsize=COPY_BYTES,
             ) as tar,
         ):
             for name, source in members:
@@ -222,15 +222,15 @@ class Tars(Folder):
         self._folders = folders
         self._packers = {tar.staging.name: Packer(tar, staged) for tar in tars}
 
-    def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> Found:
+    def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> ExistingFiles:
         """Return what exists of a rendition, in its tar or in the directory that will be packed."""
         packed = self._packers[self._folders[job.stem]].found(job, rendition, request, self.redo)
-        if packed is not Found.NOTHING:
+        if packed is not ExistingFiles.NOTHING:
             return packed
         # Without fsync a file may have its size and time after a loss of power, but neither its
         # bytes nor the mark that says whose it is.
         files = self.writer.files(job, rendition)
-        return find(files, job, request, verify=True, is_ours=True)
+        return find_existing(files, job, request, verify=True, is_exclusive=True)
 
     def receive(self, executor: Executor, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
         """Let an executor do the jobs, and yield their outcomes. Remnants are removed first.
@@ -244,15 +244,15 @@ class Tars(Folder):
         packing: Future[None] | None = None
         with ThreadPoolExecutor(1, "pack") as pool:
             for outcome in executor.run(jobs):
-                place = self._folders[outcome.job.stem]
-                packer = self._packers[place]
+                folder = self._folders[outcome.job.stem]
+                packer = self._packers[folder]
                 is_last = packer.add(outcome)
                 yield packer.packed(outcome)
                 if is_last:
                     if packing:
                         packing.result()
                     packing = pool.submit(self.pack, packer)
-                    del self._packers[place]
+                    del self._packers[folder]
             if packing:
                 packing.result()
 

@@ -14,7 +14,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.reading import TEXT_BYTES, check_regular
 from clpipe.inputs.find import Job
 from clpipe.outputs.folder import remove_unfinished
-from clpipe.outputs.sidecar import SIDECAR, SidecarError, is_sidecar, values_in
+from clpipe.outputs.sidecar import SIDECAR, SidecarError, is_sidecar, parse_sidecar
 
 STAGING = ".clpipe."  # prefix of the directory that holds a tar's pictures until it is packed
 
@@ -58,18 +58,18 @@ class Tar:
         return self.folder / f"{STAGING}{self.name}"
 
 
-def cut(jobs: Sequence[Job], count: int, folder: Path) -> list[Tar]:
+def split_into_tars(jobs: Sequence[Job], count: int, folder: Path) -> list[Tar]:
     """Return the tars of a run, with ``count`` jobs each, in the order of the jobs.
 
     Raises:
         RequestError: two jobs would have the same key, or WebDataset would skip one.
     """
-    owners: dict[str, Job] = {}
+    job_by_sample: dict[str, Job] = {}
     for job in jobs:
         name = sample_name(job)
-        if name in owners:
+        if name in job_by_sample:
             raise RequestError(
-                f"{owners[name].label} and {job.label} would both be the sample {name} "
+                f"{job_by_sample[name].label} and {job.label} would both be the sample {name} "
                 "(a key of WebDataset has no dots); give one of them another name"
             )
         if HIDDEN_BY_READERS.match(name):
@@ -77,8 +77,8 @@ def cut(jobs: Sequence[Job], count: int, folder: Path) -> list[Tar]:
                 f"{job.label}: would be the sample {name}, but WebDataset takes a folder "
                 "__NAME__ for its own and skips it; give it another name"
             )
-        owners[name] = job
-    samples = [replace(job, name=name) for name, job in owners.items()]
+        job_by_sample[name] = job
+    samples = [replace(job, name=name) for name, job in job_by_sample.items()]
     parts = [tuple(samples[first : first + count]) for first in range(0, len(samples), count)]
     return [Tar(folder, f"{i:06}.tar", part, len(parts)) for i, part in enumerate(parts)]
 
@@ -107,14 +107,14 @@ def prepare(tars: Sequence[Tar], overwrite: bool) -> None:
                 "would be read with them; remove it, or choose another output directory"
             )
     for tar in tars:
-        if not overwrite and os.path.lexists(tar.path) and not is_own(tar.path):
+        if not overwrite and os.path.lexists(tar.path) and not is_clpipe_tar(tar.path):
             raise RequestError(
                 f"{tar.path}: clpipe did not write this tar, or it is damaged, and would be "
                 "overwritten; move it, choose another output directory, or say --redo all"
             )
 
 
-def is_own(path: Path) -> bool:
+def is_clpipe_tar(path: Path) -> bool:
     """Return whether a file is a tar of clpipe: its first JSON is a sidecar, or it is all zeros.
 
     A loss of power may leave zeros.
@@ -142,34 +142,34 @@ class Members:
     def __init__(self, path: Path) -> None:
         self._path = path
         self.names: list[str] = []  # a name may occur twice
-        self.places: dict[str, tuple[int, int]] = {}  # offset and size, in bytes
+        self.locations: dict[str, tuple[int, int]] = {}  # offset and size, in bytes
         try:
             whole = check_regular(path).st_size
             with tarfile.open(path, "r:") as tar:
                 for info in tar:
                     if info.offset_data + info.size <= whole:
                         self.names.append(info.name)
-                        self.places[info.name] = (info.offset_data, info.size)
+                        self.locations[info.name] = (info.offset_data, info.size)
         except DAMAGED:
             pass
 
     def sidecar(self, name: str) -> Mapping[str, Any]:
         """Return a sidecar's values. They are empty if it is missing or was changed."""
-        if name not in self.places:
+        if name not in self.locations:
             return {}
-        start, size = self.places[name]
+        start, size = self.locations[name]
         try:
             with open(self._path, "rb") as file:
                 file.seek(start)
-                return values_in(file.read(min(size, TEXT_BYTES)), name) or {}
+                return parse_sidecar(file.read(min(size, TEXT_BYTES)), name) or {}
         except (OSError, SidecarError):
             return {}
 
     def sha256(self, name: str) -> str:
         """Return the SHA-256 of a file, or "" if it is missing or cannot be read."""
-        if name not in self.places:
+        if name not in self.locations:
             return ""
-        start, left = self.places[name]
+        start, left = self.locations[name]
         digest = hashlib.sha256()
         try:
             with open(self._path, "rb") as file:

@@ -20,7 +20,7 @@ from functools import partial
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.errors import OutputError, RequestError
 from clpipe.base.processors import available_processors
-from clpipe.batch.developing import TOGETHER, Developers, depth_of
+from clpipe.batch.developing import MAX_STACK, Developers, depth_of
 from clpipe.batch.job_state import JobState, failure_text
 from clpipe.batch.memory_budget import MemoryBudget, default_budget
 from clpipe.batch.outcome import Outcome
@@ -33,7 +33,7 @@ Jobs = queue.SimpleQueue[Job | Exception | None]  # None is the end; an error en
 
 Made = tuple[JobState, list[Written]]  # a job, and its renditions under temporary names
 
-COMMITTED = 64  # most images that are synchronised to the disk at a time
+MAX_COMMIT = 64  # most images that are synchronised to the disk at a time
 
 
 class Batch:
@@ -76,8 +76,8 @@ class Batch:
         )
         self._jobs: Jobs = queue.SimpleQueue()
         # None: one of the threads has ended.
-        self._made: queue.Queue[Made | None] = queue.Queue(COMMITTED)
-        self._outcomes: queue.Queue[Outcome | None] = queue.Queue(COMMITTED)
+        self._made: queue.Queue[Made | None] = queue.Queue(MAX_COMMIT)
+        self._outcomes: queue.Queue[Outcome | None] = queue.Queue(MAX_COMMIT)
 
     def stop(self) -> None:
         """Begin no more images, and finish those in flight. A signal handler may call it."""
@@ -115,19 +115,19 @@ class Batch:
             self.stop()
         committer = self._start("write", self._commit_all)
         threads: list[threading.Thread] = []
-        makers, is_over = 0, False
+        started, is_over = 0, False
         try:
             for number, device in enumerate(self.devices):
                 threads.append(self._start(f"device {number}", developers.develop_all, device))
-            for makers in range(1, self.in_flight + 1):
-                threads.append(self._start(f"image {makers - 1}", self._make_all))
+            for started in range(1, self.in_flight + 1):
+                threads.append(self._start(f"image {started - 1}", self._make_all))
             while (outcome := self._outcomes.get()) is not None:
                 yield outcome
             is_over = True
         finally:
             self.stop()
             self._budget.close()
-            for _ in range(self.in_flight - makers):  # threads that could not be started
+            for _ in range(self.in_flight - started):  # threads that could not be started
                 self._made.put(None)
             while not is_over and self._outcomes.get() is not None:
                 pass
@@ -167,8 +167,8 @@ class Batch:
 
     def _fail(self, error: BaseException) -> None:
         """Stop the run, and remember the first error."""
-        known = error if isinstance(error, Exception) else RuntimeError(repr(error))
-        self._failure = self._failure or known
+        exception = error if isinstance(error, Exception) else RuntimeError(repr(error))
+        self._failure = self._failure or exception
         self.stop()
 
     def _next(self, is_waiting: bool) -> Job | None:
@@ -187,7 +187,7 @@ class Batch:
     def _make_all(self) -> None:
         """Make images until there are no more."""
         decoded: list[JobState] = []
-        most = TOGETHER if self.in_flight == 1 else 1
+        max_in_flight = MAX_STACK if self.in_flight == 1 else 1
         try:
             while True:
                 with self._decoding:  # before a job is taken, so that jobs begin in order
@@ -195,7 +195,11 @@ class Batch:
                         decoded.append(self._decoded(job, decoded))
                 if not decoded:
                     break
-                if not job or len(decoded) >= most or not self._developers.is_small(decoded[-1]):
+                if (
+                    not job
+                    or len(decoded) >= max_in_flight
+                    or not self._developers.is_small(decoded[-1])
+                ):
                     self._make(decoded)
         except BaseException as error:  # of the run, not of one image
             self._fail(error)
@@ -203,12 +207,17 @@ class Batch:
         finally:
             self._made.put(None)
 
-    def _decoded(self, job: Job, beside: list[JobState]) -> JobState:
-        """Decode a job's image. ``beside`` are jobs that this thread has decoded and not made."""
+    def _decoded(self, job: Job, waiting_states: list[JobState]) -> JobState:
+        """Decode a job's image.
+
+        Args:
+            job: the job.
+            waiting_states: jobs that this thread has decoded and not yet developed.
+        """
         state = JobState(job, self._worker.loader)
         waits: list[float] = []
         try:
-            state = self._worker.decode(job, partial(self._admit, beside, waits))
+            state = self._worker.decode(job, partial(self._admit, waiting_states, waits))
         except OutputError as error:
             state.error = failure_text(job, error)
             self._fail(error)
@@ -220,7 +229,7 @@ class Batch:
         ]
         return state
 
-    def _admit(self, beside: list[JobState], waits: list[float], job: Job) -> None:
+    def _admit(self, waiting_states: list[JobState], waits: list[float], job: Job) -> None:
         """Wait until a job's image fits into memory, and append the seconds to ``waits``.
 
         Raises:
@@ -231,10 +240,10 @@ class Batch:
         if not developers.is_needed:
             worker.writer.check_folder()
         developers.begin()
-        size = worker.bytes_of(job, developers.most, None in self.devices)
+        size = worker.bytes_of(job, developers.max_in_flight, None in self.devices)
         start = time.perf_counter()
-        if beside and not self._budget.fits(size):
-            self._make(beside)  # which frees their memory
+        if waiting_states and not self._budget.fits(size):
+            self._make(waiting_states)  # which frees their memory
         self._budget.acquire(job.stem, size)
         waits.append(time.perf_counter() - start)
 
@@ -245,15 +254,15 @@ class Batch:
             DeviceError, RequestError: no device is left to make them.
         """
         failure: Exception | None = None
-        for state, orders in zip(decoded, self._developers.order(decoded), strict=True):
+        for state, orders in zip(decoded, self._developers.develop(decoded), strict=True):
             state.drop_pixels()
             self._budget.release(state.job.stem)
             try:
-                results = [order.written.result() for order in orders]
+                results = [develop.written.result() for develop in orders]
             except Exception as error:
                 failure = error
-                for order in orders:
-                    order.discard()
+                for develop in orders:
+                    develop.discard()
             else:
                 self._made.put((state, [written for written in results if written]))
         decoded.clear()
@@ -267,7 +276,7 @@ class Batch:
             while ended < self.in_flight:
                 taken = [self._made.get()]
                 with suppress(queue.Empty):
-                    while len(taken) < COMMITTED:
+                    while len(taken) < MAX_COMMIT:
                         taken.append(self._made.get_nowait())
                 made = [each for each in taken if each]
                 ended += taken.count(None)

@@ -29,8 +29,8 @@ from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.runner import Result, Runner, submit_together
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.existing import Found, Redo
-from clpipe.outputs.patches import every_patch
+from clpipe.outputs.existing import ExistingFiles, Redo
+from clpipe.outputs.patches import all_patches
 from clpipe.outputs.recipes import Recipe, recipes
 from clpipe.outputs.record import intrinsics_of, picture_record
 from clpipe.outputs.sidecar import SIDECAR, write_sidecar
@@ -81,12 +81,12 @@ class ImageWorker:
         self._spare = SpareArrays(count)
 
     @property
-    def layers(self) -> int:
+    def layer_count(self) -> int:
         """The number of layers that are read with an image: carried layers, and its depth."""
         return len(self.writer.request.carry) + bool(depth_steps(self.chain))
 
     @property
-    def later(self) -> int:
+    def later_exposures(self) -> int:
         """The number of exposures after the first one, if the light changes between them."""
         exposures = exposures_of(self.chain)
         return len(exposures.spans) - 1 if exposures else 0
@@ -101,12 +101,12 @@ class ImageWorker:
         """
         writer = self.writer
         results = min(len(writer.renditions_of(job)), most)
-        beside = 2 * self.layers + self.later
+        extra_images = 2 * self.layer_count + self.later_exposures
         if shutter := self.loader.shutter(job):
-            beside += 1 + self.later + bool(shutter.layer_of_light)
+            extra_images += 1 + self.later_exposures + bool(shutter.layer_of_light)
         # The noise of baselines is measured on floats.
         formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
-        kinds = results, formats, writer.request.keep, beside, in_numpy
+        kinds = results, formats, writer.request.keep, extra_images, in_numpy
         return host_bytes(self.loader.claim(job), self.chain, *kinds)
 
     def runners(self, device: Device | None) -> "Runners":
@@ -143,7 +143,7 @@ class ImageWorker:
                 else:
                     state.status = SKIPPED
             except (ImageError, RequestError, MemoryError) as error:
-                if state.loader.is_left_out(job, error):
+                if state.loader.is_skipped(job, error):
                     state.status = LEFT_OUT
                     state.reason = str(error) if isinstance(error, NoPictureError) else ""
                 else:
@@ -167,11 +167,11 @@ class ImageWorker:
         if redo is Redo.ALL:
             return self.writer.needed(state.job, renditions)
         found = {
-            each: self._sink.found(state.job, each, self.writer.record_of(state.request, each))
+            each: self._sink.found(state.job, each, self.writer.request_record(state.request, each))
             for each in renditions
         }
-        state.old = sum(there is Found.OLD for there in found.values())
-        missing = [each for each, there in found.items() if not redo.keeps(there)]
+        state.old = sum(existing is ExistingFiles.OLD for existing in found.values())
+        missing = [each for each, existing in found.items() if not redo.keeps(existing)]
         return self.writer.needed(state.job, missing)
 
     def _load(self, state: JobState, job: Job, renditions: Sequence[Rendition]) -> None:
@@ -196,29 +196,31 @@ class ImageWorker:
         intrinsics_of(loaded.chain, loaded.source)  # raises if they are impossible
         if patches := self.writer.patches:
             height, width = loaded.source.pixels.shape[:2]
-            state.patches = every_patch(patches, loaded.chain, width, height, job.key)
+            state.patches = all_patches(patches, loaded.chain, width, height, job.key)
         if any(map(self.writer.carries, renditions)):
             upright = self.writer.picture_orientation(loaded.source, loaded.chain)
-            state.aovs = state.loader.aovs(job, loaded, 1 if patches else upright)
+            state.carried_layers = state.loader.carried_layers(
+                job, loaded, 1 if patches else upright
+            )
             if patches and patches.augment:
-                state.aovs.check_turns()
+                state.carried_layers.check_no_vectors()
         state.source = loaded.source
         state.recipes = recipes(renditions, loaded.chain, loaded.key)
         state.unwritten = len(state.recipes)
 
     @staticmethod
-    def measured(state: JobState, recipe: Recipe) -> Recipe:
+    def with_matched_noise(state: JobState, recipe: Recipe) -> Recipe:
         """Return a recipe with its noise, if that follows from the results of earlier recipes."""
-        if not recipe.spread:
+        if not recipe.matcher:
             return recipe
-        method, estimates = recipe.spread.method(recipe.rendition.role)
+        method, estimates = recipe.matcher.method(recipe.rendition.role)
         chain = with_noise(recipe.chain, method)
-        known = replace(recipe, chain=chain, spread=None, estimates=estimates)
-        state.recipes[state.recipes.index(recipe)] = known
-        return known
+        completed = replace(recipe, chain=chain, matcher=None, estimates=estimates)
+        state.recipes[state.recipes.index(recipe)] = completed
+        return completed
 
     def start(
-        self, asked: Sequence[tuple[JobState, Recipe, Runner]]
+        self, requested: Sequence[tuple[JobState, Recipe, Runner]]
     ) -> list[Callable[[], Result | None]]:
         """Begin to develop renditions on one device. Small ones share launches.
 
@@ -230,22 +232,24 @@ class ImageWorker:
             DeviceError: the device cannot be used any more.
         """
         start = time.perf_counter()
-        orders = [self._tried(each[0], partial(self._order, *each)) for each in asked]
+        orders = [self._attempt(each[0], partial(self._order, *each)) for each in requested]
         ready = [order for order in orders if order]
         waits: list[Callable[[], Result] | None]
-        if len(asked) == 1:
-            waits = [self._tried(asked[0][0], lambda: submit_together(ready)[0]) if ready else None]
+        if len(requested) == 1:
+            waits = [
+                self._attempt(requested[0][0], lambda: submit_together(ready)[0]) if ready else None
+            ]
         else:
             try:
-                begun = iter(submit_together(ready) if ready else ())
-                waits = [next(begun) if order else None for order in orders]
+                results = iter(submit_together(ready) if ready else ())
+                waits = [next(results) if order else None for order in orders]
             except DeviceError:
                 raise
             except Exception:  # it does not say whose it is, so each is run alone instead
                 waits = [partial(o[0].run, *o[1:]) if o else None for o in orders]
         return [
             partial(self._finish, state, recipe, start, order[3].timings if order else None, wait)
-            for (state, recipe, _), order, wait in zip(asked, orders, waits, strict=True)
+            for (state, recipe, _), order, wait in zip(requested, orders, waits, strict=True)
         ]
 
     def _order(
@@ -258,9 +262,9 @@ class ImageWorker:
         width, height = runner.chain.size(*pixels.shape[1::-1])
         boxes = [patch.box for patch in state.patches]
         is_used_again = runner.encode and not boxes and device and not device.stacks(width, height)
-        into = self._spare.take((height, width, *pixels.shape[2:])) if is_used_again else None
+        reused = self._spare.take((height, width, *pixels.shape[2:])) if is_used_again else None
         timings: list[Timing] | None = [] if self._trace and device else None
-        options = RunOptions(timings, into=into, unchanged=True, boxes=boxes, later=source.later)
+        options = RunOptions(timings, into=reused, unchanged=True, boxes=boxes, later=source.later)
         return runner, pixels, recipe.noise_key, options
 
     def _finish(
@@ -272,11 +276,11 @@ class ImageWorker:
         wait: Callable[[], Result] | None,
     ) -> Result | None:
         """Wait for the result of a rendition."""
-        result = self._tried(state, wait) if wait else None
+        result = self._attempt(state, wait) if wait else None
         state.note("device", start)
         if result and result.final is not None:
-            for spread in {each.spread for each in state.recipes if each.spread}:
-                spread.take(recipe.rendition, result.final)
+            for matcher in {each.matcher for each in state.recipes if each.matcher}:
+                matcher.take(recipe.rendition, result.final)
         if result and recipe.estimates:
             result.estimates[recipe.chain.steps[-1].name] = dict(recipe.estimates)
         name = threading.current_thread().name
@@ -286,7 +290,7 @@ class ImageWorker:
         return result
 
     @staticmethod
-    def _tried(state: JobState, work: Callable[[], T]) -> T | None:
+    def _attempt(state: JobState, work: Callable[[], T]) -> T | None:
         """Return the result of some work. If it fails, note the state's error and return None."""
         try:
             return work()
@@ -331,7 +335,7 @@ class ImageWorker:
             try:
                 self.fail(state, error)
             except OutputError as reason:
-                state.error, failure = f"{state.job.shown}: {reason}", reason
+                state.error, failure = f"{state.job.display_name}: {reason}", reason
         if failure:
             raise failure
 
@@ -359,7 +363,7 @@ class ImageWorker:
         assert state.source
         carried = None
         if writer.carries(recipe.rendition):
-            carried, state.aovs = state.aovs, None
+            carried, state.carried_layers = state.carried_layers, None
         files = writer.write(job, recipe, state.source, result, carried, state.patches)
         clipped = None if recipe.noise else clipped_share(result, recipe.chain)
         if recipe.chain.source is not Kind.DISPLAY:  # photographs are clipped already
@@ -367,7 +371,7 @@ class ImageWorker:
         path = writer.path(job, SIDECAR, recipe.rendition)
         record = picture_record(
             job,
-            writer.record_of(state.request, recipe.rendition),
+            writer.request_record(state.request, recipe.rendition),
             state.stamps,
             recipe,
             device,

@@ -145,7 +145,7 @@ def _database() -> Any:
     except ImportError:
         raise KeyedError(
             "lens",
-            f"lens: lensfun's database comes with lensfunpy, which is not installed; {INSTALL}",
+            f"lens: lensfun's database needs lensfunpy. Run: {INSTALL}",
         ) from None
 
 

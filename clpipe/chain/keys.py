@@ -111,7 +111,12 @@ _ALL = (
         "aperture",
         "The f-number of the lens. Without it, a lens from lensfun's database has no vignetting.",
     ),
-    _of_lens("focus_distance", "The distance at which the lens is focused; far by default.", "m"),
+    _of_lens(
+        "focus_distance",
+        "The distance to the plane in focus. By default, vignetting is that at infinity, and "
+        "the stage defocus uses 3.",
+        "m",
+    ),
     Key("seed", int, "The seed of the noise.", usual="0"),
     Key(
         "noise_key",

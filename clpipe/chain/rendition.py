@@ -65,8 +65,8 @@ class Rendition:
         """Whether this is the noisy picture, or the first frame of its burst."""
         return self.role == NOISY and not self.frame
 
-    def beside(self, role: Role) -> "Rendition":
-        """Return the rendition of a role at the same exposure; for a burst, its first frame."""
+    def with_role(self, role: Role) -> "Rendition":
+        """Return the rendition with another role at the same exposure, or its first frame."""
         return replace(self, role=role, frame=0 if role == NOISY and self.frames else None)
 
     @classmethod

@@ -8,7 +8,7 @@ import click
 from clpipe.base.errors import RequestError
 from clpipe.base.processors import available_processors
 from clpipe.base.text import whole_number
-from clpipe.batch.bench import CPU_STEPS, BatchSpeed, bench_batch, loads
+from clpipe.batch.bench import CPU_STEPS, BatchSpeed, bench_batch, workloads
 from clpipe.chain.methods import base_name, stage_named
 from clpipe.commands.chain_options import chain_options, device_option, request_of
 from clpipe.commands.completion import methods_of
@@ -95,7 +95,7 @@ def bench(
         ask_for_report(device)
         return
     if batch:
-        batches = [bench_batch(device, request, load) for load in loads()]
+        batches = [bench_batch(device, request, workload) for workload in workloads()]
         if as_json:
             show_json({**machine_record(device), "batches": [b.record() for b in batches]})
             return
@@ -132,7 +132,7 @@ def bench(
 
 
 def batch_row(speed: BatchSpeed) -> tuple[str, ...]:
-    """Return the row of one load."""
+    """Return the table row of one batch."""
     return (
         f"{speed.images} of {speed.width}x{speed.height}",
         f"{speed.megapixels_per_second:.1f}",

@@ -14,16 +14,22 @@ from clpipe.base.errors import RequestError
 from clpipe.camera.text import check_profile_name
 from clpipe.chain.keys import KEYS
 from clpipe.commands.chain_options import option
-from clpipe.commands.options import EXISTING, Command, json_option, options_set, output_option
+from clpipe.commands.options import (
+    EXISTING,
+    Command,
+    json_option,
+    options_on_command_line,
+    output_option,
+)
 from clpipe.commands.printing import show, show_json
 from clpipe.images.dump import parse_dump
 from clpipe.reference.cfa import PATTERNS, Pattern
 
-CALIBRATION = (
+HEADINGS = (
     *("ISO", "frames", "K, DN/e-", "read, DN", "row, DN", "column, DN", "DSNU, e-", "PRNU, %"),
     *("hot", "dead", "pixels used"),
 )
-WITH_EMVA = ("emva", "output", "iso", "as_json")  # options that are allowed with --emva
+EMVA_OPTIONS = ("emva", "output", "iso", "as_json")  # options that are allowed with --emva
 
 
 @click.command("calibrate", cls=Command)
@@ -88,11 +94,13 @@ def calibrate(
     """
     check_profile_name(output)
     if emva:
-        others = [option for name, option in options_set().items() if name not in WITH_EMVA]
-        if inputs or others:
-            found = "FRAMES" if inputs else others[0]
+        disallowed = [
+            option for name, option in options_on_command_line().items() if name not in EMVA_OPTIONS
+        ]
+        if inputs or disallowed:
+            other = "FRAMES" if inputs else disallowed[0]
             raise RequestError(
-                f"--emva: found {found} as well, but the series names its frames; remove {found}"
+                f"--emva: found {other} as well, but the series names its frames; remove {other}"
             )
         calibrate_emva(emva, output, iso, as_json)
         return
@@ -112,45 +120,45 @@ def calibrate(
         }
         show_json(record)
         return
-    show(CALIBRATION, map(calibration_row, calibrations), left=0)
-    for one in calibrations:
-        for note in one.notes:
-            click.echo(f"ISO {one.iso:g}: {note}")
+    show(HEADINGS, map(calibration_row, calibrations), left=0)
+    for calibration in calibrations:
+        for note in calibration.notes:
+            click.echo(f"ISO {calibration.iso:g}: {note}")
     click.echo(f"\nwrote {output} and {picture}")
 
 
 def calibrate_emva(series: Path, output: Path, iso: float | None, as_json: bool) -> None:
     """Measure a series according to EMVA 1288, write the profile and print the figures."""
-    moments, found = measure_series(series)
-    picture = write_emva_profile(output, series, iso, moments, found)
+    moments, figures = measure_series(series)
+    picture = write_emva_profile(output, series, iso, moments, figures)
     if as_json:
         files = {"profile": str(output), "picture": str(picture)}
-        show_json({**files, "figures": found.record()})
+        show_json({**files, "figures": figures.record()})
         return
-    show(("figure", "value", "unit"), emva_rows(found))
+    show(("figure", "value", "unit"), emva_rows(figures))
     click.echo(f"\nwrote {output} and {picture}")
 
 
-def emva_rows(found: Figures) -> list[tuple[str, str, str]]:
+def emva_rows(figures: Figures) -> list[tuple[str, str, str]]:
     """Return the rows of a table of figures, with standard errors."""
-    errors = found.linearity
+    errors = figures.linearity
     rows: list[tuple[str, Estimate | None, float, str]] = [
-        ("system gain K", found.system_gain, 1, "DN/e-"),
-        ("responsivity R", found.responsivity, 1, "DN/photon"),
-        ("quantum efficiency", found.quantum_efficiency, 100, "%"),
-        ("dark noise", found.dark_noise, 1, "e-"),
-        ("dark noise, rounding included", found.dark_noise_dn, 1, "DN"),
-        ("sensitivity threshold", found.threshold, 1, "photons"),
-        ("saturation capacity", found.saturation, 1, "photons"),
-        ("saturation capacity", found.saturation_electrons, 1, "e-"),
-        ("maximum signal-to-noise ratio", found.snr_max, 1, ""),
-        ("dynamic range", found.dynamic_range, 1, ""),
+        ("system gain K", figures.system_gain, 1, "DN/e-"),
+        ("responsivity R", figures.responsivity, 1, "DN/photon"),
+        ("quantum efficiency", figures.quantum_efficiency, 100, "%"),
+        ("dark noise", figures.dark_noise, 1, "e-"),
+        ("dark noise, rounding included", figures.dark_noise_dn, 1, "DN"),
+        ("sensitivity threshold", figures.threshold, 1, "photons"),
+        ("saturation capacity", figures.saturation, 1, "photons"),
+        ("saturation capacity", figures.saturation_electrons, 1, "e-"),
+        ("maximum signal-to-noise ratio", figures.snr_max, 1, ""),
+        ("dynamic range", figures.dynamic_range, 1, ""),
         ("linearity error, minimum", errors.least, 1, "%"),
         ("linearity error, maximum", errors.most, 1, "%"),
     ]
     for name, figure, factor, unit in (
-        ("DSNU1288", found.dsnu, 1, "e-"),
-        ("PRNU1288", found.prnu, 100, "%"),
+        ("DSNU1288", figures.dsnu, 1, "e-"),
+        ("PRNU1288", figures.prnu, 100, "%"),
     ):
         rows.append((name, figure.total, factor, unit))
         rows += [
@@ -158,32 +166,31 @@ def emva_rows(found: Figures) -> list[tuple[str, str, str]]:
             for part in ("row", "column", "pixel")
         ]
     rows += [
-        ("dark current, from means", found.dark_current, 1, "e-/s"),
-        ("dark current, from noise", found.dark_current_of_noise, 1, "e-/s"),
+        ("dark current, from means", figures.dark_current, 1, "e-/s"),
+        ("dark current, from noise", figures.dark_current_of_noise, 1, "e-/s"),
     ]
     return [(name, estimate_text(figure, factor), unit) for name, figure, factor, unit in rows]
 
 
 def estimate_text(estimate: Estimate | None, factor: float = 1) -> str:
-    """Return an estimate with its standard error; a dash if there is none."""
+    """Return an estimate with its standard error, or a dash if there is none."""
     if estimate is None:
         return "-"
     return f"{estimate.value * factor:.4g} ± {estimate.error * factor:.1g}"
 
 
-def calibration_row(one: Calibration) -> tuple[str, ...]:
+def calibration_row(calibration: Calibration) -> tuple[str, ...]:
     """Return the row of one ISO: figures with their standard errors."""
-
     return (
-        f"{one.iso:g}",
-        f"{one.scene_frames} + {one.dark_frames} dark",
-        estimate_text(one.pooled.gain),
-        estimate_text(one.read_noise),
-        estimate_text(one.row_noise),
-        estimate_text(one.column_noise),
-        estimate_text(one.dsnu, 1 / one.pooled.gain.value),
-        estimate_text(one.prnu, 100),
-        str(len(one.hot.rows)) if one.hot else "-",
-        str(len(one.dead.rows)) if one.dead else "-",
-        f"{one.used:.1%}",
+        f"{calibration.iso:g}",
+        f"{calibration.scene_frames} + {calibration.dark_frames} dark",
+        estimate_text(calibration.pooled.gain),
+        estimate_text(calibration.read_noise),
+        estimate_text(calibration.row_noise),
+        estimate_text(calibration.column_noise),
+        estimate_text(calibration.dsnu, 1 / calibration.pooled.gain.value),
+        estimate_text(calibration.prnu, 100),
+        str(len(calibration.hot.rows)) if calibration.hot else "-",
+        str(len(calibration.dead.rows)) if calibration.dead else "-",
+        f"{calibration.used:.1%}",
     )

@@ -70,21 +70,23 @@ def import_command(path: Path, camera: str | None, output: Path | None, as_json:
     """
     from clpipe.analysis.noise_models.read import import_camera
 
-    text, made = import_camera(path, camera, output)
+    text, profile = import_camera(path, camera, output)
     if as_json:
         written = {"profile": None if output is None else str(output), "toml": text}
-        show_json(written | {"make": made.make, "model": made.model, "iso_range": made.iso_range})
+        show_json(
+            written | {"make": profile.make, "model": profile.model, "iso_range": profile.iso_range}
+        )
         return
     if output is None:
         click.echo(text, nl=False)
         return
-    low, high = made.iso_range
+    low, high = profile.iso_range
     isos = f"ISO {low:g}" if low == high else f"ISO {low:g} to {high:g}"
-    click.echo(f"wrote {output}: {make_and_model(made)}, {isos}")
+    click.echo(f"wrote {output}: {make_and_model(profile)}, {isos}")
 
 
 class CamerasCommand(Command):
-    """Accepts the name of a camera, or the word "import" and the arguments of that command."""
+    """A command that accepts a camera's name, or "import" with the arguments of that command."""
 
     def make_context(self, info_name: str | None, args: list[str], *rest: Any, **more: Any) -> Any:
         if args[:1] == [import_command.name]:
@@ -121,9 +123,9 @@ def cameras(names: tuple[str, ...], iso: float | None, as_json: bool) -> None:
             )
         show_cameras(map(load_camera, built_in_cameras()), as_json)
         return
-    called = [] if built_in_name(name) else cameras_called(name)
-    if iso is None and len(called) > 1:
-        show_cameras(map(load_camera, called), as_json)
+    matches = [] if built_in_name(name) else cameras_called(name)
+    if iso is None and len(matches) > 1:
+        show_cameras(map(load_camera, matches), as_json)
         return
     camera = load_camera(name)
     if as_json:
@@ -159,7 +161,9 @@ def camera_row(camera: Camera) -> tuple[str, ...]:
 
 
 def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[str, ...], Rows]]:
-    """Return a camera's noise at an ISO, or at all measured ISOs, as titles, headings and rows.
+    """Return tables of a camera's noise at an ISO, or at all measured ISOs.
+
+    Each table has a title, headings and rows.
 
     Raises:
         RequestError: the ISO is outside the camera's range.
@@ -207,18 +211,18 @@ def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[st
 
 
 def known_text(camera: Camera, key: str) -> str:
-    """Return a figure of a profile that is the same at every ISO, or "unknown".
+    """Return a value of a profile that is the same at every ISO, or "unknown".
 
     >>> known_text(load_camera("sony-a7s2"), "prnu")
     'unknown'
     """
-    said = key in camera.model_fields_set or key in DERIVED
+    is_known = key in camera.model_fields_set or key in DERIVED
     value = getattr(camera, key)
-    return short_text(value) if said and value is not None else UNKNOWN
+    return short_text(value) if is_known and value is not None else UNKNOWN
 
 
 def dark_frames_row(camera: Camera, iso: float) -> tuple[str, ...]:
-    """Return the row of an ISO with figures of dark frames other than their noise."""
+    """Return the row of one ISO with values of dark frames other than their noise."""
     stage, unit = camera.gain_stage(iso), camera.signal_range
     shape = camera.tukey_lambda_at(iso)
     bias = ", ".join(f"{offset * unit:.3g}" for offset in camera.color_bias(iso))
@@ -236,7 +240,7 @@ def figures(iso: float, *values: float) -> tuple[str, ...]:
 
 
 def noise_at(camera: Camera, iso: float) -> dict[str, Any]:
-    """Return the noise at an ISO in all three forms, and of dark frames, rows and columns in DN.
+    """Return the noise at an ISO in all three forms, and that of dark frames in DN.
 
     Raises:
         RequestError: the ISO is outside the camera's range.

@@ -1,7 +1,7 @@
-"""Options that set keys: those of a configuration, and those of a run.
+"""Command-line options for the keys of a configuration and of a run.
 
-Their names, types, ranges, choices and texts are in :mod:`clpipe.chain.keys` and
-:mod:`clpipe.chain.options`.
+:mod:`clpipe.chain.keys` and :mod:`clpipe.chain.options` define the names, types, ranges, choices
+and texts.
 """
 
 import math
@@ -23,7 +23,7 @@ from clpipe.commands.options import EXISTING, F, output_option
 
 
 class FormatName(click.Choice[str]):
-    """A format by any of its names."""
+    """The name of a format, or one of its aliases."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         return super().convert(format_named(value), param, ctx)
@@ -54,7 +54,7 @@ TYPES: dict[str, Any] = {
 
 
 def option(key: Key, parameter: str = "", **others: Any) -> Callable[[F], F]:
-    """Return the option of a command that sets a key.
+    """Return a decorator that adds the option for a key to a command.
 
     Args:
         key: the key, from which type, range, choices and help follow.
@@ -82,14 +82,18 @@ def option(key: Key, parameter: str = "", **others: Any) -> Callable[[F], F]:
 
 
 def options(*keys: Key | str) -> Callable[[F], F]:
-    """Return the options of a command that set keys. Name a key of :data:`OPTIONS` by its name."""
+    """Return a decorator that adds the options for keys to a command.
 
-    def decorated(function: F) -> F:
+    Args:
+        *keys: keys, or names of keys in :data:`OPTIONS`.
+    """
+
+    def decorate(function: F) -> F:
         for key in reversed(keys):
             function = option(OPTIONS[key] if isinstance(key, str) else key)(function)
         return function
 
-    return decorated
+    return decorate
 
 
 set_option = click.option(
@@ -109,19 +113,19 @@ SETTINGS = tuple(key for name, key in KEYS.items() if name not in ("camera", "is
 
 
 def chain_options(function: F) -> F:
-    """Add the options that choose a chain; :func:`request_of` makes a request of them."""
-    own = options("config", KEYS["camera"], KEYS["iso"], *SETTINGS, "start_at", "until", CODE)
-    return own(set_option(function))
+    """Add the options that choose a chain, which :func:`request_of` converts to a request."""
+    chosen = options("config", KEYS["camera"], KEYS["iso"], *SETTINGS, "start_at", "until", CODE)
+    return chosen(set_option(function))
 
 
 def settings_in(options: dict[str, Any]) -> dict[str, Any]:
-    """Remove the settings from a command's options, and return them nested as in a configuration.
+    """Remove the settings from a command's options, and return them nested like a configuration.
 
     Raises:
         RequestError: an assignment is wrong, or sets a value that an option also sets.
     """
-    own = {key: options.pop(key) for key in KEYS if key in options and key != CODE}
-    settings = {key: value for key, value in own.items() if value not in (None, ())}
+    chosen = {key: options.pop(key) for key in KEYS if key in options and key != CODE}
+    settings = {key: value for key, value in chosen.items() if value not in (None, ())}
     assigned: dict[str, dict[str, Any]] = {}
     for text in options.pop("assignments", ()):
         stage, parameter, value = parse_assignment(text)
@@ -132,7 +136,7 @@ def settings_in(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def request_of(options: dict[str, Any]) -> Request:
-    """Return the request that a command's options describe. Every option must belong to it.
+    """Return the request for a command's options, which must all be keys of a request.
 
     Raises:
         RequestError: a name or value is not allowed.

@@ -1,7 +1,7 @@
 """Shell completion of the names of cameras, configurations, stages and parameters.
 
-Each function has the signature of click's ``shell_complete``. It imports the packages that it
-needs, because commands that do not use it have options that name it.
+Each function has the signature of click's ``shell_complete``. It imports packages when it is
+called, because every command imports this module.
 """
 
 from collections.abc import Iterable

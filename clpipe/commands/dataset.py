@@ -12,9 +12,9 @@ from rich.console import Console
 
 from clpipe.base.errors import RequestError
 from clpipe.base.files import check_folder
+from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.run_log import Summary
 from clpipe.batch.session import Images, Run
-from clpipe.batch.where import Where
 from clpipe.chain.keys import CODE
 from clpipe.chain.options import OPTIONS, TRUTH
 from clpipe.chain.panorama import projection_of
@@ -32,21 +32,27 @@ from clpipe.commands.options import (
     EXISTING,
     GroupedCommand,
     json_lines_option,
-    options_set,
+    options_on_command_line,
     output_option,
     quiet_option,
 )
 from clpipe.commands.progress import Reporter, follow, print_line
-from clpipe.inputs.around import wide_of
+from clpipe.inputs.panoramas import wide_lens_of
 from clpipe.inputs.series import Series, split_series
 from clpipe.reference.panorama import CUBE
 from clpipe.reference.projection import seen_faces
 from clpipe.reference.wide import MODELS
 from clpipe.scenes.blender import Rendering
-from clpipe.scenes.card import About, write_card
-from clpipe.scenes.record import keep_said
+from clpipe.scenes.card import CardContents, write_card
+from clpipe.scenes.record import store_credits
 from clpipe.scenes.source import NOTE, RENDERS, UNIT, Source, from_folder, from_scene
-from clpipe.scenes.view_request import PATHS, asked_views, parse_box, parse_frames, parse_resolution
+from clpipe.scenes.view_request import (
+    PATHS,
+    parse_box,
+    parse_frames,
+    parse_resolution,
+    requested_views,
+)
 from clpipe.stage import StageRole
 
 # Options that apply only to a scene.
@@ -140,7 +146,7 @@ def dataset(
     lens_model: str | None,
     quiet: bool,
     json_lines: bool,
-    **chosen: Any,
+    **options: Any,
 ) -> None:
     """Make a dataset of a Blender scene, or of a directory of existing renders.
 
@@ -160,9 +166,9 @@ def dataset(
     clpipe dataset renders/ -o set --iso 100,800 --camera sony-a7r2 --camera canon-5d2
     """
     check_folder(output)
-    said = {name: chosen.pop(name) for name in ("licence", "author")}
-    rendering = {name: chosen.pop(name) for name in RENDER_OPTIONS}
-    settings = settings_in(chosen)
+    attribution = {name: options.pop(name) for name in ("licence", "author")}
+    rendering = {name: options.pop(name) for name in RENDER_OPTIONS}
+    settings = settings_in(options)
     if lens_model:
         stage = stage_in(StageRole.VIEW).name
         view = settings.setdefault(stage, {})
@@ -173,7 +179,7 @@ def dataset(
             )
         view["method"] = lens_model
     series, values = split_series(settings, always=True)
-    request = Request.from_options(values=values, **chosen)
+    request = Request.from_options(values=values, **options)
     if not series.isos and "iso" not in request.settings().draws:
         series = replace(series, isos=(request.settings().iso,))
     series.jobs((), request.settings())  # rejects errors before anything is rendered
@@ -181,23 +187,23 @@ def dataset(
         if source.suffix.lower() == ".blend":
             check_chain(request)
             program = rendering.pop("blender")
-            asked = rendering_of(source, output, poses, request.settings().seed, rendering)
-            asked = replace(asked, faces=faces_of(request, asked.resolution))
-            renders = from_scene(stack, asked, output, program)
+            job = rendering_from(source, output, poses, request.settings().seed, rendering)
+            job = replace(job, faces=cube_faces(request, job.resolution))
+            renders = from_scene(stack, job, output, program)
         else:
-            refuse_rendering()
+            reject_render_options()
             renders = from_folder(source, output, poses)
         request = replace(request, carry=request.carry or renders.layers)
-        said = keep_said(output, said)
+        attribution = store_credits(output, attribution)
         echo = print_line if json_lines else None
         quiet |= json_lines
-        summary = develop(renders, request, output, series, selector, quiet, said, echo)
+        summary = develop(renders, request, output, series, selector, quiet, attribution, echo)
     if renders.failure:
         raise renders.failure
     sys.exit(summary.exit_status)
 
 
-def rendering_of(
+def rendering_from(
     scene: Path, output: Path, poses: Path | None, seed: int, options: Mapping[str, Any]
 ) -> Rendering:
     """Return the job for Blender.
@@ -205,14 +211,14 @@ def rendering_of(
     Raises:
         RequestError: the options contradict each other.
     """
-    own = dict(options)
-    named = {name: own.pop(name) for name in VIEW_OPTIONS}
-    views = asked_views(**named, poses=poses, seed=seed)
+    rendering = dict(options)
+    named = {name: rendering.pop(name) for name in VIEW_OPTIONS}
+    views = requested_views(**named, poses=poses, seed=seed)
     # Blender has another working directory.
-    return Rendering(scene.absolute(), (output / RENDERS).absolute(), views, **own, seed=seed)
+    return Rendering(scene.absolute(), (output / RENDERS).absolute(), views, **rendering, seed=seed)
 
 
-def faces_of(request: Request, resolution: tuple[int, int] | None) -> dict[str, Any] | None:
+def cube_faces(request: Request, resolution: tuple[int, int] | None) -> dict[str, Any] | None:
     """Return the faces of a cube that a wide lens sees; None without such a lens.
 
     Args:
@@ -223,7 +229,7 @@ def faces_of(request: Request, resolution: tuple[int, int] | None) -> dict[str, 
         RequestError: a face is not square.
         ImageError: the lens is impossible.
     """
-    projection = projection_of(request.chain()) if wide_of(request.settings()) else None
+    projection = projection_of(request.chain()) if wide_lens_of(request.settings()) else None
     if projection is None:
         return None
     side, names = seen_faces(projection.lens)
@@ -253,13 +259,13 @@ def check_chain(request: Request) -> None:
         raise
 
 
-def refuse_rendering() -> None:
-    """Check that no option is set that applies only to a scene.
+def reject_render_options() -> None:
+    """Reject options that apply only to a scene.
 
     Raises:
         RequestError: such an option is set.
     """
-    for name, flag in options_set().items():
+    for name, flag in options_on_command_line().items():
         if name in RENDER_OPTIONS:
             raise RequestError(
                 f"{flag}: this option applies only to a .blend, not to existing renders; remove it"
@@ -273,7 +279,7 @@ def develop(
     series: Series,
     selector: str | None,
     quiet: bool,
-    said: Mapping[str, str],
+    attribution: Mapping[str, str],
     echo: Callable[[bytes], None] | None,
 ) -> Summary:
     """Develop each render when it is finished, then write the dataset's README and lists.
@@ -281,25 +287,27 @@ def develop(
     Raises:
         ClpipeError: the run cannot continue.
     """
-    found = renders.jobs() or ()
-    images = Images(renders.inputs, poses=renders.poses, series=series, found=found)
-    where = Where(output, () if selector is None else (selector,))
-    made = Run(request, images, where, arguments=sys.argv[1:], echo=echo)
-    reporter = Reporter(made, Console(stderr=True), quiet)
-    tell = (lambda text: None) if quiet else reporter.print
+    jobs = renders.jobs() or ()
+    images = Images(renders.inputs, poses=renders.poses, series=series, known_jobs=jobs)
+    execution = ExecutionOptions(output, () if selector is None else (selector,))
+    run = Run(request, images, execution, arguments=sys.argv[1:], echo=echo)
+    reporter = Reporter(run, Console(stderr=True), quiet)
+    show = (lambda text: None) if quiet else reporter.print
 
     if note := renders.about.get(NOTE):
-        tell(f"note: {note}")
+        show(f"note: {note}")
 
     def stop() -> None:
-        made.stop()
+        run.stop()
         renders.stop()
 
-    outcomes = made.outcomes(renders.as_rendered(made.jobs, tell))
-    follow(made, outcomes, quiet, reporter, stop)
-    if not made.summary.interrupted:
+    outcomes = run.outcomes(renders.jobs_when_rendered(run.jobs, show))
+    follow(run, outcomes, quiet, reporter, stop)
+    if not run.summary.interrupted:
         unit = renders.about.get(UNIT, "as in the renders")
-        about = About(renders.about, said["licence"], said["author"], unit, sys.argv[1:])
+        about = CardContents(
+            renders.about, attribution["licence"], attribution["author"], unit, sys.argv[1:]
+        )
         written = write_card(output, RENDERS, about)
-        tell(f"wrote {', '.join(map(str, written))}")
-    return made.summary
+        show(f"wrote {', '.join(map(str, written))}")
+    return run.summary

@@ -13,10 +13,10 @@ from clpipe.chain.keys import KEYS
 from clpipe.commands.chain_options import device_option, option
 from clpipe.commands.options import Command, json_option, output_option
 from clpipe.commands.printing import show_json
-from clpipe.commands.progress import told
+from clpipe.commands.progress import status_line
 from clpipe.engine.device import open_device
 
-USUAL = SeriesSize()
+DEFAULT = SeriesSize()
 
 
 @click.command("emva", cls=Command)
@@ -25,14 +25,14 @@ USUAL = SeriesSize()
 @output_option("DIR", "The directory of the series. It is created if it does not exist.")
 @click.option(
     "--size",
-    default=f"{USUAL.width}x{USUAL.height}",
+    default=f"{DEFAULT.width}x{DEFAULT.height}",
     show_default=True,
     metavar="WxH",
     help="The size of a frame in px.",
 )
 @click.option(
     "--exposures",
-    default=USUAL.exposures,
+    default=DEFAULT.exposures,
     show_default=True,
     type=click.IntRange(LEAST_EXPOSURES, 10_000),
     help="The number of exposures, evenly from dark to saturation. A tenth as many follow above "
@@ -40,7 +40,7 @@ USUAL = SeriesSize()
 )
 @click.option(
     "--stack",
-    default=USUAL.stack,
+    default=DEFAULT.stack,
     show_default=True,
     type=click.IntRange(3, 10_000),
     help="The number of frames at half saturation, and of dark frames, for DSNU and PRNU.",
@@ -80,16 +80,16 @@ def emva(
             f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 640x480, "
             f"with each side from {least} to {most} px"
         )
-    of = SeriesSize(columns, rows, exposures, stack)
-    with told() as tell:
+    series_size = SeriesSize(columns, rows, exposures, stack)
+    with status_line() as show:
         series = simulate(
             camera,
             iso,
             seed,
             output,
-            of,
+            series_size,
             open_device(selector),
-            lambda done, total: tell(f"{done} of {total} frames"),
+            lambda finished, total: show(f"{finished} of {total} frames"),
         )
     if as_json:
         stacks = len(series.bright_stack.frames), len(series.dark_stack.frames)

@@ -28,8 +28,8 @@ from clpipe.inputs.loader import ImageLoader
     "--port",
     type=click.IntRange(1, 65535),
     metavar="N",
-    help="The port of the page, for example to forward it to another machine. [default: a free "
-    "port]",
+    help="The TCP port that serves the page. Set it to forward the port through SSH, for example. "
+    "[default: a free port]",
 )
 def explore(
     inputs: tuple[str, ...],
@@ -38,13 +38,13 @@ def explore(
     port: int | None,
     **chosen: Any,
 ) -> None:
-    """Try a camera on renders: a page in the browser, developed live as settings change.
+    """Try a camera on renders, on a page in the browser that updates as you change settings.
 
     The page has a control for every parameter of every stage. It shows the image of any stage,
-    pixel values, the histogram, the noise of a region and the time of each launch. Next to the
-    picture it shows other settings or the clean picture. Save the settings as a configuration, or
-    copy them as a command; both give the same picture. Only this machine can open the page, at the
-    printed address.
+    pixel values, the histogram, the noise of a region and the time of each launch. You can compare
+    the picture with other settings or with the clean picture. Save the settings as a configuration,
+    or copy them as a command. Both give the same picture. Only this machine can open the page, at
+    the printed address.
 
     \b
     clpipe explore render.exr

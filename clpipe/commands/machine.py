@@ -1,4 +1,4 @@
-"""The machine of a measurement, as a record that contains no paths of its owner."""
+"""Describes the machine of a measurement, without the user's paths."""
 
 import platform
 from typing import Any
@@ -22,7 +22,7 @@ def machine_record(device: Device) -> dict[str, Any]:
 
 
 def ask_for_report(device: Device) -> None:
-    """Print how to report results from a device that is no CPU, as few are tested."""
+    """Print how to report results from a device that is not a CPU, because few are tested."""
     if device.info.type != "CPU":
         click.echo(
             f"clpipe is developed on CPUs. To report results for this {device.info.type}, run the "

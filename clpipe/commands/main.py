@@ -1,4 +1,4 @@
-"""The program: a group of commands, each imported on first use."""
+"""The command ``clpipe``: a group of commands, each imported on first use."""
 
 import ast
 import gc
@@ -22,19 +22,20 @@ from clpipe.base.system import address_space, processors, save_addresses
 from clpipe.base.text import alike, either, one_line
 from clpipe.commands.notices import NOTICES
 
-# Commands by the headings of the help. Each is a module here that defines a function of its name.
+# Commands by heading of the help. Each is a module of this package that defines a function of its
+# name.
 GROUPS = {
     "Make pictures": ("run", "replay", "dataset", "meter"),
-    "Look at them": ("report", "explore", "compare", "measure", "poses"),
+    "View and measure results": ("report", "explore", "compare", "measure", "poses"),
     "Cameras": ("cameras", "calibrate", "emva", "match"),
-    "What runs, and where": ("stages", "plan", "devices", "check", "bench"),
+    "Stages and devices": ("stages", "plan", "devices", "check", "bench"),
 }
 COMMANDS = tuple(name for names in GROUPS.values() for name in names)
 
-
-# Bytes of address space that libraries need, and each of their threads, one per processor.
-LIBRARIES = 240 << 20
-OF_THREAD = 10 << 20
+# Bytes of address space that the libraries need, and that each of their threads needs. They start
+# one thread per processor.
+LIBRARY_ADDRESSES = 240 << 20
+THREAD_ADDRESSES = 10 << 20
 
 
 class LazyGroup(click.Group):
@@ -53,7 +54,7 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         if args[0] not in COMMANDS and not ctx.resilient_parsing:
-            ctx.fail(f"No such command '{one_line(args[0])}'.{meant(args[0])}")
+            ctx.fail(f"No such command '{one_line(args[0])}'.{suggestion(args[0])}")
         return super().resolve_command(ctx, args)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -63,7 +64,7 @@ class LazyGroup(click.Group):
         if cmd_name not in COMMANDS:
             return None
         prepare_memory()
-        gc.disable()  # imported objects stay; collecting garbage takes a tenth of the time
+        gc.disable()  # imported objects stay, and collecting garbage takes a tenth of the time
         command = getattr(import_module(f"clpipe.commands.{cmd_name}"), cmd_name)
         gc.enable()
         assert isinstance(command, click.Command)
@@ -95,7 +96,7 @@ class LazyGroup(click.Group):
         except BrokenPipeError:
             sys.exit(0)
         except OSError as error:
-            fail(refused(error))
+            fail(os_error(error))
         except MemoryError:
             fail(
                 DeviceError(
@@ -105,8 +106,8 @@ class LazyGroup(click.Group):
             )
 
 
-def meant(text: str) -> str:
-    """Return what an unknown command probably means, as the end of a message."""
+def suggestion(text: str) -> str:
+    """Return the end of a message about an unknown command: what the user probably meant."""
     from clpipe.camera.profile import built_in_name
     from clpipe.chain.registry import all_stages
 
@@ -117,10 +118,10 @@ def meant(text: str) -> str:
     if camera := built_in_name(text):
         return f" It is a camera; to see its noise, use 'clpipe cameras {camera}'."
     stages = (f"stages {name}" for name in all_stages())
-    near = alike(text, (*COMMANDS, "cameras import", "--version"), 0.62) or alike(text, stages)
-    if not near:
+    matches = alike(text, (*COMMANDS, "cameras import", "--version"), 0.62) or alike(text, stages)
+    if not matches:
         return f" The commands are {', '.join(COMMANDS)}."
-    return f" Did you mean {either(f'clpipe {name}' for name in near)}?"
+    return f" Did you mean {either(f'clpipe {name}' for name in matches)}?"
 
 
 def prepare_memory() -> None:
@@ -129,13 +130,15 @@ def prepare_memory() -> None:
         return
     save_addresses()
     try:
-        check_addresses(LIBRARIES + OF_THREAD * processors(), "loading clpipe's libraries")
+        check_addresses(
+            LIBRARY_ADDRESSES + THREAD_ADDRESSES * processors(), "loading clpipe's libraries"
+        )
     except DeviceError as error:
         fail(error)
 
 
-def refused(error: OSError) -> ClpipeError:
-    """Return the error for a failure of the operating system, with the file if there is one."""
+def os_error(error: OSError) -> ClpipeError:
+    """Return clpipe's error for an error of the operating system, with the file's name if any."""
     if error.filename is not None:
         return OutputError(f"{error.filename}: {error.strerror or error}")
     if isinstance(error, FileNotFoundError):  # only the working directory has no name
@@ -165,9 +168,9 @@ def fail(error: ClpipeError) -> NoReturn:
     sys.exit(error.exit_status)
 
 
-def say_version(context: click.Context, _: click.Parameter, is_asked: bool) -> None:
+def print_version(context: click.Context, _: click.Parameter, is_set: bool) -> None:
     """Print the version with the commit, which is slow to look up, and exit."""
-    if is_asked and not context.resilient_parsing:
+    if is_set and not context.resilient_parsing:
         click.echo(f"clpipe, version {full_version()}")
         context.exit()
 
@@ -181,7 +184,7 @@ def say_version(context: click.Context, _: click.Parameter, is_asked: bool) -> N
     is_flag=True,
     expose_value=False,
     is_eager=True,
-    callback=say_version,
+    callback=print_version,
     help="Show the version and exit.",
 )
 def main() -> None:

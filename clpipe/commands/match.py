@@ -23,24 +23,24 @@ from clpipe.commands.chain_options import device_option, option
 from clpipe.commands.notices import NOTICES
 from clpipe.commands.options import Command, json_option, output_option
 from clpipe.commands.printing import Rows, number, show, show_json
-from clpipe.commands.progress import EVERY
+from clpipe.commands.progress import LINE_INTERVAL
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
 
-class Follower(Watch):
+class SearchProgress(Watch):
     """Shows the progress of a search, and writes the best configuration whenever it improves.
 
     Args:
         output: the path of the configuration.
-        console: the console to print on; a terminal shows a bar inside the context.
+        console: the console to print on. A terminal shows a bar inside the context.
     """
 
     def __init__(self, output: Path, console: Console) -> None:
         self._output = output
         self._console = console
-        self._began = self._said = time.perf_counter()
+        self._start = self._last_line = time.perf_counter()
         self._written: Settings | None = None
         self._bar: Progress | None = None
         self._live = contextlib.ExitStack()
@@ -70,7 +70,7 @@ class Follower(Watch):
     def advanced(self, share: float, best: Candidate, scenes: Scenes) -> None:
         """Write the best settings if they are new, and show the progress.
 
-        Without a terminal, a line is printed now and then.
+        Without a terminal, a line is printed every 10 s.
         """
         residuals = f"residuals of {best.residual:.2g}"
         if best.settings is not self._written:
@@ -81,11 +81,11 @@ class Follower(Watch):
         now = time.perf_counter()
         text = f"{share:.0%}; {residuals}"
         if share:
-            text += f"; about {duration((now - self._began) * (1 / share - 1))} left"
+            text += f"; about {duration((now - self._start) * (1 / share - 1))} left"
         if self._bar:
             self._bar.update(self._task, completed=share, description=text)
-        elif now - self._said >= EVERY:
-            self._said = now
+        elif now - self._last_line >= LINE_INTERVAL:
+            self._last_line = now
             self._print(text)
 
 
@@ -139,35 +139,35 @@ def match(
     """
     require("clpipe match", "scipy", *(["matplotlib"] if plot else []))
     check_names(output, plot)
-    follower = Follower(output, Console(stderr=True))
+    search = SearchProgress(output, Console(stderr=True))
     try:
-        with interruptible(follower.stop), follower:
-            found = match_files(frames, means, camera, iso, selector, follower)
+        with interruptible(search.stop), search:
+            result = match_files(frames, means, camera, iso, selector, search)
     except StoppedError:
-        click.echo(f"stopped: {follower.state}", err=True)
+        click.echo(f"stopped: {search.state}", err=True)
         raise click.exceptions.Exit(INTERRUPTED) from None
-    write_configuration(output, found.settings, found.scenes, found.remarks)
+    write_configuration(output, result.settings, result.scenes, result.remarks)
     if plot is not None:
         from clpipe.analysis.matching.plot import draw
 
-        draw(found, plot)
+        draw(result, plot)
     if as_json:
-        show_json({"configuration": str(output), **found.record()})
+        show_json({"configuration": str(output), **result.record()})
         return
-    for note in found.scenes.notes:
+    for note in result.scenes.notes:
         click.echo(f"note: {note}")
-    headings, *rows = columns_table(found)
+    headings, *rows = columns_table(result)
     show(headings, rows, left=1)
-    click.echo(f"\n{summary(found)}")
-    for each in found.warnings:
-        click.echo(f"warning: {each}")
+    click.echo(f"\n{summary(result)}")
+    for warning in result.warnings:
+        click.echo(f"warning: {warning}")
     click.echo(f"wrote {' and '.join(map(str, [output, *([plot] if plot else [])]))}")
 
 
-def columns_table(found: Match) -> Rows:
+def columns_table(result: Match) -> Rows:
     """Return a row for each column, with residuals and their standard errors."""
     rows: Rows = [("column", "theirs", "ours", "residual", "in places not searched")]
-    for seen, unseen in zip(found.seen, found.unseen, strict=True):
+    for seen, unseen in zip(result.seen, result.unseen, strict=True):
         text = COLUMNS[seen.name].text
         figures = number(seen.theirs, ".3f"), number(seen.ours, ".3f")
         rows.append((text, *figures, residual_text(seen), residual_text(unseen)))
@@ -175,17 +175,17 @@ def columns_table(found: Match) -> Rows:
 
 
 def residual_text(row: Row) -> str:
-    """Return a residual and its error; in percent if it is relative."""
+    """Return a residual with its standard error, in percent if it is relative."""
     if row.residual != row.residual:
         return "-"
     factor, form, unit = (100, ".1f", " %") if row.relative else (1, ".3f", "")
     return f"{row.residual * factor:+{form}} ± {row.error * factor:{form}}{unit}"
 
 
-def summary(found: Match) -> str:
+def summary(result: Match) -> str:
     """Return the result of the search in two lines."""
-    tables = found.settings.parameters.items()
+    tables = result.settings.parameters.items()
     methods = [f"{name} {table['method']}" for name, table in tables if "method" in table]
-    numbers = [f"{name} = {value_text(value)}" for name, value in found.numbers.items()]
-    developments = f"after {found.evaluations} developments"
-    return f"{', '.join([*methods, *numbers])}; {developments}\n{found.verdict}"
+    numbers = [f"{name} = {value_text(value)}" for name, value in result.numbers.items()]
+    developments = f"after {result.evaluations} developments"
+    return f"{', '.join([*methods, *numbers])}; {developments}\n{result.verdict}"

@@ -130,23 +130,23 @@ def iso_text(report: NoiseReport) -> str:
 
 
 def line_text(lines: LineNoise) -> str:
-    """Return the noise that rows or columns share; its upper limit if it is not significant."""
+    """Return the sigma of row or column noise, or its upper limit if it is not significant."""
     if lines.sigma > lines.limit:
         return number(lines.sigma)
     return "-" if math.isnan(lines.limit) else f"< {number(lines.limit)}"
 
 
 def measure_heading(report: NoiseReport) -> str:
-    """Return what was measured, in which unit, and in which pixels."""
+    """Return the heading of a report: the images, the unit, and the pixels that were used."""
     against = report.truth or ("their mean" if report.bursts == 1 else "the mean of their burst")
     of = f" in {report.bursts} bursts" if report.bursts > 1 else ""
     at = f", ISO {report.iso:g}" if report.iso else ""
-    what = "samples" if report.kind in ("mosaic", "values") else "pixels (flat, not clipped)"
+    unit_text = "samples" if report.kind in ("mosaic", "values") else "pixels (flat, not clipped)"
     lines = [
         f"{len(report.images)} x {report.kind}{of}, {report.width}x{report.height}{at}, "
         f"against {against}; "
         f"unit: {UNITS[report.kind]}",
-        f"{report.share:.1%} of the {what} are used; sigma (all) uses every one",
+        f"{report.share:.1%} of the {unit_text} are used; sigma (all) uses every one",
         *edges_text(report),
         *(f"note: {note}" for note in report.notes),
     ]
@@ -154,7 +154,7 @@ def measure_heading(report: NoiseReport) -> str:
 
 
 def edges_text(report: NoiseReport) -> list[str]:
-    """Return how much stronger the noise of pictures is at edges; [] for other images."""
+    """Return how much stronger the noise of pictures is at edges, or [] for other images."""
     if math.isnan(report.at_edges):
         return []
     ratio = f"{report.at_edges:.2f} times"
@@ -162,50 +162,60 @@ def edges_text(report: NoiseReport) -> list[str]:
 
 
 def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
-    """Return the tables of a report: titles and rows of text. The first row has the headings."""
-    names = [one.name for one in report.channels]
-    laws = ["a", "b"] if any(one.law for one in report.channels) else []
+    """Return the tables of a report: titles and rows of text. The first row holds the headings."""
+    names = [channel.name for channel in report.channels]
+    laws = ["a", "b"] if any(channel.law for channel in report.channels) else []
     which = "not clipped" if report.kind in ("mosaic", "values") else "flat"
     sigmas_of = f"sigma ({which}, {report.share:.0%})", "sigma (all, 100%)"
-    size: Rows = [("", "samples", *sigmas_of, *laws, "row sigma", "column sigma")]
-    shape: Rows = [("", *(f"{k}" for k in range(1, LAGS + 1)), "diagonal 1", "left after 2x2")]
-    far: Rows = [("", "skewness", "excess kurtosis", *(f"> {k} sigma" for k in SIGMAS))]
-    for one in report.channels:
+    noise_rows: Rows = [("", "samples", *sigmas_of, *laws, "row sigma", "column sigma")]
+    correlation_rows: Rows = [
+        ("", *(f"{k}" for k in range(1, LAGS + 1)), "diagonal 1", "left after 2x2")
+    ]
+    tail_rows: Rows = [("", "skewness", "excess kurtosis", *(f"> {k} sigma" for k in SIGMAS))]
+    for channel in report.channels:
         fit = [""] * len(laws)
-        if law := one.law:
+        if law := channel.law:
             fit = [f"{law.a:.4g} ± {law.a_error:.1g}", f"{law.b:.4g} ± {law.b_error:.1g}"]
-        lines = line_text(one.rows), line_text(one.columns)
-        sizes = number(one.sigma, ".4g"), number(one.whole_sigma, ".4g")
-        size.append((one.name, str(one.count), *sizes, *fit, *lines))
-        table, middle = one.autocorrelation, slice(LAGS + 1, None)
+        lines = line_text(channel.rows), line_text(channel.columns)
+        sizes = number(channel.sigma, ".4g"), number(channel.whole_sigma, ".4g")
+        noise_rows.append((channel.name, str(channel.count), *sizes, *fit, *lines))
+        table, middle = channel.autocorrelation, slice(LAGS + 1, None)
         right = [number(r, ".3f") for r in table[LAGS, middle]]
         down = [number(r, ".3f") for r in table[middle, LAGS]]
         diagonal = number(table[LAGS + 1, LAGS + 1], ".3f")
-        shape.append((f"{one.name} right", *right, diagonal, number(one.energy_left, ".3f")))
-        shape.append((f"{one.name} down", *down, "", ""))
-        tails = one.tails
+        correlation_rows.append(
+            (f"{channel.name} right", *right, diagonal, number(channel.energy_left, ".3f"))
+        )
+        correlation_rows.append((f"{channel.name} down", *down, "", ""))
+        tails = channel.tails
         moments = number(tails.skewness, ".3f"), number(tails.excess_kurtosis, ".3f")
-        far.append((one.name, *moments, *(number(p, ".2g") for p in tails.beyond)))
-    far.append(("Gaussian", "0", "0", *(f"{gaussian_beyond(k):.2g}" for k in SIGMAS)))
-    sigmas = [dict(zip(one.curve.bins, one.curve.sigma, strict=True)) for one in report.channels]
-    curve: Rows = [("intensity", *names)]
+        tail_rows.append((channel.name, *moments, *(number(p, ".2g") for p in tails.beyond)))
+    tail_rows.append(("Gaussian", "0", "0", *(f"{gaussian_beyond(k):.2g}" for k in SIGMAS)))
+    sigmas = [
+        dict(zip(channel.curve.bins, channel.curve.sigma, strict=True))
+        for channel in report.channels
+    ]
+    intensity_rows: Rows = [("intensity", *names)]
     for i in sorted(set().union(*sigmas)):
         middle_of_bin = (report.edges[i] + report.edges[i + 1]) / 2
         values = (f"{s[i]:.4g}" if i in s else "" for s in sigmas)
-        curve.append((f"{middle_of_bin:.3f}", *values))
+        intensity_rows.append((f"{middle_of_bin:.3f}", *values))
     pairs = [f"{a}-{b}" for a, b in report.correlations]
-    across: Rows = [tuple(pairs), tuple(number(r, ".3f") for r in report.correlations.values())]
+    channel_correlations: Rows = [
+        tuple(pairs),
+        tuple(number(r, ".3f") for r in report.correlations.values()),
+    ]
     return [
-        ("noise" + ("; variance = a * intensity + b" if laws else ""), size),
-        ("autocorrelation (independent noise: 0; left after 2x2: 0.25)", shape),
-        *([("correlation between channels", across)] if pairs else []),
+        ("noise" + ("; variance = a * intensity + b" if laws else ""), noise_rows),
+        ("autocorrelation (independent noise: 0; left after 2x2: 0.25)", correlation_rows),
+        *([("correlation between channels", channel_correlations)] if pairs else []),
         *([("covariance of the channels", covariance_rows(report))] if report.covariances else []),
-        ("tails of standardised noise", far),
-        ("sigma by intensity", curve),
+        ("tails of standardised noise", tail_rows),
+        ("sigma by intensity", intensity_rows),
     ]
 
 
-WHERE = {FLAT: "flat areas", PICTURE: "all", HALVED: "all, after 2x2"}
+AREA_NAMES = {FLAT: "flat areas", PICTURE: "all", HALVED: "all, after 2x2"}
 
 
 def covariance_rows(report: NoiseReport) -> Rows:
@@ -215,5 +225,5 @@ def covariance_rows(report: NoiseReport) -> Rows:
     names = Kind.RGB.channels
     rows: Rows = [("", *(f"{names[i]}-{names[j]}" for i, j in places))]
     for where, table in report.covariances.items():
-        rows.append((WHERE[where], *(number(float(table[at]), ".4g") for at in places)))
+        rows.append((AREA_NAMES[where], *(number(float(table[at]), ".4g") for at in places)))
     return rows

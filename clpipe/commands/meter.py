@@ -42,7 +42,7 @@ def meter(
     exclude: tuple[str, ...],
     selector: str | None,
     as_json: bool,
-    **chosen: Any,
+    **options: Any,
 ) -> None:
     """Meter the frames of a sequence, and write their exposures as a manifest for clpipe run.
 
@@ -57,26 +57,27 @@ def meter(
     """
     if output.suffix.lower() != ".csv":
         raise RequestError(f"--output: found {output}; expected a name that ends in .csv")
-    if any(os.path.realpath(each) == os.path.realpath(output) for each in frames):
+    if any(os.path.realpath(frame) == os.path.realpath(output) for frame in frames):
         raise RequestError(f"--output: found {output}, which is an input; choose another name")
     metering = ("exposure.method=auto", *assignments)
-    request = request_of({"assignments": metering, "until": "exposure", **chosen})
+    request = request_of({"assignments": metering, "until": "exposure", **options})
     loader = ImageLoader(request)
     jobs = to_meter(
         loader.exposures(find_jobs(frames, Path(os.devnull), loader.endings(), exclude))
     )
     check_request(loader, jobs)
-    found = []
-    for each in exposures(loader, jobs, open_device(selector), smooth):
-        found.append(each)
+    metered = []
+    for frame in exposures(loader, jobs, open_device(selector), smooth):
+        metered.append(frame)
         if not as_json:
-            name = printable(each.job.input)
-            click.echo(f"{name}  metered {each.metered:+.2f} EV, exposed {each.ev:+.2f} EV")
-    write_exposures(output, found)
+            name = printable(frame.job.input)
+            click.echo(f"{name}  metered {frame.metered:+.2f} EV, exposed {frame.ev:+.2f} EV")
+    write_exposures(output, metered)
     if as_json:
-        frames_found = [
-            {"frame": each.job.input, "metered_ev": each.metered, "ev": each.ev} for each in found
+        frame_records = [
+            {"frame": frame.job.input, "metered_ev": frame.metered, "ev": frame.ev}
+            for frame in metered
         ]
-        show_json({"manifest": str(output), "frames": frames_found})
+        show_json({"manifest": str(output), "frames": frame_records})
     else:
         click.echo(f"wrote {output}")

@@ -1,4 +1,4 @@
-"""Print the package's log, such as that kernels are being compiled, on the terminal."""
+"""Prints the package's log on the terminal, such as "compiling kernels"."""
 
 import logging
 from collections.abc import Callable, Iterator

@@ -37,7 +37,7 @@ GROUPS = {
 
 
 class Command(click.Command):
-    """Rejects an option that occurs twice but holds only one value.
+    """A command that rejects an option that is repeated but takes only one value.
 
     If a missing input follows the value of an option, the message explains how to pass several
     values to that option.
@@ -45,54 +45,54 @@ class Command(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         ctx.meta[ARGUMENTS] = tuple(args)
-        with self._explaining(ctx):
-            return self._parsed(ctx, args)
+        with self._with_hint(ctx):
+            return self._parse(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        with self._explaining(ctx):
+        with self._with_hint(ctx):
             return super().invoke(ctx)
 
     @contextmanager
-    def _explaining(self, ctx: click.Context) -> Iterator[None]:
+    def _with_hint(self, ctx: click.Context) -> Iterator[None]:
         try:
             yield
         except MissingError as error:
-            hint = several_values(self.get_params(ctx), ctx.meta[ARGUMENTS], error.name)
+            hint = several_values_hint(self.get_params(ctx), ctx.meta[ARGUMENTS], error.name)
             raise RequestError(f"{error}{hint}") from None
 
-    def _parsed(self, ctx: click.Context, args: list[str]) -> list[str]:
+    def _parse(self, ctx: click.Context, args: list[str]) -> list[str]:
         if not ctx.resilient_parsing:
-            given = self.make_parser(ctx).parse_args(list(args))[2]
-            options = (each for each in given if isinstance(each, click.Option))
+            parsed = self.make_parser(ctx).parse_args(list(args))[2]
+            options = (each for each in parsed if isinstance(each, click.Option))
             for option in options:
-                holds_one = not (option.multiple or option.is_flag)
-                if holds_one and given.count(option) > 1:
+                takes_one_value = not (option.multiple or option.is_flag)
+                if takes_one_value and parsed.count(option) > 1:
                     raise RequestError(
-                        f"{option.opts[-1]}: found {given.count(option)} times, but it holds only "
+                        f"{option.opts[-1]}: found {parsed.count(option)} times, but it takes only "
                         "one value; use it once"
                     )
         return super().parse_args(ctx, args)
 
 
-def several_values(
+def several_values_hint(
     options: Sequence[click.Parameter], arguments: Sequence[str], missing: str
 ) -> str:
-    """Return how to pass several values to the option before a missing input; "" without one.
+    """Return how to pass several values to the option before a missing input, or "".
 
-    >>> several_values([click.Option(["--skip"], multiple=True)], ["--skip", "a", "b"], "b")
+    >>> several_values_hint([click.Option(["--skip"], multiple=True)], ["--skip", "a", "b"], "b")
     ". To give --skip several values, use --skip a --skip b; for one with spaces, --skip 'a b'"
     """
-    place = arguments.index(missing) - 2 if missing in arguments else -1
+    index = arguments.index(missing) - 2 if missing in arguments else -1
     named = {name: option for option in options for name in option.opts}
-    option = named.get(arguments[place]) if place >= 0 else None
+    option = named.get(arguments[index]) if index >= 0 else None
     if not isinstance(option, click.Option) or option.is_flag:
         return ""
-    values = [arguments[place + 1]]
-    for value in arguments[place + 2 :]:
+    values = [arguments[index + 1]]
+    for value in arguments[index + 2 :]:
         if value.startswith("-") or os.path.exists(value):
             break
         values.append(value)
-    name = arguments[place]
+    name = arguments[index]
     quoted = f"{name} '{' '.join(values)}'"
     if "," in (option.metavar or ""):
         return f". To give {name} several values, use {name} {','.join(values)}"
@@ -107,7 +107,7 @@ class GroupedCommand(Command):
     """A command with options in groups: --help shows the usual ones, --help-all all of them."""
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
-        everything = click.Option(
+        help_all = click.Option(
             ["--help-all"],
             is_flag=True,
             is_eager=True,
@@ -115,10 +115,10 @@ class GroupedCommand(Command):
             callback=self._show_all,
             help="Show all options and exit.",
         )
-        return [*super().get_params(ctx), everything]
+        return [*super().get_params(ctx), help_all]
 
-    def _show_all(self, ctx: click.Context, _: click.Parameter, is_asked: bool) -> None:
-        if is_asked and not ctx.resilient_parsing:
+    def _show_all(self, ctx: click.Context, _: click.Parameter, is_set: bool) -> None:
+        if is_set and not ctx.resilient_parsing:
             ctx.meta[ALL] = True
             click.echo(self.get_help(ctx), color=ctx.color)
             ctx.exit()
@@ -130,20 +130,20 @@ class GroupedCommand(Command):
 
     def _groups(self, ctx: click.Context) -> Iterator[tuple[str, list[tuple[str, str]]]]:
         """Yield the headings and their rows."""
-        is_whole = ctx.meta.get(ALL, False)
+        show_all = ctx.meta.get(ALL, False)
         records = {
             option.opts[-1].lstrip("-").replace("-", "_"): record
             for option in self.get_params(ctx)
             if isinstance(option, click.Option) and (record := option.get_help_record(ctx))
         }
         for title, names in GROUPS.items():
-            shown = [n.lstrip("+") for n in names.split() if is_whole or n[0] == "+"]
+            shown = [n.lstrip("+") for n in names.split() if show_all or n[0] == "+"]
             if rows := [records[name] for name in shown if name in records]:
-                yield title, rows if is_whole else [(names, brief(text)) for names, text in rows]
+                yield title, rows if show_all else [(flags, brief(text)) for flags, text in rows]
 
 
 def brief(text: str) -> str:
-    """Return the first part of a help text, with the default, or "required".
+    """Return the first clause of a help text, with the default or "required".
 
     >>> brief("A stage, whole; may be repeated. Others follow. [default: a; else b]")
     'A stage, whole. [default: a]'
@@ -180,9 +180,9 @@ EXISTING = ExistingPath(path_type=Path)
 
 
 class OutputPath(click.Path):
-    """A file or directory to write to; "" is rejected, because it would be the working directory.
+    """A file or directory to write to. Only ``clpipe run`` accepts a URL.
 
-    Only ``clpipe run`` writes to a URL.
+    An empty path is rejected, because it would be the working directory.
     """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
@@ -201,7 +201,7 @@ class OutputPath(click.Path):
 def output_option(
     metavar: str, text: str, required: bool = True, multiple: bool = False
 ) -> Callable[[F], F]:
-    """Return the option -o; ``text`` is its help."""
+    """Return the option -o, with ``text`` as its help."""
     return click.option(
         "-o",
         "--output",
@@ -214,16 +214,18 @@ def output_option(
     )
 
 
-def _hush(_context: click.Context, _option: click.Parameter, is_quiet: bool) -> bool:
+def _set_log_level(_context: click.Context, _option: click.Parameter, is_quiet: bool) -> bool:
     if is_quiet:
         logging.getLogger("clpipe").setLevel(logging.WARNING)
     return is_quiet
 
 
-quiet_option = click.option("--quiet", is_flag=True, callback=_hush, help="Print failures only.")
+quiet_option = click.option(
+    "--quiet", is_flag=True, callback=_set_log_level, help="Print failures only."
+)
 
 
-def options_set() -> dict[str, str]:
+def options_on_command_line() -> dict[str, str]:
     """Return the options that are set on the command line, by parameter name."""
     context = click.get_current_context()
     return {

@@ -16,7 +16,7 @@ from clpipe.engine.codegen import write_kernel
 from clpipe.engine.ir import AnyLaunch, Launch, Lines, Plan, reads_of
 from clpipe.engine.plan import make_plan
 from clpipe.engine.traffic import bytes_per_pixel, launch_bytes
-from clpipe.outputs.recipes import results_of
+from clpipe.outputs.recipes import required_results
 
 LANES = 8  # vector lanes of the CPU for which sources and bytes are printed
 
@@ -47,7 +47,7 @@ def plan(as_json: bool, as_toml: bool, source: str | None, **options: Any) -> No
         return
     chain = request.chain()
     request = request.with_outputs(chain)
-    keep, encode, final = results_of(chain, request.formats, request.keep)
+    keep, encode, final = required_results(chain, request.formats, request.keep)
     plan = make_plan(chain, half=True, keep=keep, encode=encode, final=final)
     if source is not None:
         click.echo(write_kernel(plan, launch_named(plan, source), LANES).source, nl=False)
@@ -63,17 +63,17 @@ def plan(as_json: bool, as_toml: bool, source: str | None, **options: Any) -> No
     )
 
 
-def launch_named(plan: Plan, wanted: str) -> AnyLaunch:
+def launch_named(plan: Plan, name_or_number: str) -> AnyLaunch:
     """Return the launch of a plan with a number, from 1, or a name.
 
     Raises:
         RequestError: there is no such launch.
     """
     for number, launch in enumerate(plan.launches, 1):
-        if wanted in (str(number), launch.name):
+        if name_or_number in (str(number), launch.name):
             return launch
     names = (f"{number} {launch.name}" for number, launch in enumerate(plan.launches, 1))
-    raise RequestError(f"--source: {one_of('launch', wanted, names)}")
+    raise RequestError(f"--source: {one_of('launch', name_or_number, names)}")
 
 
 def plan_rows(plan: Plan) -> list[tuple[str, ...]]:

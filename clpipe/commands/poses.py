@@ -32,13 +32,13 @@ def poses(folder: Path, as_json: bool) -> None:
         )
     written = write_camera_files(folder)
     if not written.files:
-        reasons = "; ".join(written.left_out) or "there is no sidecar of a picture"
+        reasons = "; ".join(written.warnings) or "there is no sidecar of a picture"
         raise RequestError(
-            f"{folder}: the intrinsics of no picture are known: {reasons}; run with --poses FILE, "
+            f"{folder}: no picture has known intrinsics: {reasons}; run with --poses FILE, "
             "or set render.focal_length and render.sensor_width, or render.fx"
         )
     if as_json:
-        named = {"files": written.files, "pictures": written.pictures, "warnings": written.left_out}
+        named = {"files": written.files, "pictures": written.pictures, "warnings": written.warnings}
         show_json({"folder": str(folder), **named})
         return
     for line in written.lines(folder):

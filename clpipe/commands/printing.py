@@ -1,4 +1,4 @@
-"""Print tables, numbers and JSON on stdout."""
+"""Prints tables, numbers and JSON on stdout."""
 
 import json
 import math
@@ -28,7 +28,7 @@ def short_text(value: Any) -> str:
 
 
 def number(value: float, form: str = ".3g") -> str:
-    """Return a measured number as text; a dash for NaN.
+    """Return a measured number as text, or a dash for NaN.
 
     >>> number(0.01234), number(math.nan)
     ('0.0123', '-')
@@ -45,7 +45,7 @@ def show(headings: Sequence[str], rows: Iterable[Sequence[str]], left: int | Non
         left: the number of columns that are aligned left; the others are aligned right. None
             aligns all left.
     """
-    # Imported here, because --json needs none of it.
+    # Imported here, because --json does not need them.
     from rich.console import Console
     from rich.table import Table
 

@@ -1,6 +1,6 @@
-"""The progress of a run on stderr: a bar on a terminal, otherwise lines.
+"""Prints the progress of a run on stderr: a bar on a terminal, otherwise lines.
 
-There is a line for each image, or if there are many images, one every 10 s.
+Each image has a line. If there are many images, a line is printed every 10 s instead.
 """
 
 import contextlib
@@ -27,15 +27,15 @@ from clpipe.outputs.existing import Redo
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-FEW = 50  # the most images that have a line each, without a terminal
-SOON = 0.5  # s; compiling that takes longer is shown
-EVERY = 10.0  # s between lines if there are more images
+MAX_LINES = 50  # without a terminal, up to this many images have a line each
+COMPILE_DELAY = 0.5  # s; compiling that takes longer is shown
+LINE_INTERVAL = 10.0  # s between lines if there are more images
 
 
 def bar_on(console: Console) -> "Progress":
-    """Return a bar that counts images, with a description and the remaining time.
+    """Return a progress bar for images, with a description and the remaining time.
 
-    The bar is removed when it stops.
+    The bar disappears when it stops.
     """
     from rich import progress  # slow to import, and a single image needs no bar
 
@@ -50,7 +50,7 @@ def bar_on(console: Console) -> "Progress":
 
 
 @contextlib.contextmanager
-def told() -> Generator[Callable[[str], None]]:
+def status_line() -> Generator[Callable[[str], None]]:
     """Yield a function that shows progress on stderr.
 
     A terminal shows one line that changes. Otherwise a line is printed every 10 s.
@@ -60,7 +60,7 @@ def told() -> Generator[Callable[[str], None]]:
 
     def line(text: str) -> None:
         nonlocal last
-        if time.perf_counter() - last >= EVERY:
+        if time.perf_counter() - last >= LINE_INTERVAL:
             last = time.perf_counter()
             console.print(text, markup=False, highlight=False, soft_wrap=True)
 
@@ -85,18 +85,18 @@ class Reporter:
         self._writer = run.writer
         self._console = console
         self._quiet = quiet
-        self._keeps_old = run.where.redo is Redo.MISSING
+        self._keeps_old = run.execution.redo is Redo.MISSING
         self._several = summary.total > 1
-        self._said = self._began = time.perf_counter()
+        self._last_line = self._start = time.perf_counter()
         self._bar: Progress | None = None
-        self._shows = console.is_terminal and not quiet
+        self._is_live = console.is_terminal and not quiet
         self._live = contextlib.ExitStack()
-        self._warned: Counter[str] = Counter()  # each is printed once, and counted
+        self._warnings: Counter[str] = Counter()  # each is printed once, and counted
 
     def __enter__(self) -> Self:
         self._live.enter_context(NOTICES.printed_by(self.print))
         self._live.enter_context(watched(self._compiling))
-        if self._shows and self._several:
+        if self._is_live and self._several:
             self._show("")
         return self
 
@@ -112,10 +112,10 @@ class Reporter:
             self._bar.start()
         self._bar.update(self._task, completed=self._summary.finished, description=description)
 
-    def _compiling(self, compiled: int, of: int) -> None:
-        """Show how many kernels are compiled, if that takes long."""
-        if self._shows and time.perf_counter() - self._began > SOON:
-            left = f"compiling {compiled + 1} of {of}" if compiled < of else "first launches"
+    def _compiling(self, compiled: int, total: int) -> None:
+        """Show how many kernels are compiled, if compiling takes long."""
+        if self._is_live and time.perf_counter() - self._start > COMPILE_DELAY:
+            left = f"compiling {compiled + 1} of {total}" if compiled < total else "first launches"
             self._show(left)
 
     def print(self, text: str) -> None:
@@ -130,17 +130,17 @@ class Reporter:
         if self._quiet:
             return
         for warning in outcome.warnings if outcome.status == DONE else ():
-            if not self._warned[warning]:
-                self.print(f"clpipe: {outcome.job.shown}: warning: {warning}")
-            self._warned[warning] += 1
+            if not self._warnings[warning]:
+                self.print(f"clpipe: {outcome.job.display_name}: warning: {warning}")
+            self._warnings[warning] += 1
         if self._bar and self._several:
-            self._show(self._state())
-        elif self._summary.total > FEW:
-            if time.perf_counter() - self._said >= EVERY:
-                self._said = time.perf_counter()
-                self.print(self._state(with_count=True))
+            self._show(self._progress_text())
+        elif self._summary.total > MAX_LINES:
+            if time.perf_counter() - self._last_line >= LINE_INTERVAL:
+                self._last_line = time.perf_counter()
+                self.print(self._progress_text(with_count=True))
         elif outcome.status == DONE:
-            self.print(f"{outcome.job.shown} -> {self._files(outcome)}")
+            self.print(f"{outcome.job.display_name} -> {self._files(outcome)}")
 
     def _files(self, outcome: Outcome) -> str:
         first, *others = self._writer.renditions_of(outcome.job)
@@ -151,8 +151,8 @@ class Reporter:
         seconds = sum(outcome.seconds(step) for step in self._summary.seconds)
         return f"{text}  {outcome.megapixels:.2g} MP  {seconds:.2f} s"
 
-    def _state(self, with_count: bool = False) -> str:
-        """Return the progress as text for the bar; with the count of images, as text for a line."""
+    def _progress_text(self, with_count: bool = False) -> str:
+        """Return the progress as text: for the bar, or with the count of images for a line."""
         summary = self._summary
         failed = summary.counts[FAILED]
         speed = summary.megapixels / max(summary.elapsed, 1e-9)
@@ -165,17 +165,18 @@ class Reporter:
         count = f"{summary.finished} of {summary.total} images"
         return "; ".join([count, *parts, f"about {remaining} left"])
 
-    def _clipping(self) -> str:
+    def _clipping_warning(self) -> str:
         """Return a warning about images with much clipping."""
         share, path = self._summary.most_clipped
         text = clipping_text(share)
         if not self._several:
             return f"clpipe: {path}: warning: {text}"
         count = self._summary.much_clipped
-        return f"{count} image{'s are' if count > 1 else ' is'} clipped much, most {path}: {text}"
+        images = "images have" if count > 1 else "image has"
+        return f"{count} {images} many clipped pixels. The worst is {path}: {text}"
 
-    def _old(self) -> str:
-        """Return a note about pictures of other versions of clpipe or of image libraries."""
+    def _old_note(self) -> str:
+        """Return a note about pictures made by other versions of clpipe or of image libraries."""
         count = self._summary.old
         text = (
             f"{count} picture{'s were' if count > 1 else ' was'} made by another version of clpipe "
@@ -185,10 +186,10 @@ class Reporter:
             return f"{text}and {'stay' if count > 1 else 'stays'} (--redo missing)"
         return f"{text}and {'are' if count > 1 else 'is'} recomputed; --redo missing keeps them"
 
-    def _print_passed_over(self) -> None:
-        """Print notes about old pictures, and about images that were left out."""
+    def _print_left_out(self) -> None:
+        """Print notes about pictures of other versions, and about images that were left out."""
         if self._summary.old:
-            self.print(self._old())
+            self.print(self._old_note())
         without = self._summary.without_picture
         if without:
             hold = "images in directories have" if len(without) > 1 else "image in a directory has"
@@ -202,23 +203,23 @@ class Reporter:
         if self._bar:
             self._bar.stop()
         summary, counts = self._summary, self._summary.counts
-        for text, count in self._warned.items():
+        for text, count in self._warnings.items():
             if count > 1:
                 self.print(f"{count} images have this warning: {text}")
         if summary.much_clipped and not self._quiet:
-            self.print(self._clipping())
+            self.print(self._clipping_warning())
         if not self._quiet:
-            self._print_passed_over()
+            self._print_left_out()
         failed = summary.failures
         if self._quiet or not (self._several or failed or counts[SKIPPED]):
             return
         were = "was" if counts[SKIPPED] == 1 else "were"
-        there = f" ({counts[SKIPPED]} of them {were} there already)" if counts[SKIPPED] else ""
+        existing = f" ({counts[SKIPPED]} of them {were} there already)" if counts[SKIPPED] else ""
         if counts[SKIPPED] == summary.total == 1:
-            there = " (it was there already)"
+            existing = " (it was there already)"
         done = counts[DONE] + counts[SKIPPED]
         images = "image" if summary.total == 1 else "images"
-        text = f"{done} of {summary.total} {images} done{there}, {counts[FAILED]} failed"
+        text = f"{done} of {summary.total} {images} done{existing}, {counts[FAILED]} failed"
         if counts[LEFT_OUT]:
             text += f", {counts[LEFT_OUT]} left out"
         if left := summary.total - summary.finished:
@@ -244,16 +245,16 @@ def follow(
         run: the run.
         outcomes: the outcomes of its images.
         quiet: print failures only.
-        reporter: the reporter to use; None is a new one on stderr.
-        stop: the function to call at Ctrl-C instead of the run's.
+        reporter: the reporter to use. None creates one that prints on stderr.
+        stop: the function to call on Ctrl-C. None stops the run.
 
     Raises:
         ClpipeError: the run cannot continue.
     """
-    shown = reporter or Reporter(run, Console(stderr=True), quiet)
-    with contextlib.closing(outcomes), interruptible(stop or run.stop), shown:
+    output = reporter or Reporter(run, Console(stderr=True), quiet)
+    with contextlib.closing(outcomes), interruptible(stop or run.stop), output:
         for outcome in outcomes:
-            shown.report(outcome)
+            output.report(outcome)
     for note in () if quiet else run.notes:
         click.echo(note, err=True)
 

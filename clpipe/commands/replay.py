@@ -6,9 +6,9 @@ from pathlib import Path
 import click
 
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.replay import replay_of
 from clpipe.batch.session import Images, Run
-from clpipe.batch.where import Where
 from clpipe.chain.keys import CODE
 from clpipe.commands.chain_options import device_option, options, out_option
 from clpipe.commands.options import EXISTING, Command, json_option, quiet_option
@@ -37,29 +37,31 @@ def replay(
 ) -> None:
     """Recompute a sidecar's picture and compare it byte for byte, or say what has changed.
 
-    INPUT is the picture's input, if it has moved. Files that the picture was made with, such as a
-    camera profile or a curve, must be unchanged. Code that the sidecar names runs only if
-    --stage-file also names it.
+    If the picture's input was moved, name it as INPUT. Other files that were used, such as a camera
+    profile or a curve, must be unchanged. A stage file that the sidecar names runs only if you also
+    name it with --stage-file.
 
     The exit status is 0 if the bytes are the same.
 
     \b
     clpipe replay out/render.json -o again
     """
-    again = replay_of(sidecar, [image] if image else [], max_pixels, stage_files)
+    original = replay_of(sidecar, [image] if image else [], max_pixels, stage_files)
     selectors = () if selector is None else (selector,)
-    where = Where(output, selectors, memory)
+    execution = ExecutionOptions(output, selectors, memory)
     try:
-        made = Run(again.request, Images(found=[again.job]), where, arguments=sys.argv[1:])
+        run = Run(
+            original.request, Images(known_jobs=[original.job]), execution, arguments=sys.argv[1:]
+        )
     except RequestError as error:
         raise RequestError(f"{sidecar}: {error}") from None
-    follow(made, made.outcomes(made.jobs), quiet or as_json)
-    if made.summary.exit_status:
-        sys.exit(made.summary.exit_status)
-    (rendition,) = made.writer.renditions_of(again.job)
-    files = made.writer.files(again.job, rendition)
+    follow(run, run.outcomes(run.jobs), quiet or as_json)
+    if run.summary.exit_status:
+        sys.exit(run.summary.exit_status)
+    (rendition,) = run.writer.renditions_of(original.job)
+    files = run.writer.files(original.job, rendition)
     try:
-        same, text = again.comparison(files.sidecar)
+        same, text = original.comparison(files.sidecar)
     except ImageError as error:
         raise RequestError(str(error)) from None
     picture = files.pictures[0]

@@ -10,7 +10,7 @@ from clpipe.base.extras import require
 from clpipe.base.files import write_new
 from clpipe.commands.options import EXISTING, Command, json_option, output_option
 from clpipe.commands.printing import show_json
-from clpipe.commands.progress import told
+from clpipe.commands.progress import status_line
 from clpipe.outputs.existing import is_marked
 
 
@@ -47,9 +47,9 @@ def report(folders: tuple[Path, ...], output: Path | None, as_json: bool) -> Non
     from clpipe.reports.page import html
     from clpipe.reports.run import read_run
 
-    with told() as tell:
-        tell("sidecars")
-        page = html([read_run(folder) for folder in folders], tell).encode()
+    with status_line() as show:
+        show("sidecars")
+        page = html([read_run(folder) for folder in folders], show).encode()
     size = write_new(path, page).size
     if as_json:
         show_json({"report": str(path), "bytes": size})

@@ -15,19 +15,19 @@ from clpipe.chain.options import OPTIONS
 from clpipe.commands.chain_options import SETTINGS, options, out_option, set_option, settings_in
 from clpipe.commands.options import EXISTING, GroupedCommand, json_lines_option, quiet_option
 from clpipe.commands.progress import follow, print_line
-from clpipe.inputs.annotations import Annotations, parsed
+from clpipe.inputs.annotations import Annotations, read_json
 from clpipe.inputs.bop import is_by_image, read_bop
 from clpipe.inputs.coco import read_coco
 from clpipe.inputs.kitti import read_kitti
 from clpipe.outputs.annotations import write_annotations
 
-OWN = [name for name in OPTIONS if name not in ("inputs", "output")]
+RUN_OPTIONS = [name for name in OPTIONS if name not in ("inputs", "output")]
 
 
 @click.command("run", cls=GroupedCommand)
 @click.argument("inputs", nargs=-1, metavar="INPUT...")
 @out_option
-@options(*OWN, *SETTINGS, KEYS["dump"])
+@options(*RUN_OPTIONS, *SETTINGS, KEYS["dump"])
 @set_option
 @click.option(
     "--annotations",
@@ -39,7 +39,7 @@ OWN = [name for name in OPTIONS if name not in ("inputs", "output")]
 )
 @quiet_option
 @json_lines_option
-def run(annotations: Path | None, quiet: bool, json_lines: bool, **chosen: Any) -> None:
+def run(annotations: Path | None, quiet: bool, json_lines: bool, **options: Any) -> None:
     """Run images through the chain: files, folders, globs or manifests (.csv, .jsonl).
 
     Renders are linear float images (EXR). Camera raws skip the stages that add noise.
@@ -52,19 +52,19 @@ def run(annotations: Path | None, quiet: bool, json_lines: bool, **chosen: Any) 
     clpipe run render.exr -o out --camera sony-a7r2 --iso 3200
     clpipe run renders/ -o out --truth clean --set denoise.luma_strength=2
     """
-    settings = settings_in(chosen)
-    made = run_of(chosen, settings, sys.argv[1:], print_line if json_lines else None)
-    if not made.jobs:
-        shard = made.images.shard
+    settings = settings_in(options)
+    batch = run_of(options, settings, sys.argv[1:], print_line if json_lines else None)
+    if not batch.jobs:
+        shard = batch.images.shard
         click.echo(f"shard {shard.number} of {shard.of} has no images", err=True)
         return
-    annotated = read_annotations(annotations, made.images) if annotations else None
-    follow(made, made.outcomes(made.jobs), quiet or json_lines)
-    if annotated and not made.summary.interrupted:
-        for folder in made.images.series.under(made.where.output):
-            for line in write_annotations(folder, annotated):
+    render_annotations = read_annotations(annotations, batch.images) if annotations else None
+    follow(batch, batch.outcomes(batch.jobs), quiet or json_lines)
+    if render_annotations and not batch.summary.interrupted:
+        for folder in batch.images.series.folders_in(batch.execution.output):
+            for line in write_annotations(folder, render_annotations):
                 click.echo(line, err=True)
-    sys.exit(made.summary.exit_status)
+    sys.exit(batch.summary.exit_status)
 
 
 def read_annotations(path: Path, images: Images) -> Annotations:
@@ -81,5 +81,5 @@ def read_annotations(path: Path, images: Images) -> Annotations:
         )
     if path.is_dir():
         return read_kitti(path)
-    values = parsed(path)
+    values = read_json(path)
     return read_bop(path) if is_by_image(values) else read_coco(path, values)

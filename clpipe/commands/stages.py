@@ -43,15 +43,15 @@ def stages(
     if name is not None and name not in all_stages():
         raise RequestError(one_of("stage", name, all_stages()))
     settings = overlay(DEFAULTS, settings_in(values))
-    chosen = [all_stages()[name]] if name else list(all_stages().values())
+    selected = [all_stages()[name]] if name else list(all_stages().values())
     if as_json:
-        records = [stage_record(s, context_for(s, settings)) for s in chosen]
+        records = [stage_record(s, context_for(s, settings)) for s in selected]
         show_json(records)
     elif name is None:
         headings = ("stage", "reads", "writes", "what it does", "methods (first is default)")
-        show(headings, map(stage_row, chosen))
+        show(headings, map(stage_row, selected))
     else:
-        explain_stage(chosen[0], settings)
+        explain_stage(selected[0], settings)
 
 
 def type_text(annotation: Any) -> str:
@@ -85,11 +85,14 @@ def resolved(method: type[Method], context: Context) -> dict[str, str]:
 
 
 def context_for(stage: Stage, settings: Settings) -> Context:
-    """Return the context of a stage at its place, or a possible place, in the default chain."""
+    """Return the context of a stage in the default chain.
+
+    A stage that the chain does not contain gets the context of a stage with the same input.
+    """
     steps = make_chain(settings).steps
-    own = [step.context for step in steps if step.stage is stage]
-    alike = [step.context for step in steps if step.stage.reads is stage.reads]
-    return [steps[0].context, *alike, *own][-1]
+    of_stage = [step.context for step in steps if step.stage is stage]
+    same_kind = [step.context for step in steps if step.stage.reads is stage.reads]
+    return [steps[0].context, *same_kind, *of_stage][-1]
 
 
 def parameter_rows(method: type[Method]) -> list[tuple[str, ...]]:
@@ -135,7 +138,7 @@ def stage_row(stage: Stage) -> tuple[str, ...]:
 
 
 def kinds_text(kind: Kind, stage: Stage) -> str:
-    """Return the kind that a stage reads or writes, and the kinds allowed instead."""
+    """Return the kind of image that a stage reads or writes, and the kinds allowed instead."""
     return " or ".join(each.label for each in (kind, *stage.also))
 
 
@@ -144,12 +147,19 @@ def explain_stage(stage: Stage, settings: Settings) -> None:
     context = context_for(stage, settings)
     reads, writes = (kinds_text(kind, stage) for kind in (stage.reads, stage.writes))
     click.echo(f"{stage.name}: {stage.summary} Reads {reads}, writes {writes}.")
-    place = f"{context.camera.name}, ISO {context.iso:g}"
+    condition = f"{context.camera.name}, ISO {context.iso:g}"
     for method in stage.methods:
         click.echo(f"\nmethod {method.method}: {method.summary}")
         rows = parameter_rows(method)
         automatic = resolved(method, context)
-        headings = ["parameter", "default", *([place] if automatic else []), "unit", "allowed", ""]
+        headings = [
+            "parameter",
+            "default",
+            *([condition] if automatic else []),
+            "unit",
+            "allowed",
+            "",
+        ]
         if automatic:
             rows = [(row[0], row[1], automatic.get(row[0], ""), *row[2:]) for row in rows]
         if rows:

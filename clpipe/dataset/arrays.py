@@ -1,4 +1,4 @@
-"""The format of the arrays of a sample: type, order of axes, and packing of raws. Pure."""
+"""The format of the arrays of a sample: data type, order of axes, and packing of raws."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -12,16 +12,16 @@ from clpipe.reference.cfa import sites
 from clpipe.stage import Kind
 
 DTYPES = ("float16", "float32", "uint16")
-HIGHEST = 65535  # the maximum of uint16
+UINT16_MAX = 65535  # the maximum of uint16
 
-RawForm = Literal["packed", "mosaic"]
+RawLayout = Literal["packed", "mosaic"]
 
 
 def dtype_named(dtype: Any) -> str | None:
-    """Return the name of a type of :data:`DTYPES`. None stays None.
+    """Return the name of a data type in :data:`DTYPES`. None stays None.
 
     Raises:
-        RequestError: it is another type, or not a type.
+        RequestError: the value is another type, or not a type.
     """
     if dtype is None:
         return None
@@ -71,7 +71,7 @@ class ArrayFormat:
 
     dtype: str | None = None
     channels_first: bool = False
-    raw: RawForm | None = None
+    raw: RawLayout | None = None
 
     @property
     def is_in_dn(self) -> bool:
@@ -86,13 +86,14 @@ class ArrayFormat:
         """
         if self.dtype == "uint16" and kind not in (Kind.DISPLAY, Kind.RAW):
             raise RequestError(
-                "dtype uint16: it holds display values (65535 is white) and DN, but the chain ends "
-                f"in {kind.label}, with values below 0 and above 1. Use float16 or float32"
+                "dtype uint16: this type is for display values (65535 is white) and DN, but the "
+                f"chain ends in {kind.label}, with values below 0 and above 1. Use float16 or "
+                "float32"
             )
         if self.dtype == "float16" and kind is Kind.RAW:
             raise RequestError(
-                "dtype float16: it cannot hold DN exactly, in which the chain ends. Use uint16 or "
-                "float32, or end the chain with normalize"
+                "dtype float16: the chain ends in DN, which this type cannot hold exactly. Use "
+                "uint16 or float32, or end the chain with normalize"
             )
 
     def check_size(self, width: int, height: int) -> None:
@@ -110,12 +111,12 @@ class ArrayFormat:
     def picture(self, image: Array, kind: Kind) -> Array:
         """Convert the last image of a chain, (height, width[, channel]), for a sample."""
         if self.dtype == "uint16" and kind is Kind.DISPLAY:
-            image = image * np.float32(HIGHEST)
-        return self.ordered(self._typed(image, self.dtype))
+            image = image * np.float32(UINT16_MAX)
+        return self.ordered(self._converted(image, self.dtype))
 
     def mosaic(self, mosaic: Array, pattern: str) -> Array:
         """Convert a raw, (height, width) in DN or in signal, for a sample."""
-        mosaic = self._typed(mosaic, self.dtype or "uint16")
+        mosaic = self._converted(mosaic, self.dtype or "uint16")
         return packed(mosaic, pattern) if self.raw == "packed" else mosaic
 
     def variance(self, variance: Array, pattern: str) -> Array:
@@ -129,9 +130,9 @@ class ArrayFormat:
         return np.ascontiguousarray(image.transpose(2, 0, 1) if first else image)
 
     @staticmethod
-    def _typed(image: Array, dtype: str | None) -> Array:
+    def _converted(image: Array, dtype: str | None) -> Array:
         if dtype is None:
             return image
         if dtype == "uint16":
-            image = np.clip(np.rint(image), 0, HIGHEST)
+            image = np.clip(np.rint(image), 0, UINT16_MAX)
         return image.astype(dtype, copy=False)

@@ -16,11 +16,11 @@ from clpipe.base.types import plain
 from clpipe.base.validation import typed
 from clpipe.chain.rendition import DEVELOPMENT
 from clpipe.chain.request import Request
-from clpipe.dataset.ahead import PATCHES, Size, begun_ahead
 from clpipe.dataset.arrays import ArrayFormat, dtype_named
 from clpipe.dataset.developer import Sample, SampleSpec
 from clpipe.dataset.inputs import cache_size, jobs_of
 from clpipe.dataset.numbering import Numbering
+from clpipe.dataset.prefetch import PATCHES_TOGETHER, BatchSize, prefetched
 from clpipe.dataset.samples import SampleBatch, SampleLoader
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.outputs.patches import Patches
@@ -168,9 +168,9 @@ class Dataset(ReadOnly):
         chain = loader.first_chain(self._jobs)
         if truth is None and patch and any(step.adds_noise for step in chain.steps):
             truth = "clean"
-        at_random = self._patches is not None and self._patches.per_image != "grid"
+        random_positions = self._patches is not None and self._patches.per_image != "grid"
         is_drawn = bool(loader.settings.draws) or any(job.values for job in self._jobs)
-        self._draws_by_patch = is_drawn and (draws == "patch" if draws else at_random)
+        self._draws_by_patch = is_drawn and (draws == "patch" if draws else random_positions)
         spec = SampleSpec(
             arrays=ArrayFormat(dtype_named(dtype), channels_first, raw),
             keep=chain.select(several(keep)),
@@ -214,13 +214,13 @@ class Dataset(ReadOnly):
         if state.get("images") != self._digest():
             raise RequestError(
                 "the state belongs to a dataset with other images or patches. Create the dataset "
-                "with the same inputs and patches as when the state was saved"
+                "with the inputs and patches that it had when the state was saved"
             )
         self.set_epoch(state["epoch"])
         self._first = self._next = state["sample"]
 
     def shard(self, index: int, of: int) -> Self:
-        """Return the part of one of several workers: every ``of``-th image from ``index`` on.
+        """Return one of ``of`` parts of the dataset: every ``of``-th image, starting at ``index``.
 
         Raises:
             RequestError: ``index`` is not from 0 to ``of`` - 1.
@@ -241,7 +241,7 @@ class Dataset(ReadOnly):
         """
         if self._epochs is None:
             raise TypeError("a dataset with endless epochs has no length. Set epochs=N")
-        return self._numbering().of_epoch * self._epochs
+        return self._numbering().samples_per_epoch * self._epochs
 
     def __getitem__(self, index: int) -> Sample:
         """Return a sample. Samples are ordered by epoch, then by image.
@@ -259,58 +259,63 @@ class Dataset(ReadOnly):
         Samples of one image, and small samples of several images, are developed together. Raises
         the errors of :meth:`__getitem__`.
         """
-        places = [self._place(index) for index in indices]
+        positions = [self._position(index) for index in indices]
         groups: dict[tuple[int, ...], list[int]] = {}
         together = self._patches and not self._draws_by_patch
-        for i, place in enumerate(places):
+        for i, position in enumerate(positions):
             # Whole pictures are not grouped: a repeated index is developed again.
-            groups.setdefault(place[:2] if together else (i,), []).append(i)
-        samples: list[Sample] = [{}] * len(places)
-        asked = [(*places[own[0]][:2], [places[i][2] for i in own]) for own in groups.values()]
-        for group, made in zip(groups.values(), self._made_together(asked), strict=True):
-            for i, sample in zip(group, made, strict=True):
+            groups.setdefault(position[:2] if together else (i,), []).append(i)
+        samples: list[Sample] = [{}] * len(positions)
+        requested = [
+            (*positions[members[0]][:2], [positions[i][2] for i in members])
+            for members in groups.values()
+        ]
+        for group, developed in zip(
+            groups.values(), self._develop_together(requested), strict=True
+        ):
+            for i, sample in zip(group, developed, strict=True):
                 samples[i] = sample
         return samples
 
-    def _made_together(
-        self, asked: Sequence[tuple[int, int, Sequence[int]]]
+    def _develop_together(
+        self, requested: Sequence[tuple[int, int, Sequence[int]]]
     ) -> Iterator[list[Sample]]:
         """Yield the samples of several images, each given by epoch, image and sample numbers.
 
         If images fail together, each is developed alone to find the error. Raises the errors of
-        :meth:`_made`.
+        :meth:`_develop`.
         """
         side = self._patches.size if self._patches else None
-        pending: list[tuple[int, int, Sequence[int]]] = []
+        waiting: list[tuple[int, int, Sequence[int]]] = []
         read: list[tuple[SampleBatch, LoadedImage, Sample]] = []
-        size, are_enough = Size(side), False
-        for last, each in enumerate(asked, 1 - len(asked)):
-            pending.append(each)
+        size, is_full = BatchSize(side), False
+        for last, each in enumerate(requested, 1 - len(requested)):
+            waiting.append(each)
             batch = self._batch(*each)
             with suppress(ImageError):
                 read.append((batch, *self._loader.read(batch)))
-                are_enough = size.add(batch, read[-1][1].source.pixels)
-            if last and len(read) == len(pending) and not are_enough:
+                is_full = size.add(batch, read[-1][1].source.pixels)
+            if last and len(read) == len(waiting) and not is_full:
                 continue
-            begun: list[Callable[[], list[Sample]]] = []
-            if len(read) == len(pending):
+            results: list[Callable[[], list[Sample]]] = []
+            if len(read) == len(waiting):
                 with suppress(ImageError):
-                    begun = self._loader.begin(read)
-            for number, alone in enumerate(pending):
-                made: list[Sample] | None = None
+                    results = self._loader.begin(read)
+            for number, image in enumerate(waiting):
+                developed: list[Sample] | None = None
                 with suppress(ImageError):
-                    made = begun[number]() if begun else None
-                yield self._made(*alone) if made is None else made
-            pending, read, size, are_enough = [], [], Size(side), False
+                    developed = results[number]() if results else None
+                yield self._develop(*image) if developed is None else developed
+            waiting, read, size, is_full = [], [], BatchSize(side), False
 
-    def _made(self, epoch: int, image: int, numbers: Sequence[int]) -> list[Sample]:
+    def _develop(self, epoch: int, image: int, numbers: Sequence[int]) -> list[Sample]:
         """Return samples of an image. If it fails and may be skipped, use the next valid image.
 
         Raises:
             ImageError: the image, or every image, cannot be read or processed.
         """
-        for following in range(len(self._jobs)):
-            batch = self._batch(epoch, (image + following) % len(self._jobs), numbers)
+        for offset in range(len(self._jobs)):
+            batch = self._batch(epoch, (image + offset) % len(self._jobs), numbers)
             try:
                 return self._loader.begin([(batch, *self._loader.read(batch))])[0]()
             except ImageError as error:
@@ -332,10 +337,10 @@ class Dataset(ReadOnly):
             DeviceError: there is no usable device.
         """
         self._next, self._first = self._first, 0
-        together = PATCHES if self._draws_by_patch else 1
-        begun = begun_ahead(self._loader, self._batches(self._next), self._threads, together)
-        with closing(begun):
-            for batch, wait in begun:
+        together = PATCHES_TOGETHER if self._draws_by_patch else 1
+        pending = prefetched(self._loader, self._batches(self._next), self._threads, together)
+        with closing(pending):
+            for batch, wait in pending:
                 try:
                     samples = wait()
                 except ImageError as error:
@@ -358,7 +363,7 @@ class Dataset(ReadOnly):
             self._numbered = Numbering([self._loader.count(job, self._epoch) for job in self._jobs])
         return self._numbered
 
-    def _place(self, index: int) -> tuple[int, int, int]:
+    def _position(self, index: int) -> tuple[int, int, int]:
         """Return epoch, image, and number within the image of a sample.
 
         Raises:
@@ -367,10 +372,10 @@ class Dataset(ReadOnly):
         number = index + len(self) if index < 0 else index
         if number < 0 or not self._jobs or (self._epochs is not None and number >= len(self)):
             raise IndexError(f"found sample {index}; there are {len(self)}")
-        return self._numbering().place(number)
+        return self._numbering().position(number)
 
     def _batches(self, first: int) -> Iterator[SampleBatch]:
-        """Yield what to develop, image by image, from a sample on."""
+        """Yield the batches to develop, image by image, starting at a sample."""
         if self._jobs:
             for epoch, image, numbers in self._numbering().groups(first):
                 if epoch == self._epochs:
@@ -380,5 +385,5 @@ class Dataset(ReadOnly):
 
     def _digest(self) -> str:
         """Return a digest of the images and patches of this dataset."""
-        named = [self._patches, *(job.key for job in self._jobs)]
-        return hashlib.sha256(repr(named).encode()).hexdigest()
+        identity = [self._patches, *(job.key for job in self._jobs)]
+        return hashlib.sha256(repr(identity).encode()).hexdigest()

@@ -15,12 +15,12 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.truth import noisy_mosaic, picture_without_noise
-from clpipe.dataset.arrays import HIGHEST, ArrayFormat
+from clpipe.dataset.arrays import UINT16_MAX, ArrayFormat
 from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result, Runner, submit_together
 from clpipe.images.read import SourceImage
-from clpipe.outputs.patches import Patch, Patches, facts_of, variance_at, variance_steps
+from clpipe.outputs.patches import Patch, Patches, metadata_of, variance_at, variance_steps
 from clpipe.stage import Kind
 
 Sample = dict[str, Any]
@@ -76,22 +76,22 @@ def raw_step(chain: Chain, arrays: ArrayFormat) -> str:
     """
     if not arrays.is_in_dn:
         return noisy_mosaic(chain).steps[-1].name
-    maker, after = chain.maker_of_raw, chain.context_of_raw
-    if maker is None:
+    producer, context = chain.maker_of_raw, chain.context_of_raw
+    if producer is None:
         raise RequestError(
             f"the chain {chain.label} makes no raw in DN. Add the stage quantize, or use "
             "dtype='float32' for a raw scaled to signal"
         )
-    if not after.knots and (after.white_level or 0) > HIGHEST:
+    if not context.knots and (context.white_level or 0) > UINT16_MAX:
         raise RequestError(
-            f"the raw has values to {after.white_level:.0f} DN, more than uint16 holds. Use "
-            f"dtype='float32' for a raw scaled to signal, or {maker}.method=pwl"
+            f"the raw has values to {context.white_level:.0f} DN, more than uint16 holds. Use "
+            f"dtype='float32' for a raw scaled to signal, or {producer}.method=pwl"
         )
-    return maker
+    return producer
 
 
 @dataclass(frozen=True)
-class Order:
+class DevelopTask:
     """An image to develop for samples.
 
     Args:
@@ -129,7 +129,7 @@ class Developer:
         self._raws: BoundedCache[dict[str, str]] = BoundedCache(MAX_STRUCTURES)
         self._latest: dict[str, Runner] = {}
 
-    def begin(self, orders: Sequence[Order]) -> list[Callable[[], list[Sample]]]:
+    def begin(self, tasks: Sequence[DevelopTask]) -> list[Callable[[], list[Sample]]]:
         """Begin to develop samples of images. Small ones are developed together.
 
         Returns:
@@ -140,19 +140,19 @@ class Developer:
             ImageError, RequestError, MemoryError: an image cannot be developed.
         """
         with self._lock:
-            raws = [self._raws_of(order.chain) for order in orders]
-            runs = [self._runs(o.chain, own) for o, own in zip(orders, raws, strict=True)]
-            begun = submit_together(
+            raws = [self._raws_of(task.chain) for task in tasks]
+            runs = [self._runs(o.chain, runners) for o, runners in zip(tasks, raws, strict=True)]
+            pending = submit_together(
                 [
-                    (runner, order.source.pixels, order.noise_key, order.options)
-                    for order, own in zip(orders, runs, strict=True)
-                    for runner in own.values()
+                    (runner, task.source.pixels, task.noise_key, task.options)
+                    for task, runners in zip(tasks, runs, strict=True)
+                    for runner in runners.values()
                 ]
             )
-        waits = iter(begun)
+        pending_results = iter(pending)
         return [
-            partial(self._finish, order, names, dict(zip(own, waits, strict=False)))
-            for order, names, own in zip(orders, raws, runs, strict=True)
+            partial(self._finish, task, names, dict(zip(runners, pending_results, strict=False)))
+            for task, names, runners in zip(tasks, raws, runs, strict=True)
         ]
 
     def _runs(self, chain: Chain, raws: Mapping[str, str]) -> dict[str, Runner]:
@@ -177,7 +177,7 @@ class Developer:
         if not spec.arrays.raw:
             return {}
 
-        def found() -> dict[str, str]:
+        def find_raws() -> dict[str, str]:
             last = raw_step(chain, spec.arrays)
             if not spec.truth:
                 return {"image": last}
@@ -185,8 +185,8 @@ class Developer:
             return {"image": last, "truth": last_until(truth, chain, last)}
 
         if chain.structure is None:
-            return found()
-        return self._raws.get(Identity(chain.structure), found)
+            return find_raws()
+        return self._raws.get(Identity(chain.structure), find_raws)
 
     def _runner(self, name: str, chain: Chain, keep: Sequence[str], encode: bool) -> Runner:
         kept = tuple(step for step in chain.step_names if step in keep)
@@ -199,28 +199,31 @@ class Developer:
         return runner
 
     def _finish(
-        self, order: Order, raws: Mapping[str, str], begun: Mapping[str, Callable[[], Result]]
+        self,
+        task: DevelopTask,
+        raws: Mapping[str, str],
+        pending: Mapping[str, Callable[[], Result]],
     ) -> list[Sample]:
-        """Return the samples of an order that was begun."""
+        """Return the samples of a task that was started."""
         results = {}
-        for name, wait in begun.items():
+        for name, wait in pending.items():
             with self._lock:
                 results[name] = wait()
-        noise = variance_steps(order.chain)[1] if self._spec.variance else ()
-        if not order.patches:
-            samples = [self._sample(order.chain, raws, results, None, noise, lambda image: image)]
+        noise = variance_steps(task.chain)[1] if self._spec.variance else ()
+        if not task.patches:
+            samples = [self._sample(task.chain, raws, results, None, noise, lambda image: image)]
         else:
             samples = [
-                self._sample(order.chain, raws, results, patch, noise, itemgetter(i))
-                for i, patch in enumerate(order.patches)
+                self._sample(task.chain, raws, results, patch, noise, itemgetter(i))
+                for i, patch in enumerate(task.patches)
             ]
-        facts = facts_of(order.chain).items()
+        metadata = metadata_of(task.chain).items()
         for sample in samples:
-            sample |= {name: v.copy() if isinstance(v, np.ndarray) else v for name, v in facts}
+            sample |= {name: v.copy() if isinstance(v, np.ndarray) else v for name, v in metadata}
         return samples
 
     def drain(self) -> None:
-        """Wait for all orders that were begun."""
+        """Wait for all tasks that were started."""
         with self._lock:
             if self._device:
                 self._device.drain()
@@ -247,21 +250,21 @@ class Developer:
         arrays = self._spec.arrays
         pattern = chain.filters.pattern
 
-        def turned(image: Array) -> Array:
-            return patch.turned(part(image)) if patch else image
+        def orient(image: Array) -> Array:
+            return patch.orient(part(image)) if patch else image
 
         sample: Sample = {}
         for name in ("image", "truth") if self._spec.truth else ("image",):
             result, prefix = results[name], "" if name == "image" else f"{name}."
             for step, image in result.kept.items():
                 if step in self._spec.keep:
-                    sample[prefix + step] = arrays.ordered(turned(image))
-            sample[name] = arrays.picture(turned(result.image), chain.result)
+                    sample[prefix + step] = arrays.ordered(orient(image))
+            sample[name] = arrays.picture(orient(result.image), chain.result)
             if arrays.raw:
-                sample[f"{prefix}raw"] = arrays.mosaic(turned(result.kept[raws[name]]), pattern)
+                sample[f"{prefix}raw"] = arrays.mosaic(orient(result.kept[raws[name]]), pattern)
         if noise:
             variance = variance_at(noise, part(results["signal"].image), patch)
-            variance = patch.turned(variance) if patch else variance
+            variance = patch.orient(variance) if patch else variance
             sample["variance"] = arrays.variance(variance, pattern)
         if patch:
             sample |= {"place": np.array([patch.left, patch.top]), "turn": patch.orientation}
@@ -271,5 +274,5 @@ class Developer:
 def last_until(truth: Chain, chain: Chain, name: str) -> str:
     """Return the last step of a truth up to a step of its chain, which the truth may lack."""
     names = chain.step_names
-    until = names[: names.index(name) + 1]
-    return [step for step in truth.step_names if step in until][-1]
+    allowed = names[: names.index(name) + 1]
+    return [step for step in truth.step_names if step in allowed][-1]

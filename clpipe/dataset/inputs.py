@@ -16,7 +16,7 @@ from clpipe.inputs.loader import ImageLoader
 
 log = logging.getLogger(__name__)
 
-NOWHERE = Path(os.devnull)  # nothing is written
+NO_OUTPUT = Path(os.devnull)  # nothing is written
 
 
 def cache_size(cache: int | str) -> int:
@@ -48,25 +48,25 @@ def jobs_of(
         RequestError: there is no image, an input does not exist, a header cannot be read, or two
             images have the same name, and therefore the same draws.
     """
-    jobs = loader.exposures(find_jobs(inputs, NOWHERE, loader.endings(), exclude))
+    jobs = loader.exposures(find_jobs(inputs, NO_OUTPUT, loader.endings(), exclude))
     loader.check(jobs)
     if note := draw_note(loader.settings):
         log.info("%s", note)
     for note in lens_notes(loader.settings, jobs):
         log.warning("%s", note)
-    owners: dict[str, Job] = {}
+    job_by_key: dict[str, Job] = {}
     for job in jobs:
-        if job.listed and not job.path.exists():  # files of directories exist
+        if job.named_by_user and not job.path.exists():  # files of directories exist
             raise RequestError(f"{job.label}: there is no such file or folder")
-        other = owners.setdefault(job.key, job)
+        other = job_by_key.setdefault(job.key, job)
         if other is not job:
             raise RequestError(
                 f"{other.label} and {job.label} have the same name {job.key}, and would get the "
                 "same draws. Name the directory that contains both"
             )
     with ThreadPoolExecutor() as threads:
-        opens = list(threads.map(loader.opens, jobs))
-    damaged = [job for job, is_whole in zip(jobs, opens, strict=True) if not is_whole]
+        is_readable = list(threads.map(loader.has_readable_header, jobs))
+    damaged = [job for job, readable in zip(jobs, is_readable, strict=True) if not readable]
     if not damaged:
         return jobs
     others = f" (and {len(damaged) - 1} other files)" if len(damaged) > 1 else ""
@@ -74,7 +74,7 @@ def jobs_of(
     if not skips or len(damaged) == len(jobs):
         raise RequestError(f"{text}. Remove such files, or set on_error='skip'")
     warnings.warn(f"skipped: {text}", stacklevel=4)
-    return [job for job, is_whole in zip(jobs, opens, strict=True) if is_whole]
+    return [job for job, readable in zip(jobs, is_readable, strict=True) if readable]
 
 
 def _reason(loader: ImageLoader, job: Job) -> str:

@@ -1,10 +1,10 @@
-"""The numbering of samples: image after image, epoch after epoch. Pure."""
+"""The numbering of samples: image after image, epoch after epoch."""
 
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from itertools import accumulate
 
-TOGETHER = 64  # patches of an image in one batch
+MAX_PATCHES = 64  # patches of an image in one batch
 
 
 class Numbering:
@@ -14,7 +14,7 @@ class Numbering:
         counts: the number of samples of each image.
 
     >>> numbering = Numbering([2, 3])
-    >>> numbering.place(4), numbering.place(5), next(numbering.groups(1))
+    >>> numbering.position(4), numbering.position(5), next(numbering.groups(1))
     ((0, 1, 2), (1, 0, 0), (0, 0, range(1, 2)))
     """
 
@@ -22,27 +22,27 @@ class Numbering:
         self._ends = list(accumulate(counts, initial=0))
 
     @property
-    def of_epoch(self) -> int:
+    def samples_per_epoch(self) -> int:
         """The number of samples in an epoch."""
         return self._ends[-1]
 
-    def place(self, number: int) -> tuple[int, int, int]:
+    def position(self, number: int) -> tuple[int, int, int]:
         """Return epoch, image, and number within the image of a sample, from 0."""
-        epoch, rest = divmod(number, self.of_epoch)
+        epoch, rest = divmod(number, self.samples_per_epoch)
         image = bisect_right(self._ends, rest) - 1
         return epoch, image, rest - self._ends[image]
 
     def groups(self, first: int) -> Iterator[tuple[int, int, range]]:
-        """Yield all samples from a number on, at most :data:`TOGETHER` of an image at a time.
+        """Yield all samples, starting at a number, at most :data:`MAX_PATCHES` of an image at once.
 
         The iterator is endless.
         """
-        epoch, image, begin = self.place(first)
+        epoch, image, begin = self.position(first)
         while True:
             count = self._ends[image + 1] - self._ends[image]
             if begin < count:
-                yield epoch, image, range(begin, min(begin + TOGETHER, count))
-                begin += TOGETHER
+                yield epoch, image, range(begin, min(begin + MAX_PATCHES, count))
+                begin += MAX_PATCHES
             else:
                 begin, image = 0, image + 1
                 if image == len(self._ends) - 1:

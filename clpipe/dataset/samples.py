@@ -13,8 +13,8 @@ from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.carry import VALID
 from clpipe.chain.identity import noise_key, of_frame
-from clpipe.dataset.developer import Developer, Order, Sample, SampleSpec
-from clpipe.dataset.renders import SharedRenders
+from clpipe.dataset.developer import Developer, DevelopTask, Sample, SampleSpec
+from clpipe.dataset.render_cache import RenderCache
 from clpipe.engine.device import open_device
 from clpipe.images.read import SourceImage
 from clpipe.inputs.find import Job
@@ -22,7 +22,7 @@ from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.inputs.raw import RawImage
 from clpipe.outputs.patches import Patch, Patches
 
-_opening = threading.Lock()  # lets one thread open the device of a process
+_open_lock = threading.Lock()  # lets one thread open the device of a process
 
 
 @dataclass(frozen=True)
@@ -68,20 +68,20 @@ class SampleLoader:
         device: str | None,
     ) -> None:
         self.patches = patches
-        self.renders = SharedRenders(cache)
+        self.renders = RenderCache(cache)
         self._loader = loader
         self._spec = spec
         self._device = device
-        self._opened: Developer | None = None
+        self._open_developer: Developer | None = None
         self._warned: set[str] = set()
 
     def __getstate__(self) -> Mapping[str, Any]:
-        return {**self.__dict__, "_opened": None}  # a device stays with its process
+        return {**self.__dict__, "_open_developer": None}  # a device stays with its process
 
     def drain(self) -> None:
-        """Wait for all samples that were begun."""
-        if self._opened:
-            self._opened.drain()
+        """Wait for all samples whose development was started."""
+        if self._open_developer:
+            self._open_developer.drain()
 
     def count(self, job: Job, epoch: int) -> int:
         """Return the number of samples of an image. A grid needs to read the image.
@@ -95,7 +95,7 @@ class SampleLoader:
             return self.patches.per_image
         with self._errors_of(job):
             loaded, _ = self.read(SampleBatch(job, epoch, ()))
-            return self.patches.cutting(loaded.chain, *loaded.source.pixels.shape[1::-1]).count
+            return self.patches.layout(loaded.chain, *loaded.source.pixels.shape[1::-1]).count
 
     def read(self, batch: SampleBatch) -> tuple[LoadedImage, Sample]:
         """Read an image and its layers, which are warped like its picture."""
@@ -106,11 +106,11 @@ class SampleLoader:
             loader = self._loader.for_job(job, batch.draw_key)
             loaded = loader.enter(job, self._source(job, loader))
             if loaded and loader.request.carry:
-                along = loader.aovs(job, loaded)
-                named = {**along.arrays(), VALID: along.valid}
+                layers = loader.carried_layers(job, loaded)
+                named = {**layers.arrays(), VALID: layers.valid}
                 carried = {f"carried.{name}": array for name, array in named.items()}
                 if self.patches and self.patches.augment:
-                    along.check_turns()
+                    layers.check_no_vectors()
         except (ImageError, RequestError, MemoryError) as error:
             raise ImageError(loader.error_text(job, error)) from None
         if loaded is None:
@@ -125,9 +125,9 @@ class SampleLoader:
 
     def _source(self, job: Job, loader: ImageLoader) -> SourceImage:
         """Return the image of a job, from the cache unless sub-frames are combined."""
-        if loader.shutter(job):  # which may be drawn
+        if loader.shutter(job):  # its settings may be drawn
             return loader.read(job)
-        overscan = not loader.raw.takes(job.path) and loader.reads_overscan
+        overscan = not loader.raw.is_raw(job.path) and loader.reads_overscan
         key = job.key, stamp_of(job.path), overscan
         return self.renders.get(key, lambda: loader.read(job))
 
@@ -143,28 +143,28 @@ class SampleLoader:
             For each batch, a callable that waits for its samples. Call them in order.
 
         Raises:
-            ImageError: an image cannot be developed. The error of several images names none.
+            ImageError: an image cannot be developed. With several images, the error names none.
         """
-        orders = [self._order(batch, loaded) for batch, loaded, _ in read]
+        tasks = [self._task(batch, loaded) for batch, loaded, _ in read]
         with self._errors_of(*(batch.job for batch, *_ in read)):
-            begun = self._developer().begin(orders)
+            pending = self._developer().begin(tasks)
         return [
-            partial(self._finish, *each, order.patches, wait)
-            for each, order, wait in zip(read, orders, begun, strict=True)
+            partial(self._finish, *each, task.patches, wait)
+            for each, task, wait in zip(read, tasks, pending, strict=True)
         ]
 
-    def _order(self, batch: SampleBatch, loaded: LoadedImage) -> Order:
-        """Return the order of a batch."""
+    def _task(self, batch: SampleBatch, loaded: LoadedImage) -> DevelopTask:
+        """Return the development task of a batch."""
         job, chain, pixels = batch.job, loaded.chain, loaded.source.pixels
         patches: list[Patch] = []
         with self._errors_of(job):
             if self.patches:
-                cutting = self.patches.cutting(chain, *pixels.shape[1::-1])
-                patches = cutting.cut(batch.numbers, job.key, batch.epoch)
+                layout = self.patches.layout(chain, *pixels.shape[1::-1])
+                patches = layout.patches_for(batch.numbers, job.key, batch.epoch)
             else:
                 self._spec.arrays.check_size(*chain.size(*pixels.shape[1::-1]))
         key = noise_key(chain.settings, loaded.key, batch.epoch)
-        return Order(chain, loaded.source, key, patches)
+        return DevelopTask(chain, loaded.source, key, patches)
 
     def _finish(
         self,
@@ -172,16 +172,16 @@ class SampleLoader:
         loaded: LoadedImage,
         carried: Sample,
         patches: Sequence[Patch],
-        begun: Callable[[], list[Sample]],
+        pending: Callable[[], list[Sample]],
     ) -> list[Sample]:
-        """Return the samples of a batch that was begun."""
+        """Return the samples of a batch that was started."""
         with self._errors_of(batch.job):
-            samples = begun()
-        arrays, facts = self._spec.arrays, self._facts(batch, loaded)
+            samples = pending()
+        arrays, metadata = self._spec.arrays, self._metadata(batch, loaded)
         for i, sample in enumerate(samples):
             for name, layer in carried.items():
-                sample[name] = arrays.ordered(patches[i].cut_out(layer) if patches else layer)
-            sample.update(facts)
+                sample[name] = arrays.ordered(patches[i].crop(layer) if patches else layer)
+            sample.update(metadata)
         return samples
 
     @contextmanager
@@ -195,7 +195,7 @@ class SampleLoader:
             raise ImageError(text) from None
 
     @staticmethod
-    def _facts(batch: SampleBatch, loaded: LoadedImage) -> Sample:
+    def _metadata(batch: SampleBatch, loaded: LoadedImage) -> Sample:
         """Return the facts of an image for its samples."""
         chain = loaded.chain
         adds_noise = chain.is_noisy or not isinstance(loaded.source, RawImage)
@@ -209,7 +209,7 @@ class SampleLoader:
         Raises:
             DeviceError: there is no usable device, or a parent process has opened it.
         """
-        with _opening:
-            if self._opened is None or self._opened.process != os.getpid():
-                self._opened = Developer(open_device(self._device), self._spec)
-            return self._opened
+        with _open_lock:
+            if self._open_developer is None or self._open_developer.process != os.getpid():
+                self._open_developer = Developer(open_device(self._device), self._spec)
+            return self._open_developer

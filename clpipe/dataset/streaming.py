@@ -58,7 +58,7 @@ class StreamingDataset(ReadOnly, IterableDataset):
             )
         self._epoch: int = options.pop("epoch", 0)
         self._options = options
-        self._tars = [found for name in several(tars) for found in _found(name)]
+        self._tars = [tar for name in several(tars) for tar in _tars_of(name)]
 
     def __repr__(self) -> str:
         return f"StreamingDataset({len(self._tars)} tars)"
@@ -79,22 +79,22 @@ class StreamingDataset(ReadOnly, IterableDataset):
         number, count = worker()
         with (
             tempfile.TemporaryDirectory(prefix="clpipe-tars-") as folder,
-            ThreadPoolExecutor(1, "unpack") as beside,
+            ThreadPoolExecutor(1, "unpack") as unpacker,
         ):
-            places = [Path(folder) / str(i) for i in range(len(self._tars))]
-            left = list(zip(self._tars, places, strict=True))[number::count]
-            ahead: Future[None] | None = None
-            for (tar, place), following in zip(left, [*left[1:], None], strict=True):
-                if ahead:
-                    ahead.result()
+            folders = [Path(folder) / str(i) for i in range(len(self._tars))]
+            remaining = list(zip(self._tars, folders, strict=True))[number::count]
+            unpacking: Future[None] | None = None
+            for (tar, target), next_tar in zip(remaining, [*remaining[1:], None], strict=True):
+                if unpacking:
+                    unpacking.result()
                 else:
-                    _unpack(tar, place)
-                ahead = beside.submit(_unpack, *following) if following else None
-                yield from Dataset(place, epoch=epoch, **self._options)
-                shutil.rmtree(place)
+                    _unpack(tar, target)
+                unpacking = unpacker.submit(_unpack, *next_tar) if next_tar else None
+                yield from Dataset(target, epoch=epoch, **self._options)
+                shutil.rmtree(target)
 
 
-def _found(name: str) -> list[str]:
+def _tars_of(name: str) -> list[str]:
     """Return the tars of a path, a glob or a URL.
 
     Raises:
@@ -116,14 +116,14 @@ def _unpack(tar: str, folder: Path) -> None:
         ImageError: the tar cannot be read.
     """
     folder.mkdir()
-    into = folder / PurePosixPath(tar).name.removesuffix(".tar")
+    target_folder = folder / PurePosixPath(tar).name.removesuffix(".tar")
     try:
         with fetched([path_of(tar)]) as (path,), tarfile.open(path) as file:
             for member in file:
-                inside = PurePosixPath(member.name)
-                if not member.isfile() or inside.is_absolute() or ".." in inside.parts:
+                path_in_tar = PurePosixPath(member.name)
+                if not member.isfile() or path_in_tar.is_absolute() or ".." in path_in_tar.parts:
                     continue
-                target = into / inside
+                target = target_folder / path_in_tar
                 target.parent.mkdir(parents=True, exist_ok=True)
                 content = file.extractfile(member)
                 assert content

@@ -15,7 +15,7 @@ from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.stage import Kind, Stage
 
-HIDDEN = {"title", "description"}  # keys of a schema; the description is sent as "text"
+OMITTED_KEYS = {"title", "description"}  # keys of a schema; the description is sent as "text"
 
 
 def stage_controls() -> dict[str, Any]:
@@ -50,7 +50,7 @@ def parameters_of(model: type[BaseModel]) -> dict[str, Any]:
     """
     properties = model.model_json_schema().get("properties", {})
     return {
-        name: {k: v for k, v in schema.items() if k not in HIDDEN}
+        name: {k: v for k, v in schema.items() if k not in OMITTED_KEYS}
         | {"text": schema.get("description", "")}
         for name, schema in properties.items()
     }

@@ -27,8 +27,8 @@ from clpipe.engine.ir import AnyLaunch
 from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.runner import Result, Runner
 from clpipe.explorer.controls import steps_of
-from clpipe.explorer.named import check_named, files_in
-from clpipe.explorer.view import UNITS, Sample, View, cut, part_as_read, shown_of
+from clpipe.explorer.file_names import check_file_names, files_in
+from clpipe.explorer.view import UNITS, Sample, View, cut, display_pixels, measurable_part
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import upright
 from clpipe.inputs.find import Job
@@ -36,10 +36,10 @@ from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
-SOURCES = 2  # decoded images in memory
-SAMPLES = 3  # results that are always kept
-KEPT = 1 << 28  # bytes; more results are kept up to this size
-AT_START = ("camera", "iso", "seed", "stages", "skip")  # always in Settings.record()
+MAX_SOURCES = 2  # decoded images in memory
+MIN_RESULTS = 3  # results that are always kept
+MAX_RESULT_BYTES = 1 << 28  # bytes; more results are kept up to this size
+ALWAYS_RECORDED = ("camera", "iso", "seed", "stages", "skip")  # always in Settings.record()
 
 
 class Explorer:
@@ -57,16 +57,16 @@ class Explorer:
     """
 
     def __init__(self, jobs: Sequence[Job], request: Request, device: Device | None) -> None:
-        if listed := next((job for job in jobs if job.place), None):
+        if listed := next((job for job in jobs if job.location), None):
             raise RequestError(
-                f"{listed.place}: rows of a manifest may have their own settings. Name the "
+                f"{listed.location}: rows of a manifest may have their own settings. Name the "
                 "images or their directories instead"
             )
         self.jobs = tuple(jobs)
         self.device = device
         self._request = request
         self._lock = threading.Lock()  # guards the samples and the device
-        self._sources: BoundedCache[SourceImage] = BoundedCache(SOURCES)
+        self._sources: BoundedCache[SourceImage] = BoundedCache(MAX_SOURCES)
         self._runners: dict[bool, Runner] = {}
         self._samples: OrderedDict[int, Sample] = OrderedDict()
         self._number = 0
@@ -79,14 +79,14 @@ class Explorer:
 
     @cached_property
     def initial(self) -> dict[str, Any]:
-        """The initial values, nested like a configuration. Absent values are automatic."""
+        """The initial values, nested like a configuration. Missing values are automatic."""
         settings = replace(self._request, image={}, image_name="").settings()
-        asked = {**(self._request.config or {}), **self._request.options}
+        requested = {**(self._request.config or {}), **self._request.options}
         record = settings.record()
-        return {k: v for k, v in record.items() if k not in AT_START or k in asked}
+        return {k: v for k, v in record.items() if k not in ALWAYS_RECORDED or k in requested}
 
     @cached_property
-    def named(self) -> tuple[str, ...]:
+    def allowed_files(self) -> tuple[str, ...]:
         """The files in the initial settings."""
         return tuple(dict.fromkeys(name for _, name in files_in(self.initial)))
 
@@ -123,24 +123,24 @@ class Explorer:
         Raises:
             KeyedError: a value names a file that the initial settings do not name.
         """
-        check_named(values, self.named)
+        check_file_names(values, self.allowed_files)
         none = replace(self._request, config=None, options={}, image={}, image_name="")
-        if self.goes_on_from_embedded:
+        if self.overrides_embedded:
             return replace(none, options=dict(values))
         return replace(none, config=dict(values))
 
     @property
-    def goes_on_from_embedded(self) -> bool:
-        """Whether values override those that a kept image carries, because none were configured."""
+    def overrides_embedded(self) -> bool:
+        """Whether values override the settings in a kept image, because none were configured."""
         return self._request.start_at is not None and self._request.config is None
 
     def settings(self, image: int, values: Mapping[str, Any]) -> Settings:
-        """Return all settings of an image, including carried and drawn ones.
+        """Return all settings of an image, including embedded and drawn ones.
 
         Raises:
             ClpipeError: the errors of a run.
         """
-        return self._loaded(image, values)[1]
+        return self._load(image, values)[1]
 
     def develop(self, image: int, values: Mapping[str, Any], view: View) -> Sample:
         """Develop an image like ``clpipe run`` with a configuration of these values.
@@ -154,11 +154,11 @@ class Explorer:
             ClpipeError: the errors of a run.
         """
         start = time.perf_counter()
-        loaded, settings = self._loaded(image, values)
+        loaded, settings = self._load(image, values)
         timings: list[Timing] = []
         chain, result, launches = self._run(loaded, view, timings)
         orientation = OutputWriter.picture_orientation(loaded.source, chain)
-        shown = upright(shown_of(chain, result), orientation)
+        shown = upright(display_pixels(chain, result), orientation)
         facts = {
             "width": shown.shape[1],
             "height": shown.shape[0],
@@ -167,8 +167,8 @@ class Explorer:
             "camera": settings.camera,
             "iso": chain.settings.iso,
             "seed": chain.settings.seed,
-            "launches": _times(launches, timings) if self.device else [],
-            "estimates": _finite(result.estimates),
+            "launches": _launch_times(launches, timings) if self.device else [],
+            "estimates": _finite_estimates(result.estimates),
             "clipped": clipped_share(result, chain),
             "warnings": list(loaded.source.warnings),
             "seconds": time.perf_counter() - start,
@@ -180,12 +180,12 @@ class Explorer:
             values_of = shown if is_shown else upright(result.image, orientation)
             sample = Sample(values_of, unit, shown, facts | {"number": self._number})
             self._samples[self._number] = sample
-            while len(self._samples) > SAMPLES and self._kept > KEPT:
+            while len(self._samples) > MIN_RESULTS and self._result_bytes > MAX_RESULT_BYTES:
                 self._samples.popitem(last=False)
         return sample
 
     @property
-    def _kept(self) -> int:
+    def _result_bytes(self) -> int:
         return sum(each.image.nbytes + each.shown.nbytes for each in self._samples.values())
 
     def sample(self, number: int) -> Sample:
@@ -231,15 +231,15 @@ class Explorer:
         Raises:
             ClpipeError: the errors of a run, there is no noise, or the part is outside the image.
         """
-        loaded, _ = self._loaded(image, values)
+        loaded, _ = self._load(image, values)
         pair = []
         for truth in ("", DEVELOPMENT):
             chain, result, _ = self._run(loaded, View(view.step, truth), None)
             picture = upright(result.image, OutputWriter.picture_orientation(loaded.source, chain))
-            pair.append(part_as_read(truth or "picture", cut(picture, box), chain))
+            pair.append(measurable_part(truth or "picture", cut(picture, box), chain))
         return measure(pair[:1], pair[1])
 
-    def _loaded(self, image: int, values: Mapping[str, Any]) -> tuple[LoadedImage, Settings]:
+    def _load(self, image: int, values: Mapping[str, Any]) -> tuple[LoadedImage, Settings]:
         """Return an image with its chain, and its settings.
 
         Raises:
@@ -301,15 +301,15 @@ def _steps(settings: Settings, chain: Chain) -> list[dict[str, Any]]:
     steps = steps_of(settings)
     for step in steps:
         method = resolved.get(step["name"])
-        asked = settings.method(step["name"]) if step["on"] else None
-        step["method"] = (asked or method or settings.method(step["name"])).method
+        requested = settings.method(step["name"]) if step["on"] else None
+        step["method"] = (requested or method or settings.method(step["name"])).method
         step["values"] = method.model_dump(mode="json") if method else {}
         step["here"] = method is not None
         step["idle"] = method is None or not method.passes()
     return steps
 
 
-def _finite(estimates: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
+def _finite_estimates(estimates: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
     """Return the finite estimates, which JSON can represent."""
     return {
         step: {name: value for name, value in found.items() if np.isfinite(value)}
@@ -317,7 +317,7 @@ def _finite(estimates: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str,
     }
 
 
-def _times(launches: Sequence[AnyLaunch], timings: Sequence[Timing]) -> list[dict[str, Any]]:
+def _launch_times(launches: Sequence[AnyLaunch], timings: Sequence[Timing]) -> list[dict[str, Any]]:
     """Return the launches of a plan with their times in ms. None marks reused results."""
     seconds: dict[str, list[float]] = {}
     for timing in timings:

@@ -26,12 +26,12 @@ def exported(explorer: Explorer, image: int, values: Mapping[str, Any]) -> dict[
     request = explorer.request(values)
     steps = request.settings().step_names
     used = {key: v for key, v in values.items() if key in (*KEYS, *TABLES, *steps)}
-    job, reading = explorer.job(image), _reading(request)
+    job, reading = explorer.job(image), _reading_options(request)
     files = [Path(file) for file in request.stage_files]
     loading = [part for file in files for part in ("--stage-file", str(file))]
     options, saved = options_of(used), ["-c", SAVED]
     own = saved if options is None else [*loading, *options]
-    carries = explorer.goes_on_from_embedded
+    carries = explorer.overrides_embedded
     # A configuration replaces the settings that a kept image carries, so it must contain them.
     config = explorer.settings(image, values).record() if carries else values
     return {
@@ -50,11 +50,13 @@ def run_command(sources: Sequence[Path], options: list[str]) -> str:
 def inputs_of(jobs: Sequence[Job]) -> list[Path]:
     """Return the inputs of images. For a single file, this is its directory."""
     if len(jobs) == 1:
-        return [root_of(jobs[0])]
-    return list(dict.fromkeys(job.path if job.listed else root_of(job) for job in jobs))
+        return [input_folder_of(jobs[0])]
+    return list(
+        dict.fromkeys(job.path if job.named_by_user else input_folder_of(job) for job in jobs)
+    )
 
 
-def root_of(job: Job) -> Path:
+def input_folder_of(job: Job) -> Path:
     """Return the directory to which the key of an image is relative."""
     return job.path.parents[len(Path(job.key).parts) - 1]
 
@@ -65,7 +67,7 @@ def input_of(job: Job) -> Path:
     >>> input_of(Job(Path("a/b.exr"), "b.exr")), input_of(Job(Path("a/left/b.exr"), "left/b.exr"))
     (PosixPath('a/b.exr'), PosixPath('a'))
     """
-    return job.path if job.key == job.path.name else root_of(job)
+    return job.path if job.key == job.path.name else input_folder_of(job)
 
 
 def options_of(values: Mapping[str, Any]) -> list[str] | None:
@@ -92,7 +94,7 @@ def options_of(values: Mapping[str, Any]) -> list[str] | None:
     return options
 
 
-def _reading(request: Request) -> list[str]:
+def _reading_options(request: Request) -> list[str]:
     """Return the options of a request for reading images and for the ends of the chain."""
     own = {
         "--start-at": request.start_at,

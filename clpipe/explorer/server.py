@@ -33,13 +33,13 @@ from clpipe.explorer.controls import (
 )
 from clpipe.explorer.explorer import Explorer
 from clpipe.explorer.export import SAVED, exported
-from clpipe.explorer.patience import ImpatientProtocol
+from clpipe.explorer.timeout import TimeoutProtocol
 from clpipe.explorer.view import View
 from clpipe.images.preview import reduced
 
 HOST = "127.0.0.1"
-LONGEST = 1 << 20  # bytes of a request
-MOST = 1 << 20  # px, more than the side of an image
+MAX_REQUEST_BYTES = 1 << 20  # bytes of a request
+MAX_COORDINATE = 1 << 20  # px, more than the side of an image
 PAGE = "explore.html"
 TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 HEADERS = {
@@ -51,7 +51,7 @@ HEADERS = {
     "Cache-Control": "no-store",
 }
 
-Answer = Callable[[Mapping[str, Any]], Response]
+Handler = Callable[[Mapping[str, Any]], Response]
 
 
 class Server:
@@ -81,7 +81,7 @@ class Server:
         self.address = f"http://{HOST}:{self._socket.getsockname()[1]}/{token}/"
         config = uvicorn.Config(
             self._app(token),
-            http=ImpatientProtocol,
+            http=TimeoutProtocol,
             log_level="error",
             access_log=False,
             server_header=False,
@@ -100,7 +100,7 @@ class Server:
         self._server.should_exit = True
 
     def _app(self, token: str) -> Starlette:
-        answers: dict[str, Answer] = {
+        handlers: dict[str, Handler] = {
             "start": self._start,
             "develop": self._develop,
             "pixels": self._pixels,
@@ -109,10 +109,10 @@ class Server:
             "export": self._export,
         }
         routes = [
-            *(Route(path, answer) for path, answer in page_files().items()),
+            *(Route(path, handler) for path, handler in page_files().items()),
             *(
-                Route(f"/{name}", asked(answer), methods=["POST"])
-                for name, answer in answers.items()
+                Route(f"/{name}", json_route(handler), methods=["POST"])
+                for name, handler in handlers.items()
             ),
         ]
         hosts = Middleware(TrustedHostMiddleware, allowed_hosts=[HOST, "localhost"])
@@ -122,7 +122,7 @@ class Server:
         """Return the constants of a page: images, controls, and initial values."""
         explorer = self._explorer
         device = explorer.device
-        return in_json(
+        return json_response(
             {
                 "images": [job.key for job in explorer.jobs],
                 "values": explorer.initial,
@@ -140,52 +140,52 @@ class Server:
 
         Sending the whole image to a browser takes longer than its development.
         """
-        sample = self._explorer.develop(*subject(question))
+        sample = self._explorer.develop(*parse_subject(question))
         left, top, width, height, by = whole_numbers(
             question, "left", "top", "width", "height", "by"
         )
-        left, top = min(max(left, 0), MOST), min(max(top, 0), MOST)
+        left, top = min(max(left, 0), MAX_COORDINATE), min(max(top, 0), MAX_COORDINATE)
         part = sample.shown[top : top + max(height, 0), left : left + max(width, 0)]
         small = reduced(np.ascontiguousarray(part), min(max(by, 1), 64)) if part.size else part
         place = {"left": left, "top": top, "width": part.shape[1], "height": part.shape[0]}
-        return with_pixels(sample.facts, small, place)
+        return pixel_response(sample.facts, small, place)
 
     def _pixels(self, question: Mapping[str, Any]) -> Response:
         """Return all pixels of a recent result."""
         (number,) = whole_numbers(question, "number")
-        return with_pixels({}, self._explorer.sample(number).shown, {})
+        return pixel_response({}, self._explorer.sample(number).shown, {})
 
     def _values(self, question: Mapping[str, Any]) -> Response:
         number, x, y = whole_numbers(question, "number", "x", "y")
-        return in_json(self._explorer.values_at(number, x, y))
+        return json_response(self._explorer.values_at(number, x, y))
 
     def _noise(self, question: Mapping[str, Any]) -> Response:
         left, top, width, height = whole_numbers(question, "left", "top", "width", "height")
-        report = self._explorer.noise(*subject(question), (left, top, width, height))
-        return in_json({"report": report.record(), "svg": noise_svg(report)})
+        report = self._explorer.noise(*parse_subject(question), (left, top, width, height))
+        return json_response({"report": report.record(), "svg": noise_svg(report)})
 
     def _export(self, question: Mapping[str, Any]) -> Response:
-        image, values, _ = subject(question)
-        return in_json(exported(self._explorer, image, values))
+        image, values, _ = parse_subject(question)
+        return json_response(exported(self._explorer, image, values))
 
 
 def page_files() -> dict[str, Callable[[Request], Response]]:
     """Return the routes of the files of the page, by path."""
     folder = resources.files("clpipe.explorer") / "page"
     return {
-        "/" if file.name == PAGE else f"/{file.name}": file_answer(
+        "/" if file.name == PAGE else f"/{file.name}": file_route(
             file.read_bytes(), TYPES[Path(file.name).suffix]
         )
         for file in (*PAGE_FILES.iterdir(), *folder.iterdir())
     }
 
 
-def file_answer(content: bytes, media_type: str) -> Callable[[Request], Response]:
+def file_route(content: bytes, media_type: str) -> Callable[[Request], Response]:
     """Return a route that serves a file."""
     return lambda _: Response(content, media_type=media_type, headers=HEADERS)
 
 
-def asked(answer: Answer) -> Callable[[Request], Any]:
+def json_route(handler: Handler) -> Callable[[Request], Any]:
     """Return a route for requests in JSON. Errors are JSON with the key that they concern."""
 
     async def respond(request: Request) -> Response:
@@ -193,24 +193,26 @@ def asked(answer: Answer) -> Callable[[Request], Any]:
         try:
             async for part in request.stream():
                 body += part
-                if len(body) > LONGEST:
-                    return problem(f"the request is longer than {LONGEST} bytes", status=413)
+                if len(body) > MAX_REQUEST_BYTES:
+                    return error_response(
+                        f"the request is longer than {MAX_REQUEST_BYTES} bytes", status=413
+                    )
             question = parse_json(body or b"{}")
             if not isinstance(question, dict):
                 raise ValueError("expected an object")
         except ValueError as error:
-            return problem(f"the request is not valid JSON: {error}")
+            return error_response(f"the request is not valid JSON: {error}")
         except ClientDisconnect:
             return Response()  # the client has gone
         try:
-            return await run_in_threadpool(answer, question)
+            return await run_in_threadpool(handler, question)
         except ClpipeError as error:
-            return problem(str(error), error.key if isinstance(error, KeyedError) else "")
+            return error_response(str(error), error.key if isinstance(error, KeyedError) else "")
 
     return respond
 
 
-def with_pixels(facts: Mapping[str, Any], pixels: Array, place: Mapping[str, int]) -> Response:
+def pixel_response(facts: Mapping[str, Any], pixels: Array, place: Mapping[str, int]) -> Response:
     """Return the length of the JSON in four bytes, the JSON, and RGB with a byte per channel.
 
     The JSON contains the facts. Its "part" states the position and size of the pixels in the image.
@@ -222,18 +224,18 @@ def with_pixels(facts: Mapping[str, Any], pixels: Array, place: Mapping[str, int
     return Response(body, media_type="application/octet-stream", headers=HEADERS)
 
 
-def in_json(value: Any, status: int = 200) -> Response:
+def json_response(value: Any, status: int = 200) -> Response:
     """Return a value as ASCII JSON, because file names may not be UTF-8."""
     text = json.dumps(value, allow_nan=False)
     return Response(text, status, HEADERS, "application/json")
 
 
-def problem(text: str, key: str = "", status: int = 400) -> Response:
+def error_response(text: str, key: str = "", status: int = 400) -> Response:
     """Return an error for the page."""
-    return in_json({"error": text, "key": key}, status)
+    return json_response({"error": text, "key": key}, status)
 
 
-def subject(question: Mapping[str, Any]) -> tuple[int, Mapping[str, Any], View]:
+def parse_subject(question: Mapping[str, Any]) -> tuple[int, Mapping[str, Any], View]:
     """Return the image, the values and the view of a request.
 
     Raises:

@@ -49,15 +49,15 @@ UNITS = {
 }
 
 
-def shown_of(chain: Chain, result: Result) -> Array:
+def display_pixels(chain: Chain, result: Result) -> Array:
     """Return a result for display, (height, width, 3) uint8."""
     image = result.image
     if result.encoded is None:
-        image = encoded_light(signal_of(image, chain))
+        image = encoded_light(to_signal(image, chain))
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
 
-def signal_of(image: Floats, chain: Chain) -> Floats:
+def to_signal(image: Floats, chain: Chain) -> Floats:
     """Return a result scaled to 0 at black and 1 at white. Only raws need scaling."""
     context = chain.context_after
     black, white = context.black_level, context.white_level
@@ -89,7 +89,7 @@ def cut(image: Array, box: tuple[int, int, int, int]) -> Array:
     return image[top : top + height, left : left + width]
 
 
-def part_as_read(name: str, part: Array, chain: Chain) -> Picture:
+def measurable_part(name: str, part: Array, chain: Chain) -> Picture:
     """Return a part of a result to measure, as if read from a file."""
     path, kind, context = Path(name), chain.result, chain.context_after
     if kind is Kind.DISPLAY:
@@ -100,4 +100,4 @@ def part_as_read(name: str, part: Array, chain: Chain) -> Picture:
         return Picture(path, "rgb", part, white=1.0)
     black, white = context.black_level, context.white_level
     lowest = None if black is None or white is None else -black / (white - black)
-    return Picture(path, "mosaic", signal_of(part, chain), context.filters.pattern, lowest, 1.0)
+    return Picture(path, "mosaic", to_signal(part, chain), context.filters.pattern, lowest, 1.0)

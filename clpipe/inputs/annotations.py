@@ -1,4 +1,4 @@
-"""What the readers of annotation formats (COCO, KITTI, BOP) share: types, limits and errors."""
+"""Types, limits and errors that the readers of COCO, KITTI and BOP annotations share."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,11 +8,9 @@ from typing import Any, NoReturn, Protocol
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import parse_json, read_named
 
-LARGEST = 1 << 30  # bytes of a file
-
-FARTHEST = 1e5  # px: the largest coordinate that is accepted, inside or outside the render
-
-MOST_PIXELS = 10**10  # of a render: FARTHEST squared
+MAX_BYTES = 1 << 30  # of a file
+MAX_COORDINATE = 1e5  # px, inside or outside the render
+MAX_PIXELS = 10**10  # of a render: MAX_COORDINATE squared
 
 Record = dict[str, Any]
 
@@ -24,7 +22,7 @@ class AnnotatedRender:
     Args:
         name: the render's file name in the annotations.
         size: width and height in px; None if the format does not state them.
-        content: the annotations, in a type of the format's own.
+        content: the annotations, in a type that depends on the format.
     """
 
     name: str
@@ -46,13 +44,13 @@ class Annotations(Protocol):
         ...
 
 
-def parsed(path: Path) -> Any:
+def read_json(path: Path) -> Any:
     """Return the values of a JSON file.
 
     Raises:
         RequestError: the file cannot be read, or is not JSON.
     """
-    text = read_named("--annotations", path, LARGEST)
+    text = read_named("--annotations", path, MAX_BYTES)
     try:
         return parse_json(text)
     except ValueError as error:
@@ -62,7 +60,7 @@ def parsed(path: Path) -> Any:
         ) from None
 
 
-def refuse(path: Path, place: str, found: Any, expected: str) -> NoReturn:
+def reject(path: Path, place: str, found: Any, expected: str) -> NoReturn:
     """Reject a value of an annotation file.
 
     Args:

@@ -12,19 +12,19 @@ from typing import Any
 
 from clpipe.base.text import whole_number
 from clpipe.inputs.annotations import (
-    FARTHEST,
-    MOST_PIXELS,
+    MAX_COORDINATE,
+    MAX_PIXELS,
     AnnotatedRender,
     Record,
-    parsed,
-    refuse,
+    read_json,
+    reject,
 )
 
 POSES, INFOS, CAMERAS = "scene_gt.json", "scene_gt_info.json", "scene_camera.json"
 MASKS = ("mask", "mask_visib")
 BOXES = ("bbox_obj", "bbox_visib")
 DIGITS = 6  # of an image's number in file names
-LAST = 10**9 - 1  # the largest number of an image
+MAX_IMAGE_NUMBER = 10**9 - 1  # the largest number of an image
 COUNTS = ("px_count_all", "px_count_valid")  # they scale with the size of a mask
 
 
@@ -65,17 +65,19 @@ def read_bop(path: Path) -> Bop:
         RequestError: a file cannot be read or is not in BOP's format; the message says where.
     """
     poses = _by_image(path)
-    infos = _by_image(beside) if (beside := path.with_name(INFOS)).is_file() else {}
-    cameras = _by_image(beside) if (beside := path.with_name(CAMERAS)).is_file() else {}
+    infos = _by_image(neighbour) if (neighbour := path.with_name(INFOS)).is_file() else {}
+    cameras = _by_image(neighbour) if (neighbour := path.with_name(CAMERAS)).is_file() else {}
     renders: list[AnnotatedRender] = []
     for image, objects in poses.items():
         if not isinstance(objects, list) or not all(isinstance(each, dict) for each in objects):
-            refuse(path, str(image), objects, "a list of objects")
-        own: Any = infos.get(image, [{}] * len(objects))
-        if not isinstance(own, list) or len(own) != len(objects):
-            refuse(path.with_name(INFOS), str(image), own, f"a list of {len(objects)} objects")
+            reject(path, str(image), objects, "a list of objects")
+        object_infos: Any = infos.get(image, [{}] * len(objects))
+        if not isinstance(object_infos, list) or len(object_infos) != len(objects):
+            reject(
+                path.with_name(INFOS), str(image), object_infos, f"a list of {len(objects)} objects"
+            )
         found = []
-        for number, (pose, info) in enumerate(zip(objects, own, strict=True)):
+        for number, (pose, info) in enumerate(zip(objects, object_infos, strict=True)):
             _check(path.with_name(INFOS), f"{image}[{number}]", info)
             name = f"{image:0{DIGITS}d}_{number:0{DIGITS}d}.png"
             files = {kind: path.with_name(kind) / name for kind in MASKS}
@@ -83,13 +85,13 @@ def read_bop(path: Path) -> Bop:
             if found and masks.keys() != found[0].masks.keys():
                 kind = min({*masks} ^ {*found[0].masks})
                 expected = "masks for all objects of an image, or for none"
-                refuse(path, f"{image}[{number}]", f"no {files[kind]}", expected)
+                reject(path, f"{image}[{number}]", f"no {files[kind]}", expected)
             found.append(BopObject(pose, info, masks))
         renders.append(AnnotatedRender(f"{image:0{DIGITS}d}", None, found))
     for image, camera in cameras.items():
         matrix = camera.get("cam_K", [0] * 9) if isinstance(camera, dict) else None
         if not isinstance(matrix, list) or len(matrix) != 9 or not all(map(_is_number, matrix)):
-            refuse(path.with_name(CAMERAS), f"{image}.cam_K", matrix, "nine numbers")
+            reject(path.with_name(CAMERAS), f"{image}.cam_K", matrix, "nine numbers")
     return Bop(path, renders, cameras)
 
 
@@ -99,13 +101,13 @@ def is_by_image(values: Any) -> bool:
 
 
 def _by_image(path: Path) -> dict[int, Record]:
-    values = parsed(path)
+    values = read_json(path)
     if not is_by_image(values):
-        refuse(path, "the file", values, "an object whose keys are numbers of images")
+        reject(path, "the file", values, "an object whose keys are numbers of images")
     for key in values:
-        if not 0 <= whole_number(key) <= LAST:
-            expected = f"a number from 0 to {LAST}; renumber this image"
-            refuse(path, "the number of an image", key, expected)
+        if not 0 <= whole_number(key) <= MAX_IMAGE_NUMBER:
+            expected = f"a number from 0 to {MAX_IMAGE_NUMBER}; renumber this image"
+            reject(path, "the number of an image", key, expected)
     return {int(key): value for key, value in values.items()}
 
 
@@ -113,15 +115,15 @@ def _check(path: Path, place: str, info: Record) -> None:
     for name in BOXES if isinstance(info, dict) else ():
         box = info.get(name, [0] * 4)
         if not isinstance(box, list) or len(box) != 4 or not all(_is_number(v) for v in box):
-            refuse(path, f"{place}.{name}", box, "x, y, width and height")
+            reject(path, f"{place}.{name}", box, "x, y, width and height")
     for name in COUNTS if isinstance(info, dict) else ():
         count = info.get(name, 0)
-        if not isinstance(count, int | float) or not 0 <= count <= MOST_PIXELS:
-            refuse(path, f"{place}.{name}", count, "a number of pixels")
+        if not isinstance(count, int | float) or not 0 <= count <= MAX_PIXELS:
+            reject(path, f"{place}.{name}", count, "a number of pixels")
     if not isinstance(info, dict):
-        refuse(path, place, info, "an object")
+        reject(path, place, info, "an object")
 
 
 def _is_number(value: Any) -> bool:
-    is_one = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_one and abs(value) <= FARTHEST
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_number and abs(value) <= MAX_COORDINATE

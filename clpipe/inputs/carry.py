@@ -20,14 +20,14 @@ from clpipe.images.passes import (
 )
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import FLIPS
-from clpipe.inputs.companions import FoundLayer, find_all
+from clpipe.inputs.companions import LayerSource, find_carried_layers
 from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
 from clpipe.reference.geometry import Composition, Geometry, Orientation
 
 
 @dataclass(frozen=True)
-class Aov:
-    """A layer that was warped like its picture.
+class CarriedLayer:
+    """A carried layer: a render pass (AOV) that was warped like its picture.
 
     Args:
         name: its name in ``--carry``.
@@ -45,7 +45,7 @@ class Aov:
 
 
 @dataclass(frozen=True)
-class Aovs:
+class CarriedLayers:
     """All carried layers of a picture.
 
     Args:
@@ -54,20 +54,20 @@ class Aovs:
         attributes: EXR attributes of the layers, such as the names of a Cryptomatte's objects.
     """
 
-    layers: tuple[Aov, ...]
+    layers: tuple[CarriedLayer, ...]
     valid: Array
     attributes: Mapping[str, str]
 
-    def changed(self, change: Callable[[Array], Array]) -> "Aovs":
-        """Return the layers after a function was applied to each array, such as a crop."""
+    def map_arrays(self, change: Callable[[Array], Array]) -> "CarriedLayers":
+        """Return the layers with a function applied to each array, such as a crop."""
         layers = (replace(layer, pixels=change(layer.pixels)) for layer in self.layers)
         return replace(self, layers=tuple(layers), valid=change(self.valid))
 
-    def check_turns(self) -> None:
-        """Check that moving pixels is enough to flip and rotate the layers.
+    def check_no_vectors(self) -> None:
+        """Check that no layer contains vectors, which flips and rotations would have to change.
 
         Raises:
-            RequestError: a layer contains vectors, whose values would have to change too.
+            RequestError: a layer contains vectors.
         """
         for layer in self.layers:
             if layer.kind in ("normal", "flow"):
@@ -92,7 +92,7 @@ def carry(
     layers: Sequence[AovSpec],
     max_pixels: int,
     orientation: int = 1,
-) -> Aovs:
+) -> CarriedLayers:
     """Return the layers of an image, warped like its picture.
 
     Args:
@@ -101,33 +101,33 @@ def carry(
         chain: the chain whose stages move pixels.
         layers: the layers to carry.
         max_pixels: a file with more pixels is rejected before it is read.
-        orientation: EXIF's value by which the picture is rotated at the end. Normals keep their
-            directions.
+        orientation: the EXIF orientation that is applied to the picture at the end. Normals keep
+            their directions.
 
     Raises:
         ImageError: a layer or companion is missing or damaged, differs from the image in size, or
-            its kind is not known.
+            its kind is unknown.
     """
-    whole = source.pixels.shape[1::-1]
-    width, height = source.margins.inside(*whole)
-    found = find_all(path, layers)
+    full_size = source.pixels.shape[1::-1]
+    width, height = source.margins.inside(*full_size)
+    found = find_carried_layers(path, layers)
     read: list[Layer] = []
     attributes: dict[str, str] = {}
     for each in found:
-        pixels, (x, y) = read_found(each, path, (width, height), max_pixels)
+        pixels, (x, y) = read_layer_samples(each, path, (width, height), max_pixels)
         attributes |= cryptomatte_attributes(each.file, each.location.part)
         x, y = x + source.margins.left, y + source.margins.top
         read.append(Layer(each.kind, pixels, x, y, each.vectors))
-    moved, valid = warp(read, geometry_of(chain, orientation), *whole)
+    warped, valid = warp(read, geometry_of(chain, orientation), *full_size)
     carried = tuple(
-        Aov(each.name, each.kind, each.channels, pixels, record_of(path, each))
-        for each, pixels in zip(found, moved, strict=True)
+        CarriedLayer(each.name, each.kind, each.channels, pixels, record_of(path, each))
+        for each, pixels in zip(found, warped, strict=True)
     )
-    return Aovs(carried, valid, attributes)
+    return CarriedLayers(carried, valid, attributes)
 
 
-def read_found(
-    layer: FoundLayer, path: Path, size: tuple[int, int], max_pixels: int
+def read_layer_samples(
+    layer: LayerSource, path: Path, size: tuple[int, int], max_pixels: int
 ) -> tuple[Array, tuple[int, int]]:
     """Return the samples of a layer, (row, column, channel), and the x and y of the first one.
 
@@ -141,25 +141,25 @@ def read_found(
         ImageError: the layer is damaged, or differs from the image in size.
     """
     with unchanged(layer.file):
-        pixels, place, own = read_layer(layer.file, layer.location, max_pixels)
-    if own != size:
+        pixels, place, layer_size = read_layer(layer.file, layer.location, max_pixels)
+    if layer_size != size:
         raise ImageError(
-            f"{layer.file}: its layer {layer.name} has {own[0]}x{own[1]} pixels, but the "
-            f"picture {path} has {size[0]}x{size[1]}; render both at one size"
+            f"{layer.file}: its layer {layer.name} has {layer_size[0]}x{layer_size[1]} pixels, but "
+            f"the picture {path} has {size[0]}x{size[1]}; render both at one size"
         )
     return pixels, place
 
 
-def joined(of_moments: Mapping[str, Aovs], named: bool) -> Aovs:
+def merge_moments(by_moment: Mapping[str, CarriedLayers], named: bool) -> CarriedLayers:
     """Return the layers of several moments of an exposure in one object.
 
     Args:
-        of_moments: the layers, by the name of the moment.
-        named: whether to add the moment to the names of layers and channels, except for the
-            middle's.
+        by_moment: the layers, by the name of the moment.
+        named: whether to prefix the names of layers and channels with the moment, unless it is
+            the middle.
     """
-    layers: list[Aov] = []
-    for moment, own in of_moments.items():
+    layers: list[CarriedLayer] = []
+    for moment, carried_layers in by_moment.items():
         prefix = f"{moment}." if named and moment != "middle" else ""
         layers += [
             replace(
@@ -168,23 +168,23 @@ def joined(of_moments: Mapping[str, Aovs], named: bool) -> Aovs:
                 channels=tuple(f"{prefix}{channel}" for channel in each.channels),
                 record={**each.record, "layer": f"{prefix}{each.name}", "moment": moment},
             )
-            for each in own.layers
+            for each in carried_layers.layers
         ]
-    first, *others = of_moments.values()
+    first, *others = by_moment.values()
     valid = first.valid.copy()
     for other in others:
         valid *= other.valid
-    return Aovs(tuple(layers), valid, first.attributes)
+    return CarriedLayers(tuple(layers), valid, first.attributes)
 
 
 def geometry_of(chain: Chain, orientation: int) -> Geometry | None:
     """Return how pixels move from an image to its upright picture; None if they do not move."""
     parts = chain.geometry.parts if chain.geometry else ()
-    turned = (Orientation(*FLIPS[orientation]),) if orientation != 1 else ()
-    return Composition((*parts, *turned)) if parts or turned else None
+    orientation_part = (Orientation(*FLIPS[orientation]),) if orientation != 1 else ()
+    return Composition((*parts, *orientation_part)) if parts or orientation_part else None
 
 
-def record_of(path: Path, layer: FoundLayer) -> dict[str, Any]:
+def record_of(path: Path, layer: LayerSource) -> dict[str, Any]:
     """Return the entry of a carried layer in the sidecar of the image ``path``."""
     return {
         "layer": layer.name,

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import RequestError
-from clpipe.inputs.annotations import FARTHEST, MOST_PIXELS, AnnotatedRender, Record, refuse
+from clpipe.inputs.annotations import MAX_COORDINATE, MAX_PIXELS, AnnotatedRender, Record, reject
 
-LISTS = ("images", "annotations", "categories")
+REQUIRED_LISTS = ("images", "annotations", "categories")
 
 
 @dataclass(frozen=True)
@@ -43,31 +43,31 @@ def read_coco(path: Path, values: Any) -> Coco:
     Raises:
         RequestError: the values are not in COCO's format; the message says where.
     """
-    lists = [values.get(name) if isinstance(values, dict) else None for name in LISTS]
-    for name, found in zip(LISTS, lists, strict=True):
+    lists = [values.get(name) if isinstance(values, dict) else None for name in REQUIRED_LISTS]
+    for name, found in zip(REQUIRED_LISTS, lists, strict=True):
         if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
             raise RequestError(
                 f"--annotations {path}: the list '{name}' is missing; COCO's format has the lists "
-                f"{', '.join(LISTS)}"
+                f"{', '.join(REQUIRED_LISTS)}"
             )
     images, annotations, _ = lists
     assert images is not None and annotations is not None
     of_image: dict[Any, list[Record]] = {}
-    sizes_of: dict[str, tuple[int, int]] = {}
+    size_by_name: dict[str, tuple[int, int]] = {}
     names: dict[Any, str] = {}
     for number, image in enumerate(images):
         sizes = [image.get(name) for name in ("width", "height")]
-        if not all(isinstance(side, int) and 0 < side <= FARTHEST for side in sizes):
-            allowed = f"whole px from 1 to {FARTHEST:.0f}"
-            refuse(path, f"images[{number}]", f"width and height {sizes}", allowed)
+        if not all(isinstance(side, int) and 0 < side <= MAX_COORDINATE for side in sizes):
+            allowed = f"whole px from 1 to {MAX_COORDINATE:.0f}"
+            reject(path, f"images[{number}]", f"width and height {sizes}", allowed)
         _check_id(path, f"images[{number}].id", image.get("id"))
         if not isinstance(image.get("file_name"), str) or image["id"] in of_image:
             found = "no file_name, or an id that another image has"
-            refuse(path, f"images[{number}]", found, "a file_name and a unique id")
-        if image["file_name"] in sizes_of:
+            reject(path, f"images[{number}]", found, "a file_name and a unique id")
+        if image["file_name"] in size_by_name:
             found = f"the file_name {image['file_name']} of an earlier image"
-            refuse(path, f"images[{number}]", found, "one entry for each file")
-        sizes_of[image["file_name"]] = (image["width"], image["height"])
+            reject(path, f"images[{number}]", found, "one entry for each file")
+        size_by_name[image["file_name"]] = (image["width"], image["height"])
         of_image[image["id"]] = []
         names[image["id"]] = image["file_name"]
     for number, each in enumerate(annotations):
@@ -75,8 +75,8 @@ def read_coco(path: Path, values: Any) -> Coco:
         _check_id(path, f"{place}.image_id", each.get("image_id"))
         if each["image_id"] not in of_image:
             expected = "the id of an image in the list images"
-            refuse(path, place, f"image_id {each['image_id']!r}", expected)
-        _check(path, place, each, sizes_of[names[each["image_id"]]])
+            reject(path, place, f"image_id {each['image_id']!r}", expected)
+        _check(path, place, each, size_by_name[names[each["image_id"]]])
         of_image[each["image_id"]].append(each)
     return Coco(path, values, of_image)
 
@@ -88,7 +88,7 @@ def _check_id(path: Path, place: str, found: Any) -> None:
         RequestError: it is neither a number nor a string.
     """
     if not isinstance(found, int | float | str):
-        refuse(path, place, found, "the id of an image, a number or a string")
+        reject(path, place, found, "the id of an image, a number or a string")
 
 
 def _check(path: Path, place: str, annotation: Record, size: tuple[int, int]) -> None:
@@ -106,19 +106,19 @@ def _check(path: Path, place: str, annotation: Record, size: tuple[int, int]) ->
     box, points = annotation.get("bbox"), annotation.get("keypoints", [])
     outline = annotation.get("segmentation", [])
     if box is not None and not (_numbers(box) and len(box) == 4):
-        refuse(path, f"{place}.bbox", box, "x, y, width and height")
+        reject(path, f"{place}.bbox", box, "x, y, width and height")
     if not _numbers(points) or len(points) % 3:
-        refuse(path, f"{place}.keypoints", points, "x, y and visibility of each keypoint")
+        reject(path, f"{place}.keypoints", points, "x, y and visibility of each keypoint")
     if isinstance(outline, dict):
         if not {"size", "counts"} <= outline.keys():
-            refuse(path, f"{place}.segmentation", list(outline), "size and counts")
+            reject(path, f"{place}.segmentation", list(outline), "size and counts")
         _check_mask(path, f"{place}.segmentation", outline, size)
     elif not isinstance(outline, list) or not all(
         _numbers(part) and len(part) >= 6 and len(part) % 2 == 0 for part in outline
     ):
-        refuse(path, f"{place}.segmentation", outline, "polygons of three points or more")
+        reject(path, f"{place}.segmentation", outline, "polygons of three points or more")
     if box is None and not outline:
-        refuse(path, place, "neither bbox nor segmentation", "one of them")
+        reject(path, place, "neither bbox nor segmentation", "one of them")
 
 
 def _check_mask(path: Path, place: str, mask: Record, size: tuple[int, int]) -> None:
@@ -130,13 +130,13 @@ def _check_mask(path: Path, place: str, mask: Record, size: tuple[int, int]) -> 
     width, height = size
     if mask["size"] != [height, width]:
         expected = f"{[height, width]}, the height and width of its image"
-        refuse(path, f"{place}.size", mask["size"], expected)
+        reject(path, f"{place}.size", mask["size"], expected)
     try:
         runs = runs_of(mask["counts"])
     except ValueError as error:
-        refuse(path, f"{place}.counts", mask["counts"], f"run lengths ({error})")
+        reject(path, f"{place}.counts", mask["counts"], f"run lengths ({error})")
     if sum(runs) != width * height:
-        refuse(path, f"{place}.counts", f"runs of {sum(runs)} pixels", f"{width * height} in all")
+        reject(path, f"{place}.counts", f"runs of {sum(runs)} pixels", f"{width * height} in all")
 
 
 def runs_of(counts: Any) -> list[int]:
@@ -153,8 +153,8 @@ def runs_of(counts: Any) -> list[int]:
     ([3, 2, 4], [0, 8, 33], [0, 8, 0, 13])
     """
     if isinstance(counts, list):
-        if not all(type(n) is int and 0 <= n <= MOST_PIXELS for n in counts):
-            raise ValueError(f"each must be a whole number from 0 to {MOST_PIXELS}")
+        if not all(type(n) is int and 0 <= n <= MAX_PIXELS for n in counts):
+            raise ValueError(f"each must be a whole number from 0 to {MAX_PIXELS}")
         return counts
     if not isinstance(counts, str):
         raise ValueError("they must be a list or a string")
@@ -180,5 +180,5 @@ def runs_of(counts: Any) -> list[int]:
 
 def _numbers(values: Any) -> bool:
     return isinstance(values, list) and all(
-        isinstance(v, int | float) and abs(v) <= FARTHEST for v in values
+        isinstance(v, int | float) and abs(v) <= MAX_COORDINATE for v in values
     )

@@ -23,8 +23,8 @@ SEPARATORS = "_.-"  # between an image's name and that of a layer, in the name o
 
 
 @dataclass(frozen=True)
-class FoundLayer:
-    """A requested layer: its name, kind, file, place in that file, and full channel names."""
+class LayerSource:
+    """A requested layer: its name, kind, file, location in that file, and full channel names."""
 
     name: str
     kind: LayerKind
@@ -34,34 +34,34 @@ class FoundLayer:
 
     @property
     def vectors(self) -> tuple[Vector, ...]:
-        """The vectors that its channels hold; empty unless its kind is flow."""
-        own = vectors_of(self.location.name or self.name, self.location.channels)
-        return own if self.kind == "flow" else ()
+        """The vectors in its channels; empty unless its kind is flow."""
+        found = vectors_of(self.location.name or self.name, self.location.channels)
+        return found if self.kind == "flow" else ()
 
 
-def find_all(path: Path, layers: Sequence[AovSpec]) -> list[FoundLayer]:
-    """Return all requested layers of an image; see :meth:`Finder.find`.
+def find_carried_layers(path: Path, layers: Sequence[AovSpec]) -> list[LayerSource]:
+    """Return all requested layers of an image; see :meth:`LayerFinder.find`.
 
     Raises:
         ImageError: a layer is missing, or a channel is carried twice.
     """
-    found: list[FoundLayer] = []
+    found: list[LayerSource] = []
     for layer in layers:
-        found += Finder(path, [layer.pattern] if layer.pattern else []).find(layer)
+        found += LayerFinder(path, [layer.pattern] if layer.pattern else []).find(layer)
     _check_names(path, found)
     return found
 
 
-def _check_names(path: Path, found: Sequence[FoundLayer]) -> None:
+def _check_names(path: Path, found: Sequence[LayerSource]) -> None:
     """Check that no channel is carried twice.
 
     Raises:
         ImageError: one is.
     """
-    owners: dict[str, FoundLayer] = {}
+    owner_by_channel: dict[str, LayerSource] = {}
     for each in found:
         for channel in each.channels:
-            other = owners.setdefault(channel, each)
+            other = owner_by_channel.setdefault(channel, each)
             if other is not each:
                 raise ImageError(
                     f"{path}: --carry {other.name} and {each.name} both contain the channel "
@@ -70,7 +70,7 @@ def _check_names(path: Path, found: Sequence[FoundLayer]) -> None:
 
 
 @dataclass(frozen=True)
-class Finder:
+class LayerFinder:
     """Finds layers of an image, first in its file and then in its companions.
 
     Args:
@@ -83,55 +83,55 @@ class Finder:
     patterns: Sequence[str] = ()
     layers: dict[Path, list[LayerLocation]] = field(default_factory=dict)
 
-    def find(self, asked: AovSpec) -> list[FoundLayer]:
-        """Return where a requested layer is: one place, or one for each rank of a Cryptomatte.
+    def find(self, spec: AovSpec) -> list[LayerSource]:
+        """Return the source of a requested layer, or one source for each rank of a Cryptomatte.
 
         Raises:
             ImageError: there is no such layer, its name is ambiguous, or its kind is not known.
         """
-        for file in self._files(asked.name):
-            locations = self._of(file)
-            named = _named(file, asked.name, locations)
-            if not named and self._is_called(file, asked.name):
+        for file in self._files(spec.name):
+            locations = self._layers_in(file)
+            named = _named(file, spec.name, locations)
+            if not named and self._is_named_after(file, spec.name):
                 if len(locations) != 1:
                     listed = ", ".join(each.name or "one without a name" for each in locations)
                     raise ImageError(
-                        f"{file}: this file has no layer called {asked.name}, but several others "
+                        f"{file}: this file has no layer called {spec.name}, but several others "
                         f"({listed}). Name one of them in --carry"
                     )
                 named = locations
             if named:
-                self._check_alone(asked.name, file)
-                return [self._found(asked, file, each) for each in named]
-        layers = [each.without_rank for file in self.layers for each in self._of(file)]
+                self._check_unique(spec.name, file)
+                return [self._layer_source(spec, file, each) for each in named]
+        layers = [each.without_rank for file in self.layers for each in self._layers_in(file)]
         names = dict.fromkeys(layer.rpartition(".")[2] for layer in layers if layer)
-        near = alike(asked.name, names)
-        hint = f" (did you mean {either(near)}?)" if near else ""
+        similar = alike(spec.name, names)
+        hint = f" (did you mean {either(similar)}?)" if similar else ""
         files = [file.name for file in self.layers if file != self.path]
         where = f"the file and {', '.join(files)} have" if files else "the file has"
-        expected = f"{self.path.stem}_{one_line(asked.name)}.exr"
+        expected = f"{self.path.stem}_{one_line(spec.name)}.exr"
         raise ImageError(
-            f"{self.path}: --carry: there is no layer '{one_line(asked.name)}'{hint}; {where} "
+            f"{self.path}: --carry: there is no layer '{one_line(spec.name)}'{hint}; {where} "
             f"{', '.join(map(one_line, names)) or 'no layers besides the picture'}, and there is "
             f"no {expected} next to it; render the layer into one of them"
         )
 
-    def _check_alone(self, name: str, file: Path) -> None:
+    def _check_unique(self, name: str, file: Path) -> None:
         """Check that no other companion of the same format has this layer, which might differ.
 
         Raises:
             ImageError: there is one.
         """
-        is_called = self._is_called(file, name)
+        is_called = self._is_named_after(file, name)
         for other in companions_of(self.path, self.patterns) if file != self.path else ():
             if other == file or other.suffix.lower() != file.suffix.lower():
                 continue
-            is_second = (
-                self._is_called(other, name)
+            is_duplicate = (
+                self._is_named_after(other, name)
                 if is_called
-                else self._holds_no_colour(other) and _named(other, name, self._of(other))
+                else self._has_no_picture(other) and _named(other, name, self._layers_in(other))
             )
-            if is_second:
+            if is_duplicate:
                 pattern = f"{{name}}{file.name.removeprefix(self.path.stem)}"
                 raise ImageError(
                     f"{self.path}: --carry {name}: {file.name} and {other.name} both have this "
@@ -143,47 +143,47 @@ class Finder:
         if self.path.suffix.lower() in SUFFIXES:
             yield self.path
         companions = companions_of(self.path, self.patterns)
-        called = [file for file in companions if self._is_called(file, name)]
-        yield from called
-        yield from (f for f in companions if f not in called and self._holds_no_colour(f))
+        named_after = [file for file in companions if self._is_named_after(file, name)]
+        yield from named_after
+        yield from (f for f in companions if f not in named_after and self._has_no_picture(f))
 
-    def _is_called(self, file: Path, name: str) -> bool:
-        """Return whether a companion holds a layer according to its name or pattern."""
+    def _is_named_after(self, file: Path, name: str) -> bool:
+        """Return whether a companion contains a layer according to its name or pattern."""
         if file == self.path:
             return False
-        return bool(self.patterns) or _tail(self.path, file.name).lower() == name.lower()
+        return bool(self.patterns) or _layer_suffix(self.path, file.name).lower() == name.lower()
 
-    def _holds_no_colour(self, file: Path) -> bool:
-        """Return whether a file can be read and has no picture of its own."""
+    def _has_no_picture(self, file: Path) -> bool:
+        """Return whether a file can be read and contains no picture."""
         try:
-            return not any(each.is_colour and not each.name for each in self._of(file))
+            return not any(each.is_colour and not each.name for each in self._layers_in(file))
         except ImageError:
             return False
 
-    def _of(self, file: Path) -> list[LayerLocation]:
+    def _layers_in(self, file: Path) -> list[LayerLocation]:
         if file not in self.layers:
             self.layers[file] = find_layers(file)
         return self.layers[file]
 
-    def _found(self, asked: AovSpec, file: Path, location: LayerLocation) -> FoundLayer:
-        kind = asked.kind or kind_of(asked.name, location)
+    def _layer_source(self, spec: AovSpec, file: Path, location: LayerLocation) -> LayerSource:
+        kind = spec.kind or kind_of(spec.name, location)
         if kind is None:
             raise ImageError(
-                f"{file}: the kind of its layer {asked.name} is not known from the name. Add it: "
-                f"--carry {asked.name}:KIND, where KIND is one of {', '.join(RESAMPLING)}"
+                f"{file}: the kind of its layer {spec.name} is not known from the name. Add it: "
+                f"--carry {spec.name}:KIND, where KIND is one of {', '.join(RESAMPLING)}"
             )
-        least = CHANNELS.get(kind, 1)
-        if len(location.channels) < least:
+        min_channels = CHANNELS.get(kind, 1)
+        if len(location.channels) < min_channels:
             raise ImageError(
-                f"{file}: its layer {asked.name} has {len(location.channels)} "
-                f"channel{'s' * (len(location.channels) > 1)}, but a layer of {kind} needs {least} "
-                f"or more; choose another kind with --carry {asked.name}:KIND"
+                f"{file}: its layer {spec.name} has {len(location.channels)} "
+                f"channel{'s' * (len(location.channels) > 1)}, but a layer of {kind} needs "
+                f"{min_channels} or more; choose another kind with --carry {spec.name}:KIND"
             )
         is_named = location.name and not (location.is_alone and file != self.path)
-        layer = location.name if is_named else asked.name
+        layer = location.name if is_named else spec.name
         alone = location.is_alone and file == self.path
         channels = [name if alone else f"{layer}.{name}" for name in location.channels]
-        return FoundLayer(asked.name, kind, file, location, tuple(channels))
+        return LayerSource(spec.name, kind, file, location, tuple(channels))
 
 
 def _named(file: Path, name: str, locations: Sequence[LayerLocation]) -> list[LayerLocation]:
@@ -226,7 +226,7 @@ def companions_of(path: Path, patterns: Sequence[str] = ()) -> list[Path]:
     for name in names[bisect_left(names, path.stem) :]:
         if not name.startswith(path.stem):
             break
-        if Path(name).suffix.lower() in SUFFIXES and _tail(path, name) not in ("", CARRIED):
+        if Path(name).suffix.lower() in SUFFIXES and _layer_suffix(path, name) not in ("", CARRIED):
             found.append(path.with_name(name))
     return sorted(found, key=lambda file: (SUFFIXES.index(file.suffix.lower()), file.name))
 
@@ -240,14 +240,14 @@ def _names_in(folder: str, _modified: int) -> list[str]:
         return []
 
 
-def _tail(path: Path, name: str) -> str:
-    """Return the layer's name in the name of a companion; "" if the file is not a companion.
+def _layer_suffix(path: Path, name: str) -> str:
+    """Return the layer's name from a companion's file name, or "" if it is not a companion.
 
-    >>> _tail(Path("in/a.exr"), "a_depth.exr"), _tail(Path("in/a.exr"), "ab.exr")
+    >>> _layer_suffix(Path("in/a.exr"), "a_depth.exr"), _layer_suffix(Path("in/a.exr"), "ab.exr")
     ('depth', '')
     """
-    rest = Path(name).stem.removeprefix(path.stem)
-    return rest[1:] if rest[:1] and rest[0] in SEPARATORS else ""
+    suffix = Path(name).stem.removeprefix(path.stem)
+    return suffix[1:] if suffix[:1] and suffix[0] in SEPARATORS else ""
 
 
 def owner_of(path: Path) -> str | None:
@@ -257,6 +257,6 @@ def owner_of(path: Path) -> str | None:
     ('in/view00', None)
     """
     stem = path.stem
-    cut = max(map(stem.rfind, SEPARATORS))
-    is_companion = cut > 0 and (stem[cut + 1 :] == CARRIED or kind_named(stem[cut + 1 :]))
-    return str(path.with_name(stem[:cut])) if is_companion else None
+    split = max(map(stem.rfind, SEPARATORS))
+    is_companion = split > 0 and (stem[split + 1 :] == CARRIED or kind_named(stem[split + 1 :]))
+    return str(path.with_name(stem[:split])) if is_companion else None

@@ -10,12 +10,12 @@ from clpipe.chain.carry import AovSpec
 from clpipe.chain.chain import Chain
 from clpipe.chain.depth import depth_steps
 from clpipe.images.pixels import display_window
-from clpipe.inputs.carry import file_record, read_found
-from clpipe.inputs.companions import Finder, FoundLayer
+from clpipe.inputs.carry import file_record, read_layer_samples
+from clpipe.inputs.companions import LayerFinder, LayerSource
 from clpipe.reference.defocus import Depth, checked_depth
 from clpipe.reference.geometry import Margins
 
-USUAL = ("Depth", "Z", "ZDepth", "Distance")  # names of layers, in order of preference
+DEFAULT_LAYERS = ("Depth", "Z", "ZDepth", "Distance")  # names of layers, in order of preference
 
 
 def read_depth(
@@ -42,7 +42,7 @@ def read_depth(
     """
     step, method = next(iter(depth_steps(chain).items()))
     layer = _find(path, step, method.layer, [each.pattern for each in carried if each.pattern])
-    pixels, (x, y) = read_found(layer, path, margins.inside(width, height), max_pixels)
+    pixels, (x, y) = read_layer_samples(layer, path, margins.inside(width, height), max_pixels)
     place = x + margins.left, y + margins.top
     depths = pixels[..., :1].astype(np.float32)
     window = display_window(depths, *place, width, height, outside=np.inf)
@@ -53,16 +53,17 @@ def read_depth(
     return Depth(depth, {"layer": layer.name, **file_record(path, layer.file)})
 
 
-def _find(path: Path, step: str, name: str, patterns: Sequence[str]) -> FoundLayer:
-    """Return the layer called ``name``; for "", the first of the usual names that exists."""
+def _find(path: Path, step: str, name: str, patterns: Sequence[str]) -> LayerSource:
+    """Return the layer called ``name``, or for "" the first of the default layers that exists."""
     errors = []
-    for asked in (name,) if name else USUAL:
+    for layer_name in (name,) if name else DEFAULT_LAYERS:
         try:
-            return Finder(path, patterns).find(AovSpec(asked, "depth"))[0]
+            return LayerFinder(path, patterns).find(AovSpec(layer_name, "depth"))[0]
         except ImageError as error:
             errors.append(str(error))
-    usual = "" if name else f" ({', '.join(USUAL[1:])} were looked for as well)"
+    searched = "" if name else f" ({', '.join(DEFAULT_LAYERS[1:])} were looked for as well)"
+    message = errors[0].replace("--carry", f"{step} needs depth")
     raise ImageError(
-        f"{errors[0].replace('--carry', f'{step} needs depth')}{usual}; to use another layer, set "
-        f"{step}.layer; to turn {step} off, set {step}.method=none"
+        f"{message}{searched}; to use another layer, set {step}.layer; to turn {step} off, set "
+        f"{step}.method=none"
     )

@@ -26,7 +26,7 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 # By extension: why a file is not an image, and which option or command takes it.
-NO_IMAGES = {
+NON_IMAGES = {
     ".json": "this is JSON, not an image; to recompute a sidecar's picture, use 'clpipe replay'",
     ".toml": "this is a configuration or a camera, not an image; pass it with -c or --camera",
     ".blend": "this is a Blender scene, not an image; to render it, use 'clpipe dataset'",
@@ -40,43 +40,43 @@ FINISHED = (
 
 @dataclass(frozen=True)
 class Job:
-    """One image to make pictures of.
+    """One image to process.
 
     Args:
         path: the file.
         key: its name among the inputs. Random draws and the names of outputs depend on it.
         name: the path of its outputs in the output directory, without extension; "" uses the key.
-        listed: whether the user named it, by path, glob or manifest, rather than by its folder.
+        named_by_user: whether the user named the file by path, glob or manifest, not its folder.
         values: settings of this image only, nested like a configuration.
         frames: the number of frames; None uses that of the request.
-        place: its manifest and row; "" if it is not in a manifest.
+        location: its manifest and row; "" if it is not in a manifest.
         renditions: the renditions to make; None is all.
-        written: the path as the user wrote it, if ``path`` has been made absolute.
+        as_written: the path as the user wrote it, if ``path`` has been made absolute.
         subframes: further files of the same exposure.
         size: the width and height in px that the image must have; None allows any.
-        problem: why it cannot be made, if that is known before it is read.
-        around: whether its files are views of a panorama and not sub-frames.
+        problem: why it cannot be processed, if that is known before it is read.
+        is_panorama: whether its files are views of a panorama and not sub-frames.
     """
 
     path: Path
     key: str
     name: str = ""
-    listed: bool = True
+    named_by_user: bool = True
     values: Mapping[str, Any] = field(default_factory=dict)
     frames: int | None = None
-    place: str = ""
+    location: str = ""
     renditions: tuple[Rendition, ...] | None = None
-    written: str = ""
+    as_written: str = ""
     subframes: tuple[Path, ...] = ()
     size: tuple[int, int] | None = None
     problem: str = ""
-    around: bool = False
+    is_panorama: bool = False
 
     def check(self) -> None:
-        """Check that no problem of this job is known.
+        """Raise the known problem of this job, if there is one.
 
         Raises:
-            ImageError: one is.
+            ImageError: the job has a problem.
         """
         if self.problem:
             raise ImageError(f"{self.label}: {self.problem}")
@@ -95,14 +95,14 @@ class Job:
         return self.paths[places[moment]]
 
     @property
-    def shown(self) -> str:
-        """The file's name in messages and logs: its URL if it has one, otherwise its path."""
+    def display_name(self) -> str:
+        """The name of the file in messages and logs: its URL, or else its path."""
         return url_of(self.path) or str(self.path)
 
     @property
     def input(self) -> str:
-        """The path that is stored and printed: as the user wrote it, if that is known."""
-        return self.written or self.shown
+        """The path that is stored and printed: as the user wrote it, or else the display name."""
+        return self.as_written or self.display_name
 
     @cached_property
     def stem(self) -> str:
@@ -112,7 +112,7 @@ class Job:
     @property
     def label(self) -> str:
         """The job's name in errors: its file, with its manifest and row."""
-        return f"{self.shown} ({self.place})" if self.place else self.shown
+        return f"{self.display_name} ({self.location})" if self.location else self.display_name
 
 
 def find_jobs(
@@ -148,13 +148,13 @@ def find_jobs(
             raise RequestError("an input is empty; give files, folders, globs or manifests")
         path = path_of(text)
         if is_url(text) and path.suffix.lower() not in MANIFEST_SUFFIXES:
-            jobs += _jobs_behind(text, endings, excluded)
+            jobs += _jobs_at_url(text, endings, excluded)
         elif os.path.isdir(text):
             files = images_in(path, output, endings, excluded)
-            jobs += [Job(p, p.relative_to(path).as_posix(), listed=False) for p in files]
+            jobs += [Job(p, p.relative_to(path).as_posix(), named_by_user=False) for p in files]
         elif path.suffix.lower() in MANIFEST_SUFFIXES:
             jobs += [
-                Job(row.path, row.key, row.name, True, row.values, row.frames, row.place)
+                Job(row.path, row.key, row.name, True, row.values, row.frames, row.location)
                 for row in read_manifest(path)
             ]
         elif glob.has_magic(text) and not os.path.exists(text):
@@ -164,8 +164,8 @@ def find_jobs(
             jobs += [Job(Path(m), Path(m).name) for m in matches if m not in excluded]
         else:
             check_input(path)
-            if no_image := NO_IMAGES.get(path.suffix.lower()):
-                raise RequestError(f"{path}: {no_image}")
+            if reason := NON_IMAGES.get(path.suffix.lower()):
+                raise RequestError(f"{path}: {reason}")
             jobs.append(Job(path, path.name))
     for pattern in excluded.unused:
         log.warning("--exclude %s matches no file", pattern)
@@ -182,17 +182,17 @@ def without_companions(jobs: Sequence[Job]) -> list[Job]:
     lists always stay.
     """
     stems = {str(job.path.with_suffix("")) for job in jobs}
-    found = [job for job in jobs if not job.place and owner_of(job.path) in stems]
+    found = [job for job in jobs if not job.location and owner_of(job.path) in stems]
     if found:
         are = "1 file is a companion" if len(found) == 1 else f"{len(found)} files are companions"
         first = printable(str(found[0].path))
         log.info("%s of another image, such as %s; to warp layers, use --carry", are, first)
-    others = {id(job) for job in found}
-    return [job for job in jobs if id(job) not in others]
+    skipped_types = {id(job) for job in found}
+    return [job for job in jobs if id(job) not in skipped_types]
 
 
 class Exclusion:
-    """Patterns (* ? []) of what to skip: paths in an input folder, or names of files or folders."""
+    """Patterns (* ? []) of paths to skip in input folders, or of file and folder names to skip."""
 
     def __init__(self, patterns: Sequence[str] = ()) -> None:
         self._patterns = patterns
@@ -209,7 +209,7 @@ class Exclusion:
         return bool(matching)
 
 
-def _jobs_behind(url: str, endings: Sequence[str], excluded: Exclusion) -> list[Job]:
+def _jobs_at_url(url: str, endings: Sequence[str], excluded: Exclusion) -> list[Job]:
     """Return the jobs of a URL: one file, all images below it, or all files that match a glob.
 
     Raises:
@@ -232,7 +232,7 @@ def _jobs_behind(url: str, endings: Sequence[str], excluded: Exclusion) -> list[
         except RequestError as error:
             log.warning("%s; this file is skipped", error)
             continue
-        jobs.append(Job(path, key, listed=not is_below))
+        jobs.append(Job(path, key, named_by_user=not is_below))
     if not jobs:
         raise RequestError(
             f"{url}: there are no images at this URL; clpipe looked for {', '.join(endings[:6])} "
@@ -253,67 +253,70 @@ def images_in(
         RequestError: a folder cannot be read, or there are no images.
     """
     images: list[Path] = []
-    others: Counter[str] = Counter()
-    for place, names in _walk(folder, output, excluded):
-        below = os.path.relpath(place, folder)
+    skipped_types: Counter[str] = Counter()
+    for parent, names in _walk(folder, output, excluded):
+        relative = os.path.relpath(parent, folder)
         for name in names:
-            if name.startswith(".") or os.path.normpath(f"{below}/{name}") in excluded:
+            if name.startswith(".") or os.path.normpath(f"{relative}/{name}") in excluded:
                 continue
-            path = Path(place, name)
+            path = Path(parent, name)
             suffix = path.suffix.lower()
             if suffix in endings and (path.is_file() or path.is_symlink()):
                 images.append(path)
             else:
-                others["pipe or device" if suffix in endings else suffix or "without suffix"] += 1
-    ranked = sorted(others.items(), key=lambda item: (-item[1], item[0]))
+                skipped_types[
+                    "pipe or device" if suffix in endings else suffix or "without suffix"
+                ] += 1
+    ranked = sorted(skipped_types.items(), key=lambda item: (-item[1], item[0]))
     kinds = [f"{count} {suffix}" for suffix, count in ranked[:5]]
-    kinds += ["others"] * (len(others) > len(kinds))
-    listed = printable(", ".join(kinds))
+    kinds += ["others"] * (len(skipped_types) > len(kinds))
+    summary = printable(", ".join(kinds))
     if not images:
-        left = " that are not excluded" if excluded else ""
-        looked = ", ".join(e for e in endings if e not in RAW_SUFFIXES)
+        qualifier = " that are not excluded" if excluded else ""
+        types = ", ".join(e for e in endings if e not in RAW_SUFFIXES)
         raws = " and camera raws" if set(RAW_SUFFIXES) & set(endings) else ""
-        text = f"{folder}: this folder has no images{left}; clpipe looked for {looked}{raws}"
-        text += f", and the folder has {listed}" if listed else ""
-        if others.keys() & set(PICTURE_SUFFIXES):
+        text = f"{folder}: this folder has no images{qualifier}; clpipe looked for {types}{raws}"
+        text += f", and the folder has {summary}" if summary else ""
+        if skipped_types.keys() & set(PICTURE_SUFFIXES):
             text += f". {FINISHED}"
         raise RequestError(text)
-    if others:
-        is_one = others.total() == 1
-        not_images = "file is not an image" if is_one else "files are not images"
-        were = "was" if is_one else "were"
-        log.info("%s: %d %s and %s skipped: %s", folder, others.total(), not_images, were, listed)
+    if skipped_types:
+        single = skipped_types.total() == 1
+        not_images = "file is not an image" if single else "files are not images"
+        were = "was" if single else "were"
+        log.info(
+            "%s: %d %s and %s skipped: %s", folder, skipped_types.total(), not_images, were, summary
+        )
     return sorted(images)
 
 
 def _walk(folder: Path, output: Path, excluded: Exclusion) -> Iterator[tuple[str, list[str]]]:
     """Yield each folder below one, with the names of its files. Links are followed last.
 
-    A file that is also reachable through a link therefore gets its path without the link, whatever
-    the order on disk.
+    A file that is also reachable through a link therefore always gets its path without the link.
 
     Raises:
         RequestError: a folder cannot be read.
     """
     visited: set[str] = set()
-    starts = [str(folder)]
-    for start in starts:  # which grows
-        for place, folders, names in os.walk(start, onerror=_refuse):
-            real = os.path.realpath(place)
+    roots = [str(folder)]
+    for start in roots:  # the loop appends to roots
+        for parent, folders, names in os.walk(start, onerror=_reject_folder):
+            real = os.path.realpath(parent)
             if real in visited or (visited and real == os.path.realpath(output)):
                 folders.clear()
                 continue
             visited.add(real)
-            below = {name: os.path.join(place, name) for name in sorted(folders)}
-            taken = [
-                n for n, path in below.items() if os.path.relpath(path, folder) not in excluded
+            subfolders = {name: os.path.join(parent, name) for name in sorted(folders)}
+            kept = [
+                n for n, path in subfolders.items() if os.path.relpath(path, folder) not in excluded
             ]
-            starts += [below[name] for name in taken if os.path.islink(below[name])]
-            folders[:] = taken
-            yield place, names
+            roots += [subfolders[name] for name in kept if os.path.islink(subfolders[name])]
+            folders[:] = kept
+            yield parent, names
 
 
-def _refuse(error: OSError) -> None:
+def _reject_folder(error: OSError) -> None:
     raise RequestError(f"{error.filename}: this folder cannot be read: {error.strerror}") from None
 
 
@@ -324,10 +327,10 @@ class Shard:
     number: int = 1
     of: int = 1
 
-    def take(self, jobs: Sequence[T]) -> list[T]:
+    def select(self, jobs: Sequence[T]) -> list[T]:
         """Return the items of this part.
 
-        >>> [job.key for job in Shard(2, 3).take([Job(Path(k), k) for k in "abcde"])]
+        >>> [job.key for job in Shard(2, 3).select([Job(Path(k), k) for k in "abcde"])]
         ['b', 'e']
         """
         return list(jobs[self.number - 1 :: self.of])

@@ -1,6 +1,6 @@
-"""Kept images, which are intermediate images of a chain: their attributes, and how they re-enter.
+"""Kept images: intermediate images of a chain, from which another chain can resume.
 
-A mosaic from another program enters in the same way, without attributes.
+A mosaic from another program is loaded in the same way, without attributes.
 """
 
 import json
@@ -48,7 +48,7 @@ def attributes_of(step: Step, chain: Chain, key: str, frame: int | None = None) 
 
 
 def embedded_settings(attributes: Mapping[str, str], folder: Path | None = None) -> Settings | None:
-    """Return the settings that a kept image was made with; None if it has no such attribute.
+    """Return the settings of the chain that made a kept image, or None without that attribute.
 
     Args:
         attributes: the image's attributes.
@@ -83,7 +83,7 @@ class KeptLoader:
 
     @property
     def start_at(self) -> str:
-        """The step at which images enter."""
+        """The step at which the chain of an image starts."""
         assert self.request.start_at is not None
         return self.request.start_at
 
@@ -165,7 +165,7 @@ def _without_input_noise(chain: Chain) -> Chain:
 
 
 def kind_message(error: KindError, chain: Chain, start_at: str | None) -> str:
-    """Return the message for a kept image of the wrong kind: what is needed, and what fits."""
+    """Return the message for a kept image of the wrong kind, with the steps that can read it."""
     reads = f", but {start_at} reads {chain.source.label}" if start_at else ""
     return f"{error}{reads}; {_entries_of(error.attributes['kind'], chain)}"
 

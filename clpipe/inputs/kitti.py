@@ -14,9 +14,9 @@ import numpy as np
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import read_named
 from clpipe.base.types import Doubles
-from clpipe.inputs.annotations import FARTHEST, LARGEST, AnnotatedRender, refuse
+from clpipe.inputs.annotations import MAX_BYTES, MAX_COORDINATE, AnnotatedRender, reject
 
-FIELDS = 15  # of a line, without a score
+FIELD_COUNT = 15  # of a line, without a score
 CALIBRATION = "calib"  # the folder next to that of the labels
 MATRICES = ("P0", "P1", "P2", "P3")  # of cameras; labels use the third
 CENTRE = 0.5  # px from the image's corner to the first pixel's centre
@@ -27,12 +27,12 @@ class KittiObject:
     """A line of a label.
 
     Args:
-        words: all words of the line.
+        fields: all fields of the line, as text.
         truncated: the share of the object outside the picture; unknown if negative.
         box: left, top, right and bottom, in px from the image's corner.
     """
 
-    words: tuple[str, ...]
+    fields: tuple[str, ...]
     truncated: float
     box: tuple[float, float, float, float]
 
@@ -69,43 +69,43 @@ def read_kitti(folder: Path) -> Kitti:
     renders, calibrations = [], {}
     for path in files:
         renders.append(AnnotatedRender(path.stem, None, _objects(path)))
-        beside = folder.parent / CALIBRATION / path.name
-        if beside.is_file():
-            calibrations[path.stem] = _calibration(beside)
+        calibration_file = folder.parent / CALIBRATION / path.name
+        if calibration_file.is_file():
+            calibrations[path.stem] = _calibration(calibration_file)
     return Kitti(folder, renders, calibrations)
 
 
 def _lines(path: Path) -> list[str]:
     try:
-        return read_named("--annotations", path, LARGEST).decode().splitlines()
+        return read_named("--annotations", path, MAX_BYTES).decode().splitlines()
     except UnicodeDecodeError:
         raise RequestError(f"--annotations {path}: this file is not text in UTF-8") from None
 
 
 def _objects(path: Path) -> list[KittiObject]:
-    found = []
+    objects = []
     for number, line in enumerate(_lines(path), 1):
-        words = tuple(line.split())
-        if not words:
+        fields = tuple(line.split())
+        if not fields:
             continue
         try:
-            numbers = [float(word) for word in words[1:]]
+            numbers = [float(word) for word in fields[1:]]
         except ValueError:
             numbers = []
-        if len(numbers) not in (FIELDS - 1, FIELDS) or not np.isfinite(numbers).all():
-            refuse(path, f"line {number}", line, f"a type and {FIELDS - 1} numbers")
+        if len(numbers) not in (FIELD_COUNT - 1, FIELD_COUNT) or not np.isfinite(numbers).all():
+            reject(path, f"line {number}", line, f"a type and {FIELD_COUNT - 1} numbers")
         left, top, right, bottom = numbers[3:7]
-        if right < left or bottom < top or max(map(abs, numbers[3:7])) > FARTHEST:
-            refuse(
+        if right < left or bottom < top or max(map(abs, numbers[3:7])) > MAX_COORDINATE:
+            reject(
                 path, f"line {number}", line, "a box with left <= right and top <= bottom, in px"
             )
         box = left + CENTRE, top + CENTRE, right + CENTRE, bottom + CENTRE
-        found.append(KittiObject(words, numbers[0], box))
-    return found
+        objects.append(KittiObject(fields, numbers[0], box))
+    return objects
 
 
 def _calibration(path: Path) -> dict[str, Doubles]:
-    found = {}
+    calibration = {}
     for number, line in enumerate(_lines(path), 1):
         name, colon, rest = line.partition(":")
         if not colon:
@@ -115,6 +115,6 @@ def _calibration(path: Path) -> dict[str, Doubles]:
         except ValueError:
             values = np.empty(0)
         if name in MATRICES and (values.size != 12 or not np.isfinite(values).all()):
-            refuse(path, f"line {number}", line, "the 12 numbers of a 3x4 matrix")
-        found[name] = values
-    return found
+            reject(path, f"line {number}", line, "the 12 numbers of a 3x4 matrix")
+        calibration[name] = values
+    return calibration

@@ -1,4 +1,4 @@
-"""Notes about lenses that a run names incompletely."""
+"""Notes about lenses whose names are given incompletely."""
 
 from collections.abc import Sequence
 

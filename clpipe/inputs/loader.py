@@ -33,13 +33,13 @@ from clpipe.images.read import (
     SourceImage,
     read_source,
 )
-from clpipe.inputs.around import CUBE_MAP, grouped, read_around, wide_of
-from clpipe.inputs.carry import Aovs, carry, joined
-from clpipe.inputs.carry_around import carry_around
+from clpipe.inputs.carry import CarriedLayers, carry, merge_moments
+from clpipe.inputs.carry_panorama import carry_panorama
 from clpipe.inputs.depth import read_depth
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import KeptLoader, kind_message
 from clpipe.inputs.manifest import check_rows
+from clpipe.inputs.panoramas import CUBE_MAP, group_panoramas, read_panorama, wide_lens_of
 from clpipe.inputs.raw import RawImage, RawLoader, may_be_dump
 from clpipe.inputs.subframes import average, exposures, shutter_of
 from clpipe.reference.defocus import Depth
@@ -50,7 +50,7 @@ from clpipe.stages.shutter import Rows
 
 @dataclass(frozen=True)
 class LoadedImage:
-    """An image, which contains its warnings, with the chain for it and its image key."""
+    """An image, with its chain and its image key. The image contains its warnings."""
 
     chain: Chain
     source: SourceImage
@@ -71,7 +71,7 @@ class ImageLoader:
     folder: Path | None = None
 
     def for_job(self, job: Job, draw_key: str = "") -> "ImageLoader":
-        """Return the loader for one job: this loader, if the job has no values of its own.
+        """Return the loader for one job, or this loader if the job has no settings of its own.
 
         Args:
             job: the job.
@@ -109,19 +109,19 @@ class ImageLoader:
 
     @cached_property
     def reads(self) -> Kind:
-        """The kind of image that is read, except for raws."""
+        """The kind of image that the chain reads, except for raws."""
         start_at = self.request.start_at
         if start_at is None:
             return entry(self.settings)
         stage = stage_named("--start-at", base_name(start_at))
         try:
             return self.chain.source if stage.also else stage.reads
-        except RequestError:  # the stage is in the chain that a kept image carries
+        except RequestError:  # only the chain in a kept image's attributes has the stage
             return stage.reads
 
     @property
     def kept(self) -> KeptLoader | None:
-        """The loader of kept images; None if images enter at the first step."""
+        """The loader of kept images; None if chains start at their first step."""
         return None if self.request.start_at is None else KeptLoader(self.request, self.folder)
 
     @cached_property
@@ -149,8 +149,8 @@ class ImageLoader:
         """
         first = next((job for job in jobs if not job.problem), jobs[0])
         loader, path = self._for_values(first), first.path
-        takes = self.raw.takes
-        if all(takes(job.path) for job in jobs):
+        is_raw = self.raw.is_raw
+        if all(is_raw(job.path) for job in jobs):
             return loader.raw.first_chain(path)
         return loader.kept.first_chain(path) if loader.kept else loader.chain
 
@@ -162,14 +162,14 @@ class ImageLoader:
         """
         if self.kept:
             return list(jobs)
-        wide, shutter = wide_of(self.settings), shutter_of(self.settings)
+        wide, shutter = wide_lens_of(self.settings), shutter_of(self.settings)
         if wide and shutter and shutter.layer_of_light:
             raise RequestError(
                 f"{stage_in(StageRole.SHUTTER).name}.flicker_layer: found "
                 f"{shutter.layer_of_light}, but panoramas have no light layers; remove this "
                 "parameter, and all light flickers"
             )
-        return grouped(exposures(jobs, self.settings), wide)
+        return group_panoramas(exposures(jobs, self.settings), wide)
 
     def check(self, jobs: Sequence[Job]) -> None:
         """Check that the values of single images are allowed.
@@ -177,34 +177,34 @@ class ImageLoader:
         Raises:
             RequestError: they are not; the message names the row.
         """
-        carries = self.raw.takes if self.kept is None else lambda path: True
+        carries = self.raw.is_raw if self.kept is None else lambda path: True
         # Values from a file of cameras were checked when they were read.
-        if rows := [job for job in jobs if job.place or job.values.keys() - {RENDER}]:
+        if rows := [job for job in jobs if job.location or job.values.keys() - {RENDER}]:
             check_rows(rows, self.settings, carries)
         checked = {id(job) for job in rows}
         if not all(id(job) in checked or carries(job.path) for job in jobs):
             check_cameras(self.settings)
 
     def claim(self, job: Job) -> Claim:
-        """Return the size and memory that a job's files claim, without reading pixels.
+        """Return the size and memory that a job's headers claim, without reading pixels.
 
-        The claim is 0 if the file has too many pixels to be read. If the file cannot be opened, it
-        counts one pixel for each byte.
+        The claim is 0 if the file has too many pixels to be read. For a file that cannot be opened,
+        it is one pixel per byte.
         """
-        most = self.request.max_pixels or USUAL_MAX_PIXELS
+        max_pixels = self.request.max_pixels or USUAL_MAX_PIXELS
         dump = self.settings.dump_format
         if dump and may_be_dump(job.path):
             claim = plain_claim(dump.width, dump.height)
         else:
             mosaic = len(self.reads.channels) == 1
             found = claim_of(job.path, mosaic)
-            claim = found or plain_claim(min(stamp_of(job.path)[0], most), 1)
-        if claim.width * claim.height > most:
+            claim = found or plain_claim(min(stamp_of(job.path)[0], max_pixels), 1)
+        if claim.width * claim.height > max_pixels:
             return plain_claim(0, 0)
-        files = len(job.paths) if job.around else 1
+        files = len(job.paths) if job.is_panorama else 1
         return Claim(claim.width, claim.height * files, claim.image * files, claim.reading * files)
 
-    def opens(self, job: Job) -> bool:
+    def has_readable_header(self, job: Job) -> bool:
         """Return whether the header of a job's file can be read."""
         is_dump = self.settings.dump_format is not None and may_be_dump(job.path)
         return is_dump or claim_of(job.path) is not None
@@ -216,15 +216,15 @@ class ImageLoader:
             ImageError: it cannot be read, has another kind or size than expected, or changes while
                 it is read.
         """
-        wide = None if self.kept else wide_of(self.settings)
+        wide = None if self.kept else wide_lens_of(self.settings)
         shutter = None if wide else self.shutter(job)
-        if wide and not self.raw.takes(job.path):
-            return read_around(job, self._read, wide)
+        if wide and not self.raw.is_raw(job.path):
+            return read_panorama(job, self._read, wide)
         if shutter:
-            known = shutter.with_defaults(exposure_time=self.chain.optics.exposure_time)
+            resolved = shutter.with_defaults(exposure_time=self.chain.optics.exposure_time)
             exposures = exposures_of(self.chain)
             spans = exposures.spans if exposures else (Span(),)
-            source = average(job, self._read, known, spans)
+            source = average(job, self._read, resolved, spans)
         else:
             with unchanged(job.path):
                 source = self._read(job.path)
@@ -243,14 +243,14 @@ class ImageLoader:
         return source
 
     def shutter(self, job: Job) -> Rows | None:
-        """Return the shutter that combines a job's files or layers; None if nothing is combined."""
+        """Return the shutter that combines a job's files or layers, or None for a single layer."""
         shutter = shutter_of(self.settings)
-        is_render = self.kept is None and not self.raw.takes(job.path)
+        is_render = self.kept is None and not self.raw.is_raw(job.path)
         is_lit = shutter is not None and bool(shutter.layer_of_light) and is_render
         return shutter if job.subframes or is_lit else None
 
     def _read(self, path: Path, layer: str | None = None) -> SourceImage:
-        if self.raw.takes(path):
+        if self.raw.is_raw(path):
             return self.raw.read(path)
         request = self.request
         options = ReadOptions(
@@ -270,40 +270,42 @@ class ImageLoader:
             ImageError: the image cannot enter the chain, or lacks depth that the chain needs.
             RequestError: the chain cannot be made.
         """
-        loaded = self._entered(job, source)
+        loaded = self._enter_without_depth(job, source)
         if loaded is None:
             return None
         source, request = loaded.source, self.request
-        carried, most = request.aov_specs(), request.max_pixels or USUAL_MAX_PIXELS
+        carried, max_pixels = request.aov_specs(), request.max_pixels or USUAL_MAX_PIXELS
 
         def depth(chain: Chain, width: int, height: int, margins: Margins) -> Depth:
-            return read_depth(job.at("middle"), chain, width, height, margins, carried, most)
+            return read_depth(job.at("middle"), chain, width, height, margins, carried, max_pixels)
 
         around = source.panorama
-        own = enter(loaded.chain, source.pixels, source.margins, depth, source.shot, around)
-        if own.pixels is source.pixels and not (own.margins or own.depth or own.warnings):
-            return LoadedImage(own.chain, source, loaded.key)
+        entry_ = enter(loaded.chain, source.pixels, source.margins, depth, source.shot, around)
+        if entry_.pixels is source.pixels and not (
+            entry_.margins or entry_.depth or entry_.warnings
+        ):
+            return LoadedImage(entry_.chain, source, loaded.key)
         later = source.later
-        if own.margins != source.margins:
+        if entry_.margins != source.margins:
             later = tuple(np.ascontiguousarray(source.margins.cropped(each)) for each in later)
         source = replace(
             source,
-            pixels=own.pixels,
+            pixels=entry_.pixels,
             later=later,
-            margins=own.margins,
-            depth=own.depth,
-            warnings=(*source.warnings, *own.warnings),
+            margins=entry_.margins,
+            depth=entry_.depth,
+            warnings=(*source.warnings, *entry_.warnings),
         )
-        return LoadedImage(own.chain, source, loaded.key)
+        return LoadedImage(entry_.chain, source, loaded.key)
 
-    def _entered(self, job: Job, source: SourceImage) -> LoadedImage | None:
-        """Return an image with its chain, as :meth:`enter` does, but without depth."""
+    def _enter_without_depth(self, job: Job, source: SourceImage) -> LoadedImage | None:
+        """Return an image with its chain like :meth:`enter`, but without reading depth."""
         key = image_key(job.key, source.sha256)
         if isinstance(source, RawImage):
             chain, source = self.raw.enter(job.path, source)
             return LoadedImage(chain, source, key)
         if self.kept:
-            entered = self.kept.enter(job.path, source, key, job.listed)
+            entered = self.kept.enter(job.path, source, key, job.named_by_user)
             return LoadedImage(*entered) if entered else None
         if stage := source.attributes.get("stage"):
             warning = (
@@ -313,41 +315,41 @@ class ImageLoader:
             source = replace(source, warnings=(*source.warnings, warning))
         return LoadedImage(self.chain, source, key)
 
-    def aovs(self, job: Job, loaded: LoadedImage, orientation: int = 1) -> Aovs:
+    def carried_layers(self, job: Job, loaded: LoadedImage, orientation: int = 1) -> CarriedLayers:
         """Return the carried layers of a job's picture, at the requested moments.
 
         Args:
             job: the image's job.
             loaded: the image that :meth:`enter` returned.
-            orientation: EXIF's value by which the picture is rotated at the end.
+            orientation: the EXIF orientation that is applied to the picture at the end.
 
         Raises:
             ImageError: a layer is missing, or does not fit the image.
         """
         request = self.request
-        most = request.max_pixels or USUAL_MAX_PIXELS
+        max_pixels = request.max_pixels or USUAL_MAX_PIXELS
         layers = request.aov_specs()
         moments = ("middle", "start", "end") if request.truth_at == "all" else (request.truth_at,)
-        given = loaded.source, loaded.chain, layers, most, orientation
+        arguments = loaded.source, loaded.chain, layers, max_pixels, orientation
         if loaded.source.panorama and layers:
-            return carry_around(job.paths, *given)
+            return carry_panorama(job.paths, *arguments)
         if not job.subframes:
-            return carry(job.path, *given)
-        of_moments = {moment: carry(job.at(moment), *given) for moment in moments}
-        return joined(of_moments, named=len(moments) > 1)
+            return carry(job.path, *arguments)
+        by_moment = {moment: carry(job.at(moment), *arguments) for moment in moments}
+        return merge_moments(by_moment, named=len(moments) > 1)
 
-    def is_left_out(self, job: Job, error: Exception) -> bool:
-        """Return whether an image that cannot enter is skipped, as its folder was named."""
+    def is_skipped(self, job: Job, error: Exception) -> bool:
+        """Return whether an image that cannot be used is skipped, because it is from a folder."""
         is_of_other_step = isinstance(error, KindError) and self.kept is not None
-        return not job.listed and (is_of_other_step or isinstance(error, NoPictureError))
+        return not job.named_by_user and (is_of_other_step or isinstance(error, NoPictureError))
 
     def error_text(self, job: Job, error: Exception) -> str:
         """Return the message of an error, with the name of the file and a way to correct it."""
         if isinstance(error, KindError):
             return kind_message(error, self.chain, self.request.start_at)
         message = str(error) or "there is not enough memory for it"
-        message = message.replace(str(job.path), job.shown)
-        return message if job.shown in message else f"{job.shown}: {message}"
+        message = message.replace(str(job.path), job.display_name)
+        return message if job.display_name in message else f"{job.display_name}: {message}"
 
     def __getstate__(self) -> dict[str, Any]:
         # Cached values are not pickled, because they may contain classes of stage files.

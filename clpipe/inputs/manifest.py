@@ -20,10 +20,19 @@ from clpipe.chain.paths import from_folder
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import toml_value, value_text
-from clpipe.inputs.tables import OWN, PLAIN, TEXTS, csv_records, json_records
+from clpipe.inputs.tables import (
+    NON_SETTINGS,
+    TEXT_COLUMNS,
+    TOP_LEVEL_KEYS,
+    csv_records,
+    json_records,
+)
 
 MANIFEST_SUFFIXES = (".csv", ".jsonl")
-ALONE = ("seed", "noise_key")  # no other setting depends on these, and they often differ by row
+INDEPENDENT_KEYS = (
+    "seed",
+    "noise_key",
+)  # no other setting depends on these, and they often differ by row
 MANIFEST_BYTES = 256 * 2**20  # enough for two million rows
 
 
@@ -37,7 +46,7 @@ class Row:
         name: the path of its outputs in the output directory, without extension; "" uses the key.
         values: its settings, nested like a configuration.
         frames: the number of frames; None uses that of the request.
-        place: the manifest and the row, for messages.
+        location: the manifest and the row, for messages.
     """
 
     path: Path
@@ -45,7 +54,7 @@ class Row:
     name: str
     values: Mapping[str, Any]
     frames: int | None
-    place: str
+    location: str
 
     @property
     def stem(self) -> str:
@@ -56,9 +65,9 @@ class Row:
 def read_manifest(path: Path) -> list[Row]:
     """Return the rows of a manifest.
 
-    A .csv has a header, and commas between cells, in UTF-8. A cell is a TOML value, or text if it
-    is not valid TOML. An empty cell sets nothing. A .jsonl has one object per line, nested like a
-    configuration or with dotted keys, and null sets nothing.
+    A .csv file is UTF-8 text with a header and commas between cells. A cell is a TOML value, or
+    text if it is not valid TOML. An empty cell sets nothing. A .jsonl file has one object per line,
+    nested like a configuration or with dotted keys, and null sets nothing.
 
     Columns are ``path``, ``name``, ``frames``, ``iso``, ``camera``, ``lens``, ``focal_length``,
     ``aperture``, ``focus_distance``, ``seed``, ``noise_key`` and ``skip`` (a list, or names with
@@ -77,25 +86,25 @@ def read_manifest(path: Path) -> list[Row]:
     """
     text = _text(path)
     read = json_records if path.suffix.lower() == ".jsonl" else csv_records
-    faults: list[str] = []
+    errors: list[str] = []
     rows: list[Row] = []
-    makers: dict[str, Row] = {}
-    alike: dict[str, Mapping[str, Any]] = {}  # values that rows share are checked once
+    by_stem: dict[str, Row] = {}
+    shared_values: dict[str, Mapping[str, Any]] = {}  # values that rows share are checked once
     for line, record in read(path, text, _check_column):
-        place = f"{path}, row {line}"
+        location = f"{path}, row {line}"
         try:
-            row = _row(path.parent, place, record(), alike)
-            other = makers.setdefault(row.stem, row)
+            row = _row(path.parent, location, record(), shared_values)
+            other = by_stem.setdefault(row.stem, row)
             if other is not row:
                 raise RequestError(
-                    f"this row would write the same outputs as row "
-                    f"{other.place.rpartition(' ')[2]}, {row.stem}; give them different names in a "
-                    "column called name"
+                    "this row would write the same outputs as row "
+                    f"{other.location.rpartition(' ')[2]}, {row.stem}; give them different names "
+                    "in a column called name"
                 )
             rows.append(row)
         except RequestError as error:
-            faults.append(f"{place}: {error}")
-    _report(faults)
+            errors.append(f"{location}: {error}")
+    _raise_first(errors)
     if not rows:
         raise RequestError(f"{path}: this manifest has no rows; add one for each image")
     return rows
@@ -115,7 +124,7 @@ def manifest_text(folder: Path, rows: Sequence[Row]) -> bytes:
         cells = {"path": path if below.startswith("../") else below, "name": row.name}
         cells["frames"] = "" if row.frames is None else str(row.frames)
         for key, value in from_folder(Path.cwd(), row.values).items():
-            table = value if key not in PLAIN and isinstance(value, Mapping) else None
+            table = value if key not in TOP_LEVEL_KEYS and isinstance(value, Mapping) else None
             named = {key: value} if table is None else {f"{key}.{k}": v for k, v in table.items()}
             cells |= {name: _cell(each) for name, each in named.items()}
         records.append(cells)
@@ -138,71 +147,75 @@ def _cell(value: Any) -> str:
     return value if is_plain else value_text(value)
 
 
-class HasValues(Protocol):
-    """An image with settings of its own, such as a :class:`Row`."""
+class ImageSettings(Protocol):
+    """An image with its own settings, such as a :class:`Row`."""
 
     @property
     def path(self) -> Path: ...
     @property
     def values(self) -> Mapping[str, Any]: ...
     @property
-    def place(self) -> str: ...
+    def location(self) -> str: ...
 
 
 def check_rows(
-    rows: Iterable[HasValues],
+    rows: Iterable[ImageSettings],
     settings: Settings,
-    carries: Callable[[Path], bool] = lambda path: False,
+    has_embedded_settings: Callable[[Path], bool] = lambda path: False,
 ) -> list[Settings]:
     """Return the settings of each row, with every value checked and nothing drawn.
 
     Args:
         rows: rows of a manifest, or jobs made from them.
         settings: the settings for what a row does not set.
-        carries: returns whether an image has settings of its own, like a raw. Such an image may
-            have another camera and other stages.
+        has_embedded_settings: returns whether an image contains settings, like a raw. Such an image
+            may have another camera and other stages.
 
     Raises:
         RequestError: a value is not allowed, a camera or ISO does not exist, or a stage is not in
             the chain. The message is as for :func:`read_manifest`.
     """
     steps = settings.step_names
-    faults: list[str] = []
+    errors: list[str] = []
     checked: list[Settings] = []
-    known: dict[tuple[str, bool], Settings] = {}  # for rows with equal values
+    checked_settings: dict[tuple[str, bool], Settings] = {}  # for rows with equal values
     for row in rows:
-        carried = carries(row.path)
-        alone = {
+        is_embedded = has_embedded_settings(row.path)
+        independent = {
             key: value
             for key, value in row.values.items()
-            if key in ALONE and not isinstance(value, Mapping)
+            if key in INDEPENDENT_KEYS and not isinstance(value, Mapping)
         }
-        others = {key: value for key, value in row.values.items() if key not in alone}
-        alike = repr(others), carried
+        others = {key: value for key, value in row.values.items() if key not in independent}
+        cache_key = repr(others), is_embedded
         try:
-            if alike not in known:
-                own = overlay(settings, others)
-                if not carried:
-                    check_cameras(own)
+            if cache_key not in checked_settings:
+                row_settings = overlay(settings, others)
+                if not is_embedded:
+                    check_cameras(row_settings)
                     for step in others:
-                        if step not in (*PLAIN, *TABLES, *steps):
+                        if step not in (*TOP_LEVEL_KEYS, *TABLES, *steps):
                             raise RequestError(one_of("stage in this chain", step, steps))
-                known[alike] = own
-            for key, value in alone.items():
+                checked_settings[cache_key] = row_settings
+            for key, value in independent.items():
                 check_type(key, value)
-            checked.append(replace(known[alike], **alone) if alone else known[alike])
+            checked.append(
+                replace(checked_settings[cache_key], **independent)
+                if independent
+                else checked_settings[cache_key]
+            )
         except RequestError as error:
-            faults.append(f"{row.place}: {error}")
-    _report(faults)
+            errors.append(f"{row.location}: {error}")
+    _raise_first(errors)
     return checked
 
 
-def _report(faults: Sequence[str]) -> None:
+def _raise_first(errors: Sequence[str]) -> None:
     """Raise the first fault, if there is one, with the number of others."""
-    if faults:
-        more = len(faults) - 1
+    if errors:
+        more = len(errors) - 1
         rest = f"; {more} more {'rows are' if more > 1 else 'row is'} also wrong" if more else ""
-        raise RequestError(faults[0] + rest)
+        raise RequestError(errors[0] + rest)
 
 
 def _text(path: Path) -> str:
@@ -229,12 +242,14 @@ def _check_column(name: str) -> None:
     """
     step, dot, parameter = name.partition(".")
     stage = all_stages().get(base_name(step))
-    if not dot and name not in (*OWN, *PLAIN):
+    if not dot and name not in (*NON_SETTINGS, *TOP_LEVEL_KEYS):
         if stage or step in TABLES:
             raise RequestError(
                 f"{name} is not a column, but each of its parameters is; use {name}.PARAMETER"
             )
-        raise RequestError(one_of("column", name, (*OWN, *PLAIN)) + ", or stage.parameter")
+        raise RequestError(
+            one_of("column", name, (*NON_SETTINGS, *TOP_LEVEL_KEYS)) + ", or stage.parameter"
+        )
     if dot and step not in TABLES:
         if stage is None:
             raise RequestError(f"{name}: {one_of('stage', step, (*all_stages(), *TABLES))}")
@@ -246,27 +261,27 @@ def _check_column(name: str) -> None:
 
 
 def _row(
-    folder: Path, place: str, record: Mapping[str, Any], alike: dict[str, Mapping[str, Any]]
+    folder: Path, location: str, record: Mapping[str, Any], shared: dict[str, Mapping[str, Any]]
 ) -> Row:
     """Return a row, from its values by column.
 
     Args:
         folder: the folder of the manifest.
-        place: the manifest and the row.
+        location: the manifest and the row.
         record: the values.
         alike: values of earlier rows. Rows with equal values share one object.
 
     Raises:
         RequestError: path, name or frames are not allowed.
     """
-    for column in TEXTS:
+    for column in TEXT_COLUMNS:
         _check_text(column, record.get(column, ""))
     path, name, frames = record.get("path", ""), record.get("name", ""), record.get("frames")
     if os.path.basename(path) in ("", ".", ".."):
         raise RequestError(f"path: found {path!r}, but expected the path of an image")
     _check_name(name)
     if frames is not None and not OPTIONS["frames"].allows(frames):
-        raise RequestError(f"frames: found {frames!r}, but it is {OPTIONS['frames'].allowed}")
+        raise RequestError(f"frames: found {frames!r}, but expected {OPTIONS['frames'].allowed}")
     values: dict[str, Any] = {}
     for column, value in record.items():
         step, _, parameter = column.partition(".")
@@ -274,12 +289,12 @@ def _row(
             values.setdefault(step, {})[parameter] = value
         elif column == "skip" and isinstance(value, str):
             values[column] = value.split()
-        elif column in PLAIN:
+        elif column in TOP_LEVEL_KEYS:
             values[column] = value
-    own = joined(folder, path)
-    key = name or (own.name if is_url(path) else key_of(folder, own))
+    image_path = joined(folder, path)
+    key = name or (image_path.name if is_url(path) else key_of(folder, image_path))
     values = from_folder(folder, values)
-    return Row(own, key, name, alike.setdefault(repr(values), values), frames, place)
+    return Row(image_path, key, name, shared.setdefault(repr(values), values), frames, location)
 
 
 def check_output_name(name: str) -> None:

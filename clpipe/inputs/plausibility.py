@@ -1,4 +1,4 @@
-"""Warnings about an image that enters a chain: implausible values, and assumed values."""
+"""Warnings about the input of a chain: implausible values, and assumed values."""
 
 from clpipe.chain.chain import Chain
 from clpipe.chain.registry import stage_in

@@ -18,10 +18,10 @@ from clpipe.chain.render_camera import RenderCamera
 from clpipe.inputs.find import Job
 from clpipe.inputs.render_cameras import View, read_views
 
-ENDING = re.compile(r"\.[A-Za-z]\w{1,4}$")  # the extension of an image; frame.0001 has none
+EXTENSION = re.compile(r"\.[A-Za-z]\w{1,4}$")  # the extension of an image; frame.0001 has none
 
 
-def with_views(
+def assign_views(
     jobs: Sequence[Job], path: Path | None, settings: RenderCamera, truth_at: Moments = "middle"
 ) -> list[Job]:
     """Return the jobs of a run, each with its camera from a file.
@@ -31,8 +31,8 @@ def with_views(
     render's path. Otherwise their file names must be equal, and no other view or render may have
     that name. A job without a valid view gets a ``problem``.
 
-    If an exposure has several files, its camera is that of one moment. If each file has a pose, the
-    job gets all of them.
+    If an exposure has several files, its camera is the one at ``truth_at``. If each file has a
+    pose, the job gets all poses.
 
     Args:
         jobs: all jobs of the run.
@@ -45,28 +45,32 @@ def with_views(
     """
     if path is None:
         return list(jobs)
-    views = Views(read_views(path))
-    called = Counter(PurePosixPath(stem_of(job.key)).name for job in jobs)
-    given = []
+    views = ViewIndex(read_views(path))
+    name_counts = Counter(PurePosixPath(stem_of(job.key)).name for job in jobs)
+    assigned = []
     for job in jobs:
         try:
-            several = () if job.around else job.subframes
-            files = [stem_of(str(PurePosixPath(job.key).with_name(p.name))) for p in several]
-            own_name = stem_of(job.key)
-            if job.around and not views.get(own_name, called):
-                own_name = stem_of(str(PurePosixPath(job.key).with_name(job.path.name)))
-            of_files = [views.find(own_name, called)]
-            of_files += [view for file in files if (view := views.get(file, called))]
+            subframes = () if job.is_panorama else job.subframes
+            files = [stem_of(str(PurePosixPath(job.key).with_name(p.name))) for p in subframes]
+            name = stem_of(job.key)
+            if job.is_panorama and not views.get(name, name_counts):
+                name = stem_of(str(PurePosixPath(job.key).with_name(job.path.name)))
+            views_of_files = [views.find(name, name_counts)]
+            views_of_files += [view for file in files if (view := views.get(file, name_counts))]
             at = job.paths.index(job.at("middle" if truth_at == "all" else truth_at))
-            is_whole = len(of_files) == len(job.paths) and not job.around
-            own = _with_view(job, of_files[at if is_whole else 0], settings)
-            given.append(_with_motion(own, of_files) if files and is_whole else own)
+            has_view_per_file = len(views_of_files) == len(job.paths) and not job.is_panorama
+            with_view = _with_view(job, views_of_files[at if has_view_per_file else 0], settings)
+            assigned.append(
+                _with_motion(with_view, views_of_files)
+                if files and has_view_per_file
+                else with_view
+            )
         except RequestError as error:
-            given.append(replace(job, problem=f"--poses {path}: {error}"))
-    if all(job.problem for job in given):
-        more = f"; none of the {len(given)} images has a view" if len(given) > 1 else ""
-        raise RequestError(f"{given[0].path}: {given[0].problem}{more}")
-    return given
+            assigned.append(replace(job, problem=f"--poses {path}: {error}"))
+    if all(job.problem for job in assigned):
+        more = f"; none of the {len(assigned)} images has a view" if len(assigned) > 1 else ""
+        raise RequestError(f"{assigned[0].path}: {assigned[0].problem}{more}")
+    return assigned
 
 
 def _with_view(job: Job, view: View, settings: RenderCamera) -> Job:
@@ -81,17 +85,17 @@ def _with_view(job: Job, view: View, settings: RenderCamera) -> Job:
         checked = make_model(RENDER, view.values)
     except RequestError as error:
         raise RequestError(f"view {view.name}: {error}") from None
-    own = job.values.get(RENDER, {})
-    others = {**settings.model_dump(), **own}
+    row_values = job.values.get(RENDER, {})
+    others = {**settings.model_dump(), **row_values}
     for key, value in checked.model_dump(include=set(view.values)).items():
         other = others.get(key)
         if other is not None and not np.array_equal(np.array(other), np.array(value)):
-            place = job.place if key in own else "the configuration"
+            place = job.location if key in row_values else "the configuration"
             raise RequestError(
                 f"view {view.name} has {key} {value}, but {place} has {RENDER}.{key} {other}; "
                 "remove one of them"
             )
-    values = {**job.values, RENDER: {**own, **view.values}}
+    values = {**job.values, RENDER: {**row_values, **view.values}}
     return replace(job, values=values, size=view.size)
 
 
@@ -111,7 +115,7 @@ def _with_motion(job: Job, views: Sequence[View]) -> Job:
     return replace(job, values={**job.values, RENDER: {**job.values[RENDER], "motion": poses}})
 
 
-class Views:
+class ViewIndex:
     """The views of a file, looked up by the paths of renders without extensions."""
 
     def __init__(self, views: Sequence[View]) -> None:
@@ -125,19 +129,19 @@ class Views:
                 self._by_end["/".join(parts[first:])].append(stem)
         self._ends = sorted(self._by_end)
 
-    def get(self, stem: str, called: Mapping[str, int]) -> View | None:
+    def get(self, stem: str, name_counts: Mapping[str, int]) -> View | None:
         """Return the view that :meth:`find` returns, or None if there is none or several."""
         try:
-            return self.find(stem, called)
+            return self.find(stem, name_counts)
         except RequestError:
             return None
 
-    def find(self, stem: str, called: Mapping[str, int]) -> View:
+    def find(self, stem: str, name_counts: Mapping[str, int]) -> View:
         """Return the view of a render.
 
         Args:
             stem: the path of the render, without extension.
-            called: the number of renders for each file name, without extension.
+            name_counts: the number of renders for each file name, without extension.
 
         Raises:
             RequestError: there is no view of this render, or there are several.
@@ -148,19 +152,20 @@ class Views:
         if not found:
             place = bisect_left(self._ends, name)
             ends = self._ends[max(place - 2, 0) : place + 2]
-            near = dict.fromkeys(self._by_end[end][0] for end in ends)
+            similar = dict.fromkeys(self._by_end[end][0] for end in ends)
             raise RequestError(
-                f"this file has no view {stem}; the most similar names are {', '.join(near)}"
+                f"this file has no view {stem}; the most similar names are {', '.join(similar)}"
             )
         if len(found) > 1:
             raise RequestError(
                 f"{stem} may be any of the views {', '.join(found[:3])}; choose an input folder "
                 "whose relative paths match those of the views"
             )
-        if is_named and called[name] > 1:
+        if is_named and name_counts[name] > 1:
             raise RequestError(
                 f"this file has no view {stem}, and its view {found[0]} may belong to any of the "
-                f"{called[name]} images called {name}; add their folders to the names of the views"
+                f"{name_counts[name]} images called {name}; add their folders to the names of the "
+                "views"
             )
         views = self._by_path[found[0]]
         if any(view != views[0] for view in views):
@@ -176,4 +181,4 @@ def stem_of(name: str) -> str:
     >>> stem_of("./images/frame.0001"), stem_of("a/b.exr"), stem_of("../x/c.png")
     ('images/frame.0001', 'a/b', '../x/c')
     """
-    return ENDING.sub("", os.path.normpath(name.replace("\\", "/")))
+    return EXTENSION.sub("", os.path.normpath(name.replace("\\", "/")))

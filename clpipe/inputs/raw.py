@@ -1,7 +1,7 @@
 """Loads camera raws and headerless dumps, and makes their chains from their metadata.
 
-A raw enters at the first step that reads DN, so no noise is added to it. Configuration and options
-override the metadata.
+The chain of a raw starts at the first step that reads DN, so no noise is added. Configuration and
+options override the metadata.
 """
 
 from dataclasses import dataclass, field, replace
@@ -54,7 +54,7 @@ class RawLoader:
     request: Request
     dump: Dump | None = None
 
-    def takes(self, path: Path) -> bool:
+    def is_raw(self, path: Path) -> bool:
         """Return whether a file is a raw or a dump, according to its extension."""
         is_dump = self.dump is not None and may_be_dump(path)
         return path.suffix.lower() in RAW_SUFFIXES or is_dump
@@ -74,11 +74,11 @@ class RawLoader:
         Raises:
             ImageError: it cannot be read, or does not contain a mosaic.
         """
-        facts, most = self._facts(path), self._max_pixels
+        facts, max_pixels = self._facts(path), self._max_pixels
         if isinstance(facts, Dump):
-            pixels = read_dump(path, facts, most)
+            pixels = read_dump(path, facts, max_pixels)
         else:
-            pixels = read_raw(path, facts, most)
+            pixels = read_raw(path, facts, max_pixels)
         try:
             digest, _ = sha256_of(path)
         except OSError as error:
@@ -122,19 +122,19 @@ class RawLoader:
         embedded, warnings = settings_of(facts)
         parameters = dict(embedded.parameters)
         own = self.request.settings().drawn("")  # an example of settings that may be drawn
-        balance = name_of(StageRole.BALANCE)
+        balance = stage_name(StageRole.BALANCE)
         if balance in warnings and own.parameters.get(balance):
             del parameters[balance]  # the user's setting replaces the fallback
         settings = self.request.settings(replace(embedded, parameters=parameters)).drawn("")
         if isinstance(facts, RawFacts):  # its DN are linear, even if those of renders are not
-            made = [name for name in settings.parameters if writes_raw(name)]
-            left = {k: own for k, own in settings.parameters.items() if k not in made}
-            settings = replace(settings, parameters=left)
+            raw_steps = [name for name in settings.parameters if writes_raw(name)]
+            remaining = {k: own for k, own in settings.parameters.items() if k not in raw_steps}
+            settings = replace(settings, parameters=remaining)
         camera = load_camera(settings.camera)
         low, high = camera.iso_range
         iso = min(max(settings.iso, low), high)
-        is_of_file = isinstance(facts, RawFacts) and settings.iso == facts.iso
-        if is_of_file and iso != settings.iso:
+        is_iso_of_file = isinstance(facts, RawFacts) and settings.iso == facts.iso
+        if is_iso_of_file and iso != settings.iso:
             warnings["iso"] = (
                 f"its ISO of {settings.iso:g} is outside the range of camera {camera.name}, "
                 f"{low:g} to {high:g}; denoising uses {iso:g}"
@@ -157,7 +157,7 @@ class RawLoader:
                 f"{path}: a camera raw starts at {first_raw_step(settings)}, but --start-at "
                 f"{self.request.start_at} reads {chain.source.label}. Remove --start-at"
             )
-        name = name_of(StageRole.PATTERN)
+        name = stage_name(StageRole.PATTERN)
         own = settings.parameters.get(name, {})
         pattern = own.get("array") or own.get("pattern", "RGGB")
         if parse_array(pattern).rows != chain.steps[0].context.filters.rows:
@@ -165,7 +165,7 @@ class RawLoader:
                 f"{path}: its CFA pattern is {pattern}, but the chain has no {name} stage to set "
                 f"it. Add {name} and the stages that produce DN; they do not run on a raw"
             )
-        name = name_of(StageRole.LEVELS)
+        name = stage_name(StageRole.LEVELS)
         levels = settings.parameters.get(name, {})
         if isinstance(facts, RawFacts) and not {"black_level", "white_level"} <= levels.keys():
             raise ImageError(
@@ -175,7 +175,7 @@ class RawLoader:
 
 
 def _remaining(warnings: dict[str, str], chain: Chain, embedded: Settings) -> list[str]:
-    """Return the warnings that still apply: not those about settings that are set or not used.
+    """Return the warnings that still apply, without those about settings that are set or unused.
 
     Args:
         warnings: the warnings, by topic.
@@ -188,14 +188,14 @@ def _remaining(warnings: dict[str, str], chain: Chain, embedded: Settings) -> li
         "no_iso": is_denoised and settings.iso == embedded.iso,
         "camera": is_denoised and settings.camera == embedded.camera,
     }
-    for name in map(name_of, (StageRole.BALANCE, StageRole.COLOURS)):
-        same = settings.parameters.get(name) == embedded.parameters.get(name)
-        is_current[name] = same and name in stages
+    for name in map(stage_name, (StageRole.BALANCE, StageRole.COLOURS)):
+        is_same = settings.parameters.get(name) == embedded.parameters.get(name)
+        is_current[name] = is_same and name in stages
     return [text for about, text in warnings.items() if is_current.get(about, True)]
 
 
 def writes_raw(step: str) -> bool:
-    """Return whether a step produces DN, so that a raw enters after it."""
+    """Return whether a step produces DN, so that the chain of a raw starts after it."""
     return all_stages()[base_name(step)].writes is Kind.RAW
 
 
@@ -212,22 +212,24 @@ def first_raw_step(settings: Settings) -> str:
         if all_stages()[name].reads is Kind.RAW and name not in settings.skip:
             return name
     raise RequestError(
-        f"no stage of the chain reads a raw; add {name_of(StageRole.LEVELS)}, which does"
+        f"no stage of the chain reads a raw; add {stage_name(StageRole.LEVELS)}, which does"
     )
 
 
-def name_of(role: StageRole) -> str:
+def stage_name(role: StageRole) -> str:
     """Return the name of the stage that has a role."""
     return stage_in(role).name
 
 
 def settings_of(facts: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
     """Return the settings from a raw's metadata, and warnings by topic."""
-    balance, colours = name_of(StageRole.BALANCE), name_of(StageRole.COLOURS)
-    unseen: dict[str, dict[str, Any]] = {name_of(StageRole.COLOURS_OF_LIGHT): {"method": "none"}}
+    balance, colours = stage_name(StageRole.BALANCE), stage_name(StageRole.COLOURS)
+    light_parameters: dict[str, dict[str, Any]] = {
+        stage_name(StageRole.COLOURS_OF_LIGHT): {"method": "none"}
+    }
     if isinstance(facts, Dump):
         gray_world = {balance: {"method": "gray_world"}}
-        return Settings(parameters=gray_world | unseen), {
+        return Settings(parameters=gray_world | light_parameters), {
             balance: "the file does not state its white balance; gray_world estimates it",
             colours: UNKNOWN_COLOURS,
         }
@@ -235,8 +237,8 @@ def settings_of(facts: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
     profile = camera_named(facts.make, facts.model)
     camera = profile.name if profile else DEFAULT_CAMERA
     if not profile:
-        same = facts.model.casefold().startswith(facts.make.casefold())
-        name = facts.model if same else f"{facts.make} {facts.model}"
+        is_same = facts.model.casefold().startswith(facts.make.casefold())
+        name = facts.model if is_same else f"{facts.make} {facts.model}"
         warnings["camera"] = (
             f"there is no profile of {name}; denoising uses the noise of {camera} (--camera)"
         )
@@ -244,18 +246,20 @@ def settings_of(facts: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
     if not facts.iso:
         warnings["no_iso"] = f"the file does not state its ISO; denoising uses {iso:g} (--iso)"
     is_bayer = facts.pattern in PATTERNS
-    laid = {"pattern": facts.pattern} if is_bayer else {"method": "array", "array": facts.pattern}
-    parameters = unseen | {name_of(StageRole.PATTERN): laid}
+    pattern_settings = (
+        {"pattern": facts.pattern} if is_bayer else {"method": "array", "array": facts.pattern}
+    )
+    parameters = light_parameters | {stage_name(StageRole.PATTERN): pattern_settings}
     if 0 <= facts.black_level < facts.white_level:
         levels = {"black_level": float(facts.black_level), "white_level": float(facts.white_level)}
-        parameters[name_of(StageRole.LEVELS)] = levels
+        parameters[stage_name(StageRole.LEVELS)] = levels
     if not is_bayer and parse_array(facts.pattern).is_gray:
         none = {"method": "none"}
         parameters |= {balance: none, colours: none}
         return Settings(camera=camera, iso=iso, parameters=parameters), warnings
     if facts.gains:
         red_and_blue = dict(zip(("red_gain", "blue_gain"), facts.gains, strict=True))
-        light = name_of(StageRole.BALANCE_OF_LIGHT)
+        light = stage_name(StageRole.BALANCE_OF_LIGHT)
         parameters |= {light: red_and_blue, balance: {**red_and_blue}}
     else:
         parameters[balance] = {"method": "gray_world"}
@@ -287,11 +291,11 @@ def camera_named(make: str, model: str) -> Camera | None:
 def tags_of(facts: RawFacts, chain: Chain) -> Tags:
     """Return the EXIF of the picture of a raw. Its ISO is the file's, unless the user set one."""
     low, high = chain.camera.iso_range
-    is_of_file = facts.iso is not None and chain.iso == min(max(facts.iso, low), high)
+    is_iso_of_file = facts.iso is not None and chain.iso == min(max(facts.iso, low), high)
     return Tags(
         facts.make,
         facts.model,
-        facts.iso if is_of_file and facts.iso else chain.iso,
+        facts.iso if is_iso_of_file and facts.iso else chain.iso,
         facts.exposure,
         facts.aperture,
         focal_length=facts.focal_length,

@@ -17,7 +17,8 @@ from clpipe.base.types import Array
 from clpipe.inputs.manifest import MANIFEST_BYTES
 from clpipe.reference.pose import from_opengl, from_quaternion
 
-# For the models of COLMAP's that can be a pinhole: the parameters before their coefficients.
+# For COLMAP's models that can describe a pinhole: the parameters before the distortion
+# coefficients.
 FOCAL_LENGTHS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -66,11 +67,11 @@ def read_views(path: Path) -> list[View]:
             f"--poses {path}: this is not valid JSON ({error}); give a cameras.json, a "
             "transforms.json, or a folder with COLMAP's cameras.txt and images.txt"
         ) from None
-    for key, parse in FORMS.items():
+    for key, parse in PARSERS.items():
         listed = values.get(key) if isinstance(values, dict) else None
         if isinstance(listed, list) and listed:
             return [
-                _parsed(path, number, each, values, parse) for number, each in enumerate(listed)
+                _parse_view(path, number, each, values, parse) for number, each in enumerate(listed)
             ]
     raise RequestError(
         f"--poses {path}: this file has neither the list 'views' of a cameras.json nor the list "
@@ -81,7 +82,9 @@ def read_views(path: Path) -> list[View]:
 Parser = Callable[[Mapping[str, Any], Mapping[str, Any]], View]
 
 
-def _parsed(path: Path, number: int, record: Any, common: Mapping[str, Any], parse: Parser) -> View:
+def _parse_view(
+    path: Path, number: int, record: Any, common: Mapping[str, Any], parse: Parser
+) -> View:
     """Return a view, from its record in a JSON file.
 
     Raises:
@@ -105,10 +108,10 @@ def _from_view(view: Mapping[str, Any], common: Mapping[str, Any]) -> View:
     Raises:
         ValueError: a value is not allowed; the message names it.
     """
-    own = {**common, **view}
+    merged = {**common, **view}
     values: dict[str, Any] = {}
-    if "K" in own:
-        k = numbers("K", own["K"], (3, 3))
+    if "K" in merged:
+        k = number_array("K", merged["K"], (3, 3))
         if k[0, 1] or k[1, 0] or k[2].tolist() != [0, 0, 1]:
             raise ValueError(
                 f"K: found {k.tolist()}, but expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
@@ -116,18 +119,18 @@ def _from_view(view: Mapping[str, Any], common: Mapping[str, Any]) -> View:
         values = dict(
             zip(("fx", "fy", "cx", "cy"), k[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True)
         )
-    if ("R" in own) != ("t" in own):
+    if ("R" in merged) != ("t" in merged):
         raise ValueError("R or t is missing; give both or neither")
-    if "R" in own:
-        values["rotation"] = numbers("R", own["R"], (3, 3)).tolist()
-        values["translation"] = numbers("t", own["t"], (3,)).tolist()
-    coefficients = own.get("distortion") or {}
+    if "R" in merged:
+        values["rotation"] = number_array("R", merged["R"], (3, 3)).tolist()
+        values["translation"] = number_array("t", merged["t"], (3,)).tolist()
+    coefficients = merged.get("distortion") or {}
     if not isinstance(coefficients, dict):
         raise ValueError(
             f"distortion: found {coefficients!r}, but expected an object of coefficients by name"
         )
-    _check_pinhole(str(own.get("model") or "PINHOLE"), coefficients)
-    return View("", values, _size(own, "width", "height"))
+    _check_pinhole(str(merged.get("model") or "PINHOLE"), coefficients)
+    return View("", values, _size(merged, "width", "height"))
 
 
 def _from_frame(frame: Mapping[str, Any], common: Mapping[str, Any]) -> View:
@@ -136,27 +139,29 @@ def _from_frame(frame: Mapping[str, Any], common: Mapping[str, Any]) -> View:
     Raises:
         ValueError: a value is not allowed; the message names it.
     """
-    own = {**common, **frame}
+    merged = {**common, **frame}
     names = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "camera_angle_x": "camera_angle_x"}
     values: dict[str, Any] = {
-        to: numbers(name, own[name], ()).item() for name, to in names.items() if name in own
+        to: number_array(name, merged[name], ()).item()
+        for name, to in names.items()
+        if name in merged
     }
-    if "transform_matrix" in own:
-        shape = (3, 4) if np.shape(own["transform_matrix"])[:1] == (3,) else (4, 4)
-        matrix = numbers("transform_matrix", own["transform_matrix"], shape)
+    if "transform_matrix" in merged:
+        shape = (3, 4) if np.shape(merged["transform_matrix"])[:1] == (3,) else (4, 4)
+        matrix = number_array("transform_matrix", merged["transform_matrix"], shape)
         r, t = from_opengl(matrix)
         values |= {"rotation": r.tolist(), "translation": t.tolist()}
-    coefficients = {name: value for name, value in own.items() if COEFFICIENT.fullmatch(name)}
-    listed = numbers("distortion_params", own.get("distortion_params", []), None).tolist()
+    coefficients = {name: value for name, value in merged.items() if COEFFICIENT.fullmatch(name)}
+    listed = number_array("distortion_params", merged.get("distortion_params", []), None).tolist()
     coefficients |= {f"distortion_params[{i}]": value for i, value in enumerate(listed)}
-    _check_pinhole(str(own.get("camera_model") or "PINHOLE"), coefficients)
-    size = _size(own, "w", "h")
+    _check_pinhole(str(merged.get("camera_model") or "PINHOLE"), coefficients)
+    size = _size(merged, "w", "h")
     if size and "fx" not in values and 0 < values.get("camera_angle_x", 0.0) < math.pi:
         values["fx"] = size[0] / 2 / math.tan(values.pop("camera_angle_x") / 2)
     return View("", values, size)
 
 
-FORMS: dict[str, Parser] = {"views": _from_view, "frames": _from_frame}
+PARSERS: dict[str, Parser] = {"views": _from_view, "frames": _from_frame}
 
 
 def _from_colmap(folder: Path) -> Iterator[View]:
@@ -165,20 +170,22 @@ def _from_colmap(folder: Path) -> Iterator[View]:
     Raises:
         RequestError: the model cannot be read.
     """
-    places = [
-        place for place in (folder, folder / "sparse" / "0") if (place / "images.txt").exists()
+    folders = [
+        candidate
+        for candidate in (folder, folder / "sparse" / "0")
+        if (candidate / "images.txt").exists()
     ]
-    if not places:
+    if not folders:
         raise RequestError(
             f"--poses {folder}: there is no images.txt in this folder or its sparse/0; to convert "
             "a binary model, run colmap model_converter --output_type TXT"
         )
     cameras = {}
-    for line in _lines(places[0] / "cameras.txt"):
+    for line in _lines(folders[0] / "cameras.txt"):
         if line and not line.startswith("#"):
             identity, *rest = line.split()
             cameras[identity] = rest
-    lines = _lines(places[0] / "images.txt")
+    lines = _lines(folders[0] / "images.txt")
     for line in lines:
         if not line or line.startswith("#"):
             continue
@@ -186,12 +193,12 @@ def _from_colmap(folder: Path) -> Iterator[View]:
         _, *fields = line.split(maxsplit=9)
         if len(fields) != 9:
             raise RequestError(
-                f"--poses {places[0] / 'images.txt'}: found the line {line[:80]!r}; expected "
+                f"--poses {folders[0] / 'images.txt'}: found the line {line[:80]!r}; expected "
                 "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
             )
-        *numbers_, camera, name = fields
+        *pose, camera, name = fields
         try:
-            yield _from_image(name, numbers_, cameras.get(camera, []))
+            yield _from_image(name, pose, cameras.get(camera, []))
         except ValueError as error:
             yield View(name, {}, problem=str(error))
 
@@ -218,11 +225,13 @@ def _from_image(name: str, pose: Sequence[str], camera: Sequence[str]) -> View:
     if len(camera) < 4:
         raise ValueError("its camera is missing in cameras.txt")
     model, width, height, *texts = camera
-    q, t = np.split(numbers("QW QX QY QZ TX TY TZ", [_number(text) for text in pose], (7,)), [4])
+    q, t = np.split(
+        number_array("QW QX QY QZ TX TY TZ", [_number(text) for text in pose], (7,)), [4]
+    )
     if not q.any():
         raise ValueError("its quaternion is 0")
     names = FOCAL_LENGTHS.get(model, ())
-    parameters = numbers("PARAMS", [_number(text) for text in texts], None).tolist()
+    parameters = number_array("PARAMS", [_number(text) for text in texts], None).tolist()
     if names and len(parameters) < len(names):
         raise ValueError(
             f"its camera has {len(parameters)} parameters, but {model} needs {' '.join(names)}"
@@ -243,8 +252,8 @@ def _number(text: str) -> Any:
         return text
 
 
-def numbers(name: str, value: Any, shape: tuple[int, ...] | None) -> Array:
-    """Return a value as a finite float64 array of a shape; None allows any length of one axis.
+def number_array(name: str, value: Any, shape: tuple[int, ...] | None) -> Array:
+    """Return a value as a finite float64 array of a shape, or of one axis for None.
 
     Raises:
         ValueError: the value is anything else; the message contains its name.
@@ -263,14 +272,14 @@ def numbers(name: str, value: Any, shape: tuple[int, ...] | None) -> Array:
 
 
 def _size(values: Mapping[str, Any], *names: str) -> tuple[int, int] | None:
-    """Return width and height, by their names; None if one is missing.
+    """Return the values of the keys for width and height, or None if one is missing.
 
     Raises:
         ValueError: they are not whole numbers above 0.
     """
     if not set(names) <= values.keys():
         return None
-    width, height = (numbers(name, values[name], ()).item() for name in names)
+    width, height = (number_array(name, values[name], ()).item() for name in names)
     if not (width == int(width) > 0 and height == int(height) > 0):
         raise ValueError(
             f"found {width:g}x{height:g} pixels, but width and height are whole numbers above 0"
@@ -284,9 +293,9 @@ def _check_pinhole(model: str, coefficients: Mapping[str, Any]) -> None:
     Raises:
         ValueError: it has.
     """
-    bent = ", ".join(f"{k} {v}" for k, v in coefficients.items() if v)
-    if bent or model not in FOCAL_LENGTHS:
-        what = f"has distortion ({bent})" if bent else f"has the model {model}"
+    distortion = ", ".join(f"{k} {v}" for k, v in coefficients.items() if v)
+    if distortion or model not in FOCAL_LENGTHS:
+        what = f"has distortion ({distortion})" if distortion else f"has the model {model}"
         raise ValueError(
             f"its camera {what}, but renders have no lens distortion; remove it from the file, and "
             "let clpipe warp the picture (see clpipe stages distortion)"

@@ -1,4 +1,4 @@
-"""Series: several cameras and ISOs for each image, with a folder for each combination."""
+"""Series: every image with several cameras and ISOs, and a folder for each combination."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,10 +36,10 @@ class Series:
         lists = {"camera": self.cameras, "iso": self.isos}
         return {k: v[0] for k, v in lists.items() if len(v) == 1 and not self.always}
 
-    def under(self, output: Path) -> list[Path]:
-        """Return the folders of its pictures: the output directory itself if there is no series.
+    def folders_in(self, output: Path) -> list[Path]:
+        """Return the folders of its pictures, or the output directory if there is no series.
 
-        >>> Series(("sony-a7r2",), (100.0, 800.0)).under(Path("out"))
+        >>> Series(("sony-a7r2",), (100.0, 800.0)).folders_in(Path("out"))
         [PosixPath('out/iso100'), PosixPath('out/iso800')]
 
         Raises:
@@ -83,8 +83,8 @@ class Series:
     def _members(self) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield the folders, each with the settings of its pictures."""
         cameras: list[tuple[str, dict[str, Any]]] = [("", {})]
-        several = 0 if self.always else 1
-        if len(self.cameras) > several:
+        threshold = 0 if self.always else 1
+        if len(self.cameras) > threshold:
             names = [load_camera(camera).name for camera in self.cameras]
             for name in names:
                 if names.count(name) > 1:
@@ -93,7 +93,7 @@ class Series:
                 (f"{name}/", {"camera": camera})
                 for name, camera in zip(names, self.cameras, strict=True)
             ]
-        named = self.isos if len(self.isos) > several else ()
+        named = self.isos if len(self.isos) > threshold else ()
         isos = [(f"iso{iso:g}", {"iso": iso}) for iso in named]
         for folder, camera in cameras:
             for name, iso in isos or [("", {})]:
@@ -116,14 +116,14 @@ def split_series(
     Raises:
         RequestError: an ISO is not a number above 0, or occurs twice.
     """
-    own = {
+    series_values = {
         key: settings[key]
         for key in ("camera", "iso")
         if key in settings and not isinstance(settings[key], Mapping)
     }
-    isos = check_isos(own["iso"]) if "iso" in own else ()
-    series = Series(several(own.get("camera")), isos, always)
-    others = {key: value for key, value in settings.items() if key not in own}
+    isos = check_isos(series_values["iso"]) if "iso" in series_values else ()
+    series = Series(several(series_values.get("camera")), isos, always)
+    others = {key: value for key, value in settings.items() if key not in series_values}
     return series, others | series.common
 
 

@@ -55,9 +55,9 @@ def exposures(jobs: Sequence[Job], settings: Settings) -> list[Job]:
     if shutter is None or shutter.subframes == 1 or any(job.subframes for job in jobs):
         return list(jobs)
     count = shutter.subframes
-    grouped = []
-    for folder, own in groupby(jobs, lambda job: job.path.parent):
-        files = list(own)
+    joined = []
+    for folder, folder_jobs in groupby(jobs, lambda job: job.path.parent):
+        files = list(folder_jobs)
         if len(files) % count:
             raise RequestError(
                 f"{folder}: {stage_in(StageRole.SHUTTER).name}.subframes is {count}, but this "
@@ -66,8 +66,8 @@ def exposures(jobs: Sequence[Job], settings: Settings) -> list[Job]:
         for start in range(0, len(files), count):
             first, *others = files[start : start + count]
             check_values([first, *others], "a part of the same exposure")
-            grouped.append(replace(first, subframes=tuple(job.path for job in others)))
-    return grouped
+            joined.append(replace(first, subframes=tuple(job.path for job in others)))
+    return joined
 
 
 def average(
@@ -78,7 +78,7 @@ def average(
 ) -> SourceImage:
     """Return the image of an exposure: for each row, the mean of the frames while it is exposed.
 
-    Memory holds one frame at a time, and a float32 sum for each exposure.
+    One frame at a time is in memory, and a float32 sum for each exposure.
 
     Args:
         job: the job, with the files of all frames.
@@ -107,9 +107,11 @@ def average(
             shutter = shutter.with_defaults(exposure_time=time)
             size = len(job.paths), pixels.shape[0], source.margins
             for each in range(len(spans)):
-                own = shutter.during(spans, each)
-                plain, lit = (weights_of(own, *size, lit=is_lit) for is_lit in (False, True))
-                weights.append((plain, lit - plain))
+                sub_shutter = shutter.during(spans, each)
+                unlit, lit = (
+                    weights_of(sub_shutter, *size, lit=is_lit) for is_lit in (False, True)
+                )
+                weights.append((unlit, lit - unlit))
             totals = np.zeros((len(spans), *pixels.shape), np.float32)
         elif (pixels.shape, source.margins) != (totals.shape[1:], found[0].margins):
             raise ImageError(
@@ -117,20 +119,20 @@ def average(
                 f"{job.path}, in the same exposure, is {_size(found[0], totals[0])}; render all "
                 "frames at one size"
             )
-        for total, (plain, more) in zip(totals, weights, strict=True):
-            _add(total, plain[number], pixels)
+        for total, (unlit, extra) in zip(totals, weights, strict=True):
+            _add(total, unlit[number], pixels)
             if light:
-                _add(total, more[number], light.pixels)
+                _add(total, extra[number], light.pixels)
         warnings = (*source.warnings, *(light.warnings if light else ()))
         found.append(replace(source, pixels=pixels[:0], warnings=warnings))
     averaged = replace(found[0], pixels=totals[0], later=tuple(totals[1:]))
-    return of_files(averaged, job, found)
+    return with_file_records(averaged, job, found)
 
 
-def of_files(image: SourceImage, job: Job, sources: Sequence[SourceImage]) -> SourceImage:
+def with_file_records(image: SourceImage, job: Job, sources: Sequence[SourceImage]) -> SourceImage:
     """Return an image made of a job's files, with their digests and the warnings of each.
 
-    The image of a single file is returned unchanged, because it has them already.
+    The image of a single file is returned unchanged.
     """
     if len(sources) == 1:
         return image
@@ -149,12 +151,12 @@ def of_files(image: SourceImage, job: Job, sources: Sequence[SourceImage]) -> So
     )
 
 
-def check_values(jobs: Sequence[Job], why: str) -> None:
+def check_values(jobs: Sequence[Job], relation: str) -> None:
     """Check that jobs that will be joined have equal values.
 
     Args:
         jobs: the jobs.
-        why: what their files have in common, for the message.
+        relation: what their files have in common, for the message.
 
     Raises:
         RequestError: the values differ.
@@ -162,16 +164,16 @@ def check_values(jobs: Sequence[Job], why: str) -> None:
     first = jobs[0]
     if different := next((job for job in jobs if job.values != first.values), None):
         raise RequestError(
-            f"{different.label}: its values differ from those of {first.label}, which is {why}; "
-            "give both the same values"
+            f"{different.label}: its values differ from those of {first.label}, which is "
+            f"{relation}; give both the same values"
         )
 
 
 def _add(total: Floats, weights: Doubles, pixels: Array) -> None:
     """Add an image to a sum, multiplied by a weight for each row."""
-    seen = np.flatnonzero(weights)
-    if seen.size:
-        rows = slice(int(seen[0]), int(seen[-1]) + 1)
+    used = np.flatnonzero(weights)
+    if used.size:
+        rows = slice(int(used[0]), int(used[-1]) + 1)
         total[rows] += weights[rows, None, None].astype(np.float32) * pixels[rows]
 
 
@@ -191,5 +193,5 @@ def weights_of(
 def _size(source: SourceImage, pixels: Array) -> str:
     """Return the size of a picture and its overscan as text."""
     width, height = source.margins.inside(*pixels.shape[1::-1])
-    beyond = f" with {tuple(source.margins)} px of overscan" if source.margins else ""
-    return f"{width}x{height}{beyond}"
+    overscan = f" with {tuple(source.margins)} px of overscan" if source.margins else ""
+    return f"{width}x{height}{overscan}"

@@ -19,12 +19,12 @@ from clpipe.chain.toml import toml_value
 
 Record = Callable[[], dict[str, Any]]  # the values of a row by column, or a RequestError
 
-TEXTS = ("path", "name")  # columns that are never parsed as TOML values
+TEXT_COLUMNS = ("path", "name")  # columns that are not parsed as TOML values
 
-OWN = (*TEXTS, "frames")  # columns that are not settings
+NON_SETTINGS = (*TEXT_COLUMNS, "frames")  # columns that are not settings
 
 # Columns of settings that are not in a table.
-PLAIN = tuple(key for key in KEYS if key not in (CODE, "dump", "stages"))
+TOP_LEVEL_KEYS = tuple(key for key in KEYS if key not in (CODE, "dump", "stages"))
 
 
 def csv_records(
@@ -96,7 +96,7 @@ def _by_column(columns: Sequence[str], cells: Sequence[str]) -> dict[str, Any]:
         )
     pairs = zip(columns, cells, strict=True)
     filled = {column: cell for column, cell in pairs if cell.strip()}
-    return {k: v if k in TEXTS else toml_value(v.strip()) for k, v in filled.items()}
+    return {k: v if k in TEXT_COLUMNS else toml_value(v.strip()) for k, v in filled.items()}
 
 
 def json_records(
@@ -130,7 +130,11 @@ def _from_json(line: str, check_column: Callable[[str], None]) -> dict[str, Any]
         raise RequestError(f"found {line.strip()[:40]}, but expected an object: {{...}}")
     pairs: list[tuple[str, Any]] = []
     for key, value in row.items():
-        if isinstance(value, dict) and "." not in key and key not in (*OWN, *PLAIN):
+        if (
+            isinstance(value, dict)
+            and "." not in key
+            and key not in (*NON_SETTINGS, *TOP_LEVEL_KEYS)
+        ):
             pairs += [(f"{key}.{name}", item) for name, item in value.items()]
         else:
             pairs.append((key, value))
@@ -152,6 +156,6 @@ def _unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     values = dict(pairs)
     if len(values) < len(pairs):
         names = [name for name, _ in pairs]
-        twice = next(n for n in names if names.count(n) > 1)
-        raise RequestError(f"'{twice}' occurs twice; remove one of them")
+        repeated = next(n for n in names if names.count(n) > 1)
+        raise RequestError(f"'{repeated}' occurs twice; remove one of them")
     return values

@@ -6,7 +6,7 @@
 - :mod:`~clpipe.outputs.writer` writes the rest.
 - :mod:`~clpipe.outputs.sidecar` reads and writes sidecars.
 - :mod:`~clpipe.outputs.record` makes the contents of sidecars.
-- ``photographs`` and ``annotations`` read the sidecars of an output directory.
+- ``output_pictures`` and ``annotations`` read the sidecars of an output directory.
 
 This package decides names and contents, and leaves encoding to ``images``. It imports ``inputs``
 and below, and starts no threads.

@@ -18,12 +18,12 @@ from clpipe.chain.request import Request
 from clpipe.images.claims import display_size
 from clpipe.images.tags import FLIPS
 from clpipe.inputs.annotations import Annotations
-from clpipe.inputs.poses import Views, stem_of
+from clpipe.inputs.poses import ViewIndex, stem_of
 from clpipe.inputs.render_cameras import View
-from clpipe.outputs.annotated import Way
-from clpipe.outputs.annotation_files import files_for
-from clpipe.outputs.photographs import picture_of
-from clpipe.outputs.plan import ending_behind
+from clpipe.outputs.annotation_files import annotation_writer
+from clpipe.outputs.annotation_warp import PixelMapping
+from clpipe.outputs.output_pictures import picture_of
+from clpipe.outputs.plan import file_suffix
 from clpipe.outputs.sidecar import SidecarError, sidecar_files, values_at
 from clpipe.reference.geometry import (
     Composition,
@@ -32,11 +32,11 @@ from clpipe.reference.geometry import (
     Orientation,
 )
 
-LENGTHS = ("focal_length", "sensor_width")  # values that an image may state itself
+LENGTH_KEYS = ("focal_length", "sensor_width")  # an image's metadata may contain these
 
 
 def write_annotations(folder: Path, annotations: Annotations) -> list[str]:
-    """Write the annotations of all noisy pictures of a folder, in the format of the renders' own.
+    """Write the annotations of all noisy pictures of a folder, in the format of the input.
 
     Args:
         folder: the output directory of a run, or the folder of one member of its series.
@@ -48,26 +48,26 @@ def write_annotations(folder: Path, annotations: Annotations) -> list[str]:
     Raises:
         ImageError: a file cannot be written.
     """
-    views = Views([View(each.name, {"render": each}) for each in annotations.renders])
-    files = files_for(annotations)
+    views = ViewIndex([View(each.name, {"render": each}) for each in annotations.renders])
+    writer = annotation_writer(annotations)
     lines: list[str] = []
     sidecars = list(_sidecars(folder))
-    called = Counter(
+    name_counts = Counter(
         PurePosixPath(name).name
         for name in {stem_of(str(values["input"])) for _, values in sidecars}
     )
     unnamed = pictures = found = 0
     for path, values in sidecars:
         try:
-            view = views.find(stem_of(str(values["input"])), called)
+            view = views.find(stem_of(str(values["input"])), name_counts)
         except RequestError:
             unnamed += 1
             continue
         render = view.values["render"]
         try:
             size = render.size or display_size(Path(str(values["input"])))
-            for file, way in _pictures(path, values, size):
-                found += files.add(file.relative_to(folder).as_posix(), way, render)
+            for file, mapping in _pictures(path, values, size):
+                found += writer.add(file.relative_to(folder).as_posix(), mapping, render)
                 pictures += 1
         except (ClpipeError, KeyError, TypeError, ValueError) as error:
             lines.append(f"warning: {path}: its annotations are not written: {error}")
@@ -77,7 +77,7 @@ def write_annotations(folder: Path, annotations: Annotations) -> list[str]:
             f"warning: {pictures_are} not annotated, because {annotations.file} does not list the "
             "render"
         )
-    written = ", ".join(map(str, files.write(folder)))
+    written = ", ".join(map(str, writer.write(folder)))
     return [f"wrote {written}: {found} annotations of {pictures} pictures", *lines]
 
 
@@ -89,18 +89,18 @@ def _sidecars(folder: Path) -> Iterator[tuple[Path, Mapping[str, Any]]]:
             if values and Rendition.from_record(values).role == NOISY:
                 yield path, values
         except (SidecarError, KeyError, TypeError, ValueError):
-            continue  # the run has reported it
+            continue  # the run reported this sidecar
 
 
 def _pictures(
-    path: Path, values: Mapping[str, Any], own: tuple[int, int]
-) -> Iterator[tuple[Path, Way]]:
+    path: Path, values: Mapping[str, Any], render_size: tuple[int, int]
+) -> Iterator[tuple[Path, PixelMapping]]:
     """Yield the picture files of a sidecar, each with the mapping from its render.
 
     Args:
         path: the sidecar.
         values: its values.
-        own: width and height of the render in px.
+        render_size: width and height of the render in px.
 
     Raises:
         ImageError: the render has another size than its annotations state.
@@ -111,26 +111,32 @@ def _pictures(
     if "panorama" in values:
         raise ImageError("annotations of panoramas cannot be warped by a wide lens")
     parts = chain.geometry.parts if chain.geometry else ()
-    size = chain.size(*chain.margins.around(*own))
+    width, height = render_size
+    size = chain.size(*chain.margins.around(width, height))
     if size != (values["width"], values["height"]):
         raise ImageError(
-            f"the annotations are for a render of {own[0]}x{own[1]} pixels, whose picture would "
+            f"the annotations are for a render of {width}x{height} pixels, whose picture would "
             f"have {size[0]}x{size[1]}, but the picture has {values['width']}x{values['height']}"
         )
     if "patches" not in values:
         file = picture_of(path, values)
         if file:
-            yield file, Way(Composition(parts) if parts else None, *own, chain.margins, size)
+            yield (
+                file,
+                PixelMapping(
+                    Composition(parts) if parts else None, *render_size, chain.margins, size
+                ),
+            )
         return
     side = values["request"]["patch"]
     ending, rendition = ending_of(values["request"]["formats"][0]), Rendition.from_record(values)
     stem = Path(values["name"]).name
     for number, patch in enumerate(values["patches"]):
         left, top = patch["place"]
-        turned = [Orientation(*FLIPS[patch["turn"]])] if patch["turn"] != 1 else []
-        cut = (*parts, Crop(left, top, side, side), *turned)
-        file = path.with_name(stem + ending_behind(ending, rendition, number))
-        yield file, Way(Composition(cut), *own, chain.margins, (side, side))
+        orientation = [Orientation(*FLIPS[patch["turn"]])] if patch["turn"] != 1 else []
+        cut = (*parts, Crop(left, top, side, side), *orientation)
+        file = path.with_name(stem + file_suffix(ending, rendition, number))
+        yield file, PixelMapping(Composition(cut), *render_size, chain.margins, (side, side))
 
 
 def chain_of(values: Mapping[str, Any]) -> Chain:
@@ -143,10 +149,10 @@ def chain_of(values: Mapping[str, Any]) -> Chain:
     request = Request.from_record(values["request"])
     settings = request.settings()
     known = settings.render.model_dump(exclude_none=True)
-    said = {name: values["output"].get(name) for name in LENGTHS if name not in known}
-    said = {name: value for name, value in said.items() if value is not None}
-    if said:
-        image = {**request.image, "render": {**request.image.get("render", {}), **said}}
+    stated = {name: values["output"].get(name) for name in LENGTH_KEYS if name not in known}
+    stated = {name: value for name, value in stated.items() if value is not None}
+    if stated:
+        image = {**request.image, "render": {**request.image.get("render", {}), **stated}}
         request = request.for_image(request.image_name, image)
     chain = request.chain()
     overscan = values.get("overscan")

@@ -18,19 +18,21 @@ from clpipe.reference.curve import to_8_bit
 from clpipe.stage import run_reference
 from clpipe.stages.picture_noise import CHANNELS, IidGaussian, IntensityDependent, NoNoise
 
-LARGEST = 1.0  # of full scale, the largest sigma
-CURVE = 65  # intensities at which the sigma of INTENSITY is known
-FINE = 1024  # bins of the histogram of the clean picture
+MAX_SIGMA = 1.0  # of full scale
+CURVE_POINTS = 65  # intensities at which the sigma of INTENSITY is known
+HISTOGRAM_BINS = 1024  # bins of the histogram of the clean picture
 QUANTILES = np.array([NormalDist().inv_cdf((i + 0.5) / 64) for i in range(64)])
 QUANTILES /= QUANTILES.std()
 INDEPENDENT_LEFT = 0.25  # averaging 2x2 leaves this share of the variance of independent noise
-ROUNDS = 8  # of applying noise to the picture, at most; four are usually enough
-CLOSE = 0.003  # relative error of a variance at which the search stops
+MAX_ITERATIONS = 8  # each applies noise to the picture; four are usually enough
+TOLERANCE = 0.003  # relative error of a variance at which the search stops
 
 
 @dataclass(eq=False)
-class Spread:
-    """The noise of a noisy picture, and the intensities of its clean one, taken one by one.
+class NoiseMatcher:
+    """Measures the noise of a noisy picture, and matches the noise of baselines to it.
+
+    Pass the pictures to :meth:`take` one by one.
 
     Args:
         renditions: the pictures to measure, in the order of :meth:`take`: the noisy picture, its
@@ -58,9 +60,9 @@ class Spread:
         """
         noisy, developed, clean = self.renditions
         if rendition == noisy:
-            self._noisy = self._shown(picture)
+            self._noisy = self._as_displayed(picture)
         elif rendition == developed and self._noisy is not None:
-            truth = self._shown(picture)
+            truth = self._as_displayed(picture)
             noise = self._noisy - truth
             self._noisy = None
             if self.matching.match == FLAT:
@@ -72,11 +74,11 @@ class Spread:
             if self.matching.jpeg or self.matching.match == HALVED:
                 self._clean = picture.copy()
             self._intensities = [
-                np.histogram(np.clip(plane, -0.5, 1.5), FINE, (-0.5, 1.5))[0]
+                np.histogram(np.clip(plane, -0.5, 1.5), HISTOGRAM_BINS, (-0.5, 1.5))[0]
                 for plane in self._selected(picture).T
             ]
 
-    def _shown(self, picture: Floats) -> Floats:
+    def _as_displayed(self, picture: Floats) -> Floats:
         """Return a picture as users see it: clipped at black and white, or after JPEG encoding."""
         if not self.matching.jpeg:
             return np.clip(picture, 0, 1)
@@ -100,25 +102,30 @@ class Spread:
             The method. If its noise had to be applied to the picture, also the ratio of its
             variance to that of the picture's noise, by name; otherwise {}.
         """
-        wanted = np.diag(self._covariance)
+        target = np.diag(self._covariance)
         curves = [np.ones(2)] * 3 if baseline == IID else self._curves
-        left = INDEPENDENT_LEFT if self.matching.match == HALVED else 1.0
-        channels = zip(wanted / left, curves, self._intensities, strict=True)
+        remaining = INDEPENDENT_LEFT if self.matching.match == HALVED else 1.0
+        channels = zip(target / remaining, curves, self._intensities, strict=True)
         strengths = np.array([strength_for(*channel) for channel in channels])
         method = self._with_strength(baseline, strengths)
-        if self._clean is None or not (wanted > 0).all():
+        if self._clean is None or not (target > 0).all():
             return method, {}
         # JPEG's luma and chroma couple the channels, so the error of a channel depends on all
         # strengths. Broyden's method (1965) in logarithms, starting from the unit matrix.
-        clean, best, reached, least = self._shown(self._clean), method, np.ones(3), np.inf
+        clean, best, best_ratio, best_error = (
+            self._as_displayed(self._clean),
+            method,
+            np.ones(3),
+            np.inf,
+        )
         slope, step, before = np.eye(3), np.zeros(3), np.zeros(3)
-        for _ in range(ROUNDS):
-            noise = self._shown(run_reference(method, self._clean)) - clean
-            ratio = np.diag(self._covariance_of(noise)) / wanted
+        for _ in range(MAX_ITERATIONS):
+            noise = self._as_displayed(run_reference(method, self._clean)) - clean
+            ratio = np.diag(self._covariance_of(noise)) / target
             error = np.log(np.maximum(ratio, 1e-3))
-            if np.abs(error).max() < least:
-                best, reached, least = method, ratio, np.abs(error).max()
-            if least < CLOSE:
+            if np.abs(error).max() < best_error:
+                best, best_ratio, best_error = method, ratio, np.abs(error).max()
+            if best_error < TOLERANCE:
                 break
             if step.any():
                 slope += np.outer(error - before - slope @ step, step) / (step @ step)
@@ -126,7 +133,7 @@ class Spread:
             strengths = strengths * np.exp(step / 2)
             method = self._with_strength(baseline, strengths)
         names = (f"variance_ratio_{name.lower()}" for name in CHANNELS)
-        return best, dict(zip(names, reached.round(4).tolist(), strict=True))
+        return best, dict(zip(names, best_ratio.round(4).tolist(), strict=True))
 
     def _with_strength(self, baseline: str, strengths: Doubles) -> IidGaussian | IntensityDependent:
         """Return the noise of a baseline, with factors for its sigma in red, green and blue."""
@@ -137,39 +144,42 @@ class Spread:
             correlation = float(table[0, 1]), float(table[0, 2]), float(table[1, 2])
         method: IidGaussian | IntensityDependent
         if baseline == IID:
-            r, g, b = (min(float(s), LARGEST) for s in strengths.round(7))
+            r, g, b = (min(float(s), MAX_SIGMA) for s in strengths.round(7))
             method = IidGaussian(sigma=(r, g, b), correlation=correlation)
         else:
             curves = zip(strengths, self._curves, strict=True)
-            scaled = (np.minimum(s * curve, LARGEST).round(7) for s, curve in curves)
+            scaled = (np.minimum(s * curve, MAX_SIGMA).round(7) for s, curve in curves)
             red, green, blue = (tuple(map(float, curve)) for curve in scaled)
             method = IntensityDependent(sigma=(red, green, blue), correlation=correlation)
-        how = {"match": self.matching.match, "correlated": self.matching.correlated}
-        return method.model_copy(update=how)
+        matching_settings = {"match": self.matching.match, "correlated": self.matching.correlated}
+        return method.model_copy(update=matching_settings)
 
 
 def curve_of(truth: Floats, noise: Floats) -> Doubles:
-    """Return sigma before clipping at :data:`CURVE` intensities from 0 to 1.
+    """Return sigma before clipping at :data:`CURVE_POINTS` intensities from 0 to 1.
 
     It is interpolated linearly between intensities that occur.
 
     Args:
         truth, noise: values of one channel, (pixel,).
     """
-    place = np.rint(truth * (CURVE - 1)).astype(np.intp)
+    index = np.rint(truth * (CURVE_POINTS - 1)).astype(np.intp)
     noise = noise.astype(np.float64)
-    count = np.bincount(place, minlength=CURVE)
-    mean = np.bincount(place, noise, CURVE) / np.maximum(count, 1)
-    square = np.bincount(place, noise * noise, CURVE) / np.maximum(count, 1)
+    count = np.bincount(index, minlength=CURVE_POINTS)
+    mean = np.bincount(index, noise, CURVE_POINTS) / np.maximum(count, 1)
+    square = np.bincount(index, noise * noise, CURVE_POINTS) / np.maximum(count, 1)
     sigma = np.sqrt(np.maximum(square - mean * mean, 0))
-    seen = np.flatnonzero(count > 1)
-    return unclipped(np.interp(np.arange(CURVE), seen, sigma[seen]))
+    occupied = np.flatnonzero(count > 1)
+    return unclipped_sigmas(np.interp(np.arange(CURVE_POINTS), occupied, sigma[occupied]))
 
 
-def unclipped(sigmas: Doubles) -> Doubles:
-    """Return the sigmas before clipping that give ``sigmas`` after it, at :data:`CURVE` points."""
-    v = np.linspace(0, 1, CURVE)[:, None]
-    low, high = np.zeros(CURVE), np.full(CURVE, LARGEST)
+def unclipped_sigmas(sigmas: Doubles) -> Doubles:
+    """Return the sigmas before clipping that give ``sigmas`` after clipping.
+
+    Both have :data:`CURVE_POINTS` values.
+    """
+    v = np.linspace(0, 1, CURVE_POINTS)[:, None]
+    low, high = np.zeros(CURVE_POINTS), np.full(CURVE_POINTS, MAX_SIGMA)
     for _ in range(40):
         middle = (low + high) / 2
         found = np.clip(v + middle[:, None] * QUANTILES, 0, 1).std(1)
@@ -183,12 +193,12 @@ def strength_for(variance: float, curve: Doubles, intensities: Array) -> float:
     Args:
         variance: the variance after clipping.
         curve: relative sigmas at intensities evenly spaced from 0 to 1.
-        intensities: a histogram of the picture in :data:`FINE` bins from -0.5 to 1.5.
+        intensities: a histogram of the picture in :data:`HISTOGRAM_BINS` bins from -0.5 to 1.5.
     """
-    v = (np.arange(FINE) + 0.5) * 2 / FINE - 0.5
+    v = (np.arange(HISTOGRAM_BINS) + 0.5) * 2 / HISTOGRAM_BINS - 0.5
     relative = np.interp(v, np.linspace(0, 1, len(curve)), curve)
     share = intensities / intensities.sum()
-    low, high = 0.0, LARGEST / max(float(relative.max()), 1e-12)
+    low, high = 0.0, MAX_SIGMA / max(float(relative.max()), 1e-12)
     for _ in range(50):
         middle = (low + high) / 2
         noisy = np.clip(v[:, None] + (middle * relative)[:, None] * QUANTILES, 0, 1)

@@ -14,14 +14,21 @@ from types import MappingProxyType
 from clpipe.base.errors import ImageError
 from clpipe.base.files import keep_names, make_folder_of, write_whole
 from clpipe.base.reading import read_bytes
+from clpipe.outputs.camera_formats import (
+    CAMERAS,
+    COLMAP,
+    TRANSFORMS,
+    cameras_json,
+    colmap,
+    nerfstudio,
+)
 from clpipe.outputs.existing import is_marked
-from clpipe.outputs.photographs import MODELS, Photograph, photographs
+from clpipe.outputs.output_pictures import MODEL_FOLDERS, OutputPicture, output_pictures
 from clpipe.outputs.sidecar import is_sidecar
-from clpipe.outputs.views import CAMERAS, COLMAP, TRANSFORMS, cameras_json, colmap, nerfstudio
 
 FILES = tuple(
     model + name
-    for model in MODELS.values()
+    for model in MODEL_FOLDERS.values()
     for name in (
         *(CAMERAS, TRANSFORMS),
         *(f"{COLMAP}/cameras.txt", f"{COLMAP}/images.txt", f"{COLMAP}/points3D.txt"),
@@ -30,27 +37,27 @@ FILES = tuple(
 
 
 @dataclass(frozen=True)
-class Written:
+class CameraFiles:
     """The camera files that were written for a folder.
 
     Args:
         files: their paths in the folder; empty if no picture has known intrinsics.
         pictures: the number of pictures in them.
-        left_out: sentences about pictures that are missing in some files, and why.
+        warnings: sentences about pictures that are missing in some files, and why.
     """
 
     files: tuple[str, ...]
     pictures: int
-    left_out: tuple[str, ...]
+    warnings: tuple[str, ...]
 
     def lines(self, folder: Path) -> list[str]:
         """Return lines to print about files written to ``folder``."""
-        warnings = [f"warning: {each}" for each in self.left_out]
+        notes = [f"warning: {each}" for each in self.warnings]
         if not self.files:
-            return warnings
+            return notes
         shown = dict.fromkeys("/".join(name.split("/")[:2]) for name in self.files)
         files = ", ".join(str(folder / name) for name in shown)
-        return [f"wrote {files}: {self.pictures} picture{'s' * (self.pictures != 1)}", *warnings]
+        return [f"wrote {files}: {self.pictures} picture{'s' * (self.pictures != 1)}", *notes]
 
 
 def check_camera_files(folder: Path) -> None:
@@ -60,14 +67,16 @@ def check_camera_files(folder: Path) -> None:
         ImageError: a file of the same name exists that clpipe did not write.
     """
     for path in (folder / name for name in FILES):
-        if os.path.lexists(path) and not (is_marked(path) or _is_taken(path)):
+        if os.path.lexists(path) and not (is_marked(path) or _is_picture_sidecar(path)):
             raise ImageError(
                 f"{path}: clpipe did not write this file, and would overwrite it with the cameras "
                 "of this folder's pictures; move it, or choose another output directory"
             )
 
 
-def write_camera_files(folder: Path, splits: Mapping[str, str] = MappingProxyType({})) -> Written:
+def write_camera_files(
+    folder: Path, splits: Mapping[str, str] = MappingProxyType({})
+) -> CameraFiles:
     """Write the cameras of an output directory, from its sidecars.
 
     Args:
@@ -78,42 +87,42 @@ def write_camera_files(folder: Path, splits: Mapping[str, str] = MappingProxyTyp
         ImageError: a file cannot be written, or was not written by clpipe.
     """
     check_camera_files(folder)
-    left_out: dict[str, list[str]] = defaultdict(list)
-    found = sorted(photographs(folder, left_out), key=lambda each: each.file)
+    skipped: dict[str, list[str]] = defaultdict(list)
+    found = sorted(output_pictures(folder, skipped), key=lambda each: each.file)
     texts: dict[str, str] = {}
-    for role, model in MODELS.items():
-        own = [each for each in found if each.role == role]
+    for role, model in MODEL_FOLDERS.items():
+        of_role = [each for each in found if each.role == role]
         texts |= {
-            model + name: text for name, text in texts_of(own, model, left_out, splits).items()
+            model + name: text for name, text in file_texts(of_role, model, skipped, splits).items()
         }
-    taken = [name for name in FILES if _is_taken(folder / name)]
-    for name in (name for name in FILES if name not in taken):
+    occupied = [name for name in FILES if _is_picture_sidecar(folder / name)]
+    for name in (name for name in FILES if name not in occupied):
         path = folder / name
         if name in texts:
             make_folder_of(path)
             write_whole(path, texts[name].encode())
             keep_names(path.parent)
         elif texts:
-            path.unlink(missing_ok=True)  # its pictures have been removed
+            path.unlink(missing_ok=True)  # a file of pictures that have been removed
     reasons = tuple(
-        f"{len(files)} picture{'s' * (len(files) > 1)} {why}, such as {min(files)}"
-        for why, files in left_out.items()
+        f"{len(files)} picture{'s' * (len(files) > 1)} {reason}, such as {min(files)}"
+        for reason, files in skipped.items()
         if files
     )
     reasons += tuple(
         f"{folder / name} is the sidecar of a picture, so the cameras are not written to it; give "
         "that image another name"
-        for name in taken
+        for name in occupied
         if name in texts
     )
-    written = tuple(name for name in FILES if name in texts and name not in taken)
-    return Written(written, len(found), reasons)
+    written = tuple(name for name in FILES if name in texts and name not in occupied)
+    return CameraFiles(written, len(found), reasons)
 
 
-def texts_of(
-    pictures: Sequence[Photograph],
+def file_texts(
+    pictures: Sequence[OutputPicture],
     model: str,
-    left_out: Mapping[str, list[str]],
+    skipped: Mapping[str, list[str]],
     splits: Mapping[str, str],
 ) -> dict[str, str]:
     """Return the texts of the camera files for pictures of one kind, by file name.
@@ -121,24 +130,24 @@ def texts_of(
     Args:
         pictures: the pictures, sorted.
         model: the folder of these files, relative to the output directory.
-        left_out: receives the names of pictures that are missing in some files, by reason.
+        skipped: receives the names of pictures that are missing in some files, by reason.
         splits: see :func:`write_camera_files`.
     """
     if not pictures:
         return {}
-    up = "../" * model.count("/")
+    prefix = "../" * model.count("/")
     posed = [each for each in pictures if each.pose]
     if posed:
-        left_out[f"without a pose, so not in {TRANSFORMS} and images.txt"] += [
+        skipped[f"without a pose, so not in {TRANSFORMS} and images.txt"] += [
             each.file for each in pictures if not each.pose
         ]
-    texts = {CAMERAS: cameras_json(pictures, up), **colmap(pictures, posed, left_out)}
-    if nerf := nerfstudio(posed, up, left_out, splits):
-        texts[TRANSFORMS] = nerf
+    texts = {CAMERAS: cameras_json(pictures, prefix), **colmap(pictures, posed, skipped)}
+    if transforms := nerfstudio(posed, prefix, skipped, splits):
+        texts[TRANSFORMS] = transforms
     return texts
 
 
-def _is_taken(path: Path) -> bool:
+def _is_picture_sidecar(path: Path) -> bool:
     """Return whether a camera file would overwrite the sidecar of a picture."""
     try:
         return is_sidecar(read_bytes(path))

@@ -12,14 +12,14 @@ from clpipe.base.types import Array
 from clpipe.chain.carry import VALID
 from clpipe.images.attributes import PREFIX
 from clpipe.images.write import write_grey_png, write_planes
-from clpipe.inputs.carry import Aovs
+from clpipe.inputs.carry import CarriedLayers
 from clpipe.inputs.companions import CARRIED
-from clpipe.outputs.sidecar import outputs_in
+from clpipe.outputs.sidecar import output_entries
 
-MM = 1000  # in a metre
+MILLIMETRES_PER_METRE = 1000
 
 
-def write_carried(path: Path, carried: Aovs, layer: str = "") -> Stored:
+def write_carried(path: Path, carried: CarriedLayers, layer: str = "") -> Stored:
     """Write all carried layers as an EXR, or one layer (depth in metres, or labels) as a PNG.
 
     The EXR contains the channels of all layers in their types, and the channel :data:`VALID`.
@@ -36,20 +36,24 @@ def write_carried(path: Path, carried: Aovs, layer: str = "") -> Stored:
         pixels = carried.arrays()[layer][..., 0]
         kind = next(each.kind for each in carried.layers if each.name == layer)
         is_label = kind == "label"
-        return write_grey_png(path, numbers(path, pixels) if is_label else millimetres(pixels))
+        return write_grey_png(
+            path, to_label_samples(path, pixels) if is_label else to_millimetres(pixels)
+        )
     planes = {
         name: layer.pixels[..., i]
         for layer in carried.layers
         for i, name in enumerate(layer.channels)
     }
-    own = {f"{PREFIX}{CARRIED}": ",".join(carried.arrays())}
-    return write_planes(path, {**planes, VALID: carried.valid}, {**own, **carried.attributes})
+    attributes = {f"{PREFIX}{CARRIED}": ",".join(carried.arrays())}
+    return write_planes(
+        path, {**planes, VALID: carried.valid}, {**attributes, **carried.attributes}
+    )
 
 
-def png_ending(layer: str) -> str:
-    """Return what follows the image's name in the name of a layer's PNG.
+def png_suffix(layer: str) -> str:
+    """Return the suffix of the image's name for the PNG of a layer.
 
-    >>> png_ending("Object Index")
+    >>> png_suffix("Object Index")
     'Object_Index.png'
     """
     return f"{layer.replace(' ', '_')}.png"
@@ -62,12 +66,12 @@ def carried_files(values: Mapping[str, Any]) -> dict[str, str]:
         KeyError, TypeError: the values are damaged.
     """
     layers = [str(layer["layer"]) for layer in values.get("carried", ())]
-    endings = {CARRIED: f"{CARRIED}.exr", **{layer: png_ending(layer) for layer in layers}}
-    stem, listed = Path(str(values["name"])).name, outputs_in(values)
+    endings = {CARRIED: f"{CARRIED}.exr", **{layer: png_suffix(layer) for layer in layers}}
+    stem, listed = Path(str(values["name"])).name, output_entries(values)
     return {key: name for key, each in endings.items() if (name := f"{stem}.{each}") in listed}
 
 
-def numbers(path: Path, labels: Array) -> Array:
+def to_label_samples(path: Path, labels: Array) -> Array:
     """Return labels as uint16.
 
     Raises:
@@ -83,11 +87,11 @@ def numbers(path: Path, labels: Array) -> Array:
     return whole
 
 
-def millimetres(depth: Array) -> Array:
+def to_millimetres(depth: Array) -> Array:
     """Return depth in metres as uint16 millimetres: 0 if it is unknown or above 65.535 m.
 
-    >>> millimetres(np.array([1.5, 65.535, 70, 1e10, -1, np.nan, np.inf])).tolist()
+    >>> to_millimetres(np.array([1.5, 65.535, 70, 1e10, -1, np.nan, np.inf])).tolist()
     [1500, 65535, 0, 0, 0, 0, 0]
     """
-    whole = np.rint(depth.astype(np.float64) * MM)
+    whole = np.rint(depth.astype(np.float64) * MILLIMETRES_PER_METRE)
     return np.where((whole > 0) & (whole <= 65535), whole, 0).astype(np.uint16)

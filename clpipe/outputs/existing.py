@@ -22,24 +22,24 @@ from clpipe.outputs.program import program_digest
 from clpipe.outputs.sidecar import (
     SIDECAR,
     SidecarError,
-    inputs_in,
-    outputs_in,
+    input_entries,
+    output_entries,
     read_sidecar,
     sidecar_files,
     values_at,
 )
 
-MARKED = 1 << 16  # bytes at either end of a file in which clpipe's mark is searched
+MARK_SEARCH_BYTES = 1 << 16  # clpipe's mark is searched in this many bytes at both ends of a file
 
 OVERWRITTEN = "would be overwritten; move it, choose another output directory, or use --redo all"
 
-# clpipe's Software tag, or an attribute of its own. The name clpipe alone is not enough: a DNG's
-# camera has it as well, and converters copy it to their output.
+# clpipe's Software tag, or one of clpipe's attributes. The name clpipe is not enough, because it is
+# also the camera of DNGs, which converters copy to their output.
 MARK = re.compile(rb"clpipe \d+\.\d|clpipe:\w")
 
 
-class Found(Enum):
-    """What exists of a rendition."""
+class ExistingFiles(Enum):
+    """Which files of a rendition exist."""
 
     NOTHING = "nothing that matches and is complete"
     OLD = "all files, but made by another program"
@@ -62,29 +62,29 @@ class Redo(Enum):
         """Whether the SHA-256 of every file decides."""
         return self is Redo.DAMAGED
 
-    def keeps(self, found: Found) -> bool:
+    def keeps(self, found: ExistingFiles) -> bool:
         """Return whether a rendition is kept."""
-        return found is Found.DONE or (found is Found.OLD and self is Redo.MISSING)
+        return found is ExistingFiles.DONE or (found is ExistingFiles.OLD and self is Redo.MISSING)
 
 
-def find(
+def find_existing(
     files: RenditionFiles,
     job: Job,
     request: Mapping[str, Any],
     verify: bool = False,
-    is_ours: bool = False,
-) -> Found:
-    """Return what exists of a rendition: unchanged, made of the same input by the same request.
+    is_exclusive: bool = False,
+) -> ExistingFiles:
+    """Return which files of a rendition exist, unchanged and from the same input and request.
 
-    A file counts as unchanged if it has its size and was last touched before its sidecar was
-    written. Otherwise its SHA-256 decides.
+    A file counts as unchanged if its size matches and its sidecar was written after its last
+    change. Otherwise its SHA-256 decides.
 
     Args:
         files: the files of the rendition.
         job: the image.
         request: the record of the request for the image.
         verify: whether to check the SHA-256 of each file and of the input.
-        is_ours: whether only clpipe writes to this folder.
+        is_exclusive: whether only clpipe writes to this folder.
 
     Raises:
         ImageError: a file of the same name exists that clpipe did not write.
@@ -93,50 +93,52 @@ def find(
         values = read_sidecar(files.sidecar)
     except (FileNotFoundError, SidecarError):
         values = {}
-    listed = outputs_in(values)
-    written = _written(files.sidecar)
+    listed = output_entries(values)
+    written_at = _written_at(files.sidecar)
     intact = {
         name
-        for name, was in listed.items()
-        if _is_intact(files.sidecar.with_name(name), was, written, verify)
+        for name, entry in listed.items()
+        if _is_intact(files.sidecar.with_name(name), entry, written_at, verify)
     }
     if {path.name for path in files.pictures} <= intact == listed.keys():
-        found = found_in(values, job, request, verify)
-        if found is not Found.NOTHING:
+        found = match_sidecar(values, job, request, verify)
+        if found is not ExistingFiles.NOTHING:
             return found
-    if not is_ours:
+    if not is_exclusive:
         for path in (*files.pictures, *files.others):
             if path.name not in intact and os.path.lexists(path):
-                _check_own(path, files.sidecar if path.name in listed else None, written)
-    return Found.NOTHING
+                _check_written_by_clpipe(
+                    path, files.sidecar if path.name in listed else None, written_at
+                )
+    return ExistingFiles.NOTHING
 
 
-def _is_intact(path: Path, was: Mapping[str, Any], written: int, verify: bool) -> bool:
+def _is_intact(path: Path, entry: Mapping[str, Any], written_at: int, verify: bool) -> bool:
     """Return whether a file matches its entry in a sidecar.
 
     Args:
         path: the file.
-        was: its entry, with size and SHA-256.
-        written: when the sidecar was written, in ns since 1970.
+        entry: its entry in a sidecar, with size and SHA-256.
+        written_at: when the sidecar was written, in ns since 1970.
         verify: whether to compare the SHA-256 in any case.
     """
     try:
         status = os.lstat(path)
-        if not stat.S_ISREG(status.st_mode) or status.st_size != was["size"]:
+        if not stat.S_ISREG(status.st_mode) or status.st_size != entry["size"]:
             return False
-        is_untouched = not verify and status.st_ctime_ns <= written
-        return is_untouched or sha256_of(path)[0] == was["sha256"]
+        is_untouched = not verify and status.st_ctime_ns <= written_at
+        return is_untouched or sha256_of(path)[0] == entry["sha256"]
     except OSError:
         return False
 
 
-def _check_own(path: Path, sidecar: Path | None, written: int) -> None:
+def _check_written_by_clpipe(path: Path, sidecar: Path | None, written_at: int) -> None:
     """Check that clpipe wrote a file that would be overwritten.
 
     Args:
         path: the file, which does not match a sidecar.
-        sidecar: the sidecar that lists it; None if there is none.
-        written: when the sidecar was written, in ns since 1970.
+        sidecar: the sidecar that lists the file, or None.
+        written_at: when the sidecar was written, in ns since 1970.
 
     Raises:
         ImageError: clpipe did not write the file, or somebody changed it.
@@ -145,15 +147,15 @@ def _check_own(path: Path, sidecar: Path | None, written: int) -> None:
         raise ImageError(
             f"{path}: clpipe did not write this file, or it was changed later, and {OVERWRITTEN}"
         )
-    # A file that differs but was not touched was damaged by the disk.
-    if sidecar and os.lstat(path).st_ctime_ns > written and is_whole(path):
+    # A file that differs without having been modified was damaged by the disk.
+    if sidecar and os.lstat(path).st_ctime_ns > written_at and is_whole(path):
         raise ImageError(
             f"{path}: this file was changed after clpipe wrote it (its SHA-256 differs from that "
             f"in {sidecar.name}), and {OVERWRITTEN}"
         )
 
 
-def _written(path: Path) -> int:
+def _written_at(path: Path) -> int:
     """Return when a sidecar was written, in ns since 1970; 0 if that is in the future."""
     try:
         modified = path.stat().st_mtime_ns
@@ -162,27 +164,29 @@ def _written(path: Path) -> int:
     return modified if modified <= time.time_ns() else 0
 
 
-def found_in(
+def match_sidecar(
     values: Mapping[str, Any], job: Job, request: Mapping[str, Any], verify: bool = False
-) -> Found:
-    """Return whether a sidecar has the same input and request, and names this program.
+) -> ExistingFiles:
+    """Compare the input, request and program of a sidecar with the current ones.
 
-    The arguments are those of :func:`find`.
+    The arguments are those of :func:`find_existing`.
     """
     if not _same_request(values.get("request"), request) or not _same_input(values, job, verify):
-        return Found.NOTHING
-    return Found.DONE if values.get("program") == program_digest() else Found.OLD
+        return ExistingFiles.NOTHING
+    return ExistingFiles.DONE if values.get("program") == program_digest() else ExistingFiles.OLD
 
 
 def _same_input(values: Mapping[str, Any], job: Job, verify: bool) -> bool:
     """Return whether a sidecar lists a job's files unchanged, see :func:`_is_same`."""
     try:
-        return all(_is_same(path, was, verify) for path, was in inputs_in(values, job.paths))
+        return all(
+            _is_same(path, entry, verify) for path, entry in input_entries(values, job.paths)
+        )
     except (KeyError, TypeError, ValueError):  # damaged, or for another number of files
         return False
 
 
-def _is_same(path: Path, was: Mapping[str, Any], verify: bool) -> bool:
+def _is_same(path: Path, entry: Mapping[str, Any], verify: bool) -> bool:
     """Return whether an input file matches its entry in a sidecar.
 
     A file with the same size and modification time counts as unchanged. For URLs, nothing else is
@@ -192,21 +196,21 @@ def _is_same(path: Path, was: Mapping[str, Any], verify: bool) -> bool:
         KeyError, TypeError: the sidecar is damaged.
     """
     size, modified = stamp_of(path)
-    if size != was["size"]:
+    if size != entry["size"]:
         return False
-    if modified == was["modified"] and not (verify and url_of(path) is None):
+    if modified == entry["modified"] and not (verify and url_of(path) is None):
         return True
-    return was["sha256"] in digests([str(path)]).values()
+    return entry["sha256"] in digests([str(path)]).values()
 
 
-def _same_request(one: Any, other: Mapping[str, Any]) -> bool:
+def _same_request(first: Any, second: Mapping[str, Any]) -> bool:
     """Return whether records of requests are equal. Files are compared by content, not by name."""
-    if one == other:
+    if first == second:
         return True
-    if not isinstance(one, dict) or not (other["files"] and one.get("files")):
+    if not isinstance(first, dict) or not (second["files"] and first.get("files")):
         return False
     texts = []
-    for values in (one, other):
+    for values in (first, second):
         text = json.dumps({k: v for k, v in values.items() if k != "files"}, sort_keys=True)
         for file, digest in values["files"].items():
             text = text.replace(json.dumps(file), json.dumps(digest))
@@ -221,9 +225,9 @@ def is_marked(path: Path) -> bool:
             status = os.fstat(file.fileno())
             if not stat.S_ISREG(status.st_mode):
                 return False
-            ends = file.read(MARKED)
-            file.seek(max(status.st_size - MARKED, 0))
-            ends += file.read(MARKED)
+            ends = file.read(MARK_SEARCH_BYTES)
+            file.seek(max(status.st_size - MARK_SEARCH_BYTES, 0))
+            ends += file.read(MARK_SEARCH_BYTES)
     except OSError:
         return False
     return MARK.search(ends) is not None or not ends.strip(b"\0")
@@ -240,18 +244,20 @@ def pictures_without_input(plan: OutputPlan, jobs: Sequence[Job], inputs: Sequen
         jobs: all jobs of the run.
         inputs: the inputs as the user wrote them.
     """
-    own = {plan.path(job, SIDECAR, each) for job in jobs for each in plan.renditions_of(job)}
-    beside = {Path(text) for text in {os.path.dirname(job.input) for job in jobs}}
-    below = [Path(text) for text in inputs if os.path.isdir(text)]
+    planned = {plan.path(job, SIDECAR, each) for job in jobs for each in plan.renditions_of(job)}
+    input_folders = {Path(text) for text in {os.path.dirname(job.input) for job in jobs}}
+    searched_folders = [Path(text) for text in inputs if os.path.isdir(text)]
     count = 0
     for path in sidecar_files(plan.folder):
-        if path in own:
+        if path in planned:
             continue
         try:
             render = (values_at(path) or {}).get("input")
         except SidecarError:
             continue
         if isinstance(render, str) and not os.path.lexists(render):
-            was = Path(render)
-            count += was.parent in beside or any(was.is_relative_to(each) for each in below)
+            entry = Path(render)
+            count += entry.parent in input_folders or any(
+                entry.is_relative_to(each) for each in searched_folders
+            )
     return count

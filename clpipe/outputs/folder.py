@@ -17,29 +17,28 @@ from clpipe.outputs.patches import without_patch
 
 RESUMABLE = "finished pictures are kept, and the same command resumes"
 
-
-LEAST_FREE = 8 * 2**20  # bytes; a disk with less free space counts as full
+MIN_FREE = 8 * 2**20  # bytes; a disk with less free space counts as full
 
 LOCK = ".clpipe.lock"
 
-UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # names that whole_file gives
+UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # temporary names of whole_file
 
 # Locks of this process: the file, its descriptor, and the first byte and length of the locked part.
-_held: set[tuple[Path, int, int, int]] = set()
+_locks: set[tuple[Path, int, int, int]] = set()
 
 
 def write_problem(folder: Path, with_space: bool = True) -> str:
-    """Return why nothing can be written to a folder; "" if it can be written to.
+    """Return why a folder is not writable, or "" if it is.
 
-    Without ``with_space``, a full disk is accepted, because a run may find all pictures finished.
+    Without ``with_space``, a full disk is accepted, because all pictures may be finished already.
     """
     probe = folder / f".clpipe.{secrets.token_hex(8)}"
     try:
         with open(probe, "xb") as file:
             if with_space:
-                reserve(file, LEAST_FREE)
+                reserve(file, MIN_FREE)
     except OSError as error:
-        needed = f" ({in_words(LEAST_FREE)} are needed)" if error.errno == errno.ENOSPC else ""
+        needed = f" ({in_words(MIN_FREE)} are needed)" if error.errno == errno.ENOSPC else ""
         return f"cannot write to this directory: {error.strerror}{needed}"
     finally:
         with contextlib.suppress(OSError):
@@ -66,30 +65,29 @@ def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
     if reason := write_problem(folder, with_space=False):
         raise RequestError(f"{folder}: {reason}")
     # Each shard locks its part of a file that stays empty.
-    first = HOLDABLE * (shard.number - 1) // shard.of
-    share = HOLDABLE * shard.number // shard.of - first
-    held = folder / LOCK, _locked(folder / LOCK, share, first), first, share
-    _held.add(held)
+    start = HOLDABLE * (shard.number - 1) // shard.of
+    length = HOLDABLE * shard.number // shard.of - start
+    entry = folder / LOCK, _locked(folder / LOCK, length, start), start, length
+    _locks.add(entry)
     try:
         yield
     finally:
-        _held.discard(held)
-        let_go(*held)
+        _locks.discard(entry)
+        let_go(*entry)
 
 
 def release_folders() -> None:
     """Remove the lock files that no other process holds. Call it just before exiting.
 
-    It is needed for an exit that skips the end of :func:`output_folder`. Signal handlers may call
-    it.
+    An exit that skips the end of :func:`output_folder` needs this. Signal handlers may call it.
     """
-    while _held:
+    while _locks:
         with contextlib.suppress(OSError):
-            let_go(*_held.pop())
+            let_go(*_locks.pop())
 
 
-def _locked(path: Path, length: int, first: int) -> int:
-    """Open the lock file, lock ``length`` bytes starting at ``first``, and return its descriptor.
+def _locked(path: Path, length: int, start: int) -> int:
+    """Open the lock file, lock ``length`` bytes starting at ``start``, and return its descriptor.
 
     Raises:
         RequestError: another process has locked that part.
@@ -100,7 +98,7 @@ def _locked(path: Path, length: int, first: int) -> int:
         except OSError as error:
             raise RequestError(f"{path}: this file cannot be locked: {error.strerror}") from None
         try:
-            is_ours = hold(lock, first, length)
+            is_ours = hold(lock, start, length)
         except OSError:
             return lock  # a file system without locks
         if not is_ours:
@@ -117,17 +115,17 @@ def _locked(path: Path, length: int, first: int) -> int:
 
 def remove_unfinished(folder: Path, jobs: Iterable[Job], patches: bool = False) -> None:
     """Remove the unfinished files of these jobs, or of their patches, that a killed run left."""
-    named = (os.path.split(job.stem) for job in jobs)
-    stems = {os.path.join(folder, shortened(name)) for folder, name in named}
+    stem_parts = (os.path.split(job.stem) for job in jobs)
+    stems = {os.path.join(folder, shortened(name)) for folder, name in stem_parts}
 
-    def is_ours(stem: str) -> bool:
+    def is_of_jobs(stem: str) -> bool:
         return stem in stems or (patches and without_patch(stem) in stems)
 
-    for place, _, names in os.walk(folder):
+    for parent, _, names in os.walk(folder):
         for match in filter(None, map(UNFINISHED.fullmatch, names)):
-            stem = os.path.relpath(os.path.join(place, match[1]), folder)
-            while not is_ours(stem) and "." in os.path.basename(stem):
+            stem = os.path.relpath(os.path.join(parent, match[1]), folder)
+            while not is_of_jobs(stem) and "." in os.path.basename(stem):
                 stem = stem.rpartition(".")[0]
-            if is_ours(stem):
+            if is_of_jobs(stem):
                 with contextlib.suppress(OSError):
-                    os.unlink(os.path.join(place, match[0]))
+                    os.unlink(os.path.join(parent, match[0]))

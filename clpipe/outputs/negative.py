@@ -15,14 +15,14 @@ from clpipe.reference.filter_array import FilterArray
 from clpipe.stage import Context, Kind, StageRole, run_reference
 from clpipe.stages.tone_curve.neutral import Neutral
 
-MOST_DN = 2**16 - 1
+MAX_DN = 2**16 - 1
 
 
 def negative_of(chain: Chain) -> Negative:
-    """Return the raw of a chain: that of its last stage that produces DN, or the raw that enters.
+    """Return the raw of a chain: the output of its last stage that produces DN, or its input.
 
-    Its tone curve is ``neutral``, whatever the chain does after the raw. Converters apply a curve
-    to colours in their own way, and a steeper curve would saturate them.
+    Its tone curve is always ``neutral``. Converters apply a curve to colours differently from
+    clpipe, and a steeper curve would saturate them.
 
     Raises:
         RequestError: the chain has no raw, or one that DNG cannot hold.
@@ -33,10 +33,10 @@ def negative_of(chain: Chain) -> Negative:
             "--format dng writes the raw in DN that quantize produces, but this chain starts on "
             f"{chain.source.label} and has no quantize; add quantize, or use another format"
         )
-    context, end = chain.context_of_raw, chain.context_after
+    context, final_context = chain.context_of_raw, chain.context_after
     is_balanced = is_input and chain.step_in(StageRole.BALANCE) is not None
-    gains = end.applied_gains if is_balanced else context.gains
-    # The levels of a raw that enters are those of normalize.
+    gains = final_context.applied_gains if is_balanced else context.gains
+    # A raw that is the input has the levels of normalize.
     levels = chain.steps[0].method if is_input else context
     black = _level(levels, "black_level", chain.camera.black_level)
     white = _level(levels, "white_level", chain.camera.white_level)
@@ -50,12 +50,14 @@ def negative_of(chain: Chain) -> Negative:
             "--format dng: a curve compresses the DN of this raw, which converters cannot read; "
             "use --format npy, or keep the raw as an EXR"
         )
-    if white > MOST_DN:
+    if white > MAX_DN:
         raise RequestError(
             f"--format dng: found a white level of {white:.0f}, but a DNG holds at most "
-            f"{MOST_DN}; use --format npy, or fewer bits"
+            f"{MAX_DN}; use --format npy, or fewer bits"
         )
-    undone = end.colours if is_input and end.colours != context.colours else None
+    later_matrix = (
+        final_context.colours if is_input and final_context.colours != context.colours else None
+    )
     array = _balanced(context.filters, gains)
     check_array(array)
     return Negative(
@@ -63,14 +65,14 @@ def negative_of(chain: Chain) -> Negative:
         array=array,
         black_level=black,
         white_level=int(white),
-        xyz_to_camera=_xyz_to_camera(context.colours, undone, array),
-        noise=_of_white(context),
+        xyz_to_camera=_xyz_to_camera(context.colours, later_matrix, array),
+        noise=_noise_in_white_levels(context),
         tone=partial(run_reference, Neutral()),
     )
 
 
 def dng_of(chain: Chain) -> Negative:
-    """Return the raw of a chain as :func:`negative_of` does, if converters can open its DNG.
+    """Return the result of :func:`negative_of` after checking that converters can open its DNG.
 
     Raises:
         RequestError: as for :func:`negative_of`, or converters cannot open the DNG.
@@ -80,7 +82,7 @@ def dng_of(chain: Chain) -> Negative:
     return negative
 
 
-def _of_white(context: Context) -> NoiseModel | None:
+def _noise_in_white_levels(context: Context) -> NoiseModel | None:
     """Return the noise of a raw near black, in units of the white level."""
     noise, full = context.noise, context.full_scale
     if noise is None or full == 1:
@@ -88,8 +90,8 @@ def _of_white(context: Context) -> NoiseModel | None:
     return NoiseModel(noise.a / full, noise.b / full**2, noise.signal_range * full)
 
 
-def _level(owner: object, name: str, default: float) -> float:
-    value = getattr(owner, name, None)
+def _level(source: object, name: str, default: float) -> float:
+    value = getattr(source, name, None)
     return default if value is None else float(value)
 
 
@@ -99,14 +101,17 @@ def _balanced(array: FilterArray, gains: tuple[float, float]) -> FilterArray:
 
 
 @lru_cache(maxsize=64)
-def _xyz_to_camera(colours: Matrix, undone: Matrix | None, array: FilterArray) -> Doubles:
+def _xyz_to_camera(colours: Matrix, later_matrix: Matrix | None, array: FilterArray) -> Doubles:
     """Return the ColorMatrix of a raw, see :func:`~clpipe.images.dng.xyz_to_camera`.
 
     Args:
         colours: the matrix from linear sRGB to the mosaic's colours after white balance, which was
             applied to a render.
-        undone: for a raw that enters, the matrix that is applied to it later; its inverse is used.
+        later_matrix: for a raw that is the input, the matrix that the chain applies to it. Its
+            inverse is used.
         array: the filter array.
     """
-    own = np.array(colours)
-    return xyz_to_camera(own if undone is None else own @ np.linalg.inv(undone), array)
+    matrix = np.array(colours)
+    return xyz_to_camera(
+        matrix if later_matrix is None else matrix @ np.linalg.inv(later_matrix), array
+    )

@@ -1,6 +1,6 @@
 """Selects where a picture's noise is measured: flat areas, everywhere, or after averaging 2x2.
 
-The constants are choices. tests/test_statistics.py shows what they select.
+The constants are arbitrary choices. tests/test_statistics.py shows what they select.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ def covariance(noise: Floats) -> Doubles:
     """
     channels = noise.shape[-1]
     products, total = np.zeros((channels, channels)), np.zeros(channels)
-    for frame in noise:  # one at a time, because all frames as doubles take too much memory
+    for frame in noise:  # one at a time, because all frames in float64 take too much memory
         samples = frame.reshape(-1, channels).astype(np.float64)
         products += samples.T @ samples
         total += samples.sum(0)
@@ -60,21 +60,21 @@ def select_flat(truth: Floats, noise: Floats, mask: Mask) -> Mask:
         mask: the pixels to select from, (height, width); at least one is set.
     """
     smooth = _over_window(np.add, truth) / np.float32(WINDOW**2)
-    span = (_over_window(np.maximum, smooth) - _over_window(np.minimum, smooth)).max(-1)
-    quarter = np.quantile(span[mask], FLATTEST)
-    samples = noise[:, mask & (span <= quarter)]
+    local_range = (_over_window(np.maximum, smooth) - _over_window(np.minimum, smooth)).max(-1)
+    quarter = np.quantile(local_range[mask], FLATTEST)
+    samples = noise[:, mask & (local_range <= quarter)]
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(samples - np.median(samples))))
-    return mask & (span <= max(float(quarter), sigma))
+    return mask & (local_range <= max(float(quarter), sigma))
 
 
 def _over_window(function: np.ufunc, image: Floats) -> Floats:
     """Reduce the 5x5 window around each pixel with a commutative function; edges are repeated."""
     for axis in (0, 1):
         size = image.shape[axis]
-        places = np.arange(WINDOW)[:, None] + np.arange(size) - WINDOW // 2
-        first, *rest = np.clip(places, 0, size - 1)
+        offsets = np.arange(WINDOW)[:, None] + np.arange(size) - WINDOW // 2
+        first, *rest = np.clip(offsets, 0, size - 1)
         result = image.take(first, axis)
-        for place in rest:
-            result = function(result, image.take(place, axis))
+        for offset in rest:
+            result = function(result, image.take(offset, axis))
         image = result
     return image

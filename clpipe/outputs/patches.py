@@ -1,4 +1,4 @@
-"""Patches: their places in a picture, their orientations, and their metadata."""
+"""Patches: their positions in a picture, their orientations, and their metadata."""
 
 import math
 import re
@@ -43,40 +43,42 @@ class Patch:
         """The part of the picture."""
         return Box(self.left, self.top, self.left + self.size, self.top + self.size)
 
-    def cut_out(self, image: Array) -> Array:
+    def crop(self, image: Array) -> Array:
         """Return the patch of an image, (height, width[, channel]), in its orientation."""
         box = self.box
-        return self.turned(image[box.top : box.bottom, box.left : box.right])
+        return self.orient(image[box.top : box.bottom, box.left : box.right])
 
-    def turned(self, part: Array) -> Array:
+    def orient(self, part: Array) -> Array:
         """Return a part of an image in the patch's orientation, as a C-contiguous array."""
         return upright(part, self.orientation)
 
 
 @lru_cache(maxsize=64)
-def first_place(pattern: str, orientation: int, size: int) -> tuple[int, int] | None:
-    """Return the first column and row of a patch that has the pattern after it is reoriented.
+def first_aligned_position(pattern: str, orientation: int, size: int) -> tuple[int, int] | None:
+    """Return the smallest column and row at which a patch has the CFA pattern once reoriented.
 
-    Return None if there is no such place. ``pattern`` is a Bayer pattern, such as "RGGB", or rows
-    of letters.
+    Return None if there is no such position. ``pattern`` is a Bayer pattern, such as "RGGB", or
+    rows of letters.
 
     The mosaic keeps its pattern, and no pixel is interpolated or discarded. This is the
     CFA-preserving augmentation of Liu et al., "Learning Raw Image Denoising with Bayer Pattern
     Unification and Bayer Preserving Augmentation" (CVPR workshops 2019). They crop a pixel after
     the flip instead.
 
-    >>> first_place("RGGB", 2, 128), first_place("GRBG", 5, 128)  # left to right; transposed
-    ((1, 0), (1, 1))
+    >>> first_aligned_position("RGGB", 2, 128)  # mirrored left to right
+    (1, 0)
+    >>> first_aligned_position("GRBG", 5, 128)  # transposed
+    (1, 1)
     """
     cell = parse_array(pattern).letters
     rows, columns = cell.shape
-    around = math.lcm(rows, columns)  # on both axes, because a rotation may swap them
-    side = around + size % around
-    field = np.tile(cell, (4 * around // rows, 4 * around // columns))
+    period = math.lcm(rows, columns)  # on both axes, because a rotation may swap them
+    side = period + size % period
+    mosaic = np.tile(cell, (4 * period // rows, 4 * period // columns))
     for y in range(rows):
         for x in range(columns):
-            turned = upright(field[y:, x:][:side, :side], orientation)
-            if (turned[:rows, :columns] == cell).all():
+            reoriented = upright(mosaic[y:, x:][:side, :side], orientation)
+            if (reoriented[:rows, :columns] == cell).all():
                 return x, y
     return None
 
@@ -104,21 +106,24 @@ class Patches:
     augment: bool = False
 
     def __post_init__(self) -> None:
-        least = {"patch": self.size, "per_image": 1 if self.per_image == "grid" else self.per_image}
-        for name, number in least.items():
+        min_count = {
+            "patch": self.size,
+            "per_image": 1 if self.per_image == "grid" else self.per_image,
+        }
+        for name, number in min_count.items():
             if not isinstance(number, int) or number < 1:
-                or_grid = ", or 'grid'" if name == "per_image" else ""
+                alternative = ", or 'grid'" if name == "per_image" else ""
                 raise RequestError(
-                    f"{name}: found {number!r}; expected a whole number of 1 or more{or_grid}"
+                    f"{name}: found {number!r}; expected a whole number of 1 or more{alternative}"
                 )
 
     @property
-    def least(self) -> int:
-        """The number of patches that every picture has at least."""
+    def min_count(self) -> int:
+        """The smallest number of patches that a picture can have."""
         return 1 if self.per_image == "grid" else self.per_image
 
-    def cutting(self, chain: Chain, width: int, height: int) -> "Cutting":
-        """Return how patches are cut from the picture of an image.
+    def layout(self, chain: Chain, width: int, height: int) -> "PatchLayout":
+        """Return the layout of the patches of an image's picture.
 
         Args:
             chain: the chain that makes the picture.
@@ -133,14 +138,14 @@ class Patches:
                 f"its picture has {width}x{height} pixels, but patches need "
                 f"{self.size}x{self.size}; choose smaller patches, or exclude this image"
             )
-        return Cutting(self, width, height, chain.filters.pattern, chain.seed)
+        return PatchLayout(self, width, height, chain.filters.pattern, chain.seed)
 
 
 @dataclass(frozen=True)
-class Cutting:
-    """How patches are cut from pictures of one size and CFA pattern.
+class PatchLayout:
+    """The layout of patches in pictures of one size and CFA pattern.
 
-    After it is reoriented, each patch has the camera's pattern.
+    Each patch has the camera's pattern after it is reoriented.
 
     Args:
         patches: the number and size of patches.
@@ -161,16 +166,16 @@ class Cutting:
         size, count = self.patches.size, self.patches.per_image
         return -(-self.width // size) * -(-self.height // size) if count == "grid" else count
 
-    def cut(self, numbers: Sequence[int], key: str, epoch: int = 0) -> list[Patch]:
-        """Return patches by their numbers: at random places, or in a grid, row by row.
+    def patches_for(self, numbers: Sequence[int], key: str, epoch: int = 0) -> list[Patch]:
+        """Return patches by their numbers: at random positions, or in a grid, row by row.
 
-        The last patches of a grid's row or column end where the picture does. To fit the pattern, a
+        The last patch of a grid's row or column ends at the picture's edge. To fit the pattern, a
         patch of a grid may move by less than the pattern's period.
 
         Args:
             numbers: the numbers of the patches.
             key: the key of the image.
-            epoch: the epoch of a training.
+            epoch: the training epoch.
         """
         size, is_grid = self.patches.size, self.patches.per_image == "grid"
         names = ("turn",) if is_grid else ("turn", "left", "top")
@@ -179,20 +184,22 @@ class Cutting:
             [f"{number}.{name}" for number in numbers for name in names],
         )
         last_left, last_top = self.width - size, self.height - size
-        down, across = parse_array(self.pattern).period
+        y_period, x_period = parse_array(self.pattern).period
         patches = []
         for number in numbers:
             orientation = self._orientation(drawn[f"{number}.turn"])
-            place = first_place(self.pattern, orientation, size)
-            assert place  # _orientation returns only orientations that have one
-            x, y = place
+            position = first_aligned_position(self.pattern, orientation, size)
+            assert position  # _orientation returns only orientations that have one
+            x, y = position
             if is_grid:
                 row, column = divmod(number, -(-self.width // size))
                 left, top = min(column * size, last_left), min(row * size, last_top)
-                left, top = max(left - (left - x) % across, x), max(top - (top - y) % down, y)
+                left, top = max(left - (left - x) % x_period, x), max(top - (top - y) % y_period, y)
             else:
-                left = x + across * int(drawn[f"{number}.left"] * ((last_left - x) // across + 1))
-                top = y + down * int(drawn[f"{number}.top"] * ((last_top - y) // down + 1))
+                left = x + x_period * int(
+                    drawn[f"{number}.left"] * ((last_left - x) // x_period + 1)
+                )
+                top = y + y_period * int(drawn[f"{number}.top"] * ((last_top - y) // y_period + 1))
             patches.append(Patch(left, top, size, orientation))
         return patches
 
@@ -201,18 +208,20 @@ class Cutting:
         size = self.patches.size
         if not self.patches.augment:
             return 1
-        spare = self.width - size, self.height - size
-        places = {turn: first_place(self.pattern, turn, size) for turn in FLIPS}
-        fits = [
-            turn for turn, place in places.items() if place and all(np.less_equal(place, spare))
+        margin = self.width - size, self.height - size
+        positions = {turn: first_aligned_position(self.pattern, turn, size) for turn in FLIPS}
+        possible = [
+            turn
+            for turn, position in positions.items()
+            if position and all(np.less_equal(position, margin))
         ]
-        return fits[int(number * len(fits))]
+        return possible[int(number * len(possible))]
 
 
 def patch_name(number: int | None) -> str:
-    """Return what follows the image's name in that of a patch, by its number; "" for None.
+    """Return the suffix of the image's name for a patch number, or "" for None.
 
-    It contains no dot, so that WebDataset reads each patch as a sample.
+    The suffix contains no dot, so that WebDataset reads each patch as a sample.
 
     >>> patch_name(7), patch_name(None)
     ('_0007', '')
@@ -221,7 +230,7 @@ def patch_name(number: int | None) -> str:
 
 
 def without_patch(name: str) -> str:
-    """Return a name without the part that :func:`patch_name` adds.
+    """Return a name without the suffix that :func:`patch_name` returns.
 
     >>> without_patch("frame_12_0007"), without_patch("frame_12")
     ('frame_12', 'frame_12')
@@ -229,7 +238,7 @@ def without_patch(name: str) -> str:
     return re.sub(r"_\d{4,}$", "", name)
 
 
-def every_patch(patches: Patches, chain: Chain, width: int, height: int, key: str) -> list[Patch]:
+def all_patches(patches: Patches, chain: Chain, width: int, height: int, key: str) -> list[Patch]:
     """Return all patches of the picture of an image.
 
     Args:
@@ -241,12 +250,14 @@ def every_patch(patches: Patches, chain: Chain, width: int, height: int, key: st
     Raises:
         ImageError: the picture is smaller than a patch.
     """
-    cutting = patches.cutting(chain, width, height)
-    return cutting.cut(range(cutting.count), key)
+    layout = patches.layout(chain, width, height)
+    return layout.patches_for(range(layout.count), key)
 
 
 def variance_steps(chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
-    """Return :func:`signal_and_noise`, if its steps work on single pixels, which patches need.
+    """Return the result of :func:`signal_and_noise` after checking its steps.
+
+    Patches need steps that work on single pixels.
 
     Raises:
         RequestError: as for :func:`signal_and_noise`, or a step reads neighbouring pixels.
@@ -266,19 +277,19 @@ def variance_at(noise: Sequence[Step], signal: Array, patch: Patch | None) -> Ar
 
     Args:
         noise: the steps that add noise.
-        signal: the image that enters them, or the patch of it.
+        signal: the input of these steps, or the patch of it.
         patch: the patch; None for the whole image.
     """
     if patch is None:
         return variance_of(noise, signal)
     # Padding aligns the patch with the pattern, so that its first pixel has the right colour.
-    down, across = noise[0].context.filters.period
-    x, y = patch.left % across, patch.top % down
+    y_period, x_period = noise[0].context.filters.period
+    x, y = patch.left % x_period, patch.top % y_period
     padded = np.pad(signal, ((y, 0), (x, 0), (0, 0))[: signal.ndim], mode="edge")
     return variance_of(noise, padded)[y:, x:]
 
 
-def facts_of(chain: Chain) -> dict[str, Any]:
+def metadata_of(chain: Chain) -> dict[str, Any]:
     """Return the metadata of a patch or sample: its camera, seed, pattern, levels and colours."""
     facts: dict[str, Any] = {"camera": chain.camera.name, "seed": chain.seed}
     try:

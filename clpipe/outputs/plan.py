@@ -21,10 +21,10 @@ from clpipe.chain.rendition import (
 from clpipe.chain.request import ResolvedRequest
 from clpipe.inputs.companions import CARRIED
 from clpipe.inputs.find import Job
-from clpipe.outputs.carried import png_ending
+from clpipe.outputs.carried import png_suffix
 from clpipe.outputs.negative import dng_of
 from clpipe.outputs.patches import Patches, patch_name, variance_steps
-from clpipe.outputs.recipes import measured_on, recipes, renditions
+from clpipe.outputs.recipes import recipes, reference_pictures, renditions
 from clpipe.outputs.sidecar import SIDECAR
 from clpipe.stage import Kind
 
@@ -34,9 +34,9 @@ class RenditionFiles(NamedTuple):
 
     Args:
         sidecar: its sidecar.
-        pictures: the files that every such rendition has.
-        others: files that it may have. For example, images of steps before ``start_at`` are never
-            written.
+        pictures: the files that are always written.
+        others: files that may be written. For example, images of steps before ``start_at`` are
+            never written.
     """
 
     sidecar: Path
@@ -44,10 +44,10 @@ class RenditionFiles(NamedTuple):
     others: Sequence[Path] = ()
 
 
-def ending_behind(ending: str, rendition: Rendition, patch: int | None = None) -> str:
-    """Return all that follows a job's stem in the name of a file.
+def file_suffix(ending: str, rendition: Rendition, patch: int | None = None) -> str:
+    """Return what follows a job's stem in a file name: patch, rendition and extension.
 
-    >>> ending_behind("jpg", Rendition("clean"), 3)
+    >>> file_suffix("jpg", Rendition("clean"), 3)
     '_0003.truth_clean.jpg'
     """
     return f"{patch_name(patch)}{rendition.suffix}.{ending}"
@@ -70,24 +70,31 @@ class OutputPlan:
         """The formats of the last image, and of the raw."""
         return self.request.formats
 
-    def _every(self, frames: int | None) -> tuple[Rendition, ...]:
-        """Return the renditions that are made of an image with that many frames."""
-        asked = self.request
-        frames = asked.frames if frames is None else frames
-        return renditions(frames, asked.truths, asked.bracket, asked.baselines)
+    def _all_renditions(self, frames: int | None) -> tuple[Rendition, ...]:
+        """Return all renditions of an image with this number of frames; None is no burst."""
+        request = self.request
+        frames = request.frames if frames is None else frames
+        return renditions(frames, request.truths, request.bracket, request.baselines)
 
     def renditions_of(self, job: Job) -> tuple[Rendition, ...]:
-        """Return the renditions that are made of a job's image."""
-        every = self._every(job.frames)
-        return every if job.renditions is None else tuple(e for e in every if e in job.renditions)
+        """Return the renditions of a job's image."""
+        candidates = self._all_renditions(job.frames)
+        return (
+            candidates
+            if job.renditions is None
+            else tuple(e for e in candidates if e in job.renditions)
+        )
 
     def needed(self, job: Job, missing: Iterable[Rendition]) -> tuple[Rendition, ...]:
-        """Return the renditions to make, in order: missing ones, and those they are measured on."""
+        """Return the renditions to compute, in order.
+
+        They are the missing ones, and the pictures on which missing baselines are measured.
+        """
         needed = set(missing)
         for each in tuple(needed):
             if each.role in BASELINES:
-                needed |= {*measured_on(each)}
-        return tuple(each for each in self._every(job.frames) if each in needed)
+                needed |= {*reference_pictures(each)}
+        return tuple(each for each in self._all_renditions(job.frames) if each in needed)
 
     def formats_of(self, rendition: Rendition) -> tuple[str, ...]:
         """Return the formats of a rendition."""
@@ -108,17 +115,17 @@ class OutputPlan:
             return None
         return Patches(request.patch, request.patches_per_image, request.augment)
 
-    def keep_of(self, rendition: Rendition) -> tuple[str, ...]:
-        """Return the steps whose images are written next to a rendition that has them."""
+    def kept_steps(self, rendition: Rendition) -> tuple[str, ...]:
+        """Return the steps whose images are written with a rendition."""
         if rendition.role in (*FLOAT_MOSAICS, *BASELINES):
             return ()
         if rendition.role in PICTURES:
             return self.request.truth_keep
         return self.request.keep
 
-    def record_of(self, request: Mapping[str, Any], rendition: Rendition) -> dict[str, Any]:
+    def request_record(self, request: Mapping[str, Any], rendition: Rendition) -> dict[str, Any]:
         """Return the part of an image's request record that is about one rendition."""
-        record = {**request, "keep": list(self.keep_of(rendition))}
+        record = {**request, "keep": list(self.kept_steps(rendition))}
         return record if self.carries(rendition) else record | {"carry": []}
 
     def carries(self, rendition: Rendition) -> bool:
@@ -126,12 +133,12 @@ class OutputPlan:
         is_first = rendition.is_first and rendition.ev in (None, *self.request.bracket[:1])
         return bool(self.request.carry) and is_first
 
-    def carried_endings(self, rendition: Rendition) -> dict[str, str]:
-        """Return the endings of the PNGs by layer, and that of the EXR of all layers for ""."""
+    def carried_suffixes(self, rendition: Rendition) -> dict[str, str]:
+        """Return the suffixes of carried files: of each layer's PNG, and of the EXR for ""."""
         if not self.carries(rendition):
             return {}
         depths = [each.name for each in self.request.aov_specs() if each.png]
-        return {"": f"{CARRIED}.exr", **{name: png_ending(name) for name in depths}}
+        return {"": f"{CARRIED}.exr", **{name: png_suffix(name) for name in depths}}
 
     def check(self, chain: Chain, jobs: Sequence[Job]) -> None:
         """Check that the formats can hold the results, and that no file is written twice.
@@ -140,16 +147,18 @@ class OutputPlan:
             RequestError: a format cannot hold a result, or a result would overwrite an input or
                 another result.
         """
-        too_small = [f for f in self.formats if f not in (DNG, NPY) and FORMATS[f].bits < 32]
-        if too_small and chain.result is Kind.RAW:
+        low_precision = [f for f in self.formats if f not in (DNG, NPY) and FORMATS[f].bits < 32]
+        if low_precision and chain.result is Kind.RAW:
             raise RequestError(
-                f"the chain ends in DN, which {too_small[0]} cannot hold; "
+                f"the chain ends in DN, which {low_precision[0]} cannot hold; "
                 "end the chain with normalize or a later stage, or use --format dng, npy or exr"
             )
         if DNG in self.formats:
             dng_of(chain)  # rejects a chain without a raw
         for frames in {job.frames for job in jobs}:
-            recipes(self._every(frames), chain, "")  # rejects a chain that has no such truth
+            recipes(
+                self._all_renditions(frames), chain, ""
+            )  # rejects a chain that has no such truth
         if self.patches:
             self._check_patches(chain)
         endings: dict[str, str] = {}
@@ -191,10 +200,10 @@ class OutputPlan:
         real_folder = os.path.realpath(self.folder)
         inputs = set(map(os.path.realpath, {str(job.path) for job in jobs}))
         inside = {path for path in inputs if path.startswith(real_folder + os.sep)}
-        makers: dict[str, Job] = {}
+        jobs_by_path: dict[str, Job] = {}
         for job in jobs:
             for rendition in self.renditions_of(job):
-                sidecar, pictures, others = self._endings(rendition)
+                sidecar, pictures, others = self._suffixes(rendition)
                 for ending in (sidecar, *pictures, *others):
                     path = self.name(job, ending)
                     if inside and os.path.realpath(path) in inside:
@@ -202,47 +211,47 @@ class OutputPlan:
                             f"{path}: this input would be overwritten; choose another output "
                             "directory"
                         )
-                    if path in makers:
+                    if path in jobs_by_path:
                         raise RequestError(
-                            f"{makers[path].label} and {job.label} would both write {path}; use "
-                            "different output directories, or give them names in a manifest"
+                            f"{jobs_by_path[path].label} and {job.label} would both write {path}; "
+                            "use different output directories, or give them names in a manifest"
                         )
-                    makers[path] = job
+                    jobs_by_path[path] = job
 
     def path(
         self, job: Job, ending: str, rendition: Rendition = FIRST, patch: int | None = None
     ) -> Path:
-        """Return a file of a job by the end of its name. ``patch`` is the number of a patch."""
-        return Path(self.name(job, ending_behind(ending, rendition, patch)))
+        """Return the path of a job's file. ``patch`` is the number of a patch."""
+        return Path(self.name(job, file_suffix(ending, rendition, patch)))
 
     def name(self, job: Job, ending: str) -> str:
-        """Return the name of a job's file. ``ending`` is all that follows the job's stem."""
+        """Return the name of a job's file. ``ending`` is what follows the job's stem."""
         return f"{self.folder}/{job.stem}{ending}"
 
     def files(self, job: Job, rendition: Rendition) -> RenditionFiles:
         """Return the files of a rendition. For a grid of patches, this is only the first patch."""
-        sidecar, pictures, others = self._endings(rendition)
+        sidecar, pictures, others = self._suffixes(rendition)
         return RenditionFiles(
             Path(self.name(job, sidecar)),
             [Path(self.name(job, ending)) for ending in pictures],
             [Path(self.name(job, ending)) for ending in others],
         )
 
-    def _endings(self, rendition: Rendition) -> tuple[str, list[str], list[str]]:
+    def _suffixes(self, rendition: Rendition) -> tuple[str, list[str], list[str]]:
         """Return what follows a job's stem in the names of :meth:`files`."""
-        if found := self._known_endings.get(rendition):
+        if found := self._suffix_cache.get(rendition):
             return found
-        numbers = range(self.patches.least) if self.patches else (None,)
+        numbers = range(self.patches.min_count) if self.patches else (None,)
         formats = [ending_of(format_) for format_ in self.formats_of(rendition)]
-        carried = self.carried_endings(rendition).values()
-        pictures = [ending_behind(each, rendition, n) for n in numbers for each in formats]
-        pictures += [ending_behind(each, FIRST, n) for n in numbers for each in carried]
-        kept = [f"{step}.{self.kept_format}" for step in self.keep_of(rendition)]
-        others = [ending_behind(each, rendition, n) for n in numbers for each in kept]
-        found = ending_behind(SIDECAR, rendition), pictures, others
-        self._known_endings[rendition] = found
+        carried = self.carried_suffixes(rendition).values()
+        pictures = [file_suffix(each, rendition, n) for n in numbers for each in formats]
+        pictures += [file_suffix(each, FIRST, n) for n in numbers for each in carried]
+        kept = [f"{step}.{self.kept_format}" for step in self.kept_steps(rendition)]
+        others = [file_suffix(each, rendition, n) for n in numbers for each in kept]
+        found = file_suffix(SIDECAR, rendition), pictures, others
+        self._suffix_cache[rendition] = found
         return found
 
     @cached_property
-    def _known_endings(self) -> dict[Rendition, tuple[str, list[str], list[str]]]:
+    def _suffix_cache(self) -> dict[Rendition, tuple[str, list[str], list[str]]]:
         return {}

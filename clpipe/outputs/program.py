@@ -1,4 +1,4 @@
-"""Identifies what pixels depend on besides the request: the program, its libraries, the device.
+"""Identifies what affects pixels besides the request: the program, its libraries, the device.
 
 The version alone does not identify a program, because people install from a checkout. Sidecars
 therefore contain a digest of it, by which a run recognizes pictures that another program made.
@@ -23,7 +23,7 @@ from clpipe.engine.device import Device
 from clpipe.engine.sources import kernel_folder
 from clpipe.engine.store import Store
 from clpipe.images.write import versions
-from clpipe.outputs.sidecar import Constant
+from clpipe.outputs.sidecar import CachedJson
 
 # Packages that never affect a pixel: they request pictures, or read finished ones.
 WITHOUT_PIXELS = ("analysis", "commands", "dataset", "explorer", "reports", "scenes")
@@ -93,7 +93,7 @@ def device_record(device: Device | None) -> dict[str, Any]:
 @cache
 def all_versions() -> dict[str, str]:
     """Return the versions of all software that a picture's bytes may depend on, by name."""
-    return Constant(
+    return CachedJson(
         clpipe=full_version(),
         python=platform.python_version(),
         numpy=version("numpy"),

@@ -24,24 +24,24 @@ from clpipe.chain.rendition import (
 )
 from clpipe.chain.settings import overlay
 from clpipe.chain.truth import noisy_mosaic, picture_without_noise, signal_and_noise
-from clpipe.outputs.baseline_noise import Spread
+from clpipe.outputs.baseline_noise import NoiseMatcher
 from clpipe.outputs.negative import dng_of
 from clpipe.stage import StageRole
 
 
-def results_of(
+def required_results(
     chain: Chain, formats: Sequence[str], keep: Sequence[str]
 ) -> tuple[tuple[str, ...], bool, bool]:
-    """Return the results that files need of a chain, so that nothing else is computed.
+    """Return the results of a chain that its files require.
 
     Args:
         chain: the chain.
-        formats: of the last image, and of the raw.
-        keep: names of steps; those that the chain does not have are ignored.
+        formats: the formats of the last image and of the raw.
+        keep: the names of steps. Names that the chain does not contain are ignored.
 
     Returns:
-        The steps whose images are needed, and whether the last image is needed in 8 bits and in
-        floats.
+        The steps whose images are required, whether the last image is required in 8 bits, and
+        whether it is required in floats.
 
     Raises:
         RequestError: a DNG is needed, and the chain has no raw for one.
@@ -55,11 +55,11 @@ def results_of(
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a rendition of an image is made.
+    """How to compute a rendition of an image.
 
     Args:
-        rendition: which picture of the image.
-        chain: what makes it.
+        rendition: the rendition.
+        chain: the chain that computes it.
         noise: for a variance map, the steps whose noise has this variance in the chain's last
             image, see :func:`clpipe.chain.truth.variance_of`; otherwise ().
         key: the key of the image.
@@ -71,7 +71,7 @@ class Recipe:
     chain: Chain
     noise: tuple[Step, ...]
     key: str
-    spread: Spread | None = None
+    matcher: NoiseMatcher | None = None
     estimates: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -80,8 +80,8 @@ class Recipe:
         return noise_key(self.chain.settings, self.key, self.rendition.frame)
 
     @property
-    def whole(self) -> Chain:
-        """The chain with the steps of ``noise``."""
+    def full_chain(self) -> Chain:
+        """The chain, with the steps of ``noise`` in place of its last step if there are any."""
         if not self.noise:
             return self.chain
         return replace(self.chain, steps=(*self.chain.steps[:-1], *self.noise))
@@ -94,11 +94,11 @@ def renditions(
     bracket: tuple[float, ...] = (),
     baselines: tuple[str, ...] = (),
 ) -> tuple[Rendition, ...]:
-    """Return the renditions that are made of an image, exposure by exposure.
+    """Return the renditions of an image, exposure by exposure.
 
     Args:
-        frames: the number of frames; None is one picture. A burst also has the ground truth of its
-            development.
+        frames: the number of frames of a burst; None is one picture. A burst also has its developed
+            ground truth.
         truths: members of :data:`clpipe.chain.rendition.TRUTHS`.
         bracket: the EV to add to each exposure; () is one exposure.
         baselines: members of :data:`clpipe.chain.rendition.BASELINES`. Any of them adds the ground
@@ -109,19 +109,19 @@ def renditions(
     >>> [each.suffix for each in renditions(None, ("mosaic",), (-2, 0))]
     ['.ev-2', '.ev-2.truth_mosaic', '.ev+0', '.ev+0.truth_mosaic']
     """
-    asked = {NOISY, *truths, *baselines, *((DEVELOPMENT,) if frames else ())}
-    asked |= {*PICTURES} if baselines else set()
+    selected = {NOISY, *truths, *baselines, *((DEVELOPMENT,) if frames else ())}
+    selected |= {*PICTURES} if baselines else set()
     return tuple(
         Rendition(role, ev, frame, frames)
         for ev in bracket or (None,)
         for role in (NOISY, *TRUTHS, *BASELINES)
-        if role in asked
+        if role in selected
         for frame in (range(frames) if frames and role == NOISY else (None,))
     )
 
 
-def recipes(asked: Iterable[Rendition], chain: Chain, key: str) -> list[Recipe]:
-    """Return how each rendition of an image is made.
+def recipes(selected: Iterable[Rendition], chain: Chain, key: str) -> list[Recipe]:
+    """Return a recipe for each rendition of an image.
 
     The first frame equals the picture without a burst, and an exposure at 0 EV the picture without
     a bracket.
@@ -135,26 +135,28 @@ def recipes(asked: Iterable[Rendition], chain: Chain, key: str) -> list[Recipe]:
         RequestError: the chain has no such ground truth, or no such exposure.
     """
     found: list[Recipe] = []
-    spreads: dict[float | None, Spread] = {}  # baselines of one exposure share theirs
-    for each in asked:
-        own = chain if each.ev is None else exposed(chain, each.ev)
-        own_key = of_bracket(key, each.ev or 0.0)
-        recipe = Recipe(each, *chain_and_noise(each.role, own), own_key)
+    matchers: dict[float | None, NoiseMatcher] = {}  # baselines of one exposure share theirs
+    for each in selected:
+        exposed_chain = chain if each.ev is None else with_exposure(chain, each.ev)
+        exposed_key = of_bracket(key, each.ev or 0.0)
+        recipe = Recipe(each, *chain_and_noise(each.role, exposed_chain), exposed_key)
         if each.role in BASELINES:
-            spread = Spread(measured_on(each), matching_of(own), own.settings.output)
-            recipe = replace(recipe, spread=spreads.setdefault(each.ev, spread))
+            matcher = NoiseMatcher(
+                reference_pictures(each), matching_of(exposed_chain), exposed_chain.settings.output
+            )
+            recipe = replace(recipe, matcher=matchers.setdefault(each.ev, matcher))
         found.append(recipe)
     return found
 
 
-def measured_on(baseline: Rendition) -> tuple[Rendition, Rendition, Rendition]:
-    """Return the pictures on which a baseline is measured: the noisy one and two ground truths."""
-    return baseline.beside(NOISY), baseline.beside(DEVELOPMENT), baseline.beside(CLEAN)
+def reference_pictures(baseline: Rendition) -> tuple[Rendition, Rendition, Rendition]:
+    """Return the pictures to which a baseline is matched: the noisy one and two ground truths."""
+    return baseline.with_role(NOISY), baseline.with_role(DEVELOPMENT), baseline.with_role(CLEAN)
 
 
 @lru_cache(maxsize=64)  # for the same reason as chain_and_noise
-def exposed(chain: Chain, ev: float) -> Chain:
-    """Return a chain whose exposure is increased by ``ev``, with noise of its own.
+def with_exposure(chain: Chain, ev: float) -> Chain:
+    """Return a chain whose exposure is increased by ``ev``, with different noise.
 
     Raises:
         RequestError: the chain has no exposure step, or the sum is not allowed.
@@ -183,7 +185,7 @@ def exposed(chain: Chain, ev: float) -> Chain:
     return replace(chain, steps=tuple(steps), settings=settings)
 
 
-@lru_cache(maxsize=64)  # most images of a run share one chain, and plans are cached per chain
+@lru_cache(maxsize=64)  # plans are cached per chain, and most images of a run share one chain
 def chain_and_noise(role: Role, chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
     """Return the chain of a rendition, and the noise of a variance map, see :class:`Recipe`.
 

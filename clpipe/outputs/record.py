@@ -1,4 +1,4 @@
-"""Makes the contents of a sidecar: all that is needed to recompute its picture."""
+"""Makes the contents of a sidecar: everything that is needed to recompute its picture."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -15,26 +15,26 @@ from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import FLIPS, orientation_of
-from clpipe.inputs.carry import Aovs
+from clpipe.inputs.carry import CarriedLayers
 from clpipe.inputs.find import Job
 from clpipe.inputs.raw import RawImage
 from clpipe.outputs.motion import motion_records
-from clpipe.outputs.patches import Patch, facts_of
+from clpipe.outputs.patches import Patch, metadata_of
 from clpipe.outputs.program import all_versions, device_record, program_digest
 from clpipe.outputs.recipes import Recipe
-from clpipe.outputs.sidecar import OWN, Constant, sealed
+from clpipe.outputs.sidecar import VERSION_KEY, CachedJson, sidecar_bytes
 from clpipe.reference.intrinsics import Intrinsics
 
-FACTS, PATCHES = "facts", "patches"  # keys of a sidecar of patches
+METADATA, PATCHES = "facts", "patches"  # keys of a sidecar of patches
 
-SAID = ("image_key", "noise_key", "iso", "noise")  # keys that sidecars of patches repeat
+REPEATED_KEYS = ("image_key", "noise_key", "iso", "noise")  # keys that sidecars of patches repeat
 
 
 def intrinsics_of(chain: Chain, source: SourceImage) -> Intrinsics | None:
     """Return the intrinsics of the picture of a render or a photograph; None if not known.
 
-    The picture of a photograph is rotated upright. The intrinsics of a raw are not known. Those of
-    an image that enters after the first step are not known either, because a lens may have been
+    The picture of a photograph is rotated upright. The intrinsics of a raw are not known. If the
+    chain starts after its first step, they are not known either, because a lens may have been
     applied before.
 
     Raises:
@@ -52,7 +52,7 @@ def intrinsics_of(chain: Chain, source: SourceImage) -> Intrinsics | None:
 def subframe_records(
     source: SourceImage, stamps: Sequence[tuple[int, int]]
 ) -> list[dict[str, Any]]:
-    """Return the files that an exposure is the mean of, relative to the folder of the first."""
+    """Return the entries of the files that an exposure averages, relative to the first's folder."""
     return [
         {"file": name, "size": size, "modified": modified, "sha256": digest}
         for (name, digest), (size, modified) in zip(source.subframes, stamps, strict=True)
@@ -69,10 +69,10 @@ def picture_record(
     result: Result,
     outputs: Mapping[Path, Stored],
     clipped: float | None,
-    carried: Aovs | None = None,
+    carried: CarriedLayers | None = None,
     patches: Sequence[Patch] = (),
 ) -> dict[str, Any]:
-    """Return all that is needed to recompute the files of a rendition, as JSON values.
+    """Return everything that is needed to recompute the files of a rendition, as JSON values.
 
     Args:
         job: the image.
@@ -87,13 +87,13 @@ def picture_record(
         carried: layers that were written next to the picture.
         patches: patches that were written instead of the picture.
     """
-    chain, rendition = recipe.whole, recipe.rendition
+    chain, rendition = recipe.full_chain, recipe.rendition
     facts = source.facts if isinstance(source, RawImage) else None
     noise = chain.noise if not facts or chain.is_noisy else None
     width, height = chain.size(*source.pixels.shape[1::-1])
     intrinsics = intrinsics_of(chain, source)
     return {
-        OWN: __version__,
+        VERSION_KEY: __version__,
         "input": job.input,
         "input_size": stamps[0][0],
         "input_modified": stamps[0][1],
@@ -146,10 +146,10 @@ def picture_record(
 
 
 def patch_records(chain: Chain, patches: Sequence[Patch]) -> dict[str, Any]:
-    """Return a sidecar's entries for patches, as JSON values: their metadata, and their places."""
-    facts = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in facts_of(chain).items()}
+    """Return a sidecar's entries for patches, as JSON values: their metadata and positions."""
+    facts = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in metadata_of(chain).items()}
     places = [{"place": [patch.left, patch.top], "turn": patch.orientation} for patch in patches]
-    return {FACTS: facts, PATCHES: places}
+    return {METADATA: facts, PATCHES: places}
 
 
 def patch_text(values: Mapping[str, Any], number: int) -> bytes:
@@ -158,15 +158,22 @@ def patch_text(values: Mapping[str, Any], number: int) -> bytes:
     Raises:
         KeyError, TypeError, IndexError: the values are damaged.
     """
-    said = {key: values[key] for key in SAID}
-    return sealed({OWN: values[OWN], **said, **values[FACTS], **values[PATCHES][number]})
+    repeated = {key: values[key] for key in REPEATED_KEYS}
+    return sidecar_bytes(
+        {
+            VERSION_KEY: values[VERSION_KEY],
+            **repeated,
+            **values[METADATA],
+            **values[PATCHES][number],
+        }
+    )
 
 
 @lru_cache(maxsize=8)
 def stage_records(chain: Chain) -> list[dict[str, Any]]:
-    """Return a sidecar's entry for the steps of a chain, as JSON values, which images share."""
+    """Return a sidecar's entry for the steps of a chain, as JSON values that images share."""
     return [
-        Constant(
+        CachedJson(
             name=step.name,
             stage=step.stage.name,
             method=step.method.method,

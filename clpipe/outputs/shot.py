@@ -14,12 +14,12 @@ from clpipe.stage import StageRole
 
 
 def tags_of(chain: Chain, source: SourceImage, tags: Tags, estimates: Estimates) -> Tags:
-    """Return the tags of a picture: those of the request's camera first, then those of its image.
+    """Return the tags of a picture. Values of the request take precedence over the image's.
 
     A positive EV is recorded as a longer exposure time.
     """
-    optics, own = chain.optics, {**source.shot, **tags.shot}
-    time, bias = optics.exposure_time or own.get("exposure_time"), tags.bias
+    optics, stated_values = chain.optics, {**source.shot, **tags.shot}
+    time, bias = optics.exposure_time or stated_values.get("exposure_time"), tags.bias
     if exposed := exposure_of(chain, estimates):
         bias = exposed.ev
         time = exposed.time or (time and time * 2.0**bias)
@@ -33,51 +33,53 @@ def tags_of(chain: Chain, source: SourceImage, tags: Tags, estimates: Estimates)
         lens=calibration.name if calibration else tags.lens,
         focus_distance=optics.focus_distance or tags.focus_distance,
         aperture=optics.f_number or tags.aperture,
-        focal_length=optics.focal_length or own.get("focal_length"),
-        sensor_width=sensor_of(chain, source, own),
+        focal_length=optics.focal_length or stated_values.get("focal_length"),
+        sensor_width=sensor_width_of(chain, source, stated_values),
         encoding=chain.settings.output,
     )
 
 
-def sensor_of(chain: Chain, source: SourceImage, own: Mapping[str, float]) -> float | None:
+def sensor_width_of(
+    chain: Chain, source: SourceImage, stated_values: Mapping[str, float]
+) -> float | None:
     """Return the width of a picture's sensor in mm, along the longer side; None if not known.
 
-    It is stated, or computed from the focal length in mm and in px.
+    The width is given, or computed from the focal length in mm and in px.
 
     Args:
         chain: the chain of the picture.
         source: the image, as it was loaded.
-        own: values that the image states about its shot.
+        stated_values: values in the image's metadata.
     """
     optics = chain.optics
     stated = None if optics.is_sensor_of_lens else optics.sensor_width
-    if stated := stated or own.get("sensor_width"):
+    if stated := stated or stated_values.get("sensor_width"):
         return stated
-    length = optics.focal_length or own.get("focal_length")
-    if length is None or source.pixels.ndim != 3:
+    focal_length = optics.focal_length or stated_values.get("focal_length")
+    if focal_length is None or source.pixels.ndim != 3:
         return None
     width, height = source.margins.inside(*source.pixels.shape[1::-1])
     camera = chain.intrinsics_of_render(width, height, source.shot)
-    return length / camera.fx * max(width, height) if camera else None
+    return focal_length / camera.fx * max(width, height) if camera else None
 
 
-def shown_tags(chain: Chain, source: SourceImage, tags: Tags) -> Tags:
-    """Return the tags of the image that a chain makes. Binning may drop the edge of the sensor.
+def tags_after(chain: Chain, source: SourceImage, tags: Tags) -> Tags:
+    """Return the tags of a chain's output. Binning may discard the edge of the sensor.
 
     Args:
         chain: the chain of the image.
-        source: the image that entered.
+        source: the input of the chain.
         tags: the tags, with the width of the whole sensor.
     """
     if not tags.sensor_width or not chain.geometry:
         return tags
     size = source.pixels.shape[1::-1]
-    longer, share = int(np.argmax(size)), 1.0
+    long_axis, fraction = int(np.argmax(size)), 1.0
     for part in chain.geometry.parts:
         if isinstance(part, Scaling):
-            share *= part.shown(*size)[longer] / size[longer]
+            fraction *= part.shown(*size)[long_axis] / size[long_axis]
         size = part.size(*size)
-    return replace(tags, sensor_width=tags.sensor_width * share)
+    return replace(tags, sensor_width=tags.sensor_width * fraction)
 
 
 def kept_tags(chain: Chain, step: Step, source: SourceImage, tags: Tags) -> dict[str, str]:
@@ -89,11 +91,13 @@ def kept_tags(chain: Chain, step: Step, source: SourceImage, tags: Tags) -> dict
     Args:
         chain: the chain of the picture.
         step: one of its steps.
-        source: the image that entered.
+        source: the input of the chain.
         tags: the tags of the picture.
     """
-    own = {name: source.attributes[name] for name in TAG_ATTRIBUTES if name in source.attributes}
+    stated_values = {
+        name: source.attributes[name] for name in TAG_ATTRIBUTES if name in source.attributes
+    }
     exposure = chain.step_in(StageRole.EXPOSURE)
     if exposure is None or chain.steps.index(step) < chain.steps.index(exposure):
-        return own
-    return own | exposed_attributes(own, tags)
+        return stated_values
+    return stated_values | exposed_attributes(stated_values, tags)

@@ -1,7 +1,8 @@
 """Sidecar files: JSON that contains its own digest, so that edits are noticed.
 
-All sidecars are written by :func:`sealed` and read by :func:`values_in`. The digest protects
-against accidents and edits, not against forgery. :mod:`clpipe.outputs.record` makes the contents.
+:func:`sidecar_bytes` formats all sidecars, and :func:`parse_sidecar` reads them. The digest
+protects against accidents and edits, not against forgery. :mod:`clpipe.outputs.record` makes the
+contents.
 """
 
 import hashlib
@@ -19,17 +20,17 @@ from clpipe.base.errors import ImageError
 from clpipe.base.files import keep_names, write_whole
 from clpipe.base.reading import parse_json, read_bytes
 
-SIDECAR = "json"  # its extension
+SIDECAR = "json"  # the extension of sidecars
 
-OWN = "clpipe"  # the first key of every sidecar
+VERSION_KEY = "clpipe"  # the first key of every sidecar
 
-SEAL = "sidecar_sha256"  # the last one: the SHA-256 of all lines before its own
+DIGEST_KEY = "sidecar_sha256"  # the last one: the SHA-256 of all lines before its own
 
-BEGINNING = b'{\n  "%b": ' % OWN.encode()
+BEGINNING = b'{\n  "%b": ' % VERSION_KEY.encode()
 
 # The beginning and end of a sidecar identify it even if it was cut off or edited.
-_BEGINNING = re.compile(rb'\s*\{\s*"%b"\s*:' % OWN.encode())
-_END = re.compile(rb'"%b"\s*:' % SEAL.encode())
+_BEGINNING = re.compile(rb'\s*\{\s*"%b"\s*:' % VERSION_KEY.encode())
+_END = re.compile(rb'"%b"\s*:' % DIGEST_KEY.encode())
 
 
 to_json = json.JSONEncoder().encode  # json.dumps without its checks of options
@@ -40,46 +41,46 @@ class SidecarError(ImageError):
 
     def __init__(self, name: Path | str) -> None:
         super().__init__(
-            f"{name}: this sidecar was changed after clpipe wrote it (its {SEAL} does not match), "
-            "so it is not used. To restore it, repeat the same clpipe run. To change settings, use "
-            "options or a configuration"
+            f"{name}: this sidecar was changed after clpipe wrote it (its {DIGEST_KEY} does not "
+            "match), so it is not used. To restore it, repeat the same clpipe run. To change "
+            "settings, use options or a configuration"
         )
 
 
-def sealed(record: Mapping[str, Any]) -> bytes:
-    r"""Return a sidecar's bytes: its values, then the digest of all lines before.
+def sidecar_bytes(record: Mapping[str, Any]) -> bytes:
+    r"""Return the bytes of a sidecar: its values, then the digest of all lines before it.
 
     ``head -n -2 NAME.json | sha256sum`` computes that digest.
 
-    >>> sealed({"a": 1})[:28]
+    >>> sidecar_bytes({"a": 1})[:28]
     b'{\n  "a": 1,\n  "sidecar_sha25'
     """
     head = json_text(record).removesuffix("\n}\n").encode() + b",\n"
-    return head + _seal_of(head)
+    return head + _digest_lines(head)
 
 
-def values_in(data: bytes, name: Path | str) -> dict[str, Any] | None:
-    """Return the values of an unchanged sidecar. Only its key :data:`OWN` is guaranteed.
+def parse_sidecar(data: bytes, name: Path | str) -> dict[str, Any] | None:
+    """Return the values of an unchanged sidecar. Only its key :data:`VERSION_KEY` is guaranteed.
 
     Args:
         data: the bytes of a file.
         name: the name of the file, for the message.
 
     Returns:
-        The values; None if the file is empty, or is not a sidecar of clpipe's.
+        The values, or None if the file is empty or not a sidecar of clpipe.
 
     Raises:
         SidecarError: it was edited, cut off or damaged.
     """
-    end = data.rfind(b'  "%b": "' % SEAL.encode())
-    if end > 0 and data[end:] == _seal_of(data[:end]):
+    end = data.rfind(b'  "%b": "' % DIGEST_KEY.encode())
+    if end > 0 and data[end:] == _digest_lines(data[:end]):
         try:
             # pydantic's parser takes a third of the time of json's. It rejects the escapes by which
             # json writes file names that are not UTF-8.
             values = parse_json(data) if b"\\ud" in data else from_json(data)
         except ValueError:
             values = None
-        if isinstance(values, dict) and OWN in values:
+        if isinstance(values, dict) and VERSION_KEY in values:
             return values
     if is_sidecar(data):
         raise SidecarError(name)
@@ -93,7 +94,7 @@ def is_sidecar(data: bytes) -> bool:
 
 
 def read_sidecar(path: Path) -> dict[str, Any]:
-    """Return the values of a sidecar, see :func:`values_in`.
+    """Return the values of a sidecar, see :func:`parse_sidecar`.
 
     Raises:
         FileNotFoundError: it is missing, or empty after a loss of power.
@@ -108,7 +109,7 @@ def read_sidecar(path: Path) -> dict[str, Any]:
         raise ImageError(f"{path}: this file cannot be read: {error.strerror}") from None
     if not data.strip(b"\0"):
         raise FileNotFoundError(path)
-    values = values_in(data, path)
+    values = parse_sidecar(data, path)
     if values is None:
         raise ImageError(
             f"{path}: clpipe did not write this file, and would overwrite it with a sidecar; "
@@ -119,21 +120,21 @@ def read_sidecar(path: Path) -> dict[str, Any]:
 
 def sidecar_files(folder: Path) -> Iterator[Path]:
     """Yield the files below a folder that may be sidecars, sorted, without hidden ones."""
-    for place, folders, names in os.walk(folder):
+    for parent, folders, names in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for name in sorted(names):
             if name.endswith(f".{SIDECAR}") and not name.startswith("."):
-                yield Path(place, name)
+                yield Path(parent, name)
 
 
 def values_at(path: Path) -> dict[str, Any] | None:
-    """Return the values of a file if it is a sidecar; None if it is not, or cannot be read.
+    """Return the values of a file, or None if it is not a sidecar or cannot be read.
 
     Raises:
         SidecarError: it was edited, cut off or damaged.
     """
     try:
-        return values_in(read_bytes(path), path)
+        return parse_sidecar(read_bytes(path), path)
     except OSError:
         return None
 
@@ -144,7 +145,7 @@ def write_sidecar(path: Path, record: Mapping[str, Any]) -> None:
     Raises:
         ImageError: it cannot be written.
     """
-    write_whole(path, sealed(record))
+    write_whole(path, sidecar_bytes(record))
     keep_names(path.parent)
 
 
@@ -163,27 +164,28 @@ def remove_sidecar(path: Path) -> None:
         raise ImageError(f"{path}: this sidecar cannot be removed: {error.strerror}") from None
 
 
-def outputs_in(values: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+def output_entries(values: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """Return the entries of the files that a sidecar lists, by name, with their size and SHA-256.
 
     An entry without these values, or with a name outside the sidecar's folder, is ignored.
     """
     listed = values.get("outputs")
     return {
-        each["name"]: each
-        for each in (listed if isinstance(listed, list) else ())
-        if isinstance(each, dict) and {"name", "size", "sha256"} <= each.keys()
-        if isinstance(each["name"], str) and os.path.basename(each["name"]) == each["name"] != ""
-        if "\0" not in each["name"]
+        item["name"]: item
+        for item in (listed if isinstance(listed, list) else ())
+        if isinstance(item, dict) and {"name", "size", "sha256"} <= item.keys()
+        if isinstance(item["name"], str) and os.path.basename(item["name"]) == item["name"] != ""
+        if "\0" not in item["name"]
     }
 
 
-def inputs_in(
+def input_entries(
     values: Mapping[str, Any], paths: Sequence[Path]
 ) -> list[tuple[Path, Mapping[str, Any]]]:
-    """Return the files from which a picture was made: those of its image and of its layers.
+    """Return the input files of a picture, each with its entry in the sidecar.
 
-    Each has its entry in the sidecar: size, modification time and SHA-256.
+    They are the files of its image and of its layers. An entry has the size, modification time and
+    SHA-256.
 
     Args:
         values: the values of the sidecar.
@@ -192,33 +194,37 @@ def inputs_in(
     Raises:
         KeyError, TypeError, ValueError: the values are damaged, or list another number of files.
     """
-    one = {"size": values["input_size"], "modified": values["input_modified"]}
+    image_entry = {"size": values["input_size"], "modified": values["input_modified"]}
     layers = (*values.get("carried", ()), *values.get("depth", ()))
     return [
-        *zip(paths, values.get("subframes", [one | {"sha256": values["sha256"]}]), strict=True),
-        *((paths[0].parent / each["file"], each) for each in layers),
+        *zip(
+            paths,
+            values.get("subframes", [image_entry | {"sha256": values["sha256"]}]),
+            strict=True,
+        ),
+        *((paths[0].parent / layer["file"], layer) for layer in layers),
     ]
 
 
-class Constant(dict[str, Any]):
-    """A constant part of many records, which is encoded as JSON only once.
+class CachedJson(dict[str, Any]):
+    """A dictionary that many records share, and that is encoded as JSON only once.
 
-    >>> Constant(a=1).text
+    >>> CachedJson(a=1).text
     '{"a": 1}'
     """
 
     @cached_property
     def text(self) -> str:
-        """Its JSON."""
+        """The JSON text."""
         return to_json(self)
 
 
 def _text_of(value: Any) -> str:
-    return value.text if isinstance(value, Constant) else to_json(value)
+    return value.text if isinstance(value, CachedJson) else to_json(value)
 
 
 def json_text(record: Mapping[str, Any]) -> str:
-    """Return JSON with a line for each key, and for each object in a list.
+    """Return a record as JSON, with one line for each key and for each object in a list.
 
     >>> print(json_text({"a": 1, "b": [{"c": 2}, {"d": [3, 4]}]}), end="")
     {
@@ -232,14 +238,14 @@ def json_text(record: Mapping[str, Any]) -> str:
     lines = []
     for key, value in record.items():
         if isinstance(value, list) and value and isinstance(value[0], dict):
-            each = ",\n".join(f"    {_text_of(one)}" for one in value)
-            text = f"[\n{each}\n  ]"
+            items = ",\n".join(f"    {_text_of(item)}" for item in value)
+            text = f"[\n{items}\n  ]"
         else:
             text = _text_of(value)
         lines.append(f"  {to_json(key)}: {text}")
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
-def _seal_of(head: bytes) -> bytes:
+def _digest_lines(head: bytes) -> bytes:
     """Return the last two lines of a sidecar, from the bytes before them."""
-    return f'  "{SEAL}": "{hashlib.sha256(head).hexdigest()}"\n}}\n'.encode()
+    return f'  "{DIGEST_KEY}": "{hashlib.sha256(head).hexdigest()}"\n}}\n'.encode()

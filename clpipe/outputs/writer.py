@@ -18,7 +18,7 @@ from clpipe.images.dng import write_dng
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import Tags, from_attributes, orientation_of, upright
 from clpipe.images.write import JPEG_MAX_SIDE, write_display, write_exr, write_npy
-from clpipe.inputs.carry import Aovs
+from clpipe.inputs.carry import CarriedLayers
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import attributes_of
 from clpipe.outputs.carried import write_carried
@@ -26,8 +26,8 @@ from clpipe.outputs.folder import RESUMABLE, write_problem
 from clpipe.outputs.negative import negative_of
 from clpipe.outputs.patches import Patch, variance_at
 from clpipe.outputs.plan import OutputPlan
-from clpipe.outputs.recipes import Recipe, results_of
-from clpipe.outputs.shot import kept_tags, shown_tags, tags_of
+from clpipe.outputs.recipes import Recipe, required_results
+from clpipe.outputs.shot import kept_tags, tags_after, tags_of
 from clpipe.outputs.sidecar import SIDECAR, remove_sidecar
 from clpipe.reference.curve import to_16_bit
 from clpipe.reference.geometry import NO_MARGINS, Margins
@@ -39,9 +39,9 @@ class OutputWriter(OutputPlan):
     """Writes the pictures of a request to a folder."""
 
     def runner(self, recipe: Recipe, device: Device | None) -> Runner:
-        """Return a runner that computes the files of a rendition, and nothing else."""
-        formats, keep = self.formats_of(recipe.rendition), self.keep_of(recipe.rendition)
-        steps, encode, final = results_of(recipe.chain, formats, keep)
+        """Return a runner that computes only what the files of a rendition require."""
+        formats, keep = self.formats_of(recipe.rendition), self.kept_steps(recipe.rendition)
+        steps, encode, final = required_results(recipe.chain, formats, keep)
         final |= bool(self.request.baselines)  # to measure its noise
         return Runner(recipe.chain, device, steps, encode, final)
 
@@ -69,7 +69,7 @@ class OutputWriter(OutputPlan):
 
     @staticmethod
     def picture_orientation(source: SourceImage, chain: Chain) -> int:
-        """Return EXIF's orientation by which a picture is rotated upright.
+        """Return the EXIF orientation that rotates a picture upright.
 
         A mosaic is not rotated, because its pattern would change.
 
@@ -85,7 +85,7 @@ class OutputWriter(OutputPlan):
         recipe: Recipe,
         source: SourceImage,
         result: Result,
-        carried: Aovs | None = None,
+        carried: CarriedLayers | None = None,
         patches: Sequence[Patch] = (),
     ) -> dict[Path, Stored]:
         """Write the images of one rendition, or of patches of it.
@@ -106,16 +106,16 @@ class OutputWriter(OutputPlan):
             OutputError: the output directory was removed.
         """
         self._make_folder_of(job)
-        # A new picture next to an old sidecar would look like one that somebody has changed.
+        # A new picture with an old sidecar would look like a picture that somebody changed.
         remove_sidecar(self.path(job, SIDECAR, recipe.rendition))
         outputs: dict[Path, Stored] = {}
         for number, patch in numbered(patches):
-            part = part_of(result, recipe, number, patch)
+            part = patch_result(result, recipe, number, patch)
             outputs |= self._write(job, recipe, source, part, number)
         if carried:
             for number, patch in numbered(patches):
-                layers = carried.changed(patch.cut_out) if patch else carried
-                for layer, ending in self.carried_endings(recipe.rendition).items():
+                layers = carried.map_arrays(patch.crop) if patch else carried
+                for layer, ending in self.carried_suffixes(recipe.rendition).items():
                     path = self.path(job, ending, patch=number)
                     outputs[path] = write_carried(path, layers, layer)
         return outputs
@@ -123,7 +123,7 @@ class OutputWriter(OutputPlan):
     def _write(
         self, job: Job, recipe: Recipe, source: SourceImage, result: Result, patch: int | None
     ) -> dict[Path, Stored]:
-        """Write the images of one rendition, or of its patch with a number; see :meth:`write`.
+        """Write the images of one rendition, or of the patch with a number; see :meth:`write`.
 
         For a variance map, the result's last image is the variance.
         """
@@ -141,14 +141,14 @@ class OutputWriter(OutputPlan):
         ) -> Stored:
             image, kind = upright(image, turn), step.stage.writes
             if path.suffix == f".{NPY}":
-                return write_npy(path, typed(image, kind, _white(step)))
+                return write_npy(path, to_npy_type(image, kind, _white_level(step)))
             attributes = attributes_of(step, chain, recipe.key, rendition.frame)
             attributes |= kept_tags(chain, step, source, tags)
             attributes |= {"orientation": "1"} if turn != 1 else {}
             return write_exr(path, image, kind.channels, attributes, half, margins)
 
         outputs: dict[Path, Stored] = {}
-        keep = self.keep_of(rendition)
+        keep = self.kept_steps(rendition)
         for step in (step for step in chain.steps if step.name in keep):
             path = self.path(job, f"{step.name}.{self.kept_format}", rendition, patch)
             margins = NO_MARGINS if step.method.geometry() else step.method.margins
@@ -160,11 +160,11 @@ class OutputWriter(OutputPlan):
                 negative, tags_of_raw = negative_of(chain), tags
                 raw = result.kept[negative.step] if negative.step else source.pixels
                 if negative.step:
-                    tags_of_raw = shown_tags(chain.through([negative.step]), source, tags)
+                    tags_of_raw = tags_after(chain.through([negative.step]), source, tags)
                 outputs[path] = write_dng(path, raw, negative, tags_of_raw, source_orientation)
             elif ending not in (NPY, "exr"):
-                pixels = upright(samples(result, FORMATS[format_]), orientation)
-                outputs[path] = write_display(path, pixels, shown_tags(chain, source, tags))
+                pixels = upright(display_samples(result, FORMATS[format_]), orientation)
+                outputs[path] = write_display(path, pixels, tags_after(chain, source, tags))
             elif recipe.noise and format_ != NPY:
                 assert final is not None
                 outputs[path] = write_exr(path, final, ("Y",), variance_attributes(recipe))
@@ -189,43 +189,45 @@ class OutputWriter(OutputPlan):
             if folder.is_dir():
                 return
             folder.mkdir(parents=True, exist_ok=True)
-            for place in folder.relative_to(self.folder).parents:
-                keep_names(self.folder / place)
+            for parent in folder.relative_to(self.folder).parents:
+                keep_names(self.folder / parent)
         except OSError as error:
             raise ImageError(f"{folder}: this folder cannot be created: {error.strerror}") from None
 
 
-def _white(step: Step) -> float | None:
+def _white_level(step: Step) -> float | None:
     """Return the white level of a step's image in DN, after companding if there is any."""
     context = step.method.next_context(step.context)
     return context.knots[-1][1] if context.knots else context.white_level
 
 
 def variance_attributes(recipe: Recipe) -> dict[str, str]:
-    """Return the attributes of a variance map. Their kind prevents it from entering a chain."""
-    own = attributes_of(recipe.noise[-1], recipe.whole, recipe.key, recipe.rendition.frame)
-    return {**own, "stage": "variance", "kind": "variance"}
+    """Return the attributes of a variance map. Their kind prevents its use as an input."""
+    attributes = attributes_of(
+        recipe.noise[-1], recipe.full_chain, recipe.key, recipe.rendition.frame
+    )
+    return {**attributes, "stage": "variance", "kind": "variance"}
 
 
 def numbered(patches: Sequence[Patch]) -> list[tuple[int, Patch]] | list[tuple[None, None]]:
-    """Return patches with their numbers; without patches, one pair of None for the picture."""
+    """Return patches with their numbers, or one pair of None for the picture."""
     return [*enumerate(patches)] or [(None, None)]
 
 
-def part_of(result: Result, recipe: Recipe, number: int | None, patch: Patch | None) -> Result:
+def patch_result(result: Result, recipe: Recipe, number: int | None, patch: Patch | None) -> Result:
     """Return a result, or the part of it that is a patch, in the patch's orientation.
 
     For a variance map, the last image becomes the variance.
     """
     if number is not None:
-        result = mapped(result, itemgetter(number))
+        result = map_images(result, itemgetter(number))
     if recipe.noise:
         assert result.final is not None
         result = replace(result, final=variance_at(recipe.noise, result.final, patch))
-    return mapped(result, patch.turned) if patch else result
+    return map_images(result, patch.orient) if patch else result
 
 
-def mapped(result: Result, change: Callable[[Array], Array]) -> Result:
+def map_images(result: Result, change: Callable[[Array], Array]) -> Result:
     """Return a result with a function applied to each image."""
     return Result(
         None if result.final is None else change(result.final),
@@ -235,7 +237,7 @@ def mapped(result: Result, change: Callable[[Array], Array]) -> Result:
     )
 
 
-def samples(result: Result, format_: Format) -> Array:
+def display_samples(result: Result, format_: Format) -> Array:
     """Return the last image in the type of a display format: uint8, uint16 or float32."""
     if format_.bits == 8:
         assert result.encoded is not None
@@ -244,13 +246,13 @@ def samples(result: Result, format_: Format) -> Array:
     return result.final if format_.floats else to_16_bit(result.final)
 
 
-def typed(image: Floats, kind: Kind, white_level: float | None = None) -> Array:
-    """Return an image in its type for ``.npy``.
+def to_npy_type(image: Floats, kind: Kind, white_level: float | None = None) -> Array:
+    """Return an image in the data type of its ``.npy`` file.
 
-    DN are uint16, or uint32 if the white level is above 65535. Display values are float16, and all
-    others float32.
+    DN are uint16, or uint32 if the white level is above 65535. Display values are float16. All
+    other values are float32.
 
-    >>> typed(np.array([[511.0, 7e4]]), Kind.RAW)
+    >>> to_npy_type(np.array([[511.0, 7e4]]), Kind.RAW)
     array([[  511, 65535]], dtype=uint16)
     """
     if kind is Kind.RAW:

@@ -12,7 +12,7 @@ from clpipe.base.memory import in_words
 from clpipe.base.text import duration, one_line
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS
 from clpipe.engine.clipping import MUCH
-from clpipe.reports.run import Made, Run
+from clpipe.reports.run import Run, RunPicture
 
 TIMES = 60  # intervals of a run, at most
 DISTINCT = 12  # values of a parameter that are listed
@@ -68,22 +68,26 @@ class Session:
         of its steps. Intervals in which no image ends have no shares.
         """
         done = [line for line in self.images if line.get("status") == DONE]
-        begun, length = moment(self.start), self.seconds
+        start_time, length = moment(self.start), self.seconds
         if not done or length <= 0:
             return []
         width = length / min(TIMES, max(len(done) // 4, 1))
-        pieces: dict[int, list[Mapping[str, Any]]] = {}
+        intervals: dict[int, list[Mapping[str, Any]]] = {}
         for line in done:
-            ends = moment(line) - begun + sum(number(line.get(f"{step}_seconds")) for step in STEPS)
-            piece = int(min(max(ends, 0), length * 0.9999) / width)
-            pieces.setdefault(piece, []).append(line)
+            end_time = (
+                moment(line)
+                - start_time
+                + sum(number(line.get(f"{step}_seconds")) for step in STEPS)
+            )
+            interval = int(min(max(end_time, 0), length * 0.9999) / width)
+            intervals.setdefault(interval, []).append(line)
         rows = []
-        for i in range(max(pieces) + 1):
-            lines = pieces.get(i, [])
-            spent = {s: sum(number(x.get(f"{s}_seconds")) for x in lines) for s in STEPS}
-            whole = sum(spent.values())
+        for i in range(max(intervals) + 1):
+            lines = intervals.get(i, [])
+            step_seconds = {s: sum(number(x.get(f"{s}_seconds")) for x in lines) for s in STEPS}
+            total = sum(step_seconds.values())
             speed = sum(number(line.get("megapixels")) for line in lines) / width
-            shares = {step: spent[step] / whole for step in STEPS} if whole else {}
+            shares = {step: step_seconds[step] / total for step in STEPS} if total else {}
             rows.append({"seconds": (i + 0.5) * width, "speed": speed, **shares})
         return rows
 
@@ -140,7 +144,7 @@ def last_failures(found: Sequence[Session]) -> list[str]:
 def totals(run: Run, found: Sequence[Session]) -> list[tuple[str, str]]:
     """Return the figures of the summary by name. The last run is the last that made images."""
     pictures = run.pictures
-    others = len(run.made) - len(pictures)
+    others = len(run.all_pictures) - len(pictures)
     megapixels = sum(number(p.value("width")) * number(p.value("height")) for p in pictures) / 1e6
     last = next((session for session in reversed(found) if session.count(DONE)), None)
     rows = [
@@ -167,7 +171,7 @@ class Parameter:
 
     name: str
     values: Counter[Any]  # JSON values, lists as their text
-    is_asked: bool = True  # drawn, or set for single images; else derived
+    is_requested: bool = True  # drawn, or set for single images; else derived
 
     @property
     def varies(self) -> bool:
@@ -225,17 +229,17 @@ class Step:
         return set(self.methods) == {"none"}
 
 
-def steps_of(pictures: Sequence[Made]) -> list[Step]:
+def steps_of(pictures: Sequence[RunPicture]) -> list[Step]:
     """Return the steps of the chains of pictures, in the order of the longest chain."""
     order: list[str] = []
     records: dict[int, Mapping[str, Any]] = {}  # equal steps are the same object
     counts: Counter[int] = Counter()
-    for made in pictures:
-        ids = [id(step) for step in made.steps]
+    for picture in pictures:
+        ids = [id(step) for step in picture.steps]
         counts.update(ids)
-        records.update(zip(ids, made.steps, strict=True))
+        records.update(zip(ids, picture.steps, strict=True))
         if len(ids) > len(order):
-            names = [str(step.get("name")) for step in made.steps]
+            names = [str(step.get("name")) for step in picture.steps]
             order = names + [name for name in order if name not in names]
     by_name: dict[str, list[tuple[Mapping[str, Any], int]]] = {name: [] for name in order}
     for key, record in records.items():
@@ -256,15 +260,15 @@ def _step(name: str, counted: Sequence[tuple[Mapping[str, Any], int]]) -> Step:
     return Step(name, methods, parameters, methods.total())
 
 
-def drawn(pictures: Sequence[Made], steps: Sequence[Step]) -> list[Parameter]:
+def drawn(pictures: Sequence[RunPicture], steps: Sequence[Step]) -> list[Parameter]:
     """Return what varies between pictures: camera, ISO, noise and parameters."""
-    asked: set[str] = set().union(*(made.value("asked") or () for made in pictures))
-    cameras = Counter(text_of(made.value("camera")) for made in pictures)
-    isos = Counter(round(number(made.value("iso"))) for made in pictures)
-    lenses = Counter(text_of(made.value("lens") or "none") for made in pictures)
+    requested: set[str] = set().union(*(picture.value("asked") or () for picture in pictures))
+    cameras = Counter(text_of(picture.value("camera")) for picture in pictures)
+    isos = Counter(round(number(picture.value("iso"))) for picture in pictures)
+    lenses = Counter(text_of(picture.value("lens") or "none") for picture in pictures)
     facts = [Parameter(*each) for each in (("camera", cameras), ("lens", lenses), ("ISO", isos))]
     facts += [
-        Parameter(name, Counter(plain(made.value(*keys)) for made in pictures), False)
+        Parameter(name, Counter(plain(picture.value(*keys)) for picture in pictures), False)
         for name, keys in (
             ("noise a", ("noise", "signal", "a")),
             ("noise b", ("noise", "signal", "b")),
@@ -273,7 +277,7 @@ def drawn(pictures: Sequence[Made], steps: Sequence[Step]) -> list[Parameter]:
     ]
     repeated = {("sensor_noise", "a"), ("sensor_noise", "b")}
     facts += [
-        Parameter(f"{step.name}.{each.name}", each.values, f"{step.name}.{each.name}" in asked)
+        Parameter(f"{step.name}.{each.name}", each.values, f"{step.name}.{each.name}" in requested)
         for step in steps
         for each in step.parameters
         if (step.name, each.name) not in repeated
@@ -281,16 +285,16 @@ def drawn(pictures: Sequence[Made], steps: Sequence[Step]) -> list[Parameter]:
     return [fact for fact in facts if fact.varies]
 
 
-def warnings_of(made: Made) -> list[str]:
+def warnings_of(picture: RunPicture) -> list[str]:
     """Return the warnings of a picture."""
-    found = made.value("warnings")
+    found = picture.value("warnings")
     return [str(each) for each in found] if isinstance(found, list) else []
 
 
-def oddities(made: Made) -> list[str]:
+def anomalies(picture: RunPicture) -> list[str]:
     """Return what is unusual in a picture: missing or changed files, clipping, warnings."""
-    found = [blob.problem for blob in made.files.values() if blob.problem]
-    clipped = number(made.value("clipped"))
+    found = [blob.problem for blob in picture.files.values() if blob.problem]
+    clipped = number(picture.value("clipped"))
     if clipped >= MUCH:
         found.append(f"{clipped * 100:.0f} % of its pixels are clipped")
-    return found + warnings_of(made)
+    return found + warnings_of(picture)

@@ -16,10 +16,10 @@ from clpipe.analysis.svg import law_svg, noise_svg
 from clpipe.base.errors import ClpipeError
 from clpipe.chain.rendition import DEVELOPMENT, MOSAIC
 from clpipe.reports.figures import number
-from clpipe.reports.run import Blob, Made, Run
-from clpipe.reports.shown import checked, picture_file
+from clpipe.reports.images import checked, picture_file
+from clpipe.reports.run import Blob, Run, RunPicture
 
-JUDGED = 12  # raws that are compared with the noise model
+MAX_LAWS = 12  # raws that are compared with the noise model
 LIMIT = 5.0  # standard errors
 NORMALIZED = "normalize.exr"  # the mosaic in signal units
 
@@ -30,26 +30,26 @@ class Law:
 
     name: str
     measured: VarianceLaw
-    asked_a: float
-    asked_b: float
+    requested_a: float
+    requested_b: float
     report: NoiseReport
 
     @property
     def errors(self) -> float:
         """The larger deviation of a and b, in standard errors."""
         return max(
-            abs(self.measured.a - self.asked_a) / max(self.measured.a_error, 1e-30),
-            abs(self.measured.b - self.asked_b) / max(self.measured.b_error, 1e-30),
+            abs(self.measured.a - self.requested_a) / max(self.measured.a_error, 1e-30),
+            abs(self.measured.b - self.requested_b) / max(self.measured.b_error, 1e-30),
         )
 
     @property
     def svg(self) -> str:
         """A plot of the variance of the raw."""
         title = f"Variance by intensity of {self.name}, and the noise model"
-        return law_svg(self.report, self.asked_a, self.asked_b, title)
+        return law_svg(self.report, self.requested_a, self.requested_b, title)
 
     @property
-    def leaves(self) -> bool:
+    def deviates(self) -> bool:
         """Whether the raw deviates from the model."""
         return self.errors > LIMIT
 
@@ -59,7 +59,7 @@ class Noise:
     """The measured noise of one picture, with a plot."""
 
     name: str
-    against: str
+    reference: str
     iso: float
     report: NoiseReport
     svg: str
@@ -89,7 +89,7 @@ def measured(files: Sequence[Blob]) -> NoiseReport:
         return measure([picture], truth)
 
 
-def noises(run: Run, pictures: Sequence[Made], problems: list[str], most: int) -> list[Noise]:
+def noises(run: Run, pictures: Sequence[RunPicture], problems: list[str], most: int) -> list[Noise]:
     """Measure the noise of pictures against their development truth.
 
     Args:
@@ -99,18 +99,18 @@ def noises(run: Run, pictures: Sequence[Made], problems: list[str], most: int) -
         most: the number of pictures to measure.
     """
     found: list[Noise] = []
-    for made in pictures:
-        truth = run.of_image(made.image).get(made.rendition.beside(DEVELOPMENT))
-        pair = picture_file(made), truth and picture_file(truth)
+    for picture in pictures:
+        truth = run.of_image(picture.image).get(picture.rendition.with_role(DEVELOPMENT))
+        pair = picture_file(picture), truth and picture_file(truth)
         if len(found) == most or not pair[0] or not pair[1]:
             continue
         try:
             report = measured([pair[0], pair[1]])
         except ClpipeError as error:
-            problems.append(f"{made.name}: its noise cannot be measured: {error}")
+            problems.append(f"{picture.name}: its noise cannot be measured: {error}")
             continue
-        iso = number(made.value("iso"))
-        found.append(Noise(made.name, pair[1].name, iso, report, noise_svg(report)))
+        iso = number(picture.value("iso"))
+        found.append(Noise(picture.name, pair[1].name, iso, report, noise_svg(report)))
     return found
 
 
@@ -120,44 +120,47 @@ def laws(run: Run, problems: list[str]) -> list[Law]:
     The fit is over all four CFA sites together, like in ``clpipe measure``.
     """
     found = []
-    pictures = [made for made in run.pictures if NORMALIZED in made.files]
-    step = max(len(pictures) // JUDGED, 1)
-    for made in pictures[::step][:JUDGED]:
-        truth = run.of_image(made.image).get(made.rendition.beside(MOSAIC))
-        asked = made.value("noise", "signal")
-        is_known = truth and "exr" in truth.files and isinstance(asked, dict)
-        if not truth or not is_known or parameters_of(made, "prnu").get("sigma"):
+    pictures = [picture for picture in run.pictures if NORMALIZED in picture.files]
+    step = max(len(pictures) // MAX_LAWS, 1)
+    for picture in pictures[::step][:MAX_LAWS]:
+        truth = run.of_image(picture.image).get(picture.rendition.with_role(MOSAIC))
+        requested = picture.value("noise", "signal")
+        is_known = truth and "exr" in truth.files and isinstance(requested, dict)
+        if not truth or not is_known or parameters_of(picture, "prnu").get("sigma"):
             continue  # with PRNU the variance is not linear in the intensity
         try:
-            report = measured([made.files[NORMALIZED], truth.files["exr"]])
+            report = measured([picture.files[NORMALIZED], truth.files["exr"]])
         except ClpipeError as error:
-            problems.append(f"{made.name}: its raw cannot be measured: {error}")
+            problems.append(f"{picture.name}: its raw cannot be measured: {error}")
             continue
         fit = next(one.law for one in report.channels if one.name == WHOLE)
         if not fit:
             continue
-        asked_a, asked_b = number(asked.get("a")), number(asked.get("b")) + other_noise(made)
-        found.append(Law(made.name, fit, asked_a, asked_b, report))
+        requested_a, requested_b = (
+            number(requested.get("a")),
+            number(requested.get("b")) + other_noise(picture),
+        )
+        found.append(Law(picture.name, fit, requested_a, requested_b, report))
     return found
 
 
-def parameters_of(made: Made, step: str) -> Mapping[str, Any]:
+def parameters_of(picture: RunPicture, step: str) -> Mapping[str, Any]:
     """Return the parameters of a step of a picture's chain. Empty without the step."""
-    for each in made.steps:
+    for each in picture.steps:
         if each.get("name") == step:
             parameters = each.get("parameters")
             return parameters if isinstance(parameters, dict) else {}
     return {}
 
 
-def other_noise(made: Made) -> float:
+def other_noise(picture: RunPicture) -> float:
     """Return the variance of a mosaic besides shot and read noise, in squared signal.
 
     It contains row noise, column noise, DSNU and rounding to DN. Rounding adds 1/12 DN² twice,
     because the truth is rounded as well.
     """
     lines = ("row_noise", "column_noise", "dsnu")
-    variance = sum(number(parameters_of(made, step).get("sigma")) ** 2 for step in lines)
-    digital = parameters_of(made, "quantize")
+    variance = sum(number(parameters_of(picture, step).get("sigma")) ** 2 for step in lines)
+    digital = parameters_of(picture, "quantize")
     step = number(digital.get("white_level")) - number(digital.get("black_level"))
     return variance + (2 / (12 * step**2) if step > 0 else 0.0)

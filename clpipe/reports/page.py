@@ -16,17 +16,25 @@ from clpipe.base.text import duration, one_line
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, STEPS
 from clpipe.reports import figures
 from clpipe.reports.figures import Parameter, Session, Step, text_of
+from clpipe.reports.images import (
+    BUDGET,
+    Budget,
+    ComparedImage,
+    add_stages,
+    compared_image,
+    contact_sheet,
+    select_images,
+)
 from clpipe.reports.noise import LIMIT, laws, noises
-from clpipe.reports.run import Made, Run
-from clpipe.reports.shown import BUDGET, Budget, Large, add_stages, chosen, contact_sheet, large
+from clpipe.reports.run import Run, RunPicture
 
 TEMPLATES = Path(__file__).parent / "page"
 LISTED = 40  # failures, warnings, problems
 HISTOGRAMS = 12
 BARS = 8  # distinct values of a bar chart
 SHEET_SHARE = 0.45  # of the budget, for contact sheets
-STAGED = 2  # images whose kept stages can be compared
-DRAWN = 3  # pictures whose noise is plotted
+MAX_STAGED = 2  # images whose kept stages can be compared
+MAX_PLOTS = 3  # pictures whose noise is plotted
 SESSIONS = 12  # the latest starts of the program
 
 # The share of luma variance that 2x2 averaging leaves, and the luma correlation of horizontal
@@ -53,7 +61,7 @@ def listed(texts: Sequence[str]) -> Listed:
     return Listed(lines[:LISTED], max(len(lines) - LISTED, 0), len(texts))
 
 
-def html(runs: Sequence[Run], tell: Callable[[str], None] = lambda _: None) -> str:
+def html(runs: Sequence[Run], report_progress: Callable[[str], None] = lambda _: None) -> str:
     """Return the report of a run, or a comparison of two runs.
 
     Args:
@@ -63,61 +71,63 @@ def html(runs: Sequence[Run], tell: Callable[[str], None] = lambda _: None) -> s
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
         autoescape=True,
-        finalize=visible,
+        finalize=escaped,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     first, *others = runs
     labels = labels_of(runs)
-    every = [figures.sessions(run.logs) for run in runs]
+    sessions_by_run = [figures.sessions(run.logs) for run in runs]
     steps = [figures.steps_of(run.pictures) for run in runs]
     drawn = figures.drawn(first.pictures, steps[0]) if not others else []
     problems = [text for run in runs for text in run.problems]
-    tell("noise of raw mosaics")
-    judged = [law for run in runs for law in laws(run, problems)]
-    picked = chosen(first, {law.name for law in judged if law.leaves})
-    typical = sorted(picked, key=lambda made: bool(figures.oddities(made)))
+    report_progress("noise of raw mosaics")
+    all_laws = [law for run in runs for law in laws(run, problems)]
+    selected = select_images(first, {law.name for law in all_laws if law.deviates})
+    typical = sorted(selected, key=lambda picture: bool(figures.anomalies(picture)))
     budget = Budget(BUDGET)
-    tell("noise of images")
+    report_progress("noise of images")
     noise = [
         (label, each)
         for label, run in zip(labels, runs, strict=True)
-        for each in noises(run, same(run, typical), problems, DRAWN // len(runs))
+        for each in noises(run, matching_pictures(run, typical), problems, MAX_PLOTS // len(runs))
     ]
-    furthest = sorted(judged, key=lambda law: law.errors, reverse=True)[:DRAWN]
+    furthest = sorted(all_laws, key=lambda law: law.errors, reverse=True)[:MAX_PLOTS]
     law_drawings = [(law.name, law.svg) for law in furthest]
     for svg in [each.svg for _, each in noise] + [svg for _, svg in law_drawings]:
         budget.take(svg)
     share = int(budget.left * SHEET_SHARE) // len(runs)
     shares = [Budget(share) for _ in runs]
-    sheets = [contact_sheet(*each, tell) for each in zip(runs, shares, labels, strict=True)]
+    sheets = [
+        contact_sheet(*each, report_progress) for each in zip(runs, shares, labels, strict=True)
+    ]
     budget.left -= sum(share - each.left for each in shares)
     problems += [text for sheet in sheets for text in sheet.problems]
     entries = [entry for sheet in sheets for entry in sheet.entries]
-    found_large = []
-    for i, made in enumerate(picked, 1):
-        tell(f"comparison {i} of {len(picked)}")
-        found_large.append((made, large(runs, labels, made, budget, problems)))
-    tell("figures")
-    shown = [each for _, each in found_large if each]
-    for made, each in found_large[:STAGED]:
+    compared = []
+    for i, picture in enumerate(selected, 1):
+        report_progress(f"comparison {i} of {len(selected)}")
+        compared.append((picture, compared_image(runs, labels, picture, budget, problems)))
+    report_progress("figures")
+    shown = [each for _, each in compared if each]
+    for picture, each in compared[:MAX_STAGED]:
         if each:
-            add_stages(each, made, budget)
-    totals = [figures.totals(run, found) for run, found in zip(runs, every, strict=True)]
+            add_stages(each, picture, budget)
+    totals = [figures.totals(run, found) for run, found in zip(runs, sessions_by_run, strict=True)]
     names = list(dict.fromkeys(name for rows in totals for name, _ in rows))
-    found = [session for each in every for session in each]
+    found = [session for each in sessions_by_run for session in each]
     return environment.get_template("report.html").render(
         title=" and ".join(dict.fromkeys(run.folder.resolve().name for run in runs)),
         version=__version__,
         labels=labels,
         totals=[(name, [dict(rows).get(name, "-") for rows in totals]) for name in names],
         sessions=[session_row(session) for session in found[-SESSIONS:]],
-        failures=listed([text for each in every for text in figures.last_failures(each)]),
+        failures=listed([text for each in sessions_by_run for text in figures.last_failures(each)]),
         warnings=listed([text for run in runs for text in warnings(run)]),
         problems=listed(list(dict.fromkeys(problems))),
         pace=pace_drawings(found),
-        facts=machine_facts([made for run in runs for made in run.pictures]),
+        facts=machine_facts([picture for run in runs for picture in run.pictures]),
         steps=steps[0],
         differences=differences(*steps) if others else [],
         drawn=drawings_of(drawn),
@@ -130,33 +140,33 @@ def html(runs: Sequence[Run], tell: Callable[[str], None] = lambda _: None) -> s
         real_left=REAL_LEFT,
         real_right=REAL_RIGHT,
         real_edges=REAL_EDGES,
-        laws=judged,
+        laws=all_laws,
         law_drawings=law_drawings,
         limit=f"{LIMIT:g}",
-        style=shared_and_own("css"),
-        script=shared_and_own("js"),
+        style=page_text("css"),
+        script=page_text("js"),
     )
 
 
-def shared_and_own(kind: str) -> str:
-    """Return the styles ("css") or scripts ("js"): those of all pages, then those of reports."""
+def page_text(kind: str) -> str:
+    """Return the styles ("css") or scripts ("js") of all pages, followed by those of reports."""
     own = (TEMPLATES / f"report.{kind}").read_text("utf-8")
     return (PAGE_FILES / f"page.{kind}").read_text("utf-8") + own
 
 
-def visible(value: Any) -> Any:
-    r"""Return a value with an escape for each character of its texts that cannot be printed.
+def escaped(value: Any) -> Any:
+    r"""Return a value with the unprintable characters of its texts escaped.
 
     Markup stays as it is.
 
-    >>> visible({"name": "a" + chr(27), "odd": [chr(10)]})
+    >>> escaped({"name": "a" + chr(27), "unusual": [chr(10)]})
     {'name': 'a\\x1b', 'odd': ['\\n']}
     """
     if type(value) is str:
         return one_line(value)
     if isinstance(value, Mapping):
-        return {key: visible(each) for key, each in value.items()}
-    return list(map(visible, value)) if isinstance(value, list | tuple) else value
+        return {key: escaped(each) for key, each in value.items()}
+    return list(map(escaped, value)) if isinstance(value, list | tuple) else value
 
 
 def labels_of(runs: Sequence[Run]) -> list[str]:
@@ -167,14 +177,18 @@ def labels_of(runs: Sequence[Run]) -> list[str]:
     return names if len(set(names)) == len(names) else [str(run.folder) for run in runs]
 
 
-def same(run: Run, pictures: Sequence[Made]) -> list[Made]:
-    """Return the pictures of a run that have the names of given pictures."""
-    return [own for made in pictures if (own := run.picture_beside(made))]
+def matching_pictures(run: Run, pictures: Sequence[RunPicture]) -> list[RunPicture]:
+    """Return the pictures of a run that match pictures of another run."""
+    return [own for picture in pictures if (own := run.matching_picture(picture))]
 
 
 def warnings(run: Run) -> list[str]:
     """Return the warnings of all pictures, with their names."""
-    return [f"{made.name}: {text}" for made in run.pictures for text in figures.warnings_of(made)]
+    return [
+        f"{picture.name}: {text}"
+        for picture in run.pictures
+        for text in figures.warnings_of(picture)
+    ]
 
 
 def differences(first: Sequence[Step], second: Sequence[Step]) -> list[tuple[str, str, str]]:
@@ -194,19 +208,19 @@ def differences(first: Sequence[Step], second: Sequence[Step]) -> list[tuple[str
 
 def script_json(value: Any) -> str:
     """Return JSON that is safe inside a ``<script>`` element."""
-    text = json.dumps(visible(value), separators=(",", ":"))
+    text = json.dumps(escaped(value), separators=(",", ":"))
     for character in "<>&\u2028\u2029":
         text = text.replace(character, f"\\u{ord(character):04x}")
     return text
 
 
-def view_record(each: Large) -> Mapping[str, Any]:
+def view_record(each: ComparedImage) -> Mapping[str, Any]:
     """Return the data of an image for the comparison script."""
     return {
         "name": each.name,
         "width": each.width,
         "height": each.height,
-        "by": each.by,
+        "by": each.reduction,
         "places": [asdict(place) for place in each.places],
         "views": each.views,
     }
@@ -234,28 +248,28 @@ def pace_drawings(found: Sequence[Session]) -> list[str]:
             continue
         x = [row["seconds"] for row in rows]
         speed = {"MP/s": [row["speed"] for row in rows]}
-        told = [row for row in rows if STEPS[0] in row]
-        told_x = [row["seconds"] for row in told]
-        shares = {step: [row[step] for row in told] for step in STEPS}
+        with_shares = [row for row in rows if STEPS[0] in row]
+        share_times = [row["seconds"] for row in with_shares]
+        shares = {step: [row[step] for row in with_shares] for step in STEPS}
         label = "time since the start, s"
         return [
             lines_svg(x, speed, (label, "MP/s"), "Speed during the run"),
-            shares_svg(told_x, shares, label, "Time shares of the steps during the run"),
+            shares_svg(share_times, shares, label, "Time shares of the steps during the run"),
         ]
     return []
 
 
-def machine_facts(pictures: Sequence[Made]) -> list[tuple[str, str]]:
+def machine_facts(pictures: Sequence[RunPicture]) -> list[tuple[str, str]]:
     """Return the devices and versions that made the pictures."""
     rows: dict[str, dict[str, None]] = {}
-    for made in pictures:
-        device = made.value("device")
+    for picture in pictures:
+        device = picture.value("device")
         if isinstance(device, Mapping):
             text = f"{device.get('name')}, {device.get('version')}"
             rows.setdefault("Device", {})[text] = None
-        versions = made.value("versions")
-        said = versions if isinstance(versions, Mapping) else {}
-        for name, version in {"clpipe": made.value("clpipe"), **said}.items():
+        versions = picture.value("versions")
+        sidecar_entry = versions if isinstance(versions, Mapping) else {}
+        for name, version in {"clpipe": picture.value("clpipe"), **sidecar_entry}.items():
             rows.setdefault(str(name), {})[str(version)] = None
     return [(name, "; ".join(texts)) for name, texts in rows.items()]
 
@@ -269,7 +283,7 @@ def drawings_of(drawn: Sequence[Parameter]) -> list[tuple[Parameter, str]]:
     for fact in drawn:
         numbers = fact.numbers
         svg = ""
-        if fact.is_asked and sum(bool(each) for _, each in found) < HISTOGRAMS:
+        if fact.is_requested and sum(bool(each) for _, each in found) < HISTOGRAMS:
             if len(numbers) == fact.values.total() and len(fact.values) > 2:
                 svg = histogram_svg(numbers, fact.name)
             elif len(fact.values) <= BARS:

@@ -14,7 +14,7 @@ from clpipe.batch.run_log import read_log
 from clpipe.batch.tars import DAMAGED
 from clpipe.chain.keys import KEYS as SINGLE
 from clpipe.chain.rendition import Rendition
-from clpipe.outputs.sidecar import SIDECAR, SidecarError, outputs_in, values_in
+from clpipe.outputs.sidecar import SIDECAR, SidecarError, output_entries, parse_sidecar
 
 TAR = ".tar"
 # The values of sidecars to keep. There may be hundreds of thousands of sidecars.
@@ -22,7 +22,7 @@ KEYS = (
     *("clpipe", "sha256", "iso", "camera", "lens", "width", "height", "noise", "clipped"),
     "warnings",
 )
-ALIKE = ("device", "versions")  # equal in most sidecars
+SHARED_KEYS = ("device", "versions")  # equal in most sidecars
 LOGS = "run*.jsonl"
 
 
@@ -32,7 +32,7 @@ class Blob:
 
     path: str
     name: str  # relative to the output directory; for members, after the name of the tar
-    said: Mapping[str, Any]  # its size and SHA-256
+    sidecar_entry: Mapping[str, Any]  # its size and SHA-256
     offset: int | None = None  # of a member in its tar
     size: int = -1  # the actual size; -1 is a missing file
 
@@ -51,13 +51,14 @@ class Blob:
         """The problem of the file according to its size, or ""."""
         if self.size < 0:
             return f"{self.name}: is missing"
-        if self.size != self.said["size"]:
-            return f"{self.name}: has {self.size} bytes, not the {self.said['size']} of its sidecar"
+        if self.size != self.sidecar_entry["size"]:
+            expected = self.sidecar_entry["size"]
+            return f"{self.name}: has {self.size} bytes, not the {expected} of its sidecar"
         return ""
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
+class RunPicture:
     """One picture of a run, from its sidecar: an image, a frame, a truth or a baseline."""
 
     image: str  # the name of its input without extension, with directories of a series
@@ -89,56 +90,56 @@ class Run:
     """The contents of an output directory."""
 
     folder: Path
-    made: list[Made] = field(default_factory=list)
+    all_pictures: list[RunPicture] = field(default_factory=list)
     logs: list[Mapping[str, Any]] = field(default_factory=list)  # lines, of all logs
     problems: list[str] = field(default_factory=list)  # of sidecars, tars and logs
 
     @property
-    def pictures(self) -> Sequence[Made]:
+    def pictures(self) -> Sequence[RunPicture]:
         """The noisy pictures in the order of their names. Bursts count with the first frame."""
-        return [each for each in self.made if each.rendition.is_first]
+        return [each for each in self.all_pictures if each.rendition.is_first]
 
-    def of_image(self, image: str) -> Mapping[Rendition, Made]:
+    def of_image(self, image: str) -> Mapping[Rendition, RunPicture]:
         """Return all pictures of an image by rendition."""
         return self._by_image.get(image, {})
 
-    def picture_beside(self, other: Made) -> Made | None:
+    def matching_picture(self, other: RunPicture) -> RunPicture | None:
         """Return the picture, or first frame, with the image and exposure of another one."""
         return next(
             (
-                made
-                for rendition, made in self.of_image(other.image).items()
+                picture
+                for rendition, picture in self.of_image(other.image).items()
                 if rendition.is_first and rendition.ev == other.rendition.ev
             ),
             None,
         )
 
     def __post_init__(self) -> None:
-        self._by_image: dict[str, dict[Rendition, Made]] = {}
+        self._by_image: dict[str, dict[Rendition, RunPicture]] = {}
         self._alike: dict[str, Any] = {}
 
-    def slim(self, record: Mapping[str, Any]) -> dict[str, Any]:
+    def reduced_record(self, record: Mapping[str, Any]) -> dict[str, Any]:
         """Return the values of a sidecar to keep. Equal devices and steps become one object."""
         steps = record.get("stages")
         steps = steps if isinstance(steps, list) else []
-        asked, one = asked_in(record.get("request")), self._alike.setdefault
+        requested, shared = requested_values(record.get("request")), self._alike.setdefault
         kept = {key: record.get(key) for key in KEYS}
-        kept |= {key: one(repr(record.get(key)), record.get(key)) for key in ALIKE}
-        kept["asked"] = one(repr(sorted(asked)), asked)
-        kept["stages"] = [one(repr(step), step) for step in steps if isinstance(step, dict)]
+        kept |= {key: shared(repr(record.get(key)), record.get(key)) for key in SHARED_KEYS}
+        kept["asked"] = shared(repr(sorted(requested)), requested)
+        kept["stages"] = [shared(repr(step), step) for step in steps if isinstance(step, dict)]
         return kept
 
-    def add(self, made: Made) -> None:
+    def add(self, picture: RunPicture) -> None:
         """Add a picture."""
-        self.made.append(made)
-        self._by_image.setdefault(made.image, {})[made.rendition] = made
+        self.all_pictures.append(picture)
+        self._by_image.setdefault(picture.image, {})[picture.rendition] = picture
 
 
-def asked_in(request: Any) -> frozenset[str]:
+def requested_values(request: Any) -> frozenset[str]:
     """Return the names of values that a request draws, or sets for its image only.
 
     >>> config = {"iso": {"choice": [100, 200]}, "denoise": {"luma_strength": 1}}
-    >>> sorted(asked_in({"config": config, "image": {"x": {"y": 2}}}))
+    >>> sorted(requested_values({"config": config, "image": {"x": {"y": 2}}}))
     ['iso', 'x.y']
     """
     tables = request if isinstance(request, Mapping) else {}
@@ -146,11 +147,11 @@ def asked_in(request: Any) -> frozenset[str]:
     for part in ("config", "options", "image"):
         table = tables.get(part)
         for key, value in table.items() if isinstance(table, Mapping) else ():
-            own = {key: value}
+            named = {key: value}
             if key not in SINGLE and isinstance(value, Mapping):
-                own = {f"{key}.{name}": each for name, each in value.items()}
+                named = {f"{key}.{name}": each for name, each in value.items()}
             found |= {
-                name for name, each in own.items() if part == "image" or isinstance(each, Mapping)
+                name for name, each in named.items() if part == "image" or isinstance(each, Mapping)
             }
     return frozenset(found)
 
@@ -164,15 +165,15 @@ def read_run(folder: Path) -> Run:
     if not folder.is_dir():
         raise RequestError(f"{folder}: it is not a directory. Name the output directory of a run")
     run = Run(folder)
-    found = sorted(_in_folder(run), key=lambda made: (made.image, made.rendition.suffix))
-    for made in found:
-        run.add(made)
+    found = sorted(_in_folder(run), key=lambda picture: (picture.image, picture.rendition.suffix))
+    for picture in found:
+        run.add(picture)
     for path in sorted(folder.glob(LOGS)):
         try:
             run.logs += read_log(path)
         except (OSError, ValueError) as error:
             run.problems.append(f"{path.name}: cannot be read: {error}")
-    if not run.made and not run.logs:
+    if not run.all_pictures and not run.logs:
         raise RequestError(
             f"{folder}: has no picture of clpipe with its sidecar (NAME.json), and no log "
             "(run.jsonl). Name the output directory of clpipe run"
@@ -180,76 +181,78 @@ def read_run(folder: Path) -> Run:
     return run
 
 
-def _in_folder(run: Run) -> Iterator[Made]:
+def _in_folder(run: Run) -> Iterator[RunPicture]:
     """Yield the pictures of the output directory and of its tars."""
-    for place, folders, names in os.walk(run.folder):
+    for parent, folders, names in os.walk(run.folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        below = Path(place).relative_to(run.folder).as_posix()
-        beside: dict[str, Blob] = {}
+        folder = Path(parent).relative_to(run.folder).as_posix()
+        siblings: dict[str, Blob] = {}
         for name in sorted(names):
             if name.startswith("."):
                 continue
             if name.endswith(TAR):
-                yield from _in_tar(run, Path(place, name))
+                yield from _in_tar(run, Path(parent, name))
             elif name.endswith(f".{SIDECAR}"):
                 try:
-                    data = read_bytes(Path(place, name))
+                    data = read_bytes(Path(parent, name))
                 except OSError as error:
-                    run.problems.append(f"{_joined(below, name)}: cannot be read: {error}")
+                    run.problems.append(f"{_joined(folder, name)}: cannot be read: {error}")
                     continue
-                beside = beside or _files(place, below)
-                yield from _made(run, below, name, data, beside)
+                siblings = siblings or _files(parent, folder)
+                yield from _read_picture(run, folder, name, data, siblings)
 
 
-def _files(folder: str, below: str) -> dict[str, Blob]:
+def _files(path: str, folder: str) -> dict[str, Blob]:
     """Return the files of a directory by name."""
-    with os.scandir(folder) as entries:
+    with os.scandir(path) as entries:
         return {
-            entry.name: Blob(entry.path, _joined(below, entry.name), {}, None, entry.stat().st_size)
+            entry.name: Blob(
+                entry.path, _joined(folder, entry.name), {}, None, entry.stat().st_size
+            )
             for entry in entries
             if entry.is_file()
         }
 
 
-def _in_tar(run: Run, path: Path) -> Iterator[Made]:
+def _in_tar(run: Run, path: Path) -> Iterator[RunPicture]:
     """Yield the pictures of a tar."""
     label = path.relative_to(run.folder).as_posix()
-    beside: dict[str, dict[str, Blob]] = defaultdict(dict)  # by folder and name
+    siblings: dict[str, dict[str, Blob]] = defaultdict(dict)  # by folder and name
     sidecars: list[tuple[str, str, bytes]] = []
     try:
         with tarfile.open(path, "r:") as tar:
             for member in tar:
                 if not member.isfile():
                     continue
-                name, below = (
+                name, folder = (
                     PurePosixPath(member.name).name,
                     str(PurePosixPath(member.name).parent),
                 )
-                place = member.offset_data, member.size
-                beside[below][name] = Blob(str(path), f"{label}/{member.name}", {}, *place)
+                location = member.offset_data, member.size
+                siblings[folder][name] = Blob(str(path), f"{label}/{member.name}", {}, *location)
                 is_text = name.endswith(f".{SIDECAR}") and member.size <= TEXT_BYTES
                 if is_text and (file := tar.extractfile(member)):
-                    sidecars.append((below, name, file.read()))
+                    sidecars.append((folder, name, file.read()))
     except DAMAGED as error:
         run.problems.append(f"{label}: cannot be read to its end: {error}")
-    for below, name, data in sidecars:
-        yield from _made(run, below, name, data, beside[below])
+    for folder, name, data in sidecars:
+        yield from _read_picture(run, folder, name, data, siblings[folder])
 
 
-def _made(
-    run: Run, below: str, name: str, data: bytes, beside: Mapping[str, Blob]
-) -> Iterator[Made]:
+def _read_picture(
+    run: Run, folder: str, name: str, data: bytes, siblings: Mapping[str, Blob]
+) -> Iterator[RunPicture]:
     """Yield the picture of a sidecar, unless the sidecar is damaged or not from clpipe.
 
     Args:
         run: gets the problem.
-        below: the directory of the sidecar, relative to the output directory or the tar.
+        folder: the directory of the sidecar, relative to the output directory or the tar.
         name: the file name of the sidecar.
         data: its bytes.
-        beside: the files of the directory by name.
+        siblings: the files of the directory, by name.
     """
     try:
-        record = values_in(data, _joined(below, name))
+        record = parse_sidecar(data, _joined(folder, name))
     except SidecarError as error:
         run.problems.append(str(error))
         return
@@ -261,18 +264,18 @@ def _made(
     except (KeyError, TypeError, ValueError):
         rendition = None
     if not rendition or not stem.endswith(rendition.suffix):
-        run.problems.append(f"{_joined(below, name)}: is damaged, or of another version")
+        run.problems.append(f"{_joined(folder, name)}: is damaged, or of another version")
         return
     files = {}
-    for file, said in outputs_in(record).items():
-        label = _joined(below, file)
-        there = beside.get(file, Blob("", label, {}))
+    for file, sidecar_entry in output_entries(record).items():
+        label = _joined(folder, file)
+        found = siblings.get(file, Blob("", label, {}))
         files[file.removeprefix(f"{stem}.")] = Blob(
-            there.path, there.name, said, there.offset, there.size
+            found.path, found.name, sidecar_entry, found.offset, found.size
         )
-    image = _joined(below, stem.removesuffix(rendition.suffix))
-    yield Made(image, rendition, run.slim(record), files)
+    image = _joined(folder, stem.removesuffix(rendition.suffix))
+    yield RunPicture(image, rendition, run.reduced_record(record), files)
 
 
-def _joined(below: str, name: str) -> str:
-    return name if below == "." else f"{below}/{name}"
+def _joined(folder: str, name: str) -> str:
+    return name if folder == "." else f"{folder}/{name}"

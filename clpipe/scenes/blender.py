@@ -15,8 +15,8 @@ from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.base.files import write_new
 
 SCRIPT = Path(__file__).with_name("blender_script.py")
-ASKED = ".rendering.json"  # the request, in the folder of the renders
-MARK = "@clpipe "  # prefix of the script's messages on standard output
+REQUEST_FILE = ".rendering.json"  # the request, in the folder of the renders
+EVENT_PREFIX = "@clpipe "  # prefix of the script's messages on standard output
 LAST_LINES = 12  # of Blender's output that are shown if it ends unexpectedly
 
 
@@ -78,7 +78,7 @@ class Scene:
     notes: list[str] = field(default_factory=list)
 
 
-def blender_command(program: str | None, asked: Path) -> list[str]:
+def blender_command(program: str | None, request_path: Path) -> list[str]:
     """Return the command that runs clpipe's script in Blender.
 
     Args:
@@ -94,9 +94,9 @@ def blender_command(program: str | None, asked: Path) -> list[str]:
             "installed Blender, or a Python that has bpy, with --blender PATH"
         )
     if program is None or Path(program).name.startswith("python"):
-        return [program or sys.executable, str(SCRIPT), str(asked)]
+        return [program or sys.executable, str(SCRIPT), str(request_path)]
     quiet = ("--background", "--factory-startup", "--python-exit-code", "1")
-    return [program, *quiet, "--python", str(SCRIPT), "--", str(asked)]
+    return [program, *quiet, "--python", str(SCRIPT), "--", str(request_path)]
 
 
 class Renderer(AbstractContextManager["Renderer"]):
@@ -111,10 +111,10 @@ class Renderer(AbstractContextManager["Renderer"]):
     """
 
     def __init__(self, rendering: Rendering, program: str | None = None) -> None:
-        asked = rendering.folder / ASKED
-        command = blender_command(program, asked)
-        write_new(asked, json.dumps(rendering.record()).encode())
-        self._path, self._asked = rendering.scene, asked
+        request_path = rendering.folder / REQUEST_FILE
+        command = blender_command(program, request_path)
+        write_new(request_path, json.dumps(rendering.record()).encode())
+        self._path, self._asked = rendering.scene, request_path
         self._latest: deque[str] = deque(maxlen=LAST_LINES)
         try:
             self._process = subprocess.Popen(  # noqa: S603 - the user's own Blender
@@ -168,17 +168,17 @@ class Renderer(AbstractContextManager["Renderer"]):
         output: IO[str] | None = self._process.stdout
         assert output
         for line in output:
-            if not line.startswith(MARK):
+            if not line.startswith(EVENT_PREFIX):
                 self._latest.append(line.rstrip())
                 continue
-            values: dict[str, Any] = json.loads(line[len(MARK) :])
+            values: dict[str, Any] = json.loads(line[len(EVENT_PREFIX) :])
             if values["event"] == "refused":
-                refused = RequestError if kind == "scene" else RenderError
-                raise refused(f"{self._path}: {values['message']}")
+                error_type = RequestError if kind == "scene" else RenderError
+                raise error_type(f"{self._path}: {values['message']}")
             if values["event"] == kind:
                 return values
         status = self._process.wait()
-        said = "\n  ".join(self._latest)
+        last_output = "\n  ".join(self._latest)
         raise RenderError(
-            f"{self._path}: Blender ended with status {status}. Its last output:\n  {said}"
+            f"{self._path}: Blender ended with status {status}. Its last output:\n  {last_output}"
         )

@@ -18,22 +18,22 @@ import bpy
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))  # Blender does not
 from blender_views import (
     GEOMETRY,
-    RefusedError,
+    SceneError,
     camera_of,
     face_camera,
-    fault_in,
     set_face,
+    view_problem,
     views_of,
 )
 
 MARK = "@clpipe "
 OLDEST = (4, 2)
-OWNER = attrgetter("library")  # the other .blend that data was linked from
+SOURCE_LIBRARY = attrgetter("library")  # the other .blend that data was linked from
 UNFINISHED = ".unfinished.exr"
 TIMES = re.compile(rb"(cycles\.[^\0]*_time\0string\0.{4})([0-9:.]+)", re.DOTALL)
 
 
-def tell(event: str, **values: Any) -> None:
+def send_event(event: str, **values: Any) -> None:
     """Print an event."""
     print(MARK + json.dumps({"event": event, **values}), flush=True)
 
@@ -42,17 +42,17 @@ def open_scene(path: str) -> Any:
     """Open a .blend file, and return its scene.
 
     Raises:
-        RefusedError: Blender is too old, the file cannot be read, or a file that it uses is
+        SceneError: Blender is too old, the file cannot be read, or a file that it uses is
             missing.
     """
     if bpy.app.version < OLDEST:
         found = ".".join(map(str, bpy.app.version))
         oldest = ".".join(map(str, OLDEST))
-        raise RefusedError(f"this is Blender {found}, but {oldest} or newer is needed")
+        raise SceneError(f"this is Blender {found}, but {oldest} or newer is needed")
     try:
         bpy.ops.wm.open_mainfile(filepath=path, load_ui=False)
     except RuntimeError as error:
-        raise RefusedError(f"Blender cannot read this file: {str(error).strip()}") from None
+        raise SceneError(f"Blender cannot read this file: {str(error).strip()}") from None
     missing = [
         f"{kind} {each.name}: {file_of(each)}"
         for kind, files in (("texture", bpy.data.images), ("library", bpy.data.libraries))
@@ -60,7 +60,7 @@ def open_scene(path: str) -> Any:
         if is_missing(each)
     ]
     if missing:
-        raise RefusedError(
+        raise SceneError(
             f"a file that the scene uses is missing: {'; '.join(missing)}; pack it into the .blend"
         )
     return bpy.context.scene
@@ -75,38 +75,38 @@ def is_missing(data: Any) -> bool:
 
 def file_of(data: Any) -> str:
     """Return the path of an image or library, resolved against the .blend that contains it."""
-    return bpy.path.abspath(data.filepath, library=OWNER(data))
+    return bpy.path.abspath(data.filepath, library=SOURCE_LIBRARY(data))
 
 
-def prepare(scene: Any, asked: Mapping[str, Any]) -> None:
+def prepare(scene: Any, request: Mapping[str, Any]) -> None:
     """Set up rendering: Cycles, its passes, and linear EXR with the same bytes each time.
 
     Raises:
-        RefusedError: this Blender was built without Cycles or its denoiser.
+        SceneError: this Blender was built without Cycles or its denoiser.
     """
     render, layer = scene.render, bpy.context.view_layer
     try:
         render.engine = "CYCLES"
     except TypeError:
-        raise RefusedError(
+        raise SceneError(
             "this Blender has no Cycles; use one from blender.org, or the package bpy"
         ) from None
-    if asked["resolution"]:
-        render.resolution_x, render.resolution_y = asked["resolution"]
+    if request["resolution"]:
+        render.resolution_x, render.resolution_y = request["resolution"]
         render.resolution_percentage = 100
     render.use_border = render.use_motion_blur = render.use_multiview = False
     render.use_compositing = render.use_sequencer = False
     render.use_persistent_data = True
     cycles = scene.cycles
     cycles.device = "CPU"
-    cycles.samples, cycles.time_limit = asked["samples"], asked["time_limit"] or 0
-    cycles.use_denoising = asked["denoise"]
-    if asked["denoise"]:
+    cycles.samples, cycles.time_limit = request["samples"], request["time_limit"] or 0
+    cycles.use_denoising = request["denoise"]
+    if request["denoise"]:
         try:
             cycles.denoiser = "OPENIMAGEDENOISE"
         except TypeError:
-            raise RefusedError("this Blender has no denoiser; add --no-denoise") from None
-    cycles.seed, cycles.use_animated_seed = asked["seed"], False
+            raise SceneError("this Blender has no denoiser; add --no-denoise") from None
+    cycles.seed, cycles.use_animated_seed = request["seed"], False
     for each in scene.view_layers:
         each.use = each == layer
     layer.use_pass_z = layer.use_pass_normal = layer.use_pass_object_index = True
@@ -121,7 +121,7 @@ def prepare(scene: Any, asked: Mapping[str, Any]) -> None:
             setattr(render, name, False)
 
 
-def number_objects(scene: Any) -> dict[int, list[str]]:
+def index_objects(scene: Any) -> dict[int, list[str]]:
     """Return the names of objects by index. If the scene has no indices, assign them by name."""
     objects = sorted((o for o in scene.objects if o.type in GEOMETRY), key=lambda o: o.name)
     if not any(each.pass_index for each in objects):
@@ -137,7 +137,7 @@ def render_view(scene: Any, folder: str, name: str, number: int, seed: int) -> N
     """Render a view to NAME.exr, which is written as a whole or not at all.
 
     Raises:
-        RefusedError: it cannot be rendered or written.
+        SceneError: it cannot be rendered or written.
     """
     unfinished = os.path.join(folder, f".{name}.{os.getpid()}{UNFINISHED}")
     settings = scene.render.image_settings
@@ -150,12 +150,12 @@ def render_view(scene: Any, folder: str, name: str, number: int, seed: int) -> N
     try:
         bpy.ops.render.render(write_still=True)
     except RuntimeError as error:
-        raise RefusedError(f"view {name}: {' '.join(str(error).split())}") from None
-    forget_times(unfinished)
+        raise SceneError(f"view {name}: {' '.join(str(error).split())}") from None
+    clear_render_times(unfinished)
     os.replace(unfinished, os.path.join(folder, f"{name}.exr"))
 
 
-def forget_times(path: str) -> None:
+def clear_render_times(path: str) -> None:
     """Replace the render times in an EXR's header with zeros, for the same bytes each time."""
     with open(path, "r+b") as file:
         head = file.read(2**17)
@@ -163,33 +163,33 @@ def forget_times(path: str) -> None:
         file.write(TIMES.sub(lambda found: found[1] + re.sub(rb"[0-9]", b"0", found[2]), head))
 
 
-def main(asked: Mapping[str, Any]) -> None:
+def main(request: Mapping[str, Any]) -> None:
     """Render all views that do not exist yet."""
-    scene = open_scene(asked["scene"])
+    scene = open_scene(request["scene"])
     if scene.camera is None:
-        raise RefusedError("this scene has no camera; add one, or pass cameras with --poses")
-    prepare(scene, asked)
-    objects = number_objects(scene)
-    views, notes = views_of(scene, asked)
-    cameras, blind = [], []
-    for name, _, set_up in views:
-        set_up()
+        raise SceneError("this scene has no camera; add one, or pass cameras with --poses")
+    prepare(scene, request)
+    objects = index_objects(scene)
+    views, notes = views_of(scene, request)
+    cameras, obstructed = [], []
+    for name, _, set_up_scene in views:
+        set_up_scene()
         bpy.context.view_layer.update()
         cameras.append(camera_of(scene, name))
-        if fault := fault_in(scene, cameras[-1]):
-            blind.append(f"{name} ({fault})")
-    if len(blind) == len(views):
-        raise RefusedError(
-            f"no view sees enough: {', '.join(blind[:5])}; move the camera, or use --poses"
+        if problem := view_problem(scene, cameras[-1]):
+            obstructed.append(f"{name} ({problem})")
+    if len(obstructed) == len(views):
+        raise SceneError(
+            f"no view sees enough: {', '.join(obstructed[:5])}; move the camera, or use --poses"
         )
-    if blind:
-        more = f" and {len(blind) - 5} others" if len(blind) > 5 else ""
-        notes.append(f"these views see too little: {', '.join(blind[:5])}{more}")
-    faces = asked["faces"]
+    if obstructed:
+        more = f" and {len(obstructed) - 5} others" if len(obstructed) > 5 else ""
+        notes.append(f"these views see too little: {', '.join(obstructed[:5])}{more}")
+    faces = request["faces"]
     if faces:  # a cube has no focal length
         cameras = [{k: record[k] for k in ("file", "R", "t")} for record in cameras]
     unit = scene.unit_settings
-    tell(
+    send_event(
         "scene",
         blender=bpy.app.version_string,
         views=cameras,
@@ -198,24 +198,28 @@ def main(asked: Mapping[str, Any]) -> None:
         unit_metres=unit.scale_length if unit.system != "NONE" else None,
         notes=notes,
     )
-    for name in os.listdir(asked["folder"]):
+    for name in os.listdir(request["folder"]):
         if name.endswith(UNFINISHED):  # left by a Blender that was killed
-            os.remove(os.path.join(asked["folder"], name))
-    own, face = scene.camera, face_camera(scene) if faces else None
-    for name, number, set_up in views:
-        began, made = time.perf_counter(), 0
+            os.remove(os.path.join(request["folder"], name))
+    scene_camera, face = scene.camera, face_camera(scene) if faces else None
+    for name, number, set_up_scene in views:
+        start, rendered_count = time.perf_counter(), 0
         turns = faces["turns"] if faces else {"": None}
-        for turned, (ending, turn) in enumerate(turns.items()):
-            file = f"{name}_{ending}" if faces else name
-            if os.path.exists(os.path.join(asked["folder"], f"{file}.exr")):
+        for face_number, (face_name, rotation) in enumerate(turns.items()):
+            file = f"{name}_{face_name}" if faces else name
+            if os.path.exists(os.path.join(request["folder"], f"{file}.exr")):
                 continue
-            scene.camera = own
-            set_up()
+            scene.camera = scene_camera
+            set_up_scene()
             if faces:
-                set_face(scene, face, turn, faces["side"])
-            render_view(scene, asked["folder"], file, len(turns) * number + turned, asked["seed"])
-            made += 1
-        tell("rendered", name=name, seconds=time.perf_counter() - began if made else 0.0)
+                set_face(scene, face, rotation, faces["side"])
+            render_view(
+                scene, request["folder"], file, len(turns) * number + face_number, request["seed"]
+            )
+            rendered_count += 1
+        send_event(
+            "rendered", name=name, seconds=time.perf_counter() - start if rendered_count else 0.0
+        )
 
 
 if __name__ == "__main__":
@@ -223,6 +227,6 @@ if __name__ == "__main__":
         ASKED = json.load(file)
     try:
         main(ASKED)
-    except RefusedError as error:
-        tell("refused", message=str(error))
+    except SceneError as error:
+        send_event("refused", message=str(error))
         sys.exit(1)

@@ -1,4 +1,4 @@
-"""The card of a dataset: README, contact sheet, manifest, and the split of each view."""
+"""The dataset card: README, contact sheet, manifest, and the split of each view."""
 
 import csv
 import io
@@ -11,18 +11,18 @@ from clpipe.base.about import __version__
 from clpipe.base.files import write_new
 from clpipe.chain.rendition import Rendition
 from clpipe.images.sheet import SHOWN, contact_sheet
-from clpipe.inputs.carry_around import DISTANCE
+from clpipe.inputs.carry_panorama import DISTANCE
 from clpipe.outputs.camera_files import FILES, write_camera_files
 from clpipe.scenes.members import PICTURE, Member, members_of, splits_of
 from clpipe.scenes.record import RECORD
 
 SHEET, MANIFEST, README = "contact_sheet.jpg", "manifest.csv", "README.md"
-MOST_ROWS = 12  # of the contact sheet
+MAX_ROWS = 12  # of the contact sheet
 TRUTH = Rendition("clean").suffix.removeprefix(".")
 SPLITS = ("train", "val", "test")
 
 # The contents of carried layers, with axes and units.
-TRUTHS = {
+LAYER_TEXTS = {
     "depth": "along the viewing axis, in the renders' unit ({unit}); PNGs have thousandths of it",
     "normal": "of unit length, in the renders' axes",
     "flow": "in px of the picture, right and down, to the place of a surface in another frame. "
@@ -31,11 +31,13 @@ TRUTHS = {
     "label": "whole numbers, the indices of objects",
     "colour": "linear",
 }
-AWAY = "the distance from the camera, in the renders' unit ({unit})"  # depth of a wide lens
+DISTANCE_TEXT = (
+    "the distance from the camera, in the renders' unit ({unit})"  # depth of a wide lens
+)
 
 
 @dataclass(frozen=True)
-class About:
+class CardContents:
     """The contents of a dataset's card that are not in sidecars.
 
     Args:
@@ -53,7 +55,7 @@ class About:
     words: Sequence[str]
 
 
-def write_card(folder: Path, renders: str, about: About) -> list[Path]:
+def write_card(folder: Path, renders: str, about: CardContents) -> list[Path]:
     """Write the card of a dataset, and the splits of its views, from its contents.
 
     Args:
@@ -80,9 +82,9 @@ def write_card(folder: Path, renders: str, about: About) -> list[Path]:
     if sheet := _sheet(folder, members):
         write_new(folder / SHEET, sheet)
         written.append(folder / SHEET)
-    of_names = {member.name: splits[member.view] for member in members}
+    split_by_name = {member.name: splits[member.view] for member in members}
     for series in dict.fromkeys(member.folder for member in members):
-        write_camera_files(folder / series, of_names)
+        write_camera_files(folder / series, split_by_name)
     readme = _readme(folder, members, splits, about, bool(sheet))
     write_new(folder / README, readme.encode())
     return written
@@ -97,9 +99,9 @@ def _manifest(members: Sequence[Member], splits: Mapping[str, str]) -> str:
     table.writerow(["view", "split", "camera", "iso", *names, *kinds, "render"])
     for member in members:
         files = [member.files.get(kind, "") for kind in kinds]
-        facts = member.facts.camera, member.facts.iso
-        light = [getattr(member.facts, name) for name in names]
-        row = [member.view, splits[member.view], *facts, *light, *files, member.render]
+        metadata = member.metadata.camera, member.metadata.iso
+        light = [getattr(member.metadata, name) for name in names]
+        row = [member.view, splits[member.view], *metadata, *light, *files, member.render]
         table.writerow(row)
     return text.getvalue()
 
@@ -110,9 +112,9 @@ def _sheet(folder: Path, members: Sequence[Member]) -> bytes | None:
     for member in members:
         by_view.setdefault(member.view, {})[member.folder] = member
     columns = max((list(row) for row in by_view.values()), key=len, default=[])
-    whole = {view: row for view, row in by_view.items() if list(row) == columns}
-    step = -(-len(whole) // MOST_ROWS) or 1
-    rows = list(whole.items())[::step]
+    complete = {view: row for view, row in by_view.items() if list(row) == columns}
+    step = -(-len(complete) // MAX_ROWS) or 1
+    rows = list(complete.items())[::step]
     pictures = [
         [folder / member.files[PICTURE] for member in row.values()]
         + [folder / path for path in _truths(next(iter(row.values())))]
@@ -134,31 +136,32 @@ def _readme(
     folder: Path,
     members: Sequence[Member],
     splits: Mapping[str, str],
-    about: About,
+    about: CardContents,
     has_sheet: bool,
 ) -> str:
     """Return the README of a dataset, in Markdown."""
     shown = list(splits.values())
-    of_series: dict[str, list[Member]] = {}
+    by_series: dict[str, list[Member]] = {}
     for member in members:
-        of_series.setdefault(member.folder, []).append(member)
+        by_series.setdefault(member.folder, []).append(member)
     rows = [
-        f"| `{series or '.'}/` | {_all(own, 'camera')} | {_all(own, 'iso')} | {len(own)} | "
-        f"{_all(own, 'size')} | {_range(own, 'ev')} | {_range(own, 'exposure_time')} | "
-        f"{_range(own, 'f_number')} | {_all(own, 'lens')} | {_all(own, 'law')} |"
-        for series, own in of_series.items()
+        f"| `{series or '.'}/` | {_value(group, 'camera')} | {_value(group, 'iso')} | "
+        f"{len(group)} | {_value(group, 'size')} | {_range(group, 'ev')} | "
+        f"{_range(group, 'exposure_time')} | {_range(group, 'f_number')} | "
+        f"{_value(group, 'lens')} | {_value(group, 'variance_text')} |"
+        for series, group in by_series.items()
     ]
-    facts = "\n".join(f"- **{name}:** {text}" for name, text in about.renders.items())
+    metadata = "\n".join(f"- **{name}:** {text}" for name, text in about.renders.items())
     kinds = dict.fromkeys(kind for member in members for kind in member.files)
-    there = [n for n in FILES if any((folder / series / n).exists() for series in of_series)]
-    cameras = ", ".join(f"`{name}`" for name in there)
+    camera_files = [n for n in FILES if any((folder / series / n).exists() for series in by_series)]
+    cameras = ", ".join(f"`{name}`" for name in camera_files)
     views = f"- {cameras} in each folder: intrinsics and poses for COLMAP and nerfstudio. In "
     views += "`cameras.json`, x_cam = R X + t in OpenCV's axes, and px count from the corner.\n"
     layers = {each["layer"]: each for member in members for each in member.layers}
     truths = "".join(
-        f"- `{name}` ({each['kind']}): {_held(name, each['kind']).format(unit=about.unit)}.\n"
+        f"- `{name}` ({each['kind']}): {_layer_text(name, each['kind']).format(unit=about.unit)}.\n"
         for name, each in layers.items()
-        if each["kind"] in TRUTHS
+        if each["kind"] in LAYER_TEXTS
     )
     carried = (
         f"\n## Carried layers\n\n`NAME.carried.exr` has these layers, warped like the picture. "
@@ -175,7 +178,7 @@ Made by clpipe {__version__}: renders as pictures of a camera, with its noise.
 
 {sheet}- **Licence:** {about.licence or "not stated (`--licence`)"}
 - **Author:** {about.author or "not stated (`--author`)"}
-{facts}
+{metadata}
 - **Views:** {len(shown)}: {counts}. One in eight is for validation, and one for tests.
 
 | folder | camera | ISO | pictures | size | EV | time, s | f-number | lens | variance of the raw |
@@ -191,7 +194,7 @@ sidecar contains gains, vignetting and the response.
 and split. Paths are relative to this folder.
 - `NAME.json` next to each picture: all settings that made it. \
 `clpipe replay NAME.json` recomputes it, byte for byte.
-{views if there else ""}- `{RECORD}`: what the renders were made from. `run.jsonl`: the log.
+{views if camera_files else ""}- `{RECORD}`: what the renders were made from. `run.jsonl`: the log.
 {carried}
 ## Made by
 
@@ -204,21 +207,21 @@ interruption. With other ISOs, cameras or frames, it adds pictures.
 """
 
 
-def _all(members: Sequence[Member], fact: str) -> str:
-    """Return the value of some pictures; if it differs, the first and the number of others."""
-    first, *others = dict.fromkeys(getattr(member.facts, fact) for member in members)
+def _value(members: Sequence[Member], fact: str) -> str:
+    """Return the value that pictures share, or the first and the number of other values."""
+    first, *others = dict.fromkeys(getattr(member.metadata, fact) for member in members)
     return f"{first} and {len(others)} others" if others else str(first)
 
 
 def _range(members: Sequence[Member], fact: str) -> str:
     """Return the smallest and largest number of some pictures as text."""
-    texts = [text for member in members if (text := getattr(member.facts, fact))]
+    texts = [text for member in members if (text := getattr(member.metadata, fact))]
     if not texts:
         return "not known"
     low, high = min(texts, key=float), max(texts, key=float)
     return low if low == high else f"{low} to {high}"
 
 
-def _held(layer: str, kind: str) -> str:
+def _layer_text(layer: str, kind: str) -> str:
     """Return the description of a carried layer."""
-    return AWAY if layer.endswith(f".{DISTANCE}") else TRUTHS[kind]
+    return DISTANCE_TEXT if layer.endswith(f".{DISTANCE}") else LAYER_TEXTS[kind]

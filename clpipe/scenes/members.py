@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from clpipe.chain.rendition import NOISY, Rendition
 from clpipe.outputs.carried import carried_files
-from clpipe.outputs.sidecar import SidecarError, outputs_in, sidecar_files, values_at
+from clpipe.outputs.sidecar import SidecarError, output_entries, sidecar_files, values_at
 
 PICTURE = "picture"
 SERIES = re.compile(r"(?:[^/]+/)?iso[0-9.e+]+(?=/)|")  # the folder of a camera and an ISO
@@ -23,13 +23,13 @@ DAMAGED = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
 log = logging.getLogger(__name__)
 
 
-class Facts(NamedTuple):
-    """The metadata of a picture as texts; ``law`` is the variance of the raw's noise."""
+class PictureMetadata(NamedTuple):
+    """The metadata of a picture as texts; ``variance_text`` is the variance of the raw's noise."""
 
     camera: str
     iso: str
     size: str
-    law: str
+    variance_text: str
     ev: str
     gain: str
     exposure_time: str
@@ -54,7 +54,7 @@ class Member:
     view: str
     folder: str
     files: Mapping[str, str]
-    facts: Facts
+    metadata: PictureMetadata
     render: str
     layers: tuple[Mapping[str, Any], ...]
 
@@ -120,27 +120,27 @@ def _member(
     files: dict[str, str] = {}
     noisy: Mapping[str, Any] | None = None
     for suffix, (path, values) in sorted(renditions.items()):
-        first, *_ = outputs_in(values)
-        place = path.parent.relative_to(folder)
+        first, *_ = output_entries(values)
+        directory = path.parent.relative_to(folder)
         if not (path.parent / first).exists():
             continue
         if Rendition.from_record(values).role == NOISY and noisy is None:
             noisy = values
-        files[suffix.removeprefix(".") or PICTURE] = (place / first).as_posix()
-        files |= {k: (place / file).as_posix() for k, file in carried_files(values).items()}
+        files[suffix.removeprefix(".") or PICTURE] = (directory / first).as_posix()
+        files |= {k: (directory / file).as_posix() for k, file in carried_files(values).items()}
     if noisy is None:
         return None
-    own = SERIES.match(name)
-    series = own[0] if own else ""
+    series_match = SERIES.match(name)
+    series = series_match[0] if series_match else ""
     view = name.removeprefix(series).lstrip("/")
-    said = Path(str(noisy["input"]))
-    render = os.path.relpath(said.absolute(), folder.absolute())
-    if (folder / renders / said.name).exists():  # even if the dataset was moved
-        render = f"{renders}/{said.name}"
-    return Member(view, series, files, _facts(noisy), render, tuple(noisy.get("carried", ())))
+    input_path = Path(str(noisy["input"]))
+    render = os.path.relpath(input_path.absolute(), folder.absolute())
+    if (folder / renders / input_path.name).exists():  # even if the dataset was moved
+        render = f"{renders}/{input_path.name}"
+    return Member(view, series, files, _metadata(noisy), render, tuple(noisy.get("carried", ())))
 
 
-def _facts(values: Mapping[str, Any]) -> Facts:
+def _metadata(values: Mapping[str, Any]) -> PictureMetadata:
     """Return the metadata of a picture for the card, from the values of its sidecar.
 
     Raises:
@@ -148,12 +148,12 @@ def _facts(values: Mapping[str, Any]) -> Facts:
     """
     noise = (values["noise"] or {}).get("signal", {"a": 0.0, "b": 0.0})
     size = f"{values['width']:d}x{values['height']:d}"
-    law = f"{noise['a']:.3g} y + {noise['b']:.3g}"
+    variance_text = f"{noise['a']:.3g} y + {noise['b']:.3g}"
     light = values["photometry"] or {}
     names = ("ev", "gain", "exposure_time", "f_number")
     exposed = {n: "" if light.get(n) is None else f"{light[n]:g}" for n in names}
     camera, iso = str(values["camera"]), f"{values['iso']:g}"
-    return Facts(camera, iso, size, law, **exposed, lens=_lens(values))
+    return PictureMetadata(camera, iso, size, variance_text, **exposed, lens=_lens(values))
 
 
 def _lens(values: Mapping[str, Any]) -> str:
@@ -162,7 +162,9 @@ def _lens(values: Mapping[str, Any]) -> str:
     if not camera:
         return "not known"
     length = (values.get("output") or {}).get("focal_length")
-    bent = {k: v for k, v in camera["distortion"].items() if v}
-    told = f"{length:g} mm, " if length else ""
-    terms = ", ".join(f"{name} {value:.4g}" for name, value in bent.items())
-    return f"{told}fx {camera['fx']:.1f} px, {camera['model']}{f' ({terms})' if terms else ''}"
+    nonzero = {k: v for k, v in camera["distortion"].items() if v}
+    length_text = f"{length:g} mm, " if length else ""
+    terms = ", ".join(f"{name} {value:.4g}" for name, value in nonzero.items())
+    return (
+        f"{length_text}fx {camera['fx']:.1f} px, {camera['model']}{f' ({terms})' if terms else ''}"
+    )

@@ -16,7 +16,7 @@ from clpipe.images.passes import find_layers, kind_of
 from clpipe.inputs.find import Job
 from clpipe.scenes.blender import Renderer, RenderError, Rendering, Scene
 from clpipe.scenes.record import read_record, write_record
-from clpipe.scenes.view_request import made_by
+from clpipe.scenes.view_request import dependencies
 
 RENDERS, UNIT, NOTE = "renders", "Unit of depth and poses", "Which views"
 CAMERAS = "cameras.json"
@@ -55,8 +55,8 @@ class Source:
         for name in self.names:
             files = [Path(folder) / f"{name}_{face}.exr" for face in self.faces]
             first, *others = files or [Path(folder) / f"{name}.exr"]
-            found = Job(first, f"{name}.exr", listed=False)
-            jobs.append(replace(found, subframes=tuple(others), around=bool(files)))
+            found = Job(first, f"{name}.exr", named_by_user=False)
+            jobs.append(replace(found, subframes=tuple(others), is_panorama=bool(files)))
         return jobs or None
 
     def stop(self) -> None:
@@ -65,7 +65,7 @@ class Source:
         if self.renderer:
             self.renderer.stop()
 
-    def as_rendered(self, jobs: Sequence[Job], tell: Callable[[str], None]) -> Iterator[Job]:
+    def jobs_when_rendered(self, jobs: Sequence[Job], show: Callable[[str], None]) -> Iterator[Job]:
         """Yield the jobs, each as soon as its render is finished.
 
         If rendering fails, the rest is missing, and ``failure`` contains the reason.
@@ -77,14 +77,14 @@ class Source:
         if not self.renderer:
             yield from jobs
             return
-        of_view: dict[str, list[Job]] = {}
+        jobs_by_render: dict[str, list[Job]] = {}
         for job in jobs:
-            of_view.setdefault(job.key, []).append(job)
+            jobs_by_render.setdefault(job.key, []).append(job)
         try:
             for number, (name, seconds) in enumerate(self.renderer.rendered(len(self.names)), 1):
                 if seconds > 0:
-                    tell(f"rendered {name}  {number} of {len(self.names)}  {seconds:.1f} s")
-                yield from of_view[f"{name}.exr"]
+                    show(f"rendered {name}  {number} of {len(self.names)}  {seconds:.1f} s")
+                yield from jobs_by_render[f"{name}.exr"]
         except RenderError as error:
             self.failure = None if self._is_stopped else error
 
@@ -98,12 +98,16 @@ def from_folder(folder: Path, output: Path, poses: Path | None) -> Source:
     check_exists(folder)
     if not folder.is_dir():
         raise RequestError(f"{folder}: this is neither a .blend nor a folder of renders; give one")
-    made_of = {"renders": folder.resolve().name}
-    read_record(output, made_of)
-    own = [path for name in (CAMERAS, "transforms.json") if (path := folder / name).is_file()]
-    write_record(output, made_of, {})
+    origin = {"renders": folder.resolve().name}
+    read_record(output, origin)
+    layers_of_file = [
+        path for name in (CAMERAS, "transforms.json") if (path := folder / name).is_file()
+    ]
+    write_record(output, origin, {})
     about = {"Renders": f"`{folder.resolve().name}`"}
-    return Source([str(folder)], poses or next(iter(own), None), layers_in(folder), about)
+    return Source(
+        [str(folder)], poses or next(iter(layers_of_file), None), layers_in(folder), about
+    )
 
 
 def layers_in(folder: Path) -> tuple[str, ...]:
@@ -114,16 +118,20 @@ def layers_in(folder: Path) -> tuple[str, ...]:
             found = find_layers(path)
         except ImageError:  # the run reports it
             continue
-        own: dict[str, str] = {
+        layers_of_file: dict[str, str] = {
             each.without_rank.rpartition(".")[2]: kind
             for each in found
             if (kind := kind_of(each.name, each)) and kind != "colour" and each.name
         }
-        common = own if common is None else {k: v for k, v in common.items() if own.get(k) == v}
-    return tuple(_carried(name, kind) for name, kind in (common or {}).items())
+        common = (
+            layers_of_file
+            if common is None
+            else {k: v for k, v in common.items() if layers_of_file.get(k) == v}
+        )
+    return tuple(_carry_value(name, kind) for name, kind in (common or {}).items())
 
 
-def _carried(name: str, kind: str) -> str:
+def _carry_value(name: str, kind: str) -> str:
     """Return the value of --carry for a layer, with PNGs of depth and object indices."""
     is_plain = kind == "depth" or (kind == "label" and name.lower().startswith(("index", "object")))
     return f"{name}:png" if is_plain else name
@@ -142,24 +150,24 @@ def from_scene(stack: ExitStack, rendering: Rendering, output: Path, program: st
         RequestError: the scene cannot be rendered, there is no Blender, or the output directory
             has another dataset.
     """
-    asked = rendering.record()
-    path, views = rendering.scene, asked.pop("views")
+    request = rendering.record()
+    path, views = rendering.scene, request.pop("views")
     sha256 = digests([str(path)]).get(str(path))
     if sha256 is None:
         check_exists(path)
         raise RequestError(f"{path}: this scene cannot be read; check its permissions")
-    del asked["folder"]
-    made_of = {**asked, "scene": path.name, "sha256": sha256, "views": made_by(views)}
-    made_of = json.loads(json.dumps(made_of))
-    known = read_record(output, made_of)
+    del request["folder"]
+    origin = {**request, "scene": path.name, "sha256": sha256, "views": dependencies(views)}
+    origin = json.loads(json.dumps(origin))
+    stored = read_record(output, origin)
     renderer = None
     faces = list(rendering.faces["turns"]) if rendering.faces else []
-    if known.get("views") == views and _are_there(rendering.folder, known["scene"], faces):
-        scene = Scene(**known["scene"])
+    if stored.get("views") == views and _all_exist(rendering.folder, stored["scene"], faces):
+        scene = Scene(**stored["scene"])
     else:
         renderer = stack.enter_context(Renderer(rendering, program))
         scene = renderer.scene()
-        write_record(output, made_of, {"views": views, "scene": asdict(scene)})
+        write_record(output, origin, {"views": views, "scene": asdict(scene)})
         cameras = {"views": scene.views}
         write_new(rendering.folder / CAMERAS, json.dumps(cameras, indent=1).encode())
     depth, normals, numbers = scene.layers
@@ -170,7 +178,7 @@ def from_scene(stack: ExitStack, rendering: Rendering, output: Path, program: st
     return Source([str(folder)], folder / CAMERAS, layers, about, renderer, names, faces)
 
 
-def _are_there(folder: Path, scene: Mapping[str, Any], faces: Sequence[str]) -> bool:
+def _all_exist(folder: Path, scene: Mapping[str, Any], faces: Sequence[str]) -> bool:
     names = [view["file"] for view in scene["views"]]
     if faces:
         names = [f"{Path(name).stem}_{face}.exr" for name in names for face in faces]

@@ -10,12 +10,12 @@ from clpipe.base.text import whole_number
 from clpipe.inputs.render_cameras import read_views
 
 PATHS = ("orbit", "arc", "random")
-USUAL_VIEWS = 24
-LARGEST = 2**16  # px, the longer side of a render
+DEFAULT_VIEWS = 24
+MAX_SIDE = 2**16  # px, the longer side of a render
 LAST_FRAME = 2**20 - 2  # the largest that Blender knows
 
 
-def asked_views(
+def requested_views(
     views: int | None,
     path: str | None,
     box: Sequence[float] | None,
@@ -26,7 +26,7 @@ def asked_views(
     """Return the request for views, see :class:`clpipe.scenes.blender.Rendering`.
 
     Args:
-        views: the number of generated views; None is :data:`USUAL_VIEWS`, unless there are frames
+        views: the number of generated views; None is :data:`DEFAULT_VIEWS`, unless there are frames
             or poses.
         path: one of :data:`PATHS`; None is the first.
         box: two corners of a box, for random places.
@@ -39,9 +39,9 @@ def asked_views(
     """
     generated = views is not None or path is not None or box is not None
     kinds = {"--views, --path and --box": generated, "--frames": frames, "--poses": poses}
-    if len(asked := [name for name, is_asked in kinds.items() if is_asked]) > 1:
+    if len(sources := [name for name, is_asked in kinds.items() if is_asked]) > 1:
         raise RequestError(
-            f"found {' and '.join(asked)}; each of them sets the views, so use only one"
+            f"found {' and '.join(sources)}; each of them sets the views, so use only one"
         )
     if box is not None and path != "random":
         raise RequestError("--box: this option needs --path random; add it, or remove --box")
@@ -50,7 +50,7 @@ def asked_views(
     if poses:
         return {"cameras": cameras_of(poses)}
     box = None if box is None else list(box)
-    return {"path": path or PATHS[0], "count": views or USUAL_VIEWS, "seed": seed, "box": box}
+    return {"path": path or PATHS[0], "count": views or DEFAULT_VIEWS, "seed": seed, "box": box}
 
 
 def cameras_of(poses: Path) -> list[dict[str, Any]]:
@@ -80,7 +80,7 @@ def cameras_of(poses: Path) -> list[dict[str, Any]]:
     return list(records.values())
 
 
-def made_by(views: Mapping[str, Any]) -> Any:
+def dependencies(views: Mapping[str, Any]) -> Any:
     """Return the values on which renders of views depend. A frame does not depend on others."""
     return "frames" if "frames" in views else views
 
@@ -121,7 +121,7 @@ def parse_resolution(text: str) -> tuple[int, int]:
         RequestError: the text has another form.
     """
     width, height = map(whole_number, text.lower().partition("x")[::2])
-    if not (0 < width <= LARGEST and 0 < height <= LARGEST):
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
         raise RequestError(f"--resolution: found {text!r}; expected WIDTHxHEIGHT, such as 960x640")
     return width, height
 

@@ -22,7 +22,7 @@ from clpipe.torch import numbers
 from clpipe.torch.numbers import Streams, f32
 from clpipe.torch.poisson import poisson_of
 
-MOST_MAPS = 256  # of sensors that are cached, with some MB each at most
+MAX_CACHED_MAPS = 256  # of sensors that are cached, with some MB each at most
 
 
 def tapped(y: Tensor, dx: int, dy: int) -> Tensor:
@@ -44,7 +44,7 @@ def tukey_lambda_of(words: Tensor, shape: Tensor, scale: Tensor) -> Tensor:
     return torch.where(words >= 0, z, -z)
 
 
-class Photons(torch.autograd.Function):
+class PoissonNumbers(torch.autograd.Function):
     """Poisson numbers, with the derivative of their mean."""
 
     @staticmethod
@@ -56,7 +56,7 @@ class Photons(torch.autograd.Function):
         return gradients[0], None
 
 
-class Rounded(torch.autograd.Function):
+class StraightThroughRound(torch.autograd.Function):
     """Rounding to whole numbers, ties to even, with a straight-through derivative.
 
     See Bengio et al., "Estimating or propagating gradients through stochastic neurons", 2013.
@@ -79,15 +79,15 @@ class TorchBackend(Backend):
         steps: the step of each sample with the method.
         streams: the streams of noise that is new in each sample.
         sensors: the stream of each sample's sensor.
-        places: the row and column of each sample's upper left corner on its sensor.
-        area: height and width of the part of a sensor that contains the places.
+        positions: the row and column of each sample's upper left corner on its sensor.
+        area: height and width of the part of a sensor that contains the positions.
         size: height and width of the samples.
     """
 
     steps: Sequence[Step]
     streams: Streams
     sensors: Sequence[Stream]
-    places: Sequence[tuple[int, int]]
+    positions: Sequence[tuple[int, int]]
     area: tuple[int, int]
     size: tuple[int, int]
 
@@ -95,8 +95,8 @@ class TorchBackend(Backend):
     minimum = staticmethod(torch.minimum)
     square_root = staticmethod(numbers.square_root)
     inverse_root = staticmethod(numbers.inverse_root)
-    rounded = staticmethod(Rounded.apply)
-    photons = staticmethod(Photons.apply)
+    rounded = staticmethod(StraightThroughRound.apply)
+    photons = staticmethod(PoissonNumbers.apply)
     tukey_lambda = staticmethod(tukey_lambda_of)
     tap = staticmethod(tapped)
 
@@ -114,43 +114,43 @@ class TorchBackend(Backend):
         return numbers.normal_of_line(count, self.streams)
 
     def uniform(self) -> Tensor:
-        zero = torch.zeros(1, 1, 1, dtype=torch.int64, device=self._on)
+        zero = torch.zeros(1, 1, 1, dtype=torch.int64, device=self._device)
         bits = (numbers.philox(zero, 0, 0, self.streams)[0] >> 1) & numbers.LOW
         return bits.float() * f32(4.6566129e-10)
 
     def rows(self) -> Tensor:
-        return torch.arange(self.size[0], dtype=torch.float32, device=self._on)[None, :, None]
+        return torch.arange(self.size[0], dtype=torch.float32, device=self._device)[None, :, None]
 
     def tiled(self, cell: list[list[Tensor]]) -> Tensor:
         height, width = self.size
-        together = torch.cat([torch.cat(row, 2) for row in cell], 1)
-        return together.repeat(1, (height + 1) // 2, (width + 1) // 2)[:, :height, :width]
+        cells = torch.cat([torch.cat(row, 2) for row in cell], 1)
+        return cells.repeat(1, (height + 1) // 2, (width + 1) // 2)[:, :height, :width]
 
     @property
-    def _on(self) -> torch.device:
+    def _device(self) -> torch.device:
         return self.streams.keys.device
 
     def fixed(self, make: Callable[..., Floats], own: Own = nothing) -> Tensor:
         height, width = self.size
         maps = [
-            _map(make, self.area, stream, own(step.method, step.context), self._on)
+            _fixed_map(make, self.area, stream, own(step.method, step.context), self._device)
             for step, stream in zip(self.steps, self.sensors, strict=True)
         ]
-        each = list(zip(maps, self.places, strict=True))
-        if all(m is maps[0] for m in maps) and len(set(self.places)) == 1:
-            each = each[:1]
-        rows = [y if len(m) > 1 else 0 for m, (y, _) in each]
+        pairs = list(zip(maps, self.positions, strict=True))
+        if all(m is maps[0] for m in maps) and len(set(self.positions)) == 1:
+            pairs = pairs[:1]
+        rows = [y if len(m) > 1 else 0 for m, (y, _) in pairs]
         return torch.stack(
-            [m[y : y + height, x : x + width] for y, (m, (_, x)) in zip(rows, each, strict=True)]
+            [m[y : y + height, x : x + width] for y, (m, (_, x)) in zip(rows, pairs, strict=True)]
         )
 
 
-@lru_cache(maxsize=MOST_MAPS)
-def _map(
+@lru_cache(maxsize=MAX_CACHED_MAPS)
+def _fixed_map(
     make: Callable[..., Floats],
     area: tuple[int, int],
     stream: Stream,
-    own: tuple[Any, ...],
-    on: torch.device,
+    arguments: tuple[Any, ...],
+    device: torch.device,
 ) -> Tensor:
-    return torch.from_numpy(np.array(make(*area, stream, *own), np.float32)).to(on)
+    return torch.from_numpy(np.array(make(*area, stream, *arguments), np.float32)).to(device)

@@ -9,10 +9,10 @@ try:
 except ModuleNotFoundError:
 
     class IterableDataset:  # type: ignore[no-redef]
-        """Stands for PyTorch's class where PyTorch is not installed."""
+        """A substitute for the class if PyTorch is not installed."""
 
     def get_worker_info() -> Any:
-        """Stands for PyTorch's function."""
+        """A substitute for the function: no worker."""
 
 
 def worker() -> tuple[int, int]:

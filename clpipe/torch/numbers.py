@@ -42,12 +42,12 @@ def f32(value: float | np.float32) -> float:
 
 def estrin(coefficients: Any, x: Tensor) -> Tensor:
     """The counterpart of :func:`clpipe.reference.math.estrin`."""
-    own = [float(c) for c in coefficients]
+    values = [float(c) for c in coefficients]
     x2 = x * x
     x4 = x2 * x2
     total, power = x, x
-    for i in range(0, len(own), 4):
-        c = own[i : i + 4]
+    for i in range(0, len(values), 4):
+        c = values[i : i + 4]
         group = (x * c[1]).add_(c[0]) if len(c) > 1 else torch.full_like(x, c[0])
         if len(c) == 3:
             group += x2 * c[2]
@@ -128,7 +128,7 @@ def _round(word: Words, factor: int, other: Words, key: Tensor) -> tuple[Words, 
     low = product & WORD
     if not isinstance(other, int) and other.shape != product.shape:
         return (product >> 32 ^ other ^ key) & WORD, low
-    # in place: it is limited by memory bandwidth
+    # In place, because memory bandwidth limits the speed.
     high = product.bitwise_right_shift_(32).bitwise_xor_(other)
     if key.dim() and key.numel() > 1 and len(high) == 1:
         return (high ^ key).bitwise_and_(WORD), low
@@ -145,7 +145,7 @@ def philox(c0: Words, c1: Words, draw: int, streams: Streams) -> tuple[Tensor, .
         streams: keys and stage; the stage is the last counter.
 
     Returns:
-        Return int32 of (sample, height, width), with the bits of the words.
+        int32 of (sample, height, width), with the bits of the words.
     """
     key0, key1 = streams.keys[:, :, None, None]
     w0, w1, w2, w3 = c0, c1, draw, streams.stage  # they grow to full size in the second round
@@ -185,22 +185,22 @@ def normals_of(distance: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
     cosine = (f2 * c2).add_(c1).mul_(f2).add_(c0)
     sign = (direction << 1) & SIGN
     signed = cosine.view(torch.int32).bitwise_xor_(sign).view(torch.float32)
-    exchanged = direction < 0
-    one = torch.where(exchanged, sine, signed).mul_(radius)
-    return one, torch.where(exchanged, signed, sine).mul_(radius)
+    swapped = direction < 0
+    first = torch.where(swapped, sine, signed).mul_(radius)
+    return first, torch.where(swapped, signed, sine).mul_(radius)
 
 
 def words_at(height: int, width: int, draw: int, streams: Streams) -> tuple[Tensor, ...]:
     """The counterpart of :func:`clpipe.reference.random.words_at`: (sample, height / 4, width)."""
-    on = streams.keys.device
-    quarter = torch.arange((height + 3) // 4, device=on)[None, :, None]
-    return philox(torch.arange(width, device=on)[None, None], quarter, draw, streams)
+    device = streams.keys.device
+    quarter = torch.arange((height + 3) // 4, device=device)[None, :, None]
+    return philox(torch.arange(width, device=device)[None, None], quarter, draw, streams)
 
 
-def _rows(of_four: tuple[Tensor, ...], height: int) -> Tensor:
+def _rows(quarters: tuple[Tensor, ...], height: int) -> Tensor:
     """Interleave four tensors of every fourth row each into one of all rows."""
-    together = torch.stack(of_four, 2)
-    return together.reshape(len(together), -1, together.shape[-1])[:, :height]
+    stacked = torch.stack(quarters, 2)
+    return stacked.reshape(len(stacked), -1, stacked.shape[-1])[:, :height]
 
 
 def word_at(height: int, width: int, draw: int, streams: Streams) -> Tensor:
@@ -216,5 +216,5 @@ def normal_at(height: int, width: int, draw: int, streams: Streams) -> Tensor:
 
 def normal_of_line(count: int, streams: Streams) -> Tensor:
     """The counterpart of :func:`clpipe.reference.random.normal_of_line`: (sample, count)."""
-    places = torch.arange(count, device=streams.keys.device)[None, None]
-    return normal_of(philox(places, 0, 0, streams)[0])[:, 0]
+    indices = torch.arange(count, device=streams.keys.device)[None, None]
+    return normal_of(philox(indices, 0, 0, streams)[0])[:, 0]

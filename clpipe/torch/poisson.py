@@ -13,14 +13,14 @@ from clpipe.torch.numbers import (
     tail_probability,
 )
 
-SUMMED = 11  # terms of the CDF below its middle, for a mean of 10
+CDF_TERMS = 11  # terms of the CDF below its middle, for a mean of 10
 
 
 def poisson_of(mean: Tensor, words: Tensor) -> Tensor:
     """The counterpart of :func:`clpipe.reference.poisson.poisson_of`, without a derivative."""
     result = _large(mean.clamp(min=float(LARGE)), words)
     small = mean < float(LARGE)
-    # only there, because the sum takes most of the time
+    # Only for small means, because the sum takes most of the time.
     result[small] = _small(mean[small], words[small])
     return result
 
@@ -31,7 +31,7 @@ def _small(mean: Tensor, words: Tensor) -> Tensor:
     cdf, lower = terms[0], torch.zeros_like(mean)
     for k in range(1, TERMS + 1):
         terms.append(terms[-1] * (mean * f32(1 / k)))
-        if k <= SUMMED:
+        if k <= CDF_TERMS:
             lower = lower + (cdf < p)
             cdf = cdf + terms[-1]
     rest, upper = torch.zeros_like(mean), torch.zeros_like(mean)
@@ -48,8 +48,8 @@ def _large(mean: Tensor, words: Tensor) -> Tensor:
     terms = (w * w) * estrin(A, s) + (estrin(B, s) + estrin(C, s) * (r * r))
     v = ((mean * r) * w + terms) + (mean - whole)
     rounded = _nearest(v)
-    below = torch.where(rounded > v, rounded - 1, rounded)
-    return (whole + below).clamp(min=0)
+    floor = torch.where(rounded > v, rounded - 1, rounded)
+    return (whole + floor).clamp(min=0)
 
 
 def _nearest(v: Tensor) -> Tensor:

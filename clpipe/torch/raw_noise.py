@@ -20,11 +20,11 @@ from clpipe.chain.files import load_settings
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import overlay
 from clpipe.stage import NoiseScope
-from clpipe.torch.table import Drawn, Table
+from clpipe.torch.table import SampleDraws, Table
 
 FIRST, LAST = "crosstalk", "normalize"
-DRAWN = 1024  # chains, if values are drawn
-ROOM = 512  # px; positions on the sensor are drawn from the size of a sample plus this
+MAX_CHAINS = 1024  # chains, if values are drawn
+POSITION_RANGE = 512  # px; positions on the sensor are drawn from the size of a sample plus this
 
 
 class RawNoise(ReadOnly):
@@ -69,16 +69,16 @@ class RawNoise(ReadOnly):
         config: str | Path | Sequence[str | Path] = "default",
         **settings: Any,
     ) -> None:
-        own = camera if isinstance(camera, Mapping) else str(camera)
-        given = {**settings, "camera": own, "iso": iso, "seed": seed or 0}
-        self._settings = overlay(load_settings(*several(config)), plain(given))
+        camera_value = camera if isinstance(camera, Mapping) else str(camera)
+        values = {**settings, "camera": camera_value, "iso": iso, "seed": seed or 0}
+        self._settings = overlay(load_settings(*several(config)), plain(values))
         self._random = torch.Generator()
         if seed is None:
             self._random.seed()
         else:
             self._random.manual_seed(seed)
         self._table: Table | None = None
-        self._one = lru_cache(maxsize=DRAWN)(self._chain)
+        self._cached_chain = lru_cache(maxsize=MAX_CHAINS)(self._chain)
         Table([self._chain("")])  # rejects stages without a PyTorch version
 
     def __repr__(self) -> str:
@@ -112,53 +112,53 @@ class RawNoise(ReadOnly):
         if mosaic.dtype != torch.float32:
             raise ImageError(f"found {mosaic.dtype}; expected torch.float32 in signal units")
         if len(shape) == 3:
-            one: Tensor = self(mosaic[None], [key] if isinstance(key, str) else key)[0]
-            return one
+            single: Tensor = self(mosaic[None], [key] if isinstance(key, str) else key)[0]
+            return single
         if key is not None and (isinstance(key, str) or len(key) != len(mosaic)):
             raise RequestError(f"key: found {key!r}; expected {len(mosaic)}, one for each mosaic")
-        drawn = self._drawn(mosaic, key)
-        table = drawn.table
-        order = table.planes[torch.from_numpy(drawn.chains)].to(mosaic.device)
+        draws = self._draw(mosaic, key)
+        table = draws.table
+        order = table.planes[torch.from_numpy(draws.chains)].to(mosaic.device)
         mosaics = mosaic[:, 0] if shape[1] == 1 else _unpacked(mosaic, order)
         if shape[1] == 1 and bool((table.planes != table.planes[0]).any()):
             raise RequestError(
                 f"{self!r}: the cameras have several CFA patterns. Pass planes, (batch, 4, ...)"
             )
-        noisy = table.noisy(mosaics, drawn)
+        noisy = table.noisy(mosaics, draws)
         return noisy[:, None] if shape[1] == 1 else _packed(noisy, order)
 
-    def _drawn(self, mosaic: Tensor, keys: Sequence[str] | None) -> "Drawn":
-        """Return what is drawn for mosaics."""
+    def _draw(self, mosaic: Tensor, keys: Sequence[str] | None) -> "SampleDraws":
+        """Return the random draws for mosaics."""
         count, cell = len(mosaic), 2 if mosaic.shape[1] == 4 else 1
         size = cell * mosaic.shape[2], cell * mosaic.shape[3]
         if keys is None:
-            self._table = self._table or self._of_all()
+            self._table = self._table or self._all_chains()
             table = self._table
 
             def random(high: int, *shape: int) -> Tensor:
                 return torch.randint(high, shape, generator=self._random)
 
             chains = random(len(table.chains), count).numpy()
-            corners = (2 * random(ROOM // 2, count, 2)).tolist()
-            places = [(row, column) for row, column in corners]
-            area = size[0] + ROOM, size[1] + ROOM
-            return Drawn(table, chains, random(1 << 32, 2, count), places, area)
-        chains_of = [self._one(key) for key in keys]
-        distinct = list({id(chain): chain for chain in chains_of}.values())
-        table = Table(distinct)
+            offsets = (2 * random(POSITION_RANGE // 2, count, 2)).tolist()
+            positions = [(row, column) for row, column in offsets]
+            area = size[0] + POSITION_RANGE, size[1] + POSITION_RANGE
+            return SampleDraws(table, chains, random(1 << 32, 2, count), positions, area)
+        chains_by_key = [self._cached_chain(key) for key in keys]
+        unique_chains = list({id(chain): chain for chain in chains_by_key}.values())
+        table = Table(unique_chains)
         chains = np.array(
-            [next(i for i, c in enumerate(distinct) if c is own) for own in chains_of]
+            [next(i for i, c in enumerate(unique_chains) if c is chain) for chain in chains_by_key]
         )
         streams = [
             chain.stream(chain.steps[0].name, NoiseScope.IMAGE, key)
-            for chain, key in zip(chains_of, keys, strict=True)
+            for chain, key in zip(chains_by_key, keys, strict=True)
         ]
         words = torch.tensor([[s.key0 for s in streams], [s.key1 for s in streams]])
-        return Drawn(table, chains, words, [(0, 0)] * count, size)
+        return SampleDraws(table, chains, words, [(0, 0)] * count, size)
 
-    def _of_all(self) -> "Table":
-        """Return the chains to draw from. It is a single one if no value is drawn."""
-        count = DRAWN if self._settings.draws else 1
+    def _all_chains(self) -> "Table":
+        """Return the chains to draw from: a single chain if no value is drawn."""
+        count = MAX_CHAINS if self._settings.draws else 1
         return Table([self._chain(str(number)) for number in range(count)])
 
     def _chain(self, name: str) -> Chain:
@@ -171,7 +171,7 @@ class RawNoise(ReadOnly):
 def _unpacked(planes: Tensor, order: Tensor) -> Tensor:
     """Return the mosaics of planes, (sample, 4, height, width).
 
-    ``order`` has the plane of each pixel of a cell.
+    ``order`` is the plane of each pixel of a cell.
     """
     each = torch.arange(len(planes), device=planes.device)[:, None]
     mosaics: Tensor = functional.pixel_shuffle(planes[each, order], 2)[:, 0]
@@ -179,7 +179,7 @@ def _unpacked(planes: Tensor, order: Tensor) -> Tensor:
 
 
 def _packed(mosaics: Tensor, order: Tensor) -> Tensor:
-    """Return the planes of mosaics, in the form that :func:`_unpacked` takes."""
+    """Return the planes of mosaics, the inverse of :func:`_unpacked`."""
     each = torch.arange(len(mosaics), device=mosaics.device)[:, None]
-    places: Tensor = functional.pixel_unshuffle(mosaics[:, None], 2)
-    return places[each, order.argsort(1)]
+    cells: Tensor = functional.pixel_unshuffle(mosaics[:, None], 2)
+    return cells[each, order.argsort(1)]

@@ -1,4 +1,4 @@
-"""Many chains in parallel: the values that each stage needs of each of them, as tensors."""
+"""Many chains in parallel, with the values of each stage as tensors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,25 +17,25 @@ from clpipe.stage.signal import numbers_in
 from clpipe.torch.backend import TorchBackend
 from clpipe.torch.numbers import Streams
 
-AT_ONCE = 1 << 17  # pixels on a CPU, which fit its cache
+CPU_BATCH_PIXELS = 1 << 17  # pixels on a CPU, which fit its cache
 
 
 @dataclass(frozen=True)
-class Drawn:
+class SampleDraws:
     """The drawn values for the samples of a batch.
 
     Args:
         table: the chains.
         chains: the number of each sample's chain; (sample,).
         keys: the keys of the noise, (2, sample).
-        places: row and column of the upper left corner on the sensor.
-        area: height and width of the part of a sensor that contains the places.
+        positions: row and column of the upper left corner on the sensor.
+        area: height and width of the part of a sensor that contains the positions.
     """
 
     table: "Table"
     chains: NDArray[np.intp]
     keys: Tensor
-    places: Sequence[tuple[int, int]]
+    positions: Sequence[tuple[int, int]]
     area: tuple[int, int]
 
 
@@ -57,29 +57,29 @@ class Variant:
     numbers: dict[str, NDArray[np.float32]]
     stage: int
 
-    def noisy(self, mosaics: Tensor, drawn: Drawn, samples: NDArray[np.intp]) -> Tensor:
+    def noisy(self, mosaics: Tensor, draws: SampleDraws, samples: NDArray[np.intp]) -> Tensor:
         """Return the mosaics of a batch after this method, which changes those of its chains."""
-        chains = drawn.chains[samples]
-        has = np.array([self.steps[chain] is not None for chain in chains])
-        if not has.any():
+        chains = draws.chains[samples]
+        has_method = np.array([self.steps[chain] is not None for chain in chains])
+        if not has_method.any():
             return mosaics
-        own, on = mosaics, mosaics.device
-        if not has.all():
-            rows = torch.from_numpy(np.flatnonzero(has)).to(on)
-            own, samples, chains = mosaics[rows], samples[has], chains[has]
+        selected, device = mosaics, mosaics.device
+        if not has_method.all():
+            rows = torch.from_numpy(np.flatnonzero(has_method)).to(device)
+            selected, samples, chains = mosaics[rows], samples[has_method], chains[has_method]
         values = np.array([each[chains] for each in self.numbers.values()], np.float32)
-        tensors = torch.from_numpy(values).to(on)[..., None, None]
+        tensors = torch.from_numpy(values).to(device)[..., None, None]
         backend = TorchBackend(
             steps=[step for chain in chains if (step := self.steps[chain])],
-            streams=Streams(drawn.keys[:, torch.from_numpy(samples)].to(on), self.stage),
+            streams=Streams(draws.keys[:, torch.from_numpy(samples)].to(device), self.stage),
             sensors=[self.sensors[chain] for chain in chains],
-            places=[drawn.places[sample] for sample in samples],
-            area=drawn.area,
+            positions=[draws.positions[sample] for sample in samples],
+            area=draws.area,
             size=(mosaics.shape[1], mosaics.shape[2]),
         )
         numbers = dict(zip(self.numbers, tensors, strict=True))
-        noisy = self.method.apply(own, numbers, backend)
-        return noisy if has.all() else mosaics.index_copy(0, rows, noisy)
+        noisy = self.method.apply(selected, numbers, backend)
+        return noisy if has_method.all() else mosaics.index_copy(0, rows, noisy)
 
 
 class Table:
@@ -100,24 +100,24 @@ class Table:
             for variant in _variants(chains, position)
         ]
         # For each chain, the plane (R, Gr, Gb, B) of each site of the filter array, by rows.
-        orders = []
+        plane_orders = []
         for chain in chains:
-            named = sites(chain.context_after.pattern).values()
-            places = [2 * row.start + column.start for row, column in named]
-            orders.append(np.argsort(places))
-        self.planes = torch.from_numpy(np.stack(orders))
+            site_slices = sites(chain.context_after.pattern).values()
+            positions = [2 * row.start + column.start for row, column in site_slices]
+            plane_orders.append(np.argsort(positions))
+        self.planes = torch.from_numpy(np.stack(plane_orders))
 
-    def noisy(self, mosaics: Tensor, drawn: Drawn) -> Tensor:
+    def noisy(self, mosaics: Tensor, draws: SampleDraws) -> Tensor:
         """Return mosaics with noise, (sample, height, width)."""
-        at_once = len(mosaics)
+        batch_size = len(mosaics)
         if mosaics.device.type == "cpu":
-            at_once = max(1, AT_ONCE // (mosaics.shape[1] * mosaics.shape[2]))
+            batch_size = max(1, CPU_BATCH_PIXELS // (mosaics.shape[1] * mosaics.shape[2]))
         parts = []
-        for begin in range(0, len(mosaics), at_once):
-            part = mosaics[begin : begin + at_once]
+        for begin in range(0, len(mosaics), batch_size):
+            part = mosaics[begin : begin + batch_size]
             samples = np.arange(begin, begin + len(part))
             for variant in self._variants:
-                part = variant.noisy(part, drawn, samples)
+                part = variant.noisy(part, draws, samples)
             parts.append(part)
         return parts[0] if len(parts) == 1 else torch.cat(parts)
 
@@ -128,14 +128,14 @@ def _variants(chains: Sequence[Chain], position: int) -> list[Variant]:
     Raises:
         RequestError: a method does not run on tensors.
     """
-    found: dict[tuple[object, ...], dict[int, Step]] = {}
+    steps_by_signature: dict[tuple[object, ...], dict[int, Step]] = {}
     for number, chain in enumerate(chains):
         step = chain.steps[position]
         if passes := step.passes:
-            alike = type(step.method), *(each.function for each in passes)
-            found.setdefault(alike, {})[number] = step
+            signature = type(step.method), *(each.function for each in passes)
+            steps_by_signature.setdefault(signature, {})[number] = step
     variants = []
-    for steps in found.values():
+    for steps in steps_by_signature.values():
         number, example = next(iter(steps.items()))
         method = type(example.method)
         if not issubclass(method, SignalMethod) or not method.on_tensors():
@@ -152,6 +152,6 @@ def _variants(chains: Sequence[Chain], position: int) -> list[Variant]:
         }
         sensors = [chain.stream(example.name, NoiseScope.CAMERA, "") for chain in chains]
         stage = sensors[0].stage
-        own = [steps.get(k) for k in range(len(chains))]
-        variants.append(Variant(method, own, sensors, numbers, stage))
+        chain_steps = [steps.get(k) for k in range(len(chains))]
+        variants.append(Variant(method, chain_steps, sensors, numbers, stage))
     return variants

@@ -42,7 +42,7 @@ import numpy as np
 from clpipe.base.errors import ClpipeError
 from clpipe.base.processors import available_processors
 from clpipe.base.types import Array
-from clpipe.batch.bench import Load, write_renders
+from clpipe.batch.bench import Workload, write_renders
 from clpipe.batch.outcome import DONE
 from clpipe.batch.sinks import Folder
 from clpipe.batch.threads import Batch
@@ -142,11 +142,11 @@ def compare_arrays(device: Device, width: int, height: int, repeat: int) -> list
 class Files:
     """A set of files, which clpipe and the script develop."""
 
-    def __init__(self, device: Device, load: Load, folder: Path) -> None:
+    def __init__(self, device: Device, workload: Workload, folder: Path) -> None:
         from tools.compare.opencv_chain import OpenCVChain
 
         self.out = folder / "out"
-        write_renders(folder / "in", load)
+        write_renders(folder / "in", workload)
         request = replace(Request.from_options(), formats=("jpg",))
         self.loader = ImageLoader(request)
         self.writer = OutputWriter(self.out, request)
@@ -205,15 +205,15 @@ class Files:
 
 
 @contextmanager
-def files_of(device: Device, load: Load) -> Iterator[Files]:
-    """Provide a set of files in a temporary folder."""
+def files_of(device: Device, workload: Workload) -> Iterator[Files]:
+    """A load of files in a temporary folder."""
     with tempfile.TemporaryDirectory(prefix="clpipe-compare-") as name:
-        yield Files(device, load, Path(name))
+        yield Files(device, workload, Path(name))
 
 
-def compare_files(device: Device, load: Load, repeat: int) -> Comparison:
-    """Time files."""
-    with files_of(device, load) as files:
+def compare_files(device: Device, workload: Workload, repeat: int) -> Comparison:
+    """Files to files."""
+    with files_of(device, workload) as files:
         files.clear()
         files.clpipe(count=8)  # compiles kernels, and loads the files into the page cache
         files.choose_threads()
@@ -224,8 +224,8 @@ def compare_files(device: Device, load: Load, repeat: int) -> Comparison:
         }
         seconds = interleaved(works, repeat, files.clear)
     return Comparison(
-        f"{load.images} files of {load.width}x{load.height}, {files.threads} threads",
-        load.images * load.width * load.height / 1e6,
+        f"{workload.images} files of {workload.width}x{workload.height}, {files.threads} threads",
+        workload.images * workload.width * workload.height / 1e6,
         seconds.pop("clpipe"),
         seconds,
     )
@@ -237,9 +237,9 @@ def size_of(text: str) -> tuple[int, int]:
     return width, height
 
 
-def load_of(text: str) -> Load:
-    """Parse COUNTxWxH."""
-    return Load(*numbers_of(text, 3))
+def load_of(text: str) -> Workload:
+    """COUNTxWxH."""
+    return Workload(*numbers_of(text, 3))
 
 
 def rounds_of(text: str) -> int:
@@ -282,14 +282,8 @@ def main() -> int:
         nargs="*",
         type=load_of,
         metavar="COUNTxWxH",
-        default=[Load(20, 6000, 4000), Load(1000, 512, 512), Load(200, 1920, 1080)],
-        help="numbers and sizes of files; without values, skip this comparison",
-    )
-    parser.add_argument(
-        "--methods", action="store_true", help="also compare methods of other packages"
-    )
-    parser.add_argument(
-        "--repeat", type=rounds_of, default=5, metavar="N", help="rounds (default 5)"
+        default=[Workload(20, 6000, 4000), Workload(1000, 512, 512), Workload(200, 1920, 1080)],
+        help="numbers and sizes of files; none for no such comparison",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args()
@@ -320,7 +314,7 @@ def compare(options: argparse.Namespace) -> int:
     rows = []
     for size in options.arrays:
         rows += compare_arrays(device, *size, options.repeat)
-    rows += [compare_files(device, load, options.repeat) for load in options.files]
+    rows += [compare_files(device, workload, options.repeat) for workload in options.files]
     methods = []
     if options.methods:
         from tools.compare.methods import compare_methods

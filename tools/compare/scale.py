@@ -23,8 +23,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from clpipe.base.processors import available_processors
-from clpipe.batch.bench import Load, bench_batch, write_renders
-from clpipe.batch.processes import usual_processes
+from clpipe.batch.bench import Workload, bench_batch, write_renders
+from clpipe.batch.processes import default_processes
 from clpipe.chain.request import Request
 from clpipe.engine.device import open_device
 from clpipe.images.claims import plain_claim
@@ -86,7 +86,7 @@ def cost_of(folder: Path, images: int, processes: int) -> Cost:
     return Cost(parent, 0.0, elapsed) if processes == 1 else Cost(children, parent, elapsed)
 
 
-def locked_time(load: Load) -> float:
+def locked_time(load: Workload) -> float:
     """Return an upper bound of the time per image under the interpreter's lock, in ms.
 
     It is the CPU time of all threads outside of decoding, hashing, kernels, encoding and writing.
@@ -125,15 +125,15 @@ def main() -> None:
         width, height = map(int, text.split("x"))
         with tempfile.TemporaryDirectory(prefix="clpipe-scale-") as name:
             folder = Path(name)
-            write_renders(folder / "in", Load(options.images, width, height))
+            write_renders(folder / "in", Workload(options.images, width, height))
             run(folder, FEW, 1)  # compiles kernels and loads files
-            lock = locked_time(Load(options.images, width, height))
+            lock = locked_time(Workload(options.images, width, height))
             costs = {count: cost_of(folder, options.images, count) for count in COUNTS}
         for count, cost in costs.items():
             numbers = f"{cost.cpu:.2f} | {cost.parent:.2f} | {1e3 / cost.elapsed:.0f}"
             print(f"| {text} | {lock:.2f} | {count} | {numbers} |", flush=True)
         claim = plain_claim(width, height)
-        usual = usual_processes(10**6, claim, options.processors)
+        usual = default_processes(10**6, claim, options.processors)
         single = modelled(costs[1], lock, options.processors, 1)
         shared = modelled(costs[here if here in costs else 2], lock, options.processors, usual)
         models.append(f"| {text} | {single:.0f} | {usual} | {shared:.0f} |")

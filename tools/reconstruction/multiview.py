@@ -14,8 +14,8 @@ from PIL import Image
 
 from clpipe.base.types import Array, Doubles, Mask
 from clpipe.chain.rendition import NOISY
-from clpipe.outputs.photographs import Photograph
-from clpipe.outputs.views import COLMAP, colmap
+from clpipe.outputs.camera_formats import COLMAP, colmap
+from clpipe.outputs.output_pictures import OutputPicture
 from clpipe.reference.intrinsics import PINHOLE, Intrinsics
 from tools.reconstruction.views import SAME, View
 
@@ -90,7 +90,7 @@ def write_colmap(folder: Path, views: Sequence[View], pictures: Sequence[Array])
     """
     (folder / "images").mkdir(parents=True, exist_ok=True)
     (folder / COLMAP).mkdir(parents=True, exist_ok=True)
-    photographs = []
+    output_pictures = []
     for view, picture in zip(views, pictures, strict=True):
         name = f"{view.name}.png"
         Image.fromarray(picture).save(folder / "images" / name)
@@ -98,8 +98,8 @@ def write_colmap(folder: Path, views: Sequence[View], pictures: Sequence[Array])
         fx, fy, cx, cy = view.k[0, 0], view.k[1, 1], view.k[0, 2], view.k[1, 2]
         camera = Intrinsics(width, height, fx, fy, cx, cy, PINHOLE, {})
         pose = tuple(map(tuple, view.r.tolist())), tuple(view.t.tolist())
-        photographs.append(Photograph(name, NOISY, camera, pose))
-    for name, text in colmap(photographs, photographs, {}).items():
+        output_pictures.append(OutputPicture(name, NOISY, camera, pose))
+    for name, text in colmap(output_pictures, output_pictures, {}).items():
         (folder / name).write_text(text, encoding="utf-8")
 
 

@@ -82,7 +82,7 @@ def readers(suffix: str) -> tuple[Callable[[Path], object], ...]:
     from clpipe.analysis.noise_models.read import import_camera
     from clpipe.analysis.pictures import load_picture
     from clpipe.batch.replay import replay_of
-    from clpipe.batch.tars import Members, is_own
+    from clpipe.batch.tars import Members, is_clpipe_tar
     from clpipe.camera.profile import load_camera
     from clpipe.chain.files import load_settings
     from clpipe.chain.making import make_chain
@@ -94,7 +94,7 @@ def readers(suffix: str) -> tuple[Callable[[Path], object], ...]:
     from clpipe.inputs.find import Job
     from clpipe.inputs.loader import ImageLoader
     from clpipe.inputs.manifest import check_rows, read_manifest
-    from clpipe.inputs.poses import with_views
+    from clpipe.inputs.poses import assign_views
     from clpipe.outputs.sidecar import read_sidecar
 
     def loading(**options: object) -> Callable[[Path], object]:
@@ -112,7 +112,7 @@ def readers(suffix: str) -> tuple[Callable[[Path], object], ...]:
 
     def members(path: Path) -> object:
         tar = Members(path)
-        return [tar.sidecar(name) for name in tar.places], is_own(path)
+        return [tar.sidecar(name) for name in tar.places], is_clpipe_tar(path)
 
     def layers(path: Path) -> object:
         return [read_layer(path, layer, MAX_PIXELS) for layer in find_layers(path)[:8]]
@@ -124,7 +124,7 @@ def readers(suffix: str) -> tuple[Callable[[Path], object], ...]:
         return check_rows(read_manifest(path), settings_from({}))
 
     def poses(path: Path) -> object:
-        return with_views([Job(Path("a.exr"), "a.exr")], path, RenderCamera())
+        return assign_views([Job(Path("a.exr"), "a.exr")], path, RenderCamera())
 
     noise_model = partial(import_camera, camera=None, output=None)
     report = setting("picture_noise", "intensity_dependent", "measured")

@@ -1,4 +1,4 @@
-"""File names in settings. A page may only use those that the command line named."""
+"""File names in settings. A page may only use file names from the command line."""
 
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
@@ -38,14 +38,14 @@ def texts_in(value: Any) -> Iterator[str]:
             yield from texts_in(each)
 
 
-def check_named(values: Mapping[str, Any], named: Collection[str]) -> None:
-    """Check that values name only files in ``named``.
+def check_file_names(values: Mapping[str, Any], allowed_files: Collection[str]) -> None:
+    """Check that values contain only file names in ``allowed_files``.
 
     Raises:
         KeyedError: a value names another file.
     """
     for key, name in files_in(values):
-        if name not in named:
+        if name not in allowed_files:
             what = "a built-in camera or a file" if key == "camera" else "a file"
             raise KeyedError(
                 key,

@@ -11,13 +11,14 @@ from clpipe.chain.formats import DNG, ending_of
 from clpipe.chain.render_camera import Matrix, Vector
 from clpipe.chain.rendition import BASELINES, NOISY, PICTURES, Rendition, Role
 from clpipe.outputs.carried import carried_files
-from clpipe.outputs.sidecar import SIDECAR, SidecarError, outputs_in, sidecar_files, values_at
+from clpipe.outputs.sidecar import SIDECAR, SidecarError, output_entries, sidecar_files, values_at
 from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
 
-# A training set has one kind of picture: noisy ones are in the folder, others in models/.
+# A training set has one kind of picture. The cameras of noisy pictures are at the top of the
+# output directory, and those of other kinds in models/.
 OTHERS = (*PICTURES, *BASELINES)
 
-MODELS = {NOISY: "", **{role: f"models/{Rendition(role).label[1:]}/" for role in OTHERS}}
+MODEL_FOLDERS = {NOISY: "", **{role: f"models/{Rendition(role).label[1:]}/" for role in OTHERS}}
 
 CHANGED = "with a sidecar that was changed after clpipe wrote it"
 
@@ -28,18 +29,18 @@ TABLE: TypeAdapter[dict[str, Any] | None] = TypeAdapter(dict[str, Any] | None)
 
 
 @dataclass(frozen=True)
-class Photograph:
+class OutputPicture:
     """A picture of an output directory.
 
     Args:
         file: its path in the directory.
         role: the role of its rendition.
         camera: its intrinsics.
-        pose: R and t; None if they are not known.
+        pose: R, (3, 3), and t, (3,), from world to camera; None if they are not known.
         photometry: see :func:`clpipe.chain.photometry.photometry_of`.
         motion: see :func:`clpipe.outputs.motion.motion_records`.
         name: the name of its image in the sidecar.
-        depth: the path of the PNG of its depth in millimetres; "" if there is none.
+        depth: the path of its depth PNG in millimetres; "" if there is none.
     """
 
     file: str
@@ -52,42 +53,42 @@ class Photograph:
     depth: str = ""
 
 
-def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Photograph]:
+def output_pictures(folder: Path, skipped: Mapping[str, list[str]]) -> Iterator[OutputPicture]:
     """Yield the pictures that the sidecars of a folder list, in the first format except DNG.
 
     They include frames of bursts and exposures of brackets, but no mosaics.
 
     Args:
         folder: the output directory.
-        left_out: receives the names of pictures that are skipped, by reason.
+        skipped: receives the names of pictures that are skipped, by reason.
     """
     for path in sidecar_files(folder):
         shown = path.relative_to(folder).as_posix()
         try:
             values = values_at(path)
             role = values and Rendition.from_record(values).role
-            file = values and picture_of(path, values) if role in MODELS else None
+            file = values and picture_of(path, values) if role in MODEL_FOLDERS else None
             if not values or not role or not file:
                 continue
             shown = file.relative_to(folder).as_posix()
             if values["intrinsics"] is None:
-                left_out["without known intrinsics, so in none of the files"].append(shown)
+                skipped["without known intrinsics, so in none of the files"].append(shown)
                 continue
             camera = CAMERA.validate_python(values["intrinsics"])
             pose = values["pose"]
-            r_and_t = pose and POSE.validate_python((pose["R"], pose["t"]))
+            pose_values = pose and POSE.validate_python((pose["R"], pose["t"]))
             layers, files = values.get("carried", ()), carried_files(values)
             depths = [files.get(each["layer"]) for each in layers if each["kind"] == "depth"]
             depth = next((Path(shown).with_name(name).as_posix() for name in depths if name), "")
-            told = *_light_and_motion(values), str(values["name"]), depth
-            yield Photograph(shown, role, simplest(camera), r_and_t, *told)
+            remaining = *_photometry_and_motion(values), str(values["name"]), depth
+            yield OutputPicture(shown, role, simplest_model(camera), pose_values, *remaining)
         except SidecarError:
-            left_out[f"{CHANGED}, so not used; repeat the same clpipe run"].append(shown)
+            skipped[f"{CHANGED}, so not used; repeat the same clpipe run"].append(shown)
         except (KeyError, TypeError, ValueError):
-            left_out["with a sidecar that is damaged or of another version"].append(shown)
+            skipped["with a sidecar that is damaged or of another version"].append(shown)
 
 
-def _light_and_motion(
+def _photometry_and_motion(
     values: Mapping[str, Any],
 ) -> tuple[Mapping[str, Any] | None, Mapping[str, Any] | None]:
     """Return the photometry of a sidecar's picture, and the motion during its exposure.
@@ -116,24 +117,24 @@ def picture_of(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
     if not formats:
         return None
     file = sidecar.with_name(f"{sidecar.name.removesuffix(SIDECAR)}{ending_of(formats[0])}")
-    return file if file.name in outputs_in(values) and file.exists() else None
+    return file if file.name in output_entries(values) and file.exists() else None
 
 
-def simplest(camera: Intrinsics) -> Intrinsics:
-    """Return the same camera in the simplest of COLMAP's models that can describe it.
+def simplest_model(camera: Intrinsics) -> Intrinsics:
+    """Return the camera in the simplest COLMAP model that describes it exactly.
 
     Raises:
         KeyError: there is no such model.
 
     >>> camera = Intrinsics(4, 3, 5, 5, 2, 1.5, "FULL_OPENCV", {"k1": 0.1, "k2": 0.0, "k4": 0.0})
-    >>> simplest(camera).model, simplest(camera).distortion["k1"]
+    >>> simplest_model(camera).model, simplest_model(camera).distortion["k1"]
     ('OPENCV', 0.1)
     """
-    bent = {name for name, value in camera.distortion.items() if value}
+    nonzero = {name for name, value in camera.distortion.items() if value}
     simple = () if camera.model == OPENCV_FISHEYE else (PINHOLE, OPENCV)
-    model = next((each for each in simple if bent <= {*COEFFICIENTS[each]}), camera.model)
-    own = {name: camera.distortion.get(name, 0.0) for name in COEFFICIENTS[model]}
-    return replace(camera, model=model, distortion=own)
+    model = next((each for each in simple if nonzero <= {*COEFFICIENTS[each]}), camera.model)
+    coefficients = {name: camera.distortion.get(name, 0.0) for name in COEFFICIENTS[model]}
+    return replace(camera, model=model, distortion=coefficients)
 
 
 def lens_record(camera: Intrinsics) -> dict[str, Any]:

@@ -17,10 +17,10 @@ from clpipe.base.files import passing_files, whole_file
 from clpipe.engine.runner import is_planar
 from clpipe.images.read import SourceImage
 
-OPEN = 4096  # files that a process maps at most
+MAX_OPEN = 4096  # files that a process maps
 
 
-class SharedRenders:
+class RenderCache:
     """Decoded renders in files that every process maps into its memory.
 
     Each worker of a ``DataLoader`` gets a copy of the dataset with the path of the cache. Workers
@@ -35,8 +35,8 @@ class SharedRenders:
         RequestError: the temporary directory cannot be created.
 
     >>> image = SourceImage(np.ones((2, 3, 3), np.float16), "", "", (), {})
-    >>> renders = SharedRenders(100)
-    >>> [renders.get(key, lambda: image).pixels.shape for key in "aabc"], renders.taken
+    >>> renders = RenderCache(100)
+    >>> [renders.get(key, lambda: image).pixels.shape for key in "aabc"], renders.size_in_bytes
     ([(2, 3, 3), (2, 3, 3), (2, 3, 3), (2, 3, 3)], 72)
     """
 
@@ -55,10 +55,10 @@ class SharedRenders:
             weakref.finalize(self, _remove, self._folder, os.getpid())
 
     def __reduce__(self) -> tuple[object, ...]:
-        return _shared, (self._size, self._folder)
+        return _reopen, (self._size, self._folder)
 
     @property
-    def taken(self) -> int:
+    def size_in_bytes(self) -> int:
         """The bytes of all pixels in the cache."""
         # Names with a leading dot are unfinished files.
         files = list(self._folder.glob("[!.]*.npy")) if self._folder else []
@@ -76,52 +76,54 @@ class SharedRenders:
         if key in self._opened:
             return self._opened[key]
         name = blake2b(repr(key).encode("utf-8", "surrogatepass"), digest_size=16).hexdigest()
-        place = self._folder / name
-        if (mapped := _mapped(place)) is None:
+        path = self._folder / name
+        if (opened := _open_mapped(path)) is None:
             source = decode()
-            if self.taken + source.pixels.nbytes > self._size or not _keep(place, source):
+            if self.size_in_bytes + source.pixels.nbytes > self._size or not _write(path, source):
                 return source
-            mapped = _mapped(place) or source
-        if len(self._opened) >= OPEN:
+            opened = _open_mapped(path) or source
+        if len(self._opened) >= MAX_OPEN:
             self._opened.clear()
-        self._opened[key] = mapped
-        return mapped
+        self._opened[key] = opened
+        return opened
 
 
 HEADER = 128  # bytes of the header of .npy files
 
 
-def _mapped(place: Path) -> SourceImage | None:
-    """Return the render in a place of the cache, or None."""
+def _open_mapped(path: Path) -> SourceImage | None:
+    """Return the render at a path in the cache, memory-mapped, or None."""
     try:
-        with place.with_suffix(".pickle").open("rb") as file:
+        with path.with_suffix(".pickle").open("rb") as file:
             source, planar = pickle.load(file)  # noqa: S301  # written by this user
-        pixels = np.asarray(np.load(place.with_suffix(".npy"), mmap_mode="r"))
+        pixels = np.asarray(np.load(path.with_suffix(".npy"), mmap_mode="r"))
     except OSError:
         return None
     return replace(source, pixels=pixels.transpose(1, 2, 0) if planar else pixels)
 
 
-def _keep(place: Path, source: SourceImage) -> bool:
-    """Write a render to a place of the cache. Return whether that worked."""
+def _write(path: Path, source: SourceImage) -> bool:
+    """Write a render to a path in the cache, and return whether this succeeded."""
     planar, pixels = is_planar(source.pixels), source.pixels
-    rest = replace(source, pixels=np.broadcast_to(pixels[:1, :1], (1, 1, *pixels.shape[2:])))
+    without_pixels = replace(
+        source, pixels=np.broadcast_to(pixels[:1, :1], (1, 1, *pixels.shape[2:]))
+    )
     try:
         with passing_files():
-            with whole_file(place.with_suffix(".npy")) as file:
+            with whole_file(path.with_suffix(".npy")) as file:
                 np.save(file, pixels.transpose(2, 0, 1) if planar else pixels)
             with whole_file(
-                place.with_suffix(".pickle")
+                path.with_suffix(".pickle")
             ) as file:  # last, so the other file is complete
-                pickle.dump((rest, planar), file)
+                pickle.dump((without_pixels, planar), file)
     except (ImageError, OSError):
         return False
     return True
 
 
-def _shared(size: int, folder: Path | None) -> SharedRenders:
+def _reopen(size: int, folder: Path | None) -> RenderCache:
     """Return the cache of another process, or a new one if it is on another machine."""
-    renders = SharedRenders(0 if folder and folder.is_dir() else size)
+    renders = RenderCache(0 if folder and folder.is_dir() else size)
     if folder and not renders._folder:
         renders._size, renders._folder = size, folder
     return renders

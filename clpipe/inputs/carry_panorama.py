@@ -1,4 +1,4 @@
-"""Carried layers of panoramas: put into one atlas, and warped like the picture."""
+"""Carried layers of panoramas: combined in one atlas, and warped like the picture."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,9 +13,15 @@ from clpipe.chain.panorama import projection_of
 from clpipe.images.passes import cryptomatte_attributes
 from clpipe.images.pixels import display_window
 from clpipe.images.read import SourceImage
-from clpipe.inputs.around import pieces
-from clpipe.inputs.carry import Aov, Aovs, geometry_of, read_found, record_of
-from clpipe.inputs.companions import find_all
+from clpipe.inputs.carry import (
+    CarriedLayer,
+    CarriedLayers,
+    geometry_of,
+    read_layer_samples,
+    record_of,
+)
+from clpipe.inputs.companions import find_carried_layers
+from clpipe.inputs.panoramas import pieces
 from clpipe.reference.carried import Layer, warp
 from clpipe.reference.geometry import Composition, Geometry
 from clpipe.reference.panorama import LatitudeLongitude, Panorama, Views
@@ -24,18 +30,18 @@ from clpipe.reference.projection import Projection
 DISTANCE = "Distance"
 
 
-def carry_around(
+def carry_panorama(
     paths: Sequence[Path],
     source: SourceImage,
     chain: Chain,
     layers: Sequence[AovSpec],
     max_pixels: int,
     orientation: int = 1,
-) -> Aovs:
+) -> CarriedLayers:
     """Return the layers of a panorama, warped like its picture.
 
-    Depth along the axis of each view becomes depth along the picture's axis. It is 0 at right
-    angles to that axis, and negative beyond. The distance is added, as a channel "Distance". The
+    Depth along the axis of each view is converted to depth along the picture's axis. It is 0 at
+    right angles to that axis, and negative at larger angles. The channel "Distance" is added. The
     depth of a latitude-longitude map is a distance already. Normals are in world space and do not
     change.
 
@@ -45,7 +51,7 @@ def carry_around(
         chain: the chain whose stages move pixels.
         layers: the layers to carry.
         max_pixels: a file with more pixels is rejected before it is read.
-        orientation: EXIF's value by which the picture is rotated at the end.
+        orientation: the EXIF orientation that is applied to the picture at the end.
 
     Raises:
         ImageError: as for :func:`clpipe.inputs.carry.carry`, or the files have different layers.
@@ -53,22 +59,22 @@ def carry_around(
     panorama, projection = source.panorama, projection_of(chain)
     assert panorama
     assert projection
-    of_files = [find_all(path, layers) for path in paths]
-    names = [[(each.name, each.kind, each.channels) for each in found] for found in of_files]
-    for path, own in zip(paths, names, strict=True):
-        if own != names[0]:
+    sources_by_file = [find_carried_layers(path, layers) for path in paths]
+    names = [[(each.name, each.kind, each.channels) for each in found] for found in sources_by_file]
+    for path, layer_names in zip(paths, names, strict=True):
+        if layer_names != names[0]:
             raise ImageError(
                 f"{path}: the layers of this file differ from those of {paths[0]}; render all "
                 "views of a panorama with the same layers"
             )
     size = file_size(panorama, len(paths))
     read = []
-    for same in zip(*of_files, strict=True):
+    for matching in zip(*sources_by_file, strict=True):
         images: list[Array] = []
-        for path, each in zip(paths, same, strict=True):
-            pixels, place = read_found(each, path, size, max_pixels)
+        for path, each in zip(paths, matching, strict=True):
+            pixels, place = read_layer_samples(each, path, size, max_pixels)
             images += pieces(panorama, display_window(pixels, *place, *size))
-        first = same[0]
+        first = matching[0]
         if first.kind == "depth" and isinstance(panorama, Views):
             images = [
                 (image * view.lengths()[..., None]).astype(np.float32)
@@ -77,24 +83,24 @@ def carry_around(
         filter_ = {"label": "nearest", "flow": ""}.get(first.kind, "linear")
         read.append(Layer(first.kind, panorama.atlas(images, filter_), vectors=first.vectors))
     geometry = geometry_of(chain, orientation)
-    moved, valid = warp(read, geometry, *source.pixels.shape[1::-1])
-    ahead = _ahead(geometry, projection, source.pixels.shape[1::-1])
-    carried: list[Aov] = []
-    for each, pixels in zip(of_files[0], moved, strict=True):
+    warped, valid = warp(read, geometry, *source.pixels.shape[1::-1])
+    axial_depth = _axial_depth(geometry, projection, source.pixels.shape[1::-1])
+    carried: list[CarriedLayer] = []
+    for each, pixels in zip(sources_by_file[0], warped, strict=True):
         record = record_of(paths[0], each)
         if each.kind != "depth":
-            carried.append(Aov(each.name, each.kind, each.channels, pixels, record))
+            carried.append(CarriedLayer(each.name, each.kind, each.channels, pixels, record))
             continue
-        along = (pixels * ahead[..., None]).astype(np.float32)
-        carried.append(Aov(each.name, each.kind, each.channels, along, record))
+        depth = (pixels * axial_depth[..., None]).astype(np.float32)
+        carried.append(CarriedLayer(each.name, each.kind, each.channels, depth, record))
         layer = each.channels[0].rpartition(".")[0] or each.name
         name, channel = f"{each.name}.{DISTANCE}", f"{layer}.{DISTANCE}"
         record = {**record, "layer": name, "channels": [channel]}
-        carried.append(Aov(name, each.kind, (channel,), pixels, record))
+        carried.append(CarriedLayer(name, each.kind, (channel,), pixels, record))
     attributes: dict[str, str] = {}
-    for each in of_files[0]:
+    for each in sources_by_file[0]:
         attributes |= cryptomatte_attributes(each.file, each.location.part)
-    return Aovs(tuple(carried), valid, attributes)
+    return CarriedLayers(tuple(carried), valid, attributes)
 
 
 def file_size(panorama: Panorama, files: int) -> tuple[int, int]:
@@ -106,11 +112,11 @@ def file_size(panorama: Panorama, files: int) -> tuple[int, int]:
     return first.width, first.height * len(panorama.views) // files
 
 
-def _ahead(geometry: Geometry | None, projection: Projection, size: tuple[int, int]) -> Array:
+def _axial_depth(geometry: Geometry | None, projection: Projection, size: tuple[int, int]) -> Array:
     """Return the depth of a point at distance 1 from the camera: (height, width)."""
     assert isinstance(geometry, Composition)
     columns, rows = geometry.size(*size)
     y, x = np.mgrid[:rows, :columns] + 0.5
-    rest = Composition(geometry.parts[1:])
-    x, y = rest.origins(x, y, *projection.size(*size))
+    after_projection = Composition(geometry.parts[1:])
+    x, y = after_projection.origins(x, y, *projection.size(*size))
     return np.nan_to_num(projection.lens.rays(x, y)[2])

@@ -16,7 +16,7 @@ from clpipe.inputs.companions import SEPARATORS
 from clpipe.inputs.find import Job
 from clpipe.inputs.poses import stem_of
 from clpipe.inputs.render_cameras import read_views
-from clpipe.inputs.subframes import check_values, of_files
+from clpipe.inputs.subframes import check_values, with_file_records
 from clpipe.reference.panorama import (
     CUBE,
     OPENEXR_CUBE,
@@ -31,7 +31,7 @@ from clpipe.stages.projection import Wide
 
 FACES = 6
 RIGHT_ANGLE = 90.0
-ONE_POINT = 1e-6  # cameras may be this far apart, relative to their largest coordinate
+POSITION_TOLERANCE = 1e-6  # cameras may be this far apart, relative to their largest coordinate
 
 CUBE_MAP, LATITUDE_LONGITUDE = "CubeFace Environment", "LatLong Environment"
 
@@ -57,21 +57,21 @@ class Rig:
             return View.of_angle(rotation, width, height, self.angle)
         return View(rotation, *camera, width, height)
 
-    def called(self, path: Path) -> tuple[str, str] | None:
-        """Split a file's stem into its own name and that of its view; None if it has no view.
+    def split_name(self, path: Path) -> tuple[str, str] | None:
+        """Split a file's stem into the panorama's name and the view's name, or return None.
 
-        >>> Rig({"front": ()}).called(Path("a/view00_front.exr"))
+        >>> Rig({"front": ()}).split_name(Path("a/view00_front.exr"))
         ('view00', 'front')
         """
         for name in self.views:
-            before = path.stem[: -len(name)]
-            if path.stem.endswith(name) and len(before) > 1 and before[-1] in SEPARATORS:
-                return before[:-1], name
+            prefix = path.stem[: -len(name)]
+            if path.stem.endswith(name) and len(prefix) > 1 and prefix[-1] in SEPARATORS:
+                return prefix[:-1], name
         return None
 
 
-def wide_of(settings: Settings) -> Wide | None:
-    """Return the wide lens of the chain, which views panoramas; None if there is none."""
+def wide_lens_of(settings: Settings) -> Wide | None:
+    """Return the wide lens of a chain, which projects panoramas, or None."""
     name = stage_in(StageRole.VIEW).name
     if name not in settings.step_names:
         return None
@@ -79,7 +79,7 @@ def wide_of(settings: Settings) -> Wide | None:
     return method if isinstance(method, Wide) else None
 
 
-def rig_of(wide: Wide) -> Rig:
+def rig_for(wide: Wide) -> Rig:
     """Return the rig of a wide lens: the one in its file ``views``, or a cube.
 
     Raises:
@@ -87,29 +87,29 @@ def rig_of(wide: Wide) -> Rig:
             one point.
     """
     if wide.views is None:
-        return Rig({name: (turn, None) for name, turn in CUBE.items()}, _angle(wide))
-    path, place = Path(wide.views), f"{stage_in(StageRole.VIEW).name}.views"
+        return Rig({name: (rotation, None) for name, rotation in CUBE.items()}, _angle(wide))
+    path, parameter = Path(wide.views), f"{stage_in(StageRole.VIEW).name}.views"
     try:
         read = read_views(path)
     except RequestError as error:
-        raise RequestError(str(error).replace("--poses", place, 1)) from None
+        raise RequestError(str(error).replace("--poses", parameter, 1)) from None
     views: dict[str, tuple[Rotation, tuple[float, float, float, float] | None]] = {}
     points = []
     for each in read:
-        known = each.values
-        camera = tuple(float(known.get(key, 0)) for key in ("fx", "fy", "cx", "cy"))
-        if each.problem or not all(camera[:2]) or "rotation" not in known:
-            why = each.problem or "fx, fy, cx, cy or its pose is missing; add them to the file"
-            raise RequestError(f"{place} {path}: view {each.name}: {why}")
-        of_camera = np.array(known["rotation"], float)
-        points.append(-of_camera.T @ np.array(known["translation"], float))
-        turn = tuple(tuple(map(float, row)) for row in of_camera.T)
-        views[PurePosixPath(stem_of(each.name)).name] = turn, camera  # type: ignore[assignment]
-    spread = np.ptp(points, 0).max()
-    if spread > ONE_POINT * max(abs(np.array(points)).max(), 1):
+        values = each.values
+        camera = tuple(float(values.get(key, 0)) for key in ("fx", "fy", "cx", "cy"))
+        if each.problem or not all(camera[:2]) or "rotation" not in values:
+            problem = each.problem or "fx, fy, cx, cy or its pose is missing; add them to the file"
+            raise RequestError(f"{parameter} {path}: view {each.name}: {problem}")
+        camera_rotation = np.array(values["rotation"], float)
+        points.append(-camera_rotation.T @ np.array(values["translation"], float))
+        rotation = tuple(tuple(map(float, row)) for row in camera_rotation.T)
+        views[PurePosixPath(stem_of(each.name)).name] = rotation, camera  # type: ignore[assignment]
+    distance = np.ptp(points, 0).max()
+    if distance > POSITION_TOLERANCE * max(abs(np.array(points)).max(), 1):
         raise RequestError(
-            f"{place} {path}: its cameras are up to {spread:g} apart, but the views of a panorama "
-            "are taken from one point; render them all from the same position"
+            f"{parameter} {path}: its cameras are up to {distance:g} apart, but the views of a "
+            "panorama are taken from one point; render them all from the same position"
         )
     return Rig(views, source=str(path))
 
@@ -118,33 +118,33 @@ def _angle(wide: Wide) -> float:
     return wide.face_angle or RIGHT_ANGLE
 
 
-def grouped(jobs: Sequence[Job], wide: Wide | None) -> list[Job]:
+def group_panoramas(jobs: Sequence[Job], wide: Wide | None) -> list[Job]:
     """Return the jobs, with the files of one panorama joined into one job.
 
-    That job has the files' name without the name of the view. A file that is not a view stays a job
-    of its own.
+    That job has the files' name without the name of the view. A file that is not a view stays a
+    separate job.
 
     Raises:
         RequestError: the files are sub-frames, or their values differ.
     """
     if wide is None:
         return list(jobs)
-    rig = rig_of(wide)
-    places: dict[object, list[tuple[str, Job]]] = {}
+    rig = rig_for(wide)
+    groups: dict[object, list[tuple[str, Job]]] = {}
     for job in jobs:
-        found = None if job.around else rig.called(job.path)
-        place = id(job) if found is None else (job.path.parent, found[0], job.path.suffix)
-        places.setdefault(place, []).append((found[1] if found else "", job))
+        found = None if job.is_panorama else rig.split_name(job.path)
+        group_key = id(job) if found is None else (job.path.parent, found[0], job.path.suffix)
+        groups.setdefault(group_key, []).append((found[1] if found else "", job))
     result = []
     order = list(rig.views)
-    for own in places.values():
-        name, first = own[0]
+    for group in groups.values():
+        name, first = group[0]
         if not name:
             result.append(first)
             continue
-        (name, first), *others = sorted(own, key=lambda each: order.index(each[0]))
+        (name, first), *others = sorted(group, key=lambda each: order.index(each[0]))
         check_values([first, *(job for _, job in others)], "seen from the same point")
-        if any(job.subframes for _, job in own):
+        if any(job.subframes for _, job in group):
             raise RequestError(
                 f"{first.path}: a view of a panorama cannot also be a sub-frame; set "
                 f"{stage_in(StageRole.SHUTTER).name}.subframes=1"
@@ -156,13 +156,13 @@ def grouped(jobs: Sequence[Job], wide: Wide | None) -> list[Job]:
                 first,
                 key=str(key.with_name(f"{stem}{key.suffix}")),
                 subframes=tuple(job.path for _, job in others),
-                around=True,
+                is_panorama=True,
             )
         )
     return result
 
 
-def read_around(job: Job, read: Callable[[Path], SourceImage], wide: Wide) -> SourceImage:
+def read_panorama(job: Job, read: Callable[[Path], SourceImage], wide: Wide) -> SourceImage:
     """Return the image of a job for a wide lens: an atlas of all views, with its panorama.
 
     A render that is not a panorama, according to its header and name, is returned unchanged.
@@ -187,13 +187,13 @@ def read_around(job: Job, read: Callable[[Path], SourceImage], wide: Wide) -> So
         return first
     images = [piece for each in sources for piece in pieces(panorama, each.pixels)]
     atlas = panorama.atlas(images, wide.filter)
-    return of_files(replace(first, pixels=atlas, panorama=panorama), job, sources)
+    return with_file_records(replace(first, pixels=atlas, panorama=panorama), job, sources)
 
 
 def panorama_of(
     paths: Sequence[Path], wide: Wide, envmap: str, width: int, height: int
 ) -> Panorama | None:
-    """Return the panorama that files form; None for a single view, which any render can be.
+    """Return the panorama that files form, or None for a single view, which any render can be.
 
     Args:
         paths: the files.
@@ -212,10 +212,10 @@ def panorama_of(
                 f"{paths[0]}: this cube map has {width}x{height} pixels, but its height must be "
                 f"{FACES} times its width, for six faces stacked vertically"
             )
-        place = (width - 1) / 2, (width - 1) / 2, width / 2, width / 2
-        return Views(tuple(View(turn, *place, width, width) for turn in OPENEXR_CUBE))
-    rig = rig_of(wide)
-    names = [rig.called(path) for path in paths]
+        intrinsics = (width - 1) / 2, (width - 1) / 2, width / 2, width / 2
+        return Views(tuple(View(rotation, *intrinsics, width, width) for rotation in OPENEXR_CUBE))
+    rig = rig_for(wide)
+    names = [rig.split_name(path) for path in paths]
     if not all(names):
         return None
     return Views(tuple(rig.view(name[1], width, height) for name in names if name))

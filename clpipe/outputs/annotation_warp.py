@@ -20,65 +20,65 @@ from clpipe.reference.geometry import (
 )
 from clpipe.reference.intrinsics import Intrinsics
 
-STEP = 2.0  # px: the length of the segments into which an outline is divided
-SIMPLER = 0.05  # px: the tolerance with which a mapped outline is simplified
-MOST_PLACES = 4096  # of a mask, sampled to find how much of it is cut off
-LEAST = 0.5  # px^2: an object whose visible area is smaller is dropped
+SEGMENT_LENGTH = 2.0  # px: the length of the segments into which an outline is divided
+SIMPLIFY_TOLERANCE = 0.05  # px: the tolerance with which a mapped outline is simplified
+MAX_SAMPLES = 4096  # pixels of a mask that are sampled to estimate how much of it is cut off
+MIN_AREA = 0.5  # px^2: an object whose visible area is smaller is dropped
 
 
 @dataclass(frozen=True)
-class Way:
+class PixelMapping:
     """The mapping from points of a render to points of a picture.
 
     Args:
         geometry: how pixels move; None if they do not.
         width, height: size of the render in px, without overscan.
         margins: the overscan of the render.
-        after: width and height of the picture in px.
+        picture_size: width and height of the picture in px.
     """
 
     geometry: Geometry | None
     width: int
     height: int
     margins: Margins
-    after: tuple[int, int]
+    picture_size: tuple[int, int]
 
-    def places(self, points: Array) -> Doubles:
-        """Return the picture's x and y of points of the render; NaN if they cannot be shown.
+    def map_points(self, points: Array) -> Doubles:
+        """Return x and y of points in the picture, or NaN where the mapping is undefined.
 
         Args:
-            points: x and y in px from the render's corner, (point, 2).
+            points: x and y in px from the render's top left corner, (point, 2).
         """
         corner = np.array([self.margins.left, self.margins.top])
         at = (np.asarray(points, np.float64) + corner).T
         if self.geometry is None:
             return np.asarray(at.T)
         whole = self.margins.around(self.width, self.height)
-        start = at * (np.array(self.after) / np.array(whole))[:, None]
-        there = destinations(self.geometry, (at[0], at[1]), (start[0], start[1]), *whole)
-        return np.stack(there, -1)
+        start = at * (np.array(self.picture_size) / np.array(whole))[:, None]
+        mapped = destinations(self.geometry, (at[0], at[1]), (start[0], start[1]), *whole)
+        return np.stack(mapped, -1)
 
-    def shows(self, points: Array, there: Doubles) -> Mask:
-        """Return whether each point is inside both the render and the picture.
+    def is_visible(self, points: Array, mapped: Doubles) -> Mask:
+        """Return for each point whether it is inside both the render and the picture.
 
         Args:
             points: x and y in the render, (point, 2).
-            there: x and y in the picture, (point, 2).
+            mapped: x and y in the picture, (point, 2).
         """
         left, top, right, bottom = self.margins
         low, high = [-left, -top], [self.width + right, self.height + bottom]
         with np.errstate(invalid="ignore"):
-            inside = (there >= 0) & (there <= np.array(self.after))
+            inside = (mapped >= 0) & (mapped <= np.array(self.picture_size))
         return np.asarray((inside & (points >= low) & (points <= high)).all(-1))
 
     @property
-    def is_turned(self) -> bool:
+    def is_reoriented(self) -> bool:
         """Whether the picture is flipped or rotated."""
         parts = self.geometry.parts if isinstance(self.geometry, Composition) else ()
         return any(isinstance(part, Orientation) for part in parts)
 
     def camera(self, before: Intrinsics) -> Intrinsics | None:
-        """Return the intrinsics of the picture; None if they are unknown, or if it is rotated.
+        """Return the intrinsics of the picture, or None if they are unknown or it is rotated.
 
         Args:
             before: the intrinsics of the render.
@@ -90,8 +90,8 @@ class Way:
         return self.geometry.intrinsics(before, *size) if self.geometry else before
 
 
-def mapped_annotation(annotation: Record, way: Way) -> Record | None:
-    """Return the values of an annotation that change; None if its object is not in the picture.
+def warp_annotation(annotation: Record, mapping: PixelMapping) -> Record | None:
+    """Return the changed values of an annotation, or None if its object is not in the picture.
 
     The box is that of the mapped outline or mask. Without either, it encloses the mapped edges of
     the old box. ``truncated`` is the share of the object outside the picture.
@@ -100,34 +100,34 @@ def mapped_annotation(annotation: Record, way: Way) -> Record | None:
         ImageError: a mask differs from its image in size.
     """
     outline = annotation.get("segmentation") or None
-    changed: Record = {}
+    changes: Record = {}
     if isinstance(outline, dict):
-        found = _mapped_mask(outline, way)
-        if found is None:
+        from_mask = _warp_run_length_mask(outline, mapping)
+        if from_mask is None:
             return None
-        changed |= found
+        changes |= from_mask
     else:
         parts = outline or [_box_outline(annotation["bbox"])]
-        clipped = _mapped_outline([np.reshape(part, (-1, 2)) for part in parts], way)
+        clipped = _warp_outline([np.reshape(part, (-1, 2)) for part in parts], mapping)
         if clipped is None:
             return None
         polygons, share = clipped
-        changed["bbox"] = _bounds(polygons)
+        changes["bbox"] = _bounds(polygons)
         area = sum(abs(_area(part)) for part in polygons)
-        changed |= {"area": round(area, 3), "truncated": round(1 - share, 4)}
+        changes |= {"area": round(area, 3), "truncated": round(1 - share, 4)}
         if outline:
-            changed["segmentation"] = [part.round(3).ravel().tolist() for part in polygons]
+            changes["segmentation"] = [part.round(3).ravel().tolist() for part in polygons]
     if points := annotation.get("keypoints"):
-        changed |= _mapped_keypoints(points, way)
-    return changed
+        changes |= _warp_keypoints(points, mapping)
+    return changes
 
 
-def mapped_box(box: Sequence[float], way: Way) -> tuple[list[float], float] | None:
+def warp_box(box: Sequence[float], mapping: PixelMapping) -> tuple[list[float], float] | None:
     """Return the box around the mapped edges of a box, and the share of it in the picture.
 
     Return None if nothing of the box is in the picture. Boxes are x, y, width and height in px.
     """
-    clipped = _mapped_outline([_box_outline(box)], way)
+    clipped = _warp_outline([_box_outline(box)], mapping)
     if clipped is None:
         return None
     outlines, share = clipped
@@ -141,11 +141,13 @@ def _bounds(outlines: Sequence[Array]) -> list[float]:
     return [*low.round(3).tolist(), *(high - low).round(3).tolist()]
 
 
-def moved_mask(mask: Array, way: Way) -> Array:
+def warp_mask(mask: Array, mapping: PixelMapping) -> Array:
     """Return a mask of the render, (height, width) of 0 and 1, warped into the picture."""
-    layer = Layer("label", mask[..., None], way.margins.left, way.margins.top)
-    (moved,), _ = warp([layer], way.geometry, *way.margins.around(way.width, way.height))
-    return np.asarray(moved[..., 0])
+    layer = Layer("label", mask[..., None], mapping.margins.left, mapping.margins.top)
+    (warped,), _ = warp(
+        [layer], mapping.geometry, *mapping.margins.around(mapping.width, mapping.height)
+    )
+    return np.asarray(warped[..., 0])
 
 
 def _box_outline(box: Sequence[float]) -> Array:
@@ -159,57 +161,62 @@ def _area(outline: Array) -> float:
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
 
 
-def _mapped_outline(parts: Sequence[Array], way: Way) -> tuple[list[Array], float] | None:
-    """Return outlines in the picture, and the share of their area in it; None if none is."""
+def _warp_outline(
+    parts: Sequence[Array], mapping: PixelMapping
+) -> tuple[list[Array], float] | None:
+    """Return outlines in the picture and the share of their area in it, or None if all are outside.
+
+    Each outline is (corner, 2).
+    """
     from shapely import Polygon, box, make_valid
     from shapely.ops import unary_union
 
-    left, top, right, bottom = way.margins
-    render = box(-left, -top, way.width + right, way.height + bottom)
-    picture = box(0, 0, *way.after)
-    whole, shown = 0.0, []
+    left, top, right, bottom = mapping.margins
+    render = box(-left, -top, mapping.width + right, mapping.height + bottom)
+    picture = box(0, 0, *mapping.picture_size)
+    whole, visible = 0.0, []
     for part in parts:
-        own = make_valid(Polygon(part))
-        whole += _mapped(own, way)[0]
-        _, pieces = _mapped(own.intersection(render), way)
-        shown += [piece.intersection(picture) for piece in pieces]
-    kept = unary_union(shown).simplify(SIMPLER)
+        valid = make_valid(Polygon(part))
+        whole += _warp_shape(valid, mapping)[0]
+        _, pieces = _warp_shape(valid.intersection(render), mapping)
+        visible += [piece.intersection(picture) for piece in pieces]
+    kept = unary_union(visible).simplify(SIMPLIFY_TOLERANCE)
     outlines = [np.array(piece.exterior.coords)[:-1] for piece in _polygons(kept)]
-    if sum(abs(_area(each)) for each in outlines) < LEAST:
+    if sum(abs(_area(each)) for each in outlines) < MIN_AREA:
         return None
-    return outlines, min(sum(each.area for each in shown) / whole, 1.0)
+    return outlines, min(sum(each.area for each in visible) / whole, 1.0)
 
 
 def _polygons(shape: Any) -> list[Any]:
-    """Return the polygons in a shape of shapely's."""
+    """Return the polygons in a shapely geometry."""
     parts = getattr(shape, "geoms", [shape])
     return [each for each in parts if each.geom_type == "Polygon" and each.area > 0]
 
 
-def _mapped(shape: Any, way: Way) -> tuple[float, list[Any]]:
-    """Return the area of a shape after mapping, with its hidden parts, and its visible polygons."""
+def _warp_shape(shape: Any, mapping: PixelMapping) -> tuple[float, list[Any]]:
+    """Return the warped area of a shape, hidden parts included, and its visible polygons."""
     from shapely import Polygon, make_valid
 
-    area, found = 0.0, []
+    area, polygons = 0.0, []
     for polygon in _polygons(shape):
         corners = np.array(polygon.exterior.coords)
         dense = np.concatenate(
             [
-                np.linspace(a, b, max(int(np.hypot(*(b - a)) / STEP), 1), endpoint=False)
+                np.linspace(a, b, max(int(np.hypot(*(b - a)) / SEGMENT_LENGTH), 1), endpoint=False)
                 for a, b in pairwise(corners)
             ]
         )
-        there = way.places(dense)
-        known = np.isfinite(there).all(-1)
-        if known.sum() >= 3:
-            moved = make_valid(Polygon(there[known]))
-            area += moved.area / known.mean()
-            found += _polygons(moved)
-    return area, found
+        mapped = mapping.map_points(dense)
+        finite = np.isfinite(mapped).all(-1)
+        if finite.sum() >= 3:
+            warped = make_valid(Polygon(mapped[finite]))
+            area += warped.area / finite.mean()
+            polygons += _polygons(warped)
+    return area, polygons
 
 
-def _mapped_mask(encoded: Record, way: Way) -> Record | None:
-    """Return a run-length encoded mask in the picture, with its area and box; None if it is empty.
+def _warp_run_length_mask(encoded: Record, mapping: PixelMapping) -> Record | None:
+    """Return a run-length encoded mask in the picture with its area and box, or None if empty.
 
     Raises:
         ImageError: the mask differs from its image in size.
@@ -219,32 +226,34 @@ def _mapped_mask(encoded: Record, way: Way) -> Record | None:
     is_text = not isinstance(encoded["counts"], list)
     runs = runs_of(encoded["counts"])
     values = np.arange(len(runs), dtype=np.uint8) % 2
-    mask = np.repeat(values, runs).reshape((way.height, way.width), order="F")
-    moved = moved_mask(mask, way)
-    if not moved.any():
+    mask = np.repeat(values, runs).reshape((mapping.height, mapping.width), order="F")
+    warped = warp_mask(mask, mapping)
+    if not warped.any():
         return None
-    packed = coder.encode(np.asfortranarray(moved))
+    packed = coder.encode(np.asfortranarray(warped))
     counts: Any = packed["counts"].decode("ascii")
     if not is_text:
-        flat = moved.ravel(order="F")
+        flat = warped.ravel(order="F")
         edges = np.flatnonzero(np.diff(np.concatenate([[0], flat, [2]])))
         counts = np.diff(np.concatenate([[0], edges])).tolist()
     y, x = np.nonzero(mask)
-    some = slice(None, None, max(len(x) // MOST_PLACES, 1))
-    points = np.stack([x[some], y[some]], -1) + 0.5
+    sampled = slice(None, None, max(len(x) // MAX_SAMPLES, 1))
+    points = np.stack([x[sampled], y[sampled]], -1) + 0.5
     return {
-        "segmentation": {"size": list(moved.shape), "counts": counts},
+        "segmentation": {"size": list(warped.shape), "counts": counts},
         "bbox": coder.toBbox(packed).tolist(),
-        "area": float(moved.sum()),
-        "truncated": round(1 - float(way.shows(points, way.places(points)).mean()), 4),
+        "area": float(warped.sum()),
+        "truncated": round(
+            1 - float(mapping.is_visible(points, mapping.map_points(points)).mean()), 4
+        ),
     }
 
 
-def _mapped_keypoints(points: Sequence[float], way: Way) -> Record:
+def _warp_keypoints(points: Sequence[float], mapping: PixelMapping) -> Record:
     """Return keypoints in the picture. Those outside it become unlabelled: 0, 0, 0."""
-    found = np.reshape(np.asarray(points, np.float64), (-1, 3))
-    there = way.places(found[:, :2])
-    inside = way.shows(found[:, :2], there) & (found[:, 2] > 0)
-    kept = np.where(inside[:, None], np.column_stack([there.round(3), found[:, 2]]), 0)
+    keypoints = np.reshape(np.asarray(points, np.float64), (-1, 3))
+    mapped = mapping.map_points(keypoints[:, :2])
+    inside = mapping.is_visible(keypoints[:, :2], mapped) & (keypoints[:, 2] > 0)
+    kept = np.where(inside[:, None], np.column_stack([mapped.round(3), keypoints[:, 2]]), 0)
     values = [int(v) if i % 3 == 2 else v for i, v in enumerate(kept.ravel().tolist())]
     return {"keypoints": values, "num_keypoints": int(inside.sum())}

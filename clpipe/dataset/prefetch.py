@@ -15,16 +15,16 @@ from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.loader import LoadedImage
 
 Read = Future[tuple[LoadedImage, Sample]]
-Begun = tuple[SampleBatch, Callable[[], list[Sample]]]
+Pending = tuple[SampleBatch, Callable[[], list[Sample]]]
 
-PATCHES = 16  # patches with their own draws in one batch
+PATCHES_TOGETHER = 16  # patches with their own draws in one batch
 # Samples are developed together until either limit is reached. In a shuffled dataset, every sample
-# may have its own render. More pixels would only wait in memory.
-MOST_BYTES = 2**27  # of renders
-MOST_PIXELS = 2**21  # of samples
+# may have its own render. Larger groups only take more memory.
+MAX_BYTES = 2**27  # of renders
+MAX_PIXELS = 2**21  # of samples
 
 
-class Size:
+class BatchSize:
     """The size of the images that are developed together.
 
     Args:
@@ -37,7 +37,7 @@ class Size:
         self._pixels = self._bytes = 0
 
     def add(self, batch: SampleBatch, source: Array) -> bool:
-        """Add samples of an image. Return whether that is enough."""
+        """Add samples of an image, and return whether the batch is full."""
         is_new = id(source) not in self._sources
         self._sources.add(id(source))
         self._bytes += source.nbytes * is_new
@@ -45,13 +45,13 @@ class Size:
             self._pixels += len(batch.numbers) * self._side**2
         else:
             self._pixels += source.shape[0] * source.shape[1] * is_new
-        return self._pixels >= MOST_PIXELS or self._bytes >= MOST_BYTES
+        return self._pixels >= MAX_PIXELS or self._bytes >= MAX_BYTES
 
 
-def begun_ahead(
-    loader: SampleLoader, batches: Iterator[SampleBatch], threads: int, together: int
-) -> Generator[Begun]:
-    """Decode images in threads and begin to develop them, a few ahead.
+def prefetched(
+    loader: SampleLoader, batches: Iterator[SampleBatch], threads: int, group_size: int
+) -> Generator[Pending]:
+    """Decode images in threads and start to develop them, a few in advance.
 
     Args:
         loader: decodes and develops.
@@ -67,34 +67,36 @@ def begun_ahead(
         DeviceError: there is no usable device.
     """
     set_codec_threads(max(available_processors() // threads, 1))
-    ahead: deque[Future[list[Begun]]] = deque()
+    in_flight: deque[Future[list[Pending]]] = deque()
     decoders = ThreadPoolExecutor(threads, "decode")
     developer = ThreadPoolExecutor(1, "device")
     try:
-        while some := list(islice(batches, together)):
-            read = [decoders.submit(loader.read, batch) for batch in some]
-            ahead.append(developer.submit(_begun, loader, some, read))
-            if len(ahead) > threads + 1:
-                yield from ahead.popleft().result()
-        while ahead:
-            yield from ahead.popleft().result()
+        while group := list(islice(batches, group_size)):
+            decoded = [decoders.submit(loader.read, batch) for batch in group]
+            in_flight.append(developer.submit(_begin, loader, group, decoded))
+            if len(in_flight) > threads + 1:
+                yield from in_flight.popleft().result()
+        while in_flight:
+            yield from in_flight.popleft().result()
     finally:
         decoders.shutdown(cancel_futures=True)
         developer.shutdown(cancel_futures=True)
         loader.drain()
 
 
-def _begun(
-    loader: SampleLoader, batches: Sequence[SampleBatch], read: Sequence[Read]
-) -> list[Begun]:
-    """Begin with batches together. If that fails, each one begins when it is waited for."""
-    pairs = list(zip(batches, read, strict=True))
+def _begin(
+    loader: SampleLoader, batches: Sequence[SampleBatch], decoded: Sequence[Read]
+) -> list[Pending]:
+    """Start batches together. If that fails, each batch starts when its samples are requested."""
+    pairs = list(zip(batches, decoded, strict=True))
     try:
-        waits = loader.begin([(batch, *own.result()) for batch, own in pairs])
+        pending = loader.begin([(batch, *read_future.result()) for batch, read_future in pairs])
     except ImageError:
-        waits = [partial(_alone, loader, batch, own) for batch, own in pairs]
-    return list(zip(batches, waits, strict=True))
+        pending = [
+            partial(_develop_alone, loader, batch, read_future) for batch, read_future in pairs
+        ]
+    return list(zip(batches, pending, strict=True))
 
 
-def _alone(loader: SampleLoader, batch: SampleBatch, read: Read) -> list[Sample]:
-    return loader.begin([(batch, *read.result())])[0]()
+def _develop_alone(loader: SampleLoader, batch: SampleBatch, decoded: Read) -> list[Sample]:
+    return loader.begin([(batch, *decoded.result())])[0]()

@@ -19,15 +19,15 @@ from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
 from clpipe.chain.rendition import BASELINES, NOISY, PICTURES
 from clpipe.images.preview import decoded, jpeg_bytes, reduced, thumbnail_bytes
-from clpipe.reports.figures import number, oddities
-from clpipe.reports.run import Blob, Made, Run
+from clpipe.reports.figures import anomalies, number
+from clpipe.reports.run import Blob, Run, RunPicture
 
 BUDGET = 14 << 20  # bytes of the whole page
-SMALL = 160  # px, the longer side of a thumbnail
-SMALL_PIXELS = 4e9  # to read for the contact sheet: about a minute of one processor
-TOGETHER = 64  # thumbnails in one batch
-CHOSEN = 8  # images to compare
-LARGE = 1_200_000  # px; larger images are reduced for the comparison
+THUMBNAIL_SIZE = 160  # px, the longer side of a thumbnail
+MAX_THUMBNAIL_PIXELS = 4e9  # to read for the contact sheet: about a minute of one processor
+BATCH_SIZE = 64  # thumbnails in one batch
+MAX_COMPARED = 8  # images to compare
+MAX_COMPARED_PIXELS = 1_200_000  # px; larger images are reduced for the comparison
 CROP = 320, 240  # px, width and height of full-resolution regions of reduced images
 TRUE_QUALITY, REDUCED_QUALITY = 93, 85  # of JPEGs at full and at reduced resolution
 PICTURE = "image"  # its label in the comparison
@@ -48,9 +48,9 @@ class Budget:
         return True
 
 
-def picture_file(made: Made) -> Blob | None:
+def picture_file(picture: RunPicture) -> Blob | None:
     """Return the file of a picture to display: the first one in a supported format."""
-    return next((made.files[kind] for kind in SHOWN if kind in made.files), None)
+    return next((picture.files[kind] for kind in SHOWN if kind in picture.files), None)
 
 
 def checked(blob: Blob) -> bytes:
@@ -65,7 +65,7 @@ def checked(blob: Blob) -> bytes:
         data = blob.read()
     except OSError as error:
         raise ImageError(f"{blob.name}: cannot be read: {error.strerror}") from None
-    if hashlib.sha256(data).hexdigest() != blob.said["sha256"]:
+    if hashlib.sha256(data).hexdigest() != blob.sidecar_entry["sha256"]:
         raise ImageError(f"{blob.name}: was changed since; its SHA-256 is not that of its sidecar")
     return data
 
@@ -90,7 +90,7 @@ class Sheet:
 
 
 def contact_sheet(
-    run: Run, budget: Budget, label: str, tell: Callable[[str], None] = lambda _: None
+    run: Run, budget: Budget, label: str, report_progress: Callable[[str], None] = lambda _: None
 ) -> Sheet:
     """Return thumbnails of a run in its order, limited by the budget and by time.
 
@@ -103,20 +103,20 @@ def contact_sheet(
     pictures = run.pictures
     sheet = Sheet(pictures=len(pictures))
     entries: dict[int, dict[str, Any]] = {}
-    order = telling_order([bool(oddities(made)) for made in pictures])
+    order = sample_order([bool(anomalies(picture)) for picture in pictures])
     for i, image, problem in _small_pictures(pictures, order):
         entry = _entry(pictures[i], image, label)
         if not budget.take(json.dumps(entry)):
             break
         entries[i] = entry
-        tell(f"thumbnail {len(entries)} of {len(order)}")
+        report_progress(f"thumbnail {len(entries)} of {len(order)}")
         sheet.problems += [problem] if problem else []
     sheet.entries = [entries[i] for i in sorted(entries)]
     return sheet
 
 
 def _small_pictures(
-    pictures: Sequence[Made], order: Sequence[int]
+    pictures: Sequence[RunPicture], order: Sequence[int]
 ) -> Iterator[tuple[int, str, str]]:
     """Yield the numbers of pictures, each with its thumbnail or the reason for its absence."""
 
@@ -124,47 +124,47 @@ def _small_pictures(
         if not (file := picture_file(pictures[i])):
             return "", ""
         try:
-            return data_uri("webp", thumbnail_bytes(checked(file), file.name, SMALL)), ""
+            return data_uri("webp", thumbnail_bytes(checked(file), file.name, THUMBNAIL_SIZE)), ""
         except ImageError as error:
             return "", str(error)
 
     pixels = 0.0
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for start in range(0, len(order), TOGETHER):
-            numbers = order[start : start + TOGETHER]
+        for start in range(0, len(order), BATCH_SIZE):
+            numbers = order[start : start + BATCH_SIZE]
             for i, (image, problem) in zip(numbers, pool.map(small, numbers), strict=True):
                 yield i, image, problem
                 pixels += number(pictures[i].value("width")) * number(pictures[i].value("height"))
-            if pixels >= SMALL_PIXELS:
+            if pixels >= MAX_THUMBNAIL_PIXELS:
                 return
 
 
-def _entry(made: Made, image: str, label: str) -> dict[str, Any]:
+def _entry(picture: RunPicture, image: str, label: str) -> dict[str, Any]:
     """Return the data of a thumbnail for the script of the page."""
     return {
-        "name": f"{label}: {made.name}" if label else made.name,
+        "name": f"{label}: {picture.name}" if label else picture.name,
         "image": image,
-        "iso": round(number(made.value("iso"))),
-        "camera": str(made.value("camera")),
-        "clipped": number(made.value("clipped")),
-        "odd": oddities(made),
+        "iso": round(number(picture.value("iso"))),
+        "camera": str(picture.value("camera")),
+        "clipped": number(picture.value("clipped")),
+        "odd": anomalies(picture),
     }
 
 
-def telling_order(odd: Sequence[bool]) -> list[int]:
-    """Return the numbers of pictures in an order of which every prefix is a fair sample.
+def sample_order(flags: Sequence[bool]) -> list[int]:
+    """Return the indices of pictures in an order whose every prefix is a fair sample.
 
     Unusual and other pictures alternate while both remain. Both are spread evenly, in the order of
     van der Corput (1935).
 
     Args:
-        odd: whether each picture is unusual.
+        flags: whether each picture is unusual.
 
-    >>> telling_order([False, False, True, False, False])
+    >>> sample_order([False, False, True, False, False])
     [2, 0, 3, 1, 4]
     """
-    unusual = [i for i, is_odd in enumerate(odd) if is_odd]
-    others = [i for i, is_odd in enumerate(odd) if not is_odd]
+    unusual = [i for i, is_unusual in enumerate(flags) if is_unusual]
+    others = [i for i, is_unusual in enumerate(flags) if not is_unusual]
     pairs = zip_longest(_spread(unusual), _spread(others))
     return [i for pair in pairs for i in pair if i is not None]
 
@@ -176,21 +176,23 @@ def _spread(values: Sequence[int]) -> list[int]:
 
 
 @dataclass
-class Large:
-    """An image to compare, with its views."""
+class ComparedImage:
+    """An image of the comparison, with its views."""
 
     name: str
     facts: str
-    odd: Sequence[str]
+    unusual: Sequence[str]
     width: int  # px, of the picture
     height: int
-    by: int  # the reduction factor; 1 is full resolution
+    reduction: int  # the reduction factor; 1 is full resolution
     places: Sequence[Place]  # regions of interest; reduced images have these at full resolution
     views: list[dict[str, Any]] = field(default_factory=list)  # label, image, crops
-    strip: list[dict[str, str]] = field(default_factory=list)  # thumbnails of kept stages
+    stage_thumbnails: list[dict[str, str]] = field(
+        default_factory=list
+    )  # thumbnails of kept stages
 
     @classmethod
-    def of(cls, made: Made, pixels: Array) -> "Large":
+    def of(cls, picture: RunPicture, pixels: Array) -> "ComparedImage":
         """Return an image without views.
 
         Args:
@@ -198,9 +200,11 @@ class Large:
             pixels: (height, width, 3) uint8.
         """
         height, width = pixels.shape[:2]
-        by = math.ceil((height * width / LARGE) ** 0.5)
-        places = places_of(pixels, by)
-        return cls(made.name, _facts(made), oddities(made), width, height, by, places)
+        reduction = math.ceil((height * width / MAX_COMPARED_PIXELS) ** 0.5)
+        places = places_of(pixels, reduction)
+        return cls(
+            picture.name, _facts(picture), anomalies(picture), width, height, reduction, places
+        )
 
     def add(self, label: str, pixels: Array, budget: Budget) -> bool:
         """Add a view. Return False if it exceeds the budget.
@@ -210,8 +214,8 @@ class Large:
             pixels: (height, width, 3) uint8, as large as the picture.
             budget: the budget that the view uses.
         """
-        if self.by > 1:
-            image = jpeg_uri(reduced(pixels, self.by), REDUCED_QUALITY)
+        if self.reduction > 1:
+            image = jpeg_uri(reduced(pixels, self.reduction), REDUCED_QUALITY)
             crops = [jpeg_uri(place.of(pixels)) for place in self.places]
         else:
             image, crops = jpeg_uri(pixels), []
@@ -221,28 +225,32 @@ class Large:
         return True
 
 
-def places_of(pixels: Array, by: int) -> list[Place]:
+def places_of(pixels: Array, reduction: int) -> list[Place]:
     """Return regions of interest of a picture.
 
     Args:
         pixels: (height, width, 3) uint8.
-        by: the reduction factor, as in :class:`Large`. The search uses the reduced picture. Regions
-            of reduced pictures are enlarged to CROP px.
+        reduction: the reduction factor, as in :class:`ComparedImage`. The search uses the reduced
+            picture. Regions of reduced pictures are enlarged to CROP px.
     """
     height, width = pixels.shape[:2]
-    small = reduced(pixels, by)
+    small = reduced(pixels, reduction)
     if small.shape[1] < WIDTH or small.shape[0] < HEIGHT:
         found = [Place("middle", 0, 0, small.shape[1], small.shape[0])]
     else:
         found = choose_places((), small.astype(np.float32) / np.float32(255))
-    if by == 1:
+    if reduction == 1:
         return found
     wide, high = min(CROP[0], width), min(CROP[1], height)
     return [
         replace(
             place,
-            left=min(max(by * (2 * place.left + place.width) // 2 - wide // 2, 0), width - wide),
-            top=min(max(by * (2 * place.top + place.height) // 2 - high // 2, 0), height - high),
+            left=min(
+                max(reduction * (2 * place.left + place.width) // 2 - wide // 2, 0), width - wide
+            ),
+            top=min(
+                max(reduction * (2 * place.top + place.height) // 2 - high // 2, 0), height - high
+            ),
             width=wide,
             height=high,
         )
@@ -250,18 +258,24 @@ def places_of(pixels: Array, by: int) -> list[Place]:
     ]
 
 
-def chosen(run: Run, names: Collection[str]) -> list[Made]:
+def select_images(run: Run, names: Collection[str]) -> list[RunPicture]:
     """Return the images to compare: given and unusual ones first, then an even sample."""
-    pictures = [made for made in run.pictures if picture_file(made)]
-    odd = [made for made in pictures if made.name in names or oddities(made)][: CHOSEN // 2]
-    others = [made for made in pictures if made not in odd]
-    count = min(CHOSEN - len(odd), len(others))
-    return odd + [others[i * len(others) // count] for i in range(count)]
+    pictures = [picture for picture in run.pictures if picture_file(picture)]
+    unusual = [picture for picture in pictures if picture.name in names or anomalies(picture)][
+        : MAX_COMPARED // 2
+    ]
+    others = [picture for picture in pictures if picture not in unusual]
+    count = min(MAX_COMPARED - len(unusual), len(others))
+    return unusual + [others[i * len(others) // count] for i in range(count)]
 
 
-def large(
-    runs: Sequence[Run], labels: Sequence[str], made: Made, budget: Budget, problems: list[str]
-) -> Large | None:
+def compared_image(
+    runs: Sequence[Run],
+    labels: Sequence[str],
+    picture: RunPicture,
+    budget: Budget,
+    problems: list[str],
+) -> ComparedImage | None:
     """Return one image to compare. None if no view of it can be shown.
 
     Args:
@@ -271,12 +285,14 @@ def large(
         budget: the budget that views use.
         problems: gets the errors of views.
     """
-    shown: Large | None = None
-    comparison = [(label, file) for label, file in _beside(runs[0], made) if len(runs) == 1]
+    shown: ComparedImage | None = None
+    comparison = [
+        (label, file) for label, file in _comparison_picture(runs[0], picture) if len(runs) == 1
+    ]
     views = [
         (" ".join(filter(None, (label, view))), file)
         for label, run in zip(labels, runs, strict=True)
-        if (own := run.picture_beside(made))
+        if (own := run.matching_picture(picture))
         for view, file in _views(run, own)
     ]
     views.sort(key=lambda view: not view[0].endswith(PICTURE))
@@ -286,27 +302,29 @@ def large(
         except ImageError as error:
             problems.append(str(error))
             continue
-        shown = shown or Large.of(made, pixels)
+        shown = shown or ComparedImage.of(picture, pixels)
         if pixels.shape[:2] != (shown.height, shown.width):
-            problems.append(f"{file.name}: its size differs from {made.name}")
+            problems.append(f"{file.name}: its size differs from {picture.name}")
         elif not shown.add(label, pixels, budget):
             return None
     if shown:
-        shown.strip = _strip(made, budget, problems)
+        shown.stage_thumbnails = _strip(picture, budget, problems)
     return shown
 
 
-def _views(run: Run, made: Made) -> Iterator[tuple[str, Blob]]:
+def _views(run: Run, picture: RunPicture) -> Iterator[tuple[str, Blob]]:
     """Yield the picture, its truths and its baselines, with their labels."""
-    if file := picture_file(made):
+    if file := picture_file(picture):
         yield PICTURE, file
-    for rendition, other in run.of_image(made.image).items():
-        is_shown = rendition.role in (*PICTURES, *BASELINES) and rendition.ev == made.rendition.ev
+    for rendition, other in run.of_image(picture.image).items():
+        is_shown = (
+            rendition.role in (*PICTURES, *BASELINES) and rendition.ev == picture.rendition.ev
+        )
         if is_shown and (file := picture_file(other)):
             yield rendition.label.strip("."), file
 
 
-def _beside(run: Run, made: Made) -> Iterator[tuple[str, Blob]]:
+def _comparison_picture(run: Run, picture: RunPicture) -> Iterator[tuple[str, Blob]]:
     """Yield a picture to compare with one without truths, and its label.
 
     It is a picture of the same file with another ISO, exposure or frame. Otherwise it is the
@@ -314,16 +332,16 @@ def _beside(run: Run, made: Made) -> Iterator[tuple[str, Blob]]:
     """
     alike = [
         other
-        for other in run.made
-        if other is not made
+        for other in run.all_pictures
+        if other is not picture
         and other.rendition.role == NOISY
-        and other.value("sha256") == made.value("sha256")
-        and all(other.value(key) == made.value(key) for key in ("width", "height"))
+        and other.value("sha256") == picture.value("sha256")
+        and all(other.value(key) == picture.value(key) for key in ("width", "height"))
     ]
     pictures = run.pictures
-    number_of = pictures.index(made)
+    number_of = pictures.index(picture)
     near = pictures[number_of - 1 if number_of else 1 : number_of or 2]
-    alike += [each for each in near if _without_digits(each.name) == _without_digits(made.name)]
+    alike += [each for each in near if _without_digits(each.name) == _without_digits(picture.name)]
     for other in alike[:1]:
         if file := picture_file(other):
             iso = f"{number(other.value('iso')):.0f}"
@@ -334,20 +352,20 @@ def _without_digits(name: str) -> str:
     return re.sub(r"\d+", "", name)
 
 
-def _kept(made: Made) -> Iterator[tuple[str, Blob]]:
+def _kept(picture: RunPicture) -> Iterator[tuple[str, Blob]]:
     """Yield the kept stages of a picture in the order of its chain."""
-    for name in (str(step.get("name")) for step in made.steps):
-        if file := made.files.get(f"{name}.exr") or made.files.get(f"{name}.npy"):
+    for name in (str(step.get("name")) for step in picture.steps):
+        if file := picture.files.get(f"{name}.exr") or picture.files.get(f"{name}.npy"):
             yield name, file
 
 
-def add_stages(shown: Large, made: Made, budget: Budget) -> None:
+def add_stages(shown: ComparedImage, picture: RunPicture, budget: Budget) -> None:
     """Add the kept stages of a picture as views, within the budget.
 
     Stages of another size, before the picture is resized, are skipped. Unreadable files are
     reported with the thumbnails.
     """
-    for name, file in _kept(made):
+    for name, file in _kept(picture):
         try:
             pixels = decoded(checked(file), file.name)
         except ImageError:
@@ -357,26 +375,26 @@ def add_stages(shown: Large, made: Made, budget: Budget) -> None:
             return
 
 
-def _strip(made: Made, budget: Budget, problems: list[str]) -> list[dict[str, str]]:
+def _strip(picture: RunPicture, budget: Budget, problems: list[str]) -> list[dict[str, str]]:
     """Return thumbnails of the kept stages of a picture in the order of its chain."""
-    strip = []
-    for name, file in _kept(made):
+    stage_thumbnails = []
+    for name, file in _kept(picture):
         try:
-            image = data_uri("webp", thumbnail_bytes(checked(file), file.name, 2 * SMALL))
+            image = data_uri("webp", thumbnail_bytes(checked(file), file.name, 2 * THUMBNAIL_SIZE))
         except ImageError as error:
             problems.append(str(error))
             continue
         if budget.take(image):
-            strip.append({"label": name, "image": image})
-    return strip
+            stage_thumbnails.append({"label": name, "image": image})
+    return stage_thumbnails
 
 
-def _facts(made: Made) -> str:
+def _facts(picture: RunPicture) -> str:
     """Return a line of facts about a picture."""
-    a, b = (number(made.value("noise", "signal", key)) for key in "ab")
+    a, b = (number(picture.value("noise", "signal", key)) for key in "ab")
     law = f", noise variance {a:.3g} y + {b:.3g} (in squared signal, y from 0 to 1)"
-    size = f"{number(made.value('width')):.0f} x {number(made.value('height')):.0f} px"
-    iso, clipped = number(made.value("iso")), number(made.value("clipped"))
-    lens = f" with {made.value('lens')}" if made.value("lens") else ""
-    text = f"{size}, {made.value('camera')}{lens}, ISO {iso:.0f}, {clipped * 100:.2f} % clipped"
-    return text + (law if made.value("noise", "signal") else "")
+    size = f"{number(picture.value('width')):.0f} x {number(picture.value('height')):.0f} px"
+    iso, clipped = number(picture.value("iso")), number(picture.value("clipped"))
+    lens = f" with {picture.value('lens')}" if picture.value("lens") else ""
+    text = f"{size}, {picture.value('camera')}{lens}, ISO {iso:.0f}, {clipped * 100:.2f} % clipped"
+    return text + (law if picture.value("noise", "signal") else "")

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Any
 
 from clpipe.base.about import __version__
-from clpipe.outputs.photographs import Photograph, lens_record
+from clpipe.outputs.output_pictures import OutputPicture, lens_record
 from clpipe.outputs.sidecar import json_text
 from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE
 from clpipe.reference.pose import to_opengl, to_quaternion
@@ -36,8 +36,8 @@ class Responses:
     def __init__(self) -> None:
         self._curves: list[Any] = []
 
-    def of(self, picture: Photograph) -> dict[str, Any]:
-        """Return a picture's photometry; its response is an index into the list of curves."""
+    def record_for(self, picture: OutputPicture) -> dict[str, Any]:
+        """Return a picture's photometry, with its response as an index into the list of curves."""
         if picture.photometry is None:
             return {}
         curve = picture.photometry["response"]
@@ -51,7 +51,7 @@ class Responses:
         return {"responses": self._curves} if self._curves else {}
 
 
-def cameras_json(pictures: Sequence[Photograph], up: str = "") -> str:
+def cameras_json(pictures: Sequence[OutputPicture], prefix: str = "") -> str:
     """Return the text of a cameras.json, which ``--poses`` also reads.
 
     Args:
@@ -62,49 +62,49 @@ def cameras_json(pictures: Sequence[Photograph], up: str = "") -> str:
     for each in pictures:
         camera = each.camera
         k = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
-        view = {"file": up + each.file, "width": camera.width, "height": camera.height, "K": k}
+        view = {"file": prefix + each.file, "width": camera.width, "height": camera.height, "K": k}
         view |= dict(zip("Rt", each.pose, strict=True)) if each.pose else {}
         view |= lens_record(camera)
         view |= {"motion": each.motion} if each.motion else {}
-        views.append(view | responses.of(each))
+        views.append(view | responses.record_for(each))
     return json_text({"note": NOTE, **responses.record, "views": views})
 
 
 def colmap(
-    pictures: Sequence[Photograph],
-    posed: Sequence[Photograph],
-    left_out: Mapping[str, list[str]],
+    pictures: Sequence[OutputPicture],
+    posed: Sequence[OutputPicture],
+    skipped: Mapping[str, list[str]],
 ) -> dict[str, str]:
-    """Return the texts of COLMAP's text model, by path; only the cameras if no pose is known.
+    """Return the files of COLMAP's text model by path, or only the cameras if no pose is known.
 
-    https://colmap.github.io/format.html. Pictures with the same camera share it.
+    See https://colmap.github.io/format.html. Pictures with the same camera share its entry.
 
     Args:
         pictures: all pictures.
         posed: the pictures whose pose is known.
-        left_out: receives the names of pictures that the format cannot hold, by reason.
+        skipped: receives the names of pictures that the format cannot hold, by reason.
     """
     numbers: dict[str, int] = defaultdict(count(1).__next__)
-    of_file = {}
+    camera_ids = {}
     for each in pictures:
         camera, names = each.camera, COEFFICIENTS[each.camera.model]
         values = [camera.fx, camera.fy, camera.cx, camera.cy]
         values += [camera.distortion[name] for name in names]
         size = f"{camera.width} {camera.height}"
-        of_file[each.file] = numbers[f"{camera.model} {size} {_text(values)}"]
+        camera_ids[each.file] = numbers[f"{camera.model} {size} {_text(values)}"]
     cameras = [f"{number} {text}" for text, number in numbers.items()]
     files = {"cameras.txt": ("CAMERA_ID MODEL WIDTH HEIGHT PARAMS", cameras)}
     if posed:
         images = []
         for number, each in enumerate(posed, 1):
             if any(letter.isspace() for letter in each.file):
-                why = "with a space in the name, which images.txt cannot hold"
-                left_out[why].append(each.file)
+                reason = "with a space in the name, which images.txt cannot hold"
+                skipped[reason].append(each.file)
                 continue
             assert each.pose
             r, t = each.pose
-            placed = f"{number} {_text([*to_quaternion(r), *t])}"
-            images.append(f"{placed} {of_file[each.file]} {each.file}\n")
+            frame = f"{number} {_text([*to_quaternion(r), *t])}"
+            images.append(f"{frame} {camera_ids[each.file]} {each.file}\n")
         files["images.txt"] = ("IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and points", images)
         files["points3D.txt"] = ("none", [])
     return {
@@ -117,7 +117,7 @@ def _text(values: Sequence[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def _rows_of(picture: Photograph) -> dict[str, Any]:
+def _rows_of(picture: OutputPicture) -> dict[str, Any]:
     """Return a moving camera's poses at the first and last row, camera to world, and the times."""
     motion = picture.motion
     if not motion:
@@ -131,21 +131,22 @@ def _rows_of(picture: Photograph) -> dict[str, Any]:
 
 
 def nerfstudio(
-    pictures: Sequence[Photograph],
-    up: str,
-    left_out: Mapping[str, list[str]],
+    pictures: Sequence[OutputPicture],
+    prefix: str,
+    skipped: Mapping[str, list[str]],
     splits: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """Return the text of a nerfstudio transforms.json; "" if it cannot contain any picture.
+    """Return the text of a nerfstudio transforms.json, or "" if it cannot contain any picture.
 
-    https://docs.nerf.studio/quickstart/data_conventions.html. Its pixel coordinates are COLMAP's.
-    All pictures must have one camera model, so fisheye pictures are omitted if there are others. A
-    camera that all pictures share is written at the top level, where other readers expect it.
+    See https://docs.nerf.studio/quickstart/data_conventions.html. Pixel coordinates are those of
+    COLMAP. All pictures must have one camera model, so fisheye pictures are skipped if there are
+    others. A camera that all pictures share is written at the top level, where other readers expect
+    it.
 
     Args:
         pictures: the pictures whose pose is known.
         up: the relative path from the file's folder to the pictures' folder.
-        left_out: receives the names of pictures that the format cannot hold, by reason.
+        skipped: receives the names of pictures that the format cannot hold, by reason.
         splits: "train", "val" or "test" for each picture, by its name in sidecars.
     """
     fisheyes = [each for each in pictures if each.camera.model == OPENCV_FISHEYE]
@@ -154,30 +155,30 @@ def nerfstudio(
     cameras, frames, responses = [], [], Responses()
     for each in pictures:
         if (each.camera.model == OPENCV_FISHEYE) != is_fisheye:
-            why = f"with a fisheye lens, which {TRANSFORMS} cannot hold together with others"
-            left_out[why].append(each.file)
+            reason = f"with a fisheye lens, which {TRANSFORMS} cannot hold together with others"
+            skipped[reason].append(each.file)
             continue
         assert each.pose
         camera = each.camera if is_fisheye else each.camera.polynomial()
         sizes = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
-        own = {name: camera.distortion.get(name, 0.0) for name in NERFSTUDIO[model]}
-        off = {"distortion_residual": camera.residual} if camera.residual else {}
-        cameras.append({**sizes, "cx": camera.cx, "cy": camera.cy, **own, **off})
-        placed: dict[str, Any] = {"file_path": up + each.file}
-        placed |= {"depth_file_path": up + each.depth} if each.depth else {}
-        placed["transform_matrix"] = to_opengl(*each.pose).tolist()
-        frames.append(placed | _rows_of(each) | responses.of(each))
+        coefficients = {name: camera.distortion.get(name, 0.0) for name in NERFSTUDIO[model]}
+        residual = {"distortion_residual": camera.residual} if camera.residual else {}
+        cameras.append({**sizes, "cx": camera.cx, "cy": camera.cy, **coefficients, **residual})
+        frame: dict[str, Any] = {"file_path": prefix + each.file}
+        frame |= {"depth_file_path": prefix + each.depth} if each.depth else {}
+        frame["transform_matrix"] = to_opengl(*each.pose).tolist()
+        frames.append(frame | _rows_of(each) | responses.record_for(each))
     if not frames:
         return ""
     shared = cameras[0] if all(each == cameras[0] for each in cameras) else {}
     if not shared:
         frames = [{**frame, **camera} for frame, camera in zip(frames, cameras, strict=True)]
     of_split = {
-        split: [up + each.file for each in pictures if splits.get(each.name) == split]
+        split: [prefix + each.file for each in pictures if splits.get(each.name) == split]
         for split in dict.fromkeys(splits.values())
     }
-    if "val" in of_split:  # nerfstudio needs all three if there is one
+    if "val" in of_split:  # nerfstudio needs all three lists if there is one
         of_split.setdefault("test", of_split["val"])
     lists = {f"{split}_filenames": files for split, files in of_split.items()}
-    said = {"note": OPENGL_NOTE, "camera_model": model, **shared, **responses.record, **lists}
-    return json_text({**said, "frames": frames})
+    header = {"note": OPENGL_NOTE, "camera_model": model, **shared, **responses.record, **lists}
+    return json_text({**header, "frames": frames})

@@ -1,0 +1,33 @@
+"""Options of a run that do not change its pictures, such as devices and threads."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from clpipe.outputs.existing import Redo
+
+
+@dataclass(frozen=True)
+class ExecutionOptions:
+    """Where and how a run is executed. Its pictures do not depend on these options.
+
+    Args:
+        output: the output directory.
+        devices: indices or parts of names from ``clpipe devices``, or "numpy". () is the first GPU
+            and all GPUs like it, or else the CPU.
+        memory: the memory limit of a device in bytes. Larger images are processed in tiles. None
+            is the free memory.
+        threads: the number of threads that decode, and of threads that encode. None is one per
+            processor.
+        redo: which existing pictures are recomputed.
+        trace: the file for a timeline, or None.
+        processes: the number of processes that share the work on this machine. None chooses it
+            from the number and size of the images.
+    """
+
+    output: Path
+    devices: tuple[str, ...] = ()
+    memory: int | None = None
+    threads: int | None = None
+    redo: Redo = Redo.OLD
+    trace: Path | None = None
+    processes: int | None = None
