@@ -83,7 +83,7 @@ def interrupt(process: "subprocess.Popen[str]", number: int = signal.SIGINT) -> 
     assert process.stderr
     process.send_signal(number)
     with _guarded(process):
-        is_noticed = any("again to stop now" in line for line in process.stderr)
+        is_noticed = any("to stop now" in line for line in process.stderr)
     assert is_noticed, "the run ended, or hung, without noticing the signal"
 
 

@@ -160,7 +160,7 @@ def escaped(value: Any) -> Any:
     Markup stays as it is.
 
     >>> escaped({"name": "a" + chr(27), "unusual": [chr(10)]})
-    {'name': 'a\\x1b', 'odd': ['\\n']}
+    {'name': 'a\\x1b', 'unusual': ['\\n']}
     """
     if type(value) is str:
         return one_line(value)
