@@ -23,7 +23,7 @@ from clpipe.chain.identity import image_key, noise_key
 from clpipe.chain.making import make_chain
 from clpipe.chain.overscan import margins_of_array
 from clpipe.chain.settings import Settings, overlay
-from clpipe.engine.clipping import MUCH, clipped_share, clipping_text
+from clpipe.engine.clipping import WARNING_SHARE, clipped_share, clipping_text
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.arrays import as_array, as_image
@@ -180,7 +180,9 @@ class Pipeline(ReadOnly):
         with self._lock:
             result = runner.run(pixels, noise_key(chain.settings, own_key))
         share = clipped_share(result, chain) or 0.0
-        if share >= MUCH and chain.source is not Kind.DISPLAY:  # photographs are clipped already
+        if (
+            share >= WARNING_SHARE and chain.source is not Kind.DISPLAY
+        ):  # photographs are clipped already
             warnings.warn(f"{key}: {clipping_text(share)}", stacklevel=2)
         return result
 

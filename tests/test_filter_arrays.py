@@ -16,7 +16,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import settings_from
 from clpipe.dataset import Dataset
-from clpipe.engine.check import ARRAYS, NOISE, compare, laid
+from clpipe.engine.check import ARRAYS, NOISE, compare, mosaic_parameters
 from clpipe.engine.runner import Runner
 from clpipe.images.dng import write_dng
 from clpipe.images.raw import read_facts, read_raw
@@ -45,7 +45,7 @@ RAW = ("sensor_noise", "row_noise", "column_noise")
 
 def on(array: str, **settings):
     """A chain whose mosaic has that array."""
-    return make_chain(settings_from({"iso": 800, "mosaic": laid(array), **settings}))
+    return make_chain(settings_from({"iso": 800, "mosaic": mosaic_parameters(array), **settings}))
 
 
 @pytest.fixture
@@ -92,7 +92,7 @@ def test_a_clear_pixel_saturates_first(develop):
         light,
         numpy=True,
         keep=("normalize",),
-        mosaic=laid("RGBW"),
+        mosaic=mosaic_parameters("RGBW"),
         skip=["noise"],
         exposure={"ev": 1.5},
         inverse_color_matrix={"method": "none"},
@@ -396,7 +396,7 @@ def test_libraw_opens_the_dng_of_an_array(tmp_path, array):
 
 @pytest.mark.slow
 def test_a_dataset_of_another_array(half):
-    options = {"mosaic": laid("quad-RGGB"), "iso": 800, "device": "numpy"}
+    options = {"mosaic": mosaic_parameters("quad-RGGB"), "iso": 800, "device": "numpy"}
     data = Dataset(half, patch=32, raw="mosaic", variance=True, **options)
     sample = data[3]
     assert sample["cfa"] == "RRGG/RRGG/GGBB/GGBB"
@@ -463,7 +463,9 @@ def test_a_bayer_pattern_as_an_array_is_one(array):
     laid_as_array = {"method": "array", "array": array}
     settings = {"white_balance": {"method": "gray_world"}, "demosaic": {"method": "menon2007"}}
     for each in ({}, settings):
-        chains = [on(array, **each, mosaic=own) for own in (laid_as_array, laid("GBRG"))]
+        chains = [
+            on(array, **each, mosaic=own) for own in (laid_as_array, mosaic_parameters("GBRG"))
+        ]
         image = np.random.default_rng(0).random((12, 14, 3)).astype(np.float32)
         one, two = (Runner(chain, None, final=True).run(image, "k").final for chain in chains)
         np.testing.assert_allclose(one, two, rtol=1e-6)
@@ -572,7 +574,11 @@ def test_a_cell_of_charge_saturates_as_one_readout(develop):
     stages = [*DEFAULT_CHAIN]
     stages.insert(stages.index("mosaic") + 1, "remosaic")
     light = np.full((16, 16, 3), 0.3, np.float32)
-    options = {"mosaic": laid("quad-RGGB"), "remosaic": {"method": "binning"}, "skip": ["noise"]}
+    options = {
+        "mosaic": mosaic_parameters("quad-RGGB"),
+        "remosaic": {"method": "binning"},
+        "skip": ["noise"],
+    }
     result = develop(
         light, numpy=True, stages=stages, keep=("normalize",), exposure={"ev": 3}, **options
     )
@@ -604,7 +610,7 @@ def test_a_remosaiced_picture_is_as_the_array_saw_it(develop):
     light = read_image(STILL_LIFE).pixels.astype(np.float32)[100:356, 200:520]
     options = {"stages": ["mosaic", "remosaic", "demosaic"], "demosaic": {"method": "menon2007"}}
     for array, least in (("x-trans", 32.5), ("RGBW", 29), ("quad-RGGB", 26)):
-        mosaic, remosaic = laid(array), {"method": "linear_mmse", "pattern": "GBRG"}
+        mosaic, remosaic = mosaic_parameters(array), {"method": "linear_mmse", "pattern": "GBRG"}
         result = develop(light, mosaic=mosaic, remosaic=remosaic, numpy=True, **options).final
         error = np.mean((np.clip(result, 0, 1) - np.clip(light, 0, 1)) ** 2)
         assert -10 * np.log10(error) > least, array
@@ -629,7 +635,7 @@ def test_what_has_no_cells(array):
 @pytest.mark.slow
 def test_the_variance_of_each_channel_is_that_of_its_noise(write_exr):
     flat = write_exr("flat.exr", np.full((240, 240, 3), 0.5, np.float32))
-    settings = {"mosaic": laid("RGBW"), "iso": 1600}
+    settings = {"mosaic": mosaic_parameters("RGBW"), "iso": 1600}
     options = {"raw": "mosaic", "variance": True, "dtype": "float32", "truth": "clean"}
     sample = Dataset(flat, **options, **settings)[0]
     noise, array = sample["raw"] - sample["truth.raw"], parse_array("RGBW")

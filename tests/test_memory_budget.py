@@ -28,7 +28,7 @@ class SharingDevice:
     """A device in this machine's memory."""
 
     def __init__(self, limit, held=0):
-        self.info = SimpleNamespace(in_place=True)
+        self.info = SimpleNamespace(zero_copy=True)
         self.memory, self.bytes_held = limit, held
         self.limits = []
 
@@ -276,7 +276,7 @@ print(held - _listed(Path("/proc/self/status"), "VmSize") > 100 << 20)
 @pytest.mark.slow
 @LIMITED
 def test_where_memory_ends_tiles_become_smaller(device):
-    if device is None or not device.info.in_place:
+    if device is None or not device.info.zero_copy:
         pytest.skip("needs an OpenCL device for CPUs, such as PoCL")
     assert run_python("-c", WITHOUT_ROOM).stdout == "True\nTrue True\nTrue\n"
 

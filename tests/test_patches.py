@@ -207,11 +207,11 @@ def test_no_buffer_is_replaced_while_an_image_is_on_the_device(device, monkeypat
     make_way, reserve = Flow.reserve, Pool.reserve
 
     def recording_flow(flow, *arguments):
-        before.append(len(flow._sent))
+        before.append(len(flow._in_flight))
         return make_way(flow, *arguments)
 
     def recording_reserve(pool, *arguments):
-        held, tiles = dict(pool.buffers), len(fresh.flow._sent)
+        held, tiles = dict(pool.buffers), len(fresh.flow._in_flight)
         reserve(pool, *arguments)
         if pool.buffers != held:
             replaced.append(tiles)

@@ -113,7 +113,7 @@ class Developers:
     def is_small(self, state: JobState) -> bool:
         """Return whether a job's image is small enough to share launches with others."""
         size = state.source.pixels.shape[1::-1] if state.source else (0, 0)
-        return all(each is not None and each.stacks(*size) for each in self.devices)
+        return all(each is not None and each.can_stack(*size) for each in self.devices)
 
     def order(self, states: Sequence[JobState]) -> list[list[Order]]:
         """Make all renditions of jobs, some at a time, and wait. Returns them by job."""

@@ -95,8 +95,8 @@ class MemoryBudget:
         left: Callable[[], Left | None] | None = None,
     ) -> None:
         self._size = size
-        self._sharing = [each for each in devices if each and each.info.in_place]
-        has_staged = any(each and not each.info.in_place for each in devices)
+        self._sharing = [each for each in devices if each and each.info.zero_copy]
+        has_staged = any(each and not each.info.zero_copy for each in devices)
         self._aside = size or 0 if has_staged else 0  # for staging buffers of GPUs
         self._starting = len(devices)
         self._drop = drop
@@ -189,7 +189,7 @@ class MemoryBudget:
             for device in self._sharing:
                 if device.memory > least:
                     self._limits[device] = device.memory
-                    device.limit(least)
+                    device.limit_memory(least)
             end = time.monotonic() + PATIENCE
             while not (fits := self._fits(size)) and time.monotonic() < end:
                 time.sleep(PATIENCE / 20)

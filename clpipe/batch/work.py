@@ -26,7 +26,7 @@ from clpipe.chain.rendition import Rendition
 from clpipe.engine.clipping import clipped_share
 from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions, Timing
-from clpipe.engine.runner import Result, Runner, submit_together
+from clpipe.engine.runner import Result, Runner, submit_batch
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.existing import Found, Redo
@@ -234,10 +234,10 @@ class ImageWorker:
         ready = [order for order in orders if order]
         waits: list[Callable[[], Result] | None]
         if len(asked) == 1:
-            waits = [self._tried(asked[0][0], lambda: submit_together(ready)[0]) if ready else None]
+            waits = [self._tried(asked[0][0], lambda: submit_batch(ready)[0]) if ready else None]
         else:
             try:
-                begun = iter(submit_together(ready) if ready else ())
+                begun = iter(submit_batch(ready) if ready else ())
                 waits = [next(begun) if order else None for order in orders]
             except DeviceError:
                 raise
@@ -257,10 +257,14 @@ class ImageWorker:
         pixels, device = source.pixels, runner.device
         width, height = runner.chain.size(*pixels.shape[1::-1])
         boxes = [patch.box for patch in state.patches]
-        is_used_again = runner.encode and not boxes and device and not device.stacks(width, height)
+        is_used_again = (
+            runner.encode and not boxes and device and not device.can_stack(width, height)
+        )
         into = self._spare.take((height, width, *pixels.shape[2:])) if is_used_again else None
         timings: list[Timing] | None = [] if self._trace and device else None
-        options = RunOptions(timings, into=into, unchanged=True, boxes=boxes, later=source.later)
+        options = RunOptions(
+            timings, into=into, unchanged=True, boxes=boxes, later_exposures=source.later
+        )
         return runner, pixels, recipe.noise_key, options
 
     def _finish(

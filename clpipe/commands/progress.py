@@ -21,7 +21,7 @@ from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
 from clpipe.batch.session import Run
 from clpipe.commands.notices import NOTICES
 from clpipe.engine.clipping import clipping_text
-from clpipe.engine.programs import watched
+from clpipe.engine.programs import watching_compilation
 from clpipe.outputs.existing import Redo
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ class Reporter:
 
     def __enter__(self) -> Self:
         self._live.enter_context(NOTICES.printed_by(self.print))
-        self._live.enter_context(watched(self._compiling))
+        self._live.enter_context(watching_compilation(self._compiling))
         if self._shows and self._several:
             self._show("")
         return self

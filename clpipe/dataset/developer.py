@@ -18,7 +18,7 @@ from clpipe.chain.truth import noisy_mosaic, picture_without_noise
 from clpipe.dataset.arrays import HIGHEST, ArrayFormat
 from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions
-from clpipe.engine.runner import Result, Runner, submit_together
+from clpipe.engine.runner import Result, Runner, submit_batch
 from clpipe.images.read import SourceImage
 from clpipe.outputs.patches import Patch, Patches, facts_of, variance_at, variance_steps
 from clpipe.stage import Kind
@@ -110,7 +110,7 @@ class Order:
     def options(self) -> RunOptions:
         """The options of the run."""
         boxes = [patch.box for patch in self.patches]
-        return RunOptions(unchanged=True, boxes=boxes, later=self.source.later)
+        return RunOptions(unchanged=True, boxes=boxes, later_exposures=self.source.later)
 
 
 class Developer:
@@ -142,7 +142,7 @@ class Developer:
         with self._lock:
             raws = [self._raws_of(order.chain) for order in orders]
             runs = [self._runs(o.chain, own) for o, own in zip(orders, raws, strict=True)]
-            begun = submit_together(
+            begun = submit_batch(
                 [
                     (runner, order.source.pixels, order.noise_key, order.options)
                     for order, own in zip(orders, runs, strict=True)

@@ -23,13 +23,15 @@ class Store:
         of: texts that are part of every key.
     """
 
-    def __init__(self, folder: Path | None, *of: str) -> None:
+    def __init__(self, folder: Path | None, *namespace: str) -> None:
         self.folder = folder
-        self._of = of
+        self._namespace = namespace
 
     def path(self, *key: str) -> Path | None:
         """Return the file of a key; None without a folder."""
-        parts = b"\0".join(hashlib.sha256(part.encode()).digest() for part in (*self._of, *key))
+        parts = b"\0".join(
+            hashlib.sha256(part.encode()).digest() for part in (*self._namespace, *key)
+        )
         return self.folder / hashlib.sha256(parts).hexdigest()[:40] if self.folder else None
 
     def load(self, *key: str) -> bytes | None:

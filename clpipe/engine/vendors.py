@@ -48,7 +48,7 @@ def icd_files() -> list[tuple[Path, str]]:
     return found
 
 
-def loaded() -> Any:
+def load_pyopencl() -> Any:
     """Return pyopencl, after preparing the environment. Every use of OpenCL starts here.
 
     Raises:
@@ -68,7 +68,7 @@ def installed_drivers() -> list[str]:
 
     If the user has set one of :data:`VARIABLES`, the .icd files cannot be hidden.
     """
-    bundled = [BUNDLED] if any(Path(loaded().__file__).parent.glob(".libs/*.icd")) else []
+    bundled = [BUNDLED] if any(Path(load_pyopencl().__file__).parent.glob(".libs/*.icd")) else []
     named = any(name in os.environ for name in VARIABLES)
     return bundled if named else [*bundled, *(str(path) for path, _ in icd_files())]
 
@@ -84,7 +84,7 @@ def platforms(hidden: Collection[str] = ()) -> list[Any]:
     Raises:
         DeviceError: pyopencl cannot be loaded, or the platforms cannot be listed.
     """
-    cl = loaded()
+    cl = load_pyopencl()
     try:
         with drivers_visible(hidden):
             return list(cl.get_platforms())

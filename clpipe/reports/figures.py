@@ -11,7 +11,7 @@ from typing import Any
 from clpipe.base.memory import in_words
 from clpipe.base.text import duration, one_line
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS
-from clpipe.engine.clipping import MUCH
+from clpipe.engine.clipping import WARNING_SHARE
 from clpipe.reports.run import Made, Run
 
 TIMES = 60  # intervals of a run, at most
@@ -291,6 +291,6 @@ def oddities(made: Made) -> list[str]:
     """Return what is unusual in a picture: missing or changed files, clipping, warnings."""
     found = [blob.problem for blob in made.files.values() if blob.problem]
     clipped = number(made.value("clipped"))
-    if clipped >= MUCH:
+    if clipped >= WARNING_SHARE:
         found.append(f"{clipped * 100:.0f} % of its pixels are clipped")
     return found + warnings_of(made)
