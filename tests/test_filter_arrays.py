@@ -150,7 +150,7 @@ def test_a_polarised_array_has_no_colours():
     ):
         on("polarised", skip=["inverse_color_matrix"], color_matrix={"method": "camera"})
     chain = on("polarised", skip=["inverse_color_matrix"])
-    assert chain.filters.name == "polarised"
+    assert chain.filter_array.name == "polarised"
     flat = np.full((12, 12, 3), 0.2, np.float32)  # unpolarised light is gray
     stages = ["mosaic", "inverse_white_balance", "white_balance", "demosaic"]
     gray = Runner(on("polarised", stages=stages), None, final=True, encode=False).run(flat, "k")
@@ -618,12 +618,15 @@ def test_a_remosaiced_picture_is_as_the_array_saw_it(develop):
 
 def test_the_array_of_a_raw_is_that_of_its_pixels():
     quad, wanted = "RRGG/RRGG/GGBB/GGBB", {"method": "linear_mmse", "pattern": "GBRG"}
-    assert remosaiced("quad-RGGB", "binning").filters.pattern == quad
-    assert remosaiced("quad-RGGB", "linear_mmse").filters.pattern == quad
-    assert on("RGGB", stages=WITH_REMOSAIC, remosaic=wanted).filters.pattern == "RGGB"
+    assert remosaiced("quad-RGGB", "binning").filter_array.pattern == quad
+    assert remosaiced("quad-RGGB", "linear_mmse").filter_array.pattern == quad
+    assert on("RGGB", stages=WITH_REMOSAIC, remosaic=wanted).filter_array.pattern == "RGGB"
     charge = [*DEFAULT_CHAIN]
     charge.insert(charge.index("mosaic") + 1, "remosaic")
-    assert on("quad-RGGB", stages=charge, remosaic={"method": "binning"}).filters.pattern == "RGGB"
+    assert (
+        on("quad-RGGB", stages=charge, remosaic={"method": "binning"}).filter_array.pattern
+        == "RGGB"
+    )
 
 
 @pytest.mark.parametrize("array", ["x-trans", "RGGB"])

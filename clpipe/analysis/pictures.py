@@ -101,7 +101,7 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
     black, white = context.black_level, context.white_level
     if black is None or white is None:  # not digitised, so nothing is clipped at black
         highest = context.full_scale
-        clean = Picture(path, "mosaic", pixels, context.filters.pattern, white=highest)
+        clean = Picture(path, "mosaic", pixels, context.filter_array.pattern, white=highest)
         return replace(clean, balance=balance, iso=iso)
     full = np.float32(context.full_scale)
     lowest = float(-black / (white - black) * full)
@@ -113,7 +113,9 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
     if kind == Kind.RAW.label:
         pixels = (pixels - np.float32(black)) / np.float32(white - black) * full
     highest = float(full)
-    return Picture(path, "mosaic", pixels, context.filters.pattern, lowest, highest, balance, iso)
+    return Picture(
+        path, "mosaic", pixels, context.filter_array.pattern, lowest, highest, balance, iso
+    )
 
 
 def context_after(settings: Settings, stage: str | None) -> Context:

@@ -170,16 +170,16 @@ class Chain:
         return maker.method.next_context(maker.context)
 
     @cached_property
-    def filters(self) -> FilterArray:
+    def filter_array(self) -> FilterArray:
         """The filter array of the raw, or of the mosaic if the chain makes no raw."""
         if self.maker_of_raw:
-            return self.context_of_raw.filters
+            return self.context_of_raw.filter_array
         if self.result is Kind.MOSAIC:
-            return self.context_after.filters
+            return self.context_after.filter_array
         if self.source in (Kind.RAW, Kind.MOSAIC):
-            return self.steps[0].context.filters
+            return self.steps[0].context.filter_array
         step = self.step_in(StageRole.PATTERN) or self.steps[-1]
-        return step.method.next_context(step.context).filters
+        return step.method.next_context(step.context).filter_array
 
     @cached_property
     def result(self) -> Kind:
@@ -297,11 +297,11 @@ class Chain:
         for step in self.steps:
             name, folder = step.name, step.stage.folder
             is_set = bool(self.settings.parameters.get(name))
-            method = step.stage.chosen(self.settings.method(name), is_set, step.context)
-            context = step.context.but(clean=True)
+            method = step.stage.method_at_step(self.settings.method(name), is_set, step.context)
+            context = step.context.replace(clean=True)
             with validation_errors(name, type(method)), user_code_errors(f"stage {name}", folder):
                 own = method.noise_free(context)
-                left.append((step, own and own.as_for(step.method)))
+                left.append((step, own and own.with_image_state_of(step.method)))
         return self._with(left, clean=True)
 
     def _with(self, methods: Sequence[tuple[Step, Method | None]], clean: bool) -> "Chain":
@@ -312,7 +312,7 @@ class Chain:
         def context_of(step: Step) -> Context:
             key = id(step.context)
             if key not in contexts:
-                contexts[key] = step.context.but(noise=None, clean=clean)
+                contexts[key] = step.context.replace(noise=None, clean=clean)
             return contexts[key]
 
         steps = tuple(

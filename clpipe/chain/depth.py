@@ -9,12 +9,12 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, of_structure
 from clpipe.reference.defocus import Depth, checked_depth
-from clpipe.stage import OfDepth
+from clpipe.stage import DepthMethod
 
 
-def depth_steps(chain: Chain) -> dict[str, OfDepth]:
+def depth_steps(chain: Chain) -> dict[str, DepthMethod]:
     """Return the methods of the steps that need depth, by step name."""
-    return {s.name: s.method for s in chain.steps if isinstance(s.method, OfDepth)}
+    return {s.name: s.method for s in chain.steps if isinstance(s.method, DepthMethod)}
 
 
 @of_structure
@@ -42,7 +42,9 @@ def with_depth(chain: Chain, depth: Depth) -> Chain:
                 f"depth that {[*needing][-1]} needs; list {step.name} after {[*needing][-1]}"
             )
     steps = tuple(
-        replace(step, context=step.context.but(depth=reference)) if step.name in needing else step
+        replace(step, context=step.context.replace(depth=reference))
+        if step.name in needing
+        else step
         for step in chain.steps
     )
     return replace(chain, steps=steps)

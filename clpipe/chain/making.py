@@ -19,8 +19,8 @@ from clpipe.chain.settings import Settings
 from clpipe.reference.geometry import Scaling
 from clpipe.stage import (
     Context,
-    FromLens,
     Kind,
+    LensMethod,
     Method,
     Stage,
     StageRole,
@@ -137,12 +137,12 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     before, takes_lens = "the input", not settings.lens
     wide = ""  # the step after which the picture is no longer in perspective
     for name, as_set in methods.items():
-        stage = all_stages()[base_name(name)].reading(kind)
-        own = stage.chosen(as_set, bool(settings.parameters.get(name)), context)
+        stage = all_stages()[base_name(name)].for_kind(kind)
+        own = stage.method_at_step(as_set, bool(settings.parameters.get(name)), context)
         with validation_errors(name, type(own)), user_code_errors(f"stage {name}", stage.folder):
             fits = stage.reads is (kind or stage.reads)
             method = own
-            is_resolved = fits or isinstance(own, FromLens)
+            is_resolved = fits or isinstance(own, LensMethod)
             if is_resolved:
                 try:
                     method = own.resolve(context)
@@ -150,7 +150,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
                     if wide:
                         _check_behind(wide, name, own)
                     raise
-            takes_lens |= isinstance(own, FromLens) and not isinstance(method, Unchanged)
+            takes_lens |= isinstance(own, LensMethod) and not isinstance(method, Unchanged)
             if wide and is_resolved and method.passes():
                 _check_behind(wide, name, own)
             if fits and isinstance(method, Wide):
@@ -162,7 +162,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
             _check_array(name, method, context)
             after = method.next_context(context)
             if (states := method.optics()) and method.passes():
-                after = after.but(optics=after.optics.set_to(states))
+                after = after.replace(optics=after.optics.set_to(states))
         if stage.folder and not isinstance(context.iso, Traced):  # else it has been checked
             check_passes(name, stage, method, context)
         steps.append(Step(name, stage, method, context))
@@ -219,7 +219,7 @@ def _check_behind(wide: str, name: str, method: Method) -> None:
     Raises:
         RequestError: the step needs a picture in perspective.
     """
-    if isinstance(method, FromLens):
+    if isinstance(method, LensMethod):
         raise KeyedError(
             "lens",
             f"lens: a lens from lensfun needs a picture in perspective, but {wide} is a lens as "
@@ -283,7 +283,7 @@ def _check_array(name: str, method: Method, context: Context) -> None:
     array = context.array
     if array and any("pattern" in pass_.all_arguments for pass_ in method.passes()):
         stage = all_stages()[base_name(name)]
-        usual = stage.usual and stage.usual(context)
+        usual = stage.default_method and stage.default_method(context)
         fitting = [m.method for m in ((usual,) if usual else stage.methods) if m.any_array]
         rest = f"use {name}.method={' or '.join(fitting)}" if fitting else f"skip {name}"
         raise KeyedError(
@@ -297,7 +297,7 @@ def _unused_lens(settings: Settings, methods: Mapping[str, Method]) -> str:
     """Return the message for a lens that is set, but that no step uses."""
     known = "lensfun has neither distortion nor vignetting for it at these settings; remove it"
     stages = " or ".join(s.name for s in all_stages().values() if "lens" in s.by_name)
-    takes_it = any(isinstance(method, FromLens) for method in methods.values())
+    takes_it = any(isinstance(method, LensMethod) for method in methods.values())
     why = known if takes_it else f"no step uses it; set the method of {stages} to lens"
     return f"lens: found {settings.lens}, but {why}"
 

@@ -185,7 +185,7 @@ def check_passes(name: str, stage: Stage, method: Method, context: Context) -> N
     with user_code_errors(f"stage {name}", stage.folder):
         passes, arguments = method.passes(), typed_arguments(method.arguments(context))
         for pass_ in passes:
-            names = [*arguments, *(name for p in passes for name in p.gives)]
+            names = [*arguments, *(name for p in passes for name in p.provides)]
             for argument in pass_.all_arguments:
                 if argument not in names:
                     raise RequestError(

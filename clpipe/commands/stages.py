@@ -136,7 +136,7 @@ def stage_row(stage: Stage) -> tuple[str, ...]:
 
 def kinds_text(kind: Kind, stage: Stage) -> str:
     """Return the kind that a stage reads or writes, and the kinds allowed instead."""
-    return " or ".join(each.label for each in (kind, *stage.also))
+    return " or ".join(each.label for each in (kind, *stage.also_reads))
 
 
 def explain_stage(stage: Stage, settings: Settings) -> None:

@@ -54,10 +54,10 @@ class SampleSpec:
                 f"found patch {patches.size}, but a packed raw has planes of half the size. Use an "
                 "even size"
             )
-        if self.arrays.raw == "packed" and not chain.filters.bayer:
+        if self.arrays.raw == "packed" and not chain.filter_array.bayer:
             raise RequestError(
                 f"raw='packed': planes need a Bayer pattern, but the mosaic is "
-                f"{chain.filters.name}. Use raw='mosaic'"
+                f"{chain.filter_array.name}. Use raw='mosaic'"
             )
         self.arrays.check(chain.result)
         if self.truth:
@@ -245,7 +245,7 @@ class Developer:
             part: returns the part of an image that belongs to the sample.
         """
         arrays = self._spec.arrays
-        pattern = chain.filters.pattern
+        pattern = chain.filter_array.pattern
 
         def turned(image: Array) -> Array:
             return patch.turned(part(image)) if patch else image

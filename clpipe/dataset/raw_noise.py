@@ -68,7 +68,7 @@ class RawNoise(ReadOnly):
         self._settings = {**settings, "camera": str(camera), "iso": iso, "seed": seed or 0}
         self._seed = seed
         self._device = device
-        self._pattern = self._pipeline("numpy").chain.filters.pattern
+        self._pattern = self._pipeline("numpy").chain.filter_array.pattern
         self._opened: tuple[int, Pipeline, np.random.Generator] | None = None
 
     def __getstate__(self) -> Mapping[str, Any]:

@@ -100,4 +100,6 @@ def part_as_read(name: str, part: Array, chain: Chain) -> Picture:
         return Picture(path, "rgb", part, white=1.0)
     black, white = context.black_level, context.white_level
     lowest = None if black is None or white is None else -black / (white - black)
-    return Picture(path, "mosaic", signal_of(part, chain), context.filters.pattern, lowest, 1.0)
+    return Picture(
+        path, "mosaic", signal_of(part, chain), context.filter_array.pattern, lowest, 1.0
+    )

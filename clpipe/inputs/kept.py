@@ -159,7 +159,7 @@ def _without_input_noise(chain: Chain) -> Chain:
     steps: list[Step] = []
     noise = None
     for step in chain.steps:
-        steps.append(replace(step, context=step.context.but(noise=noise)))
+        steps.append(replace(step, context=step.context.replace(noise=noise)))
         noise = step.method.next_context(steps[-1].context).noise
     return replace(chain, steps=tuple(steps))
 
@@ -176,7 +176,7 @@ def _entries_of(kind: str, chain: Chain) -> str:
     names = [
         name
         for name, stage in stages.items()
-        if kind in [each.label for each in (stage.reads, *stage.also)]
+        if kind in [each.label for each in (stage.reads, *stage.also_reads)]
     ]
     if not names:
         return f"no stage of the chain reads {kind}"

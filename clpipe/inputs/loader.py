@@ -115,7 +115,7 @@ class ImageLoader:
             return entry(self.settings)
         stage = stage_named("--start-at", base_name(start_at))
         try:
-            return self.chain.source if stage.also else stage.reads
+            return self.chain.source if stage.also_reads else stage.reads
         except RequestError:  # the stage is in the chain that a kept image carries
             return stage.reads
 

@@ -160,7 +160,7 @@ class RawLoader:
         name = name_of(StageRole.PATTERN)
         own = settings.parameters.get(name, {})
         pattern = own.get("array") or own.get("pattern", "RGGB")
-        if parse_array(pattern).rows != chain.steps[0].context.filters.rows:
+        if parse_array(pattern).rows != chain.steps[0].context.filter_array.rows:
             raise ImageError(
                 f"{path}: its CFA pattern is {pattern}, but the chain has no {name} stage to set "
                 f"it. Add {name} and the stages that produce DN; they do not run on a raw"

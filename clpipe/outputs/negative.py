@@ -56,7 +56,7 @@ def negative_of(chain: Chain) -> Negative:
             f"{MOST_DN}; use --format npy, or fewer bits"
         )
     undone = end.colours if is_input and end.colours != context.colours else None
-    array = _balanced(context.filters, gains)
+    array = _balanced(context.filter_array, gains)
     check_array(array)
     return Negative(
         step=chain.maker_of_raw,

@@ -133,7 +133,7 @@ class Patches:
                 f"its picture has {width}x{height} pixels, but patches need "
                 f"{self.size}x{self.size}; choose smaller patches, or exclude this image"
             )
-        return Cutting(self, width, height, chain.filters.pattern, chain.seed)
+        return Cutting(self, width, height, chain.filter_array.pattern, chain.seed)
 
 
 @dataclass(frozen=True)
@@ -272,7 +272,7 @@ def variance_at(noise: Sequence[Step], signal: Array, patch: Patch | None) -> Ar
     if patch is None:
         return variance_of(noise, signal)
     # Padding aligns the patch with the pattern, so that its first pixel has the right colour.
-    down, across = noise[0].context.filters.period
+    down, across = noise[0].context.filter_array.period
     x, y = patch.left % across, patch.top % down
     padded = np.pad(signal, ((y, 0), (x, 0), (0, 0))[: signal.ndim], mode="edge")
     return variance_of(noise, padded)[y:, x:]
@@ -286,7 +286,7 @@ def facts_of(chain: Chain) -> dict[str, Any]:
     except RequestError:  # there is no raw
         return facts
     return facts | {
-        "cfa": chain.filters.pattern,
+        "cfa": chain.filter_array.pattern,
         "black_level": float(raw.black_level),
         "white_level": float(raw.white_level),
         "gains": np.array([raw.array.gains[0], 1, raw.array.gains[1]], np.float32),

@@ -90,8 +90,8 @@ class Sine(SignalMethod):
     def arguments(self, context: Context) -> Arguments:
         return {"frequency": self.frequency, "amplitude": self.amplitude}
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        return before + np.float32(self.amplitude) ** 2 / np.float32(2)
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
+        return input_variance + np.float32(self.amplitude) ** 2 / np.float32(2)
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:

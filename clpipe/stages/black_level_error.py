@@ -95,8 +95,8 @@ class Offsets(SignalMethod):
             "sigma": self.sigma,
         }
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        return before + np.float32(self.sigma) ** 2
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
+        return input_variance + np.float32(self.sigma) ** 2
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:

@@ -147,11 +147,11 @@ class Thermal(SignalMethod):
         mean, spread, electron = self._charge
         return {"mean": mean, "spread": spread, "per_electron": electron}
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         if not self.electrons:
-            return before
+            return input_variance
         mean, spread, electron = self._charge
-        return before + (mean * electron + spread * spread)
+        return input_variance + (mean * electron + spread * spread)
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:

@@ -142,9 +142,9 @@ class Smooth(SignalMethod):
         numbers = {f"curve_{k}": CompileTime(f"{k}u") for k in range(2 * MAPS)}
         return {**numbers, "per_px": self._per_px, "slope": slope, "offset": offset}
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         """The variance of the noise: a smooth map that is the same in every frame adds none."""
-        return before
+        return input_variance
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:

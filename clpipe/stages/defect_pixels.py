@@ -86,9 +86,9 @@ class Random(SignalMethod):
             "hot_level": self.hot_level,
         }
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         """The variance without defect pixels, which are few and not part of the noise model."""
-        return before
+        return input_variance
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:

@@ -12,9 +12,9 @@ from clpipe.reference.defocus import NOWHERE, Depth, aperture_taps, defocus, rea
 from clpipe.stage import (
     Arguments,
     Context,
-    InFocalLengths,
+    DepthMethod,
+    FocalLengthMethod,
     Kind,
-    OfDepth,
     Pass,
     ReferenceContext,
     Stage,
@@ -34,7 +34,7 @@ class InFocus(Unchanged):
     summary: ClassVar = "everything is in focus"
 
 
-class ThinLens(InFocalLengths, OfDepth):
+class ThinLens(FocalLengthMethod, DepthMethod):
     """A thin lens: a point at distance z becomes a disc of diameter c.
 
     c = f^2 |z - zf| / (N z (zf - f)), with focal length f, f-number N and focus distance zf
@@ -227,9 +227,9 @@ class ThinLens(InFocalLengths, OfDepth):
         border = ((reach, reach), (reach, reach + VECTOR))
         return np.pad(radii, border, "reflect"), reach, aperture_taps(self.blades, largest)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        taps = self.arguments(given.context)["taps"]
-        depth = np.broadcast_to(_depth_in(given.context).pixels, image.shape[:2])
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        taps = self.arguments(inputs.context)["taps"]
+        depth = np.broadcast_to(_depth_in(inputs.context).pixels, image.shape[:2])
         radii = self.clipped(depth)
         assert isinstance(taps, np.ndarray)
         return defocus(image, radii, taps)

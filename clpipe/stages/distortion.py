@@ -20,15 +20,15 @@ from clpipe.reference import warp
 from clpipe.reference.lens import DistortionMap
 from clpipe.reference.radial import Radial
 from clpipe.stage import (
-    AboutAxis,
     Arguments,
     CompileTime,
     Context,
-    FromLens,
-    InFocalLengths,
+    FocalLengthMethod,
     Kind,
+    LensMethod,
     Method,
     Pass,
+    PrincipalPointMethod,
     ReferenceContext,
     Resample,
     Stage,
@@ -55,7 +55,7 @@ def filter_arguments(name: str) -> Arguments:
     }
 
 
-class HasPicture(AboutAxis):
+class HasPicture(PrincipalPointMethod):
     """Parameters that every lens model has."""
 
     fit: bool = parameter(
@@ -68,12 +68,12 @@ class HasPicture(AboutAxis):
     )
 
 
-class DistortionOfLens(FromLens, HasPicture):
+class DistortionOfLens(LensMethod, HasPicture):
     """Distortion of the lens that ``--lens`` names, from lensfun; without it, none."""
 
     summary: ClassVar = "distortion of the lens that --lens names; none without it"
 
-    def of_lens(self, lens: LensCalibration | None) -> Method:
+    def for_lens(self, lens: LensCalibration | None) -> Method:
         if lens is None or not lens.distortion:
             return NoDistortion()
         own, table = dict(self), dict(lens.distortion)
@@ -136,14 +136,14 @@ class Distortion(HasPicture):
     def arguments(self, context: Context) -> Arguments:
         return filter_arguments(self.filter)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return self.resampling.reference(image) if self.passes() else image
 
 
 Coefficient = Annotated[float, Field(ge=-1e4, le=1e4)]
 
 
-class OfCamera(InFocalLengths, Distortion):
+class OfCamera(FocalLengthMethod, Distortion):
     """A model that is defined in focal lengths."""
 
     fy: float | None = parameter(
@@ -174,7 +174,7 @@ class OfCamera(InFocalLengths, Distortion):
         lens = super().lens()
         if self.fx and self.fy:
             return replace(lens, focal=(self.fx, self.fy))
-        return replace(lens, share=self.share)
+        return replace(lens, share=self.relative_focal_length)
 
 
 class BrownConrady(OfCamera):

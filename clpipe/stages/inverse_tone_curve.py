@@ -54,7 +54,7 @@ class Standard(standard.Standard):
     def arguments(self, context: Context) -> Arguments:
         return self.numbers(standard.GREY_OUT)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         inside = inside_of(image)
         to_high = inside.max(-1, keepdims=True)
         high = self.inverse(to_high)
@@ -76,7 +76,7 @@ class Neutral(Method):
     def arguments(self, context: Context) -> Arguments:
         return {"a": A, "b": B, "c": C, "d": D}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return keep_hue(image, inverse_neutral)
 
 

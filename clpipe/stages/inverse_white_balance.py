@@ -35,7 +35,7 @@ class Gains(CameraGains):
         return ArrayGains.on(context.array, own) if context.array else own
 
     def next_context(self, context: Context) -> Context:
-        return context.but(gains=self.gains)
+        return context.replace(gains=self.gains)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("inverse_white_balance", arguments=("pattern", "red", "blue")),)
@@ -44,13 +44,13 @@ class Gains(CameraGains):
         red, blue = self.factors
         return {"pattern": context.cfa, "red": red, "blue": blue}
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         red, blue = (np.float32(gain**-2) for gain in self.gains)
-        return before * by_site(signal.shape[:2], context.pattern, red, np.float32(1), blue)
+        return input_variance * by_site(signal.shape[:2], context.pattern, red, np.float32(1), blue)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         red, blue = self.factors
-        return image * by_site(image.shape, given.context.pattern, red, np.float32(1), blue)
+        return image * by_site(image.shape, inputs.context.pattern, red, np.float32(1), blue)
 
 
 class ArrayGains(OfArray, Gains):
@@ -59,10 +59,10 @@ class ArrayGains(OfArray, Gains):
     function: ClassVar = "white_to_level"
     inverse: ClassVar = False
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        return before * self.factors_at(signal.shape[:2]) ** 2
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
+        return input_variance * self.factors_at(signal.shape[:2]) ** 2
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return image * self.factors_at(image.shape)
 
 

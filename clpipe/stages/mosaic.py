@@ -50,15 +50,15 @@ class Bayer(Method):
     )
 
     def next_context(self, context: Context) -> Context:
-        return context.but(pattern=self.pattern, array=None)
+        return context.replace(pattern=self.pattern, array=None)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("mosaic", arguments=("pattern",)),)
 
     def arguments(self, context: Context) -> Arguments:
-        return {"pattern": context.but(pattern=self.pattern).cfa}
+        return {"pattern": context.replace(pattern=self.pattern).cfa}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         red, green, blue = np.moveaxis(image, -1, 0)
         return by_site(image.shape, self.pattern, red, green, blue)
 
@@ -105,7 +105,7 @@ class AnyArray(Method):
         return self
 
     def _laid(self, context: Context) -> FilterArray:
-        return parse_array(self.array).with_gains(context.gains_of_light)
+        return parse_array(self.array).with_gains(context.illuminant_gains)
 
     def next_context(self, context: Context) -> Context:
         return context.with_array(self._laid(context))
@@ -117,8 +117,8 @@ class AnyArray(Method):
         array = self._laid(context)
         return {"responses": responses_table(array), **period_of(array.period)}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        table = responses_of(self._laid(given.context))
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        table = responses_of(self._laid(inputs.context))
         red, green, blue = (tiled(table[:, c], image.shape) for c in range(3))
         return (image[..., 0] * red + image[..., 1] * green) + image[..., 2] * blue
 
@@ -149,5 +149,5 @@ STAGE = Stage(
     Kind.MOSAIC,
     (Bayer, AnyArray),
     role=StageRole.PATTERN,
-    usual=_of_camera,
+    default_method=_of_camera,
 )

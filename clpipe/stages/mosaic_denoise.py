@@ -143,9 +143,9 @@ class NonLocalMeans(Method):
             **self.numbers(context),
         }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        n = self.numbers(given.context)
-        shape, pattern = image.shape, given.context.pattern
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        n = self.numbers(inputs.context)
+        shape, pattern = image.shape, inputs.context.pattern
         one = np.float32(1)
         sensor = image * by_site(shape, pattern, n["red_inverse"], one, n["blue_inverse"])
         stable = stabilized(sensor, n["a"], n["offset"], n["root_of_offset"])

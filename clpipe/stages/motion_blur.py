@@ -12,13 +12,13 @@ from clpipe.base.types import Floats
 from clpipe.reference.convolve import convolve, reach_of, taps_of
 from clpipe.reference.turning import BILINEAR, Turning
 from clpipe.stage import (
-    AboutAxis,
     Arguments,
     Context,
-    InFocalLengths,
+    FocalLengthMethod,
     Kind,
     Method,
     Pass,
+    PrincipalPointMethod,
     ReferenceContext,
     Resample,
     Stage,
@@ -156,11 +156,11 @@ class Linear(Method):
             return {}
         return {"taps": self.taps, "count": np.int32(len(self.taps))}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return convolve(image, self.taps) if self.pixels else image
 
 
-class Perspective(InFocalLengths, AboutAxis):
+class Perspective(FocalLengthMethod, PrincipalPointMethod):
     """Streaks of a rotating camera, with their perspective at each position of the image.
 
     The camera rotates evenly about an axis in its image plane. It shows the render unchanged in the
@@ -209,7 +209,9 @@ class Perspective(InFocalLengths, AboutAxis):
     def turning(self) -> Turning:
         """The geometry from render to image."""
         centre = self.cx, self.cy
-        return Turning(self.rotation, self.angle, self.fx, self.share, centre, self.margins)
+        return Turning(
+            self.rotation, self.angle, self.fx, self.relative_focal_length, centre, self.margins
+        )
 
     def passes(self) -> tuple[Pass, ...]:
         if not self.rotation:
@@ -220,7 +222,7 @@ class Perspective(InFocalLengths, AboutAxis):
     def arguments(self, context: Context) -> Arguments:
         return {"filter": BILINEAR} if self.rotation else {}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return self.turning.reference(image) if self.rotation else image
 
 

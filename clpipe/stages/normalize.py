@@ -94,7 +94,7 @@ class Linear(SignalMethod):
             return context
         assert self.black_level is not None and self.white_level is not None
         whole = context.white_level - context.black_level
-        return context.but(full_scale=whole / (self.white_level - self.black_level))
+        return context.replace(full_scale=whole / (self.white_level - self.black_level))
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("normalize_levels", arguments=("black_level", "scale")),)
@@ -104,9 +104,9 @@ class Linear(SignalMethod):
         scale = float32(1 / (self.white_level - self.black_level))
         return {"black_level": self.black_level, "scale": scale}
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         assert self.black_level is not None and self.white_level is not None
-        return before * np.float32((self.white_level - self.black_level) ** -2)
+        return input_variance * np.float32((self.white_level - self.black_level) ** -2)
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
@@ -163,7 +163,7 @@ class Pwl(Linear):
         return pieces_of(knots_in(self.knots), inverse=True)
 
     def next_context(self, context: Context) -> Context:
-        return super().next_context(context).but(knots=())
+        return super().next_context(context).replace(knots=())
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("expand", arguments=("black_level", "scale", "pieces", "count")),)
@@ -172,8 +172,8 @@ class Pwl(Linear):
         count = CompileTime(str(len(self._pieces)))
         return {**super().arguments(context), "pieces": self._pieces, "count": count}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return super().reference(along_pieces(image, self._pieces), given)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return super().reference(along_pieces(image, self._pieces), inputs)
 
 
 def _of_curve(context: Context) -> Method | None:
@@ -187,5 +187,5 @@ STAGE = Stage(
     Kind.MOSAIC,
     (Linear, Pwl),
     role=StageRole.LEVELS,
-    usual=_of_curve,
+    default_method=_of_curve,
 )

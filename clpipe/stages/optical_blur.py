@@ -292,8 +292,8 @@ class Lens(Method):
         across, down = line_taps(*lines)
         return {"across": across, "down": down, "count": int32(len(across))}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        own = self.resolve(given.context)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        own = self.resolve(inputs.context)
         lines = own._by_lines
         if lines is None:
             return convolve(image, own._taps)

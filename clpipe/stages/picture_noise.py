@@ -159,10 +159,10 @@ class IndependentNoise(Matched):
             )
         return self.with_defaults(correlation=self.noise(iso).correlation)
 
-    def normals(self, image: Floats, given: ReferenceContext) -> Floats:
+    def normals(self, image: Floats, inputs: ReferenceContext) -> Floats:
         """Return the normals of each sample, (height, width, 3), from the image's stream."""
         assert self.correlation is not None
-        stream = given.stream[NoiseScope.IMAGE]
+        stream = inputs.stream[NoiseScope.IMAGE]
         return correlated_normals(image.shape, stream, mixing(*self.correlation))
 
     def mixing_arguments(self) -> dict[str, Argument]:
@@ -209,8 +209,8 @@ class IidGaussian(IndependentNoise):
         sigmas = zip(("red", "green", "blue"), map(float32, self.sigma), strict=True)
         return {**dict(sigmas), **self.mixing_arguments()}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return image + self.normals(image, given) * np.array(self.sigma, np.float32)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return image + self.normals(image, inputs) * np.array(self.sigma, np.float32)
 
 
 class IntensityDependent(IndependentNoise):
@@ -264,9 +264,9 @@ class IntensityDependent(IndependentNoise):
     def arguments(self, context: Context) -> Arguments:
         return {"sigmas": self.table(), **self.mixing_arguments()}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         place = to_8_bit(image) + np.arange(3) * ENTRIES
-        return image + self.normals(image, given) * self.table()[place]
+        return image + self.normals(image, inputs) * self.table()[place]
 
 
 @lru_cache(maxsize=16)

@@ -105,8 +105,8 @@ class Wide(Method):
         other._panorama = panorama
         return other
 
-    def as_for(self, other: Method) -> Self:
-        own = super().as_for(other)
+    def with_image_state_of(self, other: Method) -> Self:
+        own = super().with_image_state_of(other)
         around = other._panorama if isinstance(other, Wide) else None
         return own.with_panorama(around) if around else own
 
@@ -144,7 +144,7 @@ class Wide(Method):
     def arguments(self, context: Context) -> Arguments:
         return filter_arguments(self.filter)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return self.geometry().reference(image)
 
 

@@ -98,7 +98,7 @@ class Linear(SignalMethod):
         return type(self).model_validate(dict(filled))
 
     def next_context(self, context: Context) -> Context:
-        return context.but(black_level=self.black_level, white_level=self.white_level)
+        return context.replace(black_level=self.black_level, white_level=self.white_level)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("quantize", arguments=("range", "black_level", "white_level")),)
@@ -110,10 +110,10 @@ class Linear(SignalMethod):
             "white_level": self.white_level,
         }
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats | None:
         """The variance in DN^2: rounding adds 1/12. Clipping reduces it, which is not modelled."""
         scale = self._range / context.full_scale
-        return before * np.float32(scale**2) + np.float32(1 / 12)
+        return input_variance * np.float32(scale**2) + np.float32(1 / 12)
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
@@ -176,7 +176,7 @@ class Pwl(Linear):
         return knots_in(self.knots)
 
     def next_context(self, context: Context) -> Context:
-        return super().next_context(context).but(knots=self._knots)
+        return super().next_context(context).replace(knots=self._knots)
 
     def passes(self) -> tuple[Pass, ...]:
         names = ("range", "black_level", "white_level", "pieces", "count")
@@ -187,11 +187,11 @@ class Pwl(Linear):
         count = CompileTime(str(len(pieces)))
         return {**super().arguments(context), "pieces": pieces, "count": count}
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats | None:
         return None
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return np.rint(along_pieces(super().reference(image, given), pieces_of(self._knots)))
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return np.rint(along_pieces(super().reference(image, inputs), pieces_of(self._knots)))
 
 
 STAGE = Stage(

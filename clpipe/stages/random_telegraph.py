@@ -89,9 +89,11 @@ class TwoLevels(SignalMethod):
         limit, scale = self._chosen
         return {"limit": limit, "scale": scale, "amplitude": self.amplitude}
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         """The mean variance over the sensor: share * E[A^2] / 4, E[A^2] = 2 amplitude^2."""
-        return before + np.float32(self.share) * np.float32(self.amplitude) ** 2 / np.float32(2)
+        return input_variance + np.float32(self.share) * np.float32(
+            self.amplitude
+        ) ** 2 / np.float32(2)
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:

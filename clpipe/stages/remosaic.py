@@ -55,7 +55,7 @@ class Binning(Method):
     _factor: int = PrivateAttr(2)
 
     def resolve(self, context: Context) -> Self:
-        array = context.filters
+        array = context.filter_array
         factor = next((n for n in (3, 2) if binned(array, n)), None)
         if factor is None:
             raise RequestError(
@@ -67,11 +67,11 @@ class Binning(Method):
         return other
 
     def next_context(self, context: Context) -> Context:
-        array = binned(context.filters, self._factor)
+        array = binned(context.filter_array, self._factor)
         assert array
         of_one, noise = self._factor**2, context.noise
         less = noise and replace(noise, a=noise.a / of_one, b=noise.b / of_one)
-        return context.with_array(array).but(noise=less)
+        return context.with_array(array).replace(noise=less)
 
     @property
     def bins(self) -> tuple[Bins, Bins]:
@@ -88,7 +88,7 @@ class Binning(Method):
     def geometry(self) -> Scaling | None:
         return Scaling(self.bins)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         rows, columns = self.bins
         return resample(resample(image, rows), columns)
 
@@ -123,17 +123,20 @@ class LinearMmse(Method):
     pattern: Pattern = parameter("RGGB", "Bayer pattern of the result.", structural=True)
 
     def next_context(self, context: Context) -> Context:
-        return context.but(array=None, pattern=self.pattern)
+        return context.replace(array=None, pattern=self.pattern)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("remosaic", Stencil(RADIUS), ("weights", *PERIOD)),)
 
     def arguments(self, context: Context) -> Arguments:
-        weights = weights_of(context.filters, self.pattern)
-        return {"weights": table_of(context.filters, self.pattern), **period_of(weights.shape[:2])}
+        weights = weights_of(context.filter_array, self.pattern)
+        return {
+            "weights": table_of(context.filter_array, self.pattern),
+            **period_of(weights.shape[:2]),
+        }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        array = given.context.filters
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        array = inputs.context.filter_array
         made = weights_of(array, self.pattern)
         return filtered(image, array.period, made[..., None])[..., 0]
 

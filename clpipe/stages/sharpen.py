@@ -140,7 +140,7 @@ class Unsharp(Method):
             "offset": self.offset,
         }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         if not self.amount:
             return image
         offset = np.float32(self.offset)

@@ -234,10 +234,10 @@ class Rows(Method):
             "scale": float32(self.depth / self.flicker_duty / self.cycles),
         }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         if not self.passes():
             return image
-        n: Any = self.arguments(given.context)
+        n: Any = self.arguments(inputs.context)
         rows = np.arange(image.shape[0], dtype=np.uint32)
         if not self.flicker_duty:
             turns = rows.astype(np.float32) * n["step"] + n["start"]

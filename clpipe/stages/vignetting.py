@@ -10,16 +10,16 @@ from clpipe.base.types import Floats
 from clpipe.camera.lens import LensCalibration
 from clpipe.reference.math import inverse_root
 from clpipe.stage import (
-    AboutAxis,
     Argument,
     Arguments,
     CompileTime,
     Context,
-    FromLens,
-    InFocalLengths,
+    FocalLengthMethod,
     Kind,
+    LensMethod,
     Method,
     Pass,
+    PrincipalPointMethod,
     ReferenceContext,
     Stage,
     StageRole,
@@ -37,14 +37,14 @@ class NoVignetting(Unchanged):
     summary: ClassVar = "no vignetting"
 
 
-class VignettingOfLens(FromLens):
+class VignettingOfLens(LensMethod):
     """Vignetting of the lens that ``--lens`` names, at the camera's f-number."""
 
     summary: ClassVar = (
         "vignetting of the lens that --lens names, at --aperture; none without these"
     )
 
-    def of_lens(self, lens: LensCalibration | None) -> Method:
+    def for_lens(self, lens: LensCalibration | None) -> Method:
         if lens is None or not lens.vignetting:
             return NoVignetting()
         table = dict(lens.vignetting)
@@ -81,7 +81,7 @@ class Pa(Method):
         ks = {name: float32(getattr(self, name)) for name in ("k1", "k2", "k3")}
         return {"extent": CompileTime("e"), **ks}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         sides: Floats = np.maximum(np.array(image.shape[:2], np.float32) - 1, 1)
         corner = (sides * sides).sum(keepdims=True) * np.float32(0.25)
         r2 = _squared_radius(image) * _reciprocal(corner)
@@ -90,7 +90,7 @@ class Pa(Method):
         return image * np.maximum(gain, np.float32(0))[..., None]
 
 
-class CosineFourth(InFocalLengths, AboutAxis):
+class CosineFourth(FocalLengthMethod, PrincipalPointMethod):
     """v * cos^4 of the angle to the optical axis, which passes through the principal point.
 
     This is the illumination of a sensor by a lens without vignetting of its own. With r in focal
@@ -138,7 +138,7 @@ class CosineFourth(InFocalLengths, AboutAxis):
         assert self.focal_length and self.sensor_width
         return float32(0), float32((self.sensor_width / self.focal_length) ** 2)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         per_px, per_side = self._units()
         side: Floats = np.full(1, max(image.shape[:2]), np.float32)
         unit = per_px or per_side * _reciprocal(side * side)

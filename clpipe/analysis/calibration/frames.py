@@ -226,7 +226,7 @@ def _from_kept(
         camera.model,
         overrides.iso or chain.iso,
         f"{ev:+g} EV",
-        _sensor(overrides, context.filters.pattern, black, white),
+        _sensor(overrides, context.filter_array.pattern, black, white),
         signal=kind == Kind.MOSAIC.label,
         gains=camera.white_balance_gains,
         xyz_to_camera=camera.xyz_to_camera,

@@ -26,5 +26,5 @@ STAGE = Stage(
         *(Bounded, EdgeDirectedMedian, EdgeDirected, Median, Bilinear, Malvar2004, Menon2007),
         *(LinearMmse, DirectionalMmse, Gray),
     ),
-    usual=_of_array,
+    default_method=_of_array,
 )

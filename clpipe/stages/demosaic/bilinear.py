@@ -46,5 +46,5 @@ class Bilinear(Method):
     def arguments(self, context: Context) -> Arguments:
         return {"pattern": context.cfa}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return bilinear(image, given.context.pattern)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return bilinear(image, inputs.context.pattern)

@@ -167,8 +167,8 @@ class Bounded(Method):
             "offset": self.offset,
         }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        pattern, offset = given.context.pattern, np.float32(self.offset)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        pattern, offset = inputs.context.pattern, np.float32(self.offset)
         roots = root_of(image, offset)
         known = green_or_difference(roots, pattern)
         differences = spread_differences(known, pattern)

@@ -58,7 +58,7 @@ class DirectionalMmse(Method):
         return (*foretold, blend)
 
     def arguments(self, context: Context) -> Arguments:
-        array = context.filters
+        array = context.filter_array
         colours, misses = tables(array)
         return {
             "colours": colours,
@@ -67,5 +67,5 @@ class DirectionalMmse(Method):
             **period_of(array.period),
         }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return directional_mmse(image, given.context.filters)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return directional_mmse(image, inputs.context.filter_array)

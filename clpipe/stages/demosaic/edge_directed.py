@@ -99,7 +99,7 @@ class EdgeDirected(Method):
     def arguments(self, context: Context) -> Arguments:
         return {"pattern": context.cfa, "classifier": CompileTime(self.classifier.upper())}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        pattern = given.context.pattern
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        pattern = inputs.context.pattern
         sparse = green_or_difference(image, pattern, self.classifier)
         return from_differences(image, pattern, *spread_differences(sparse, pattern))

@@ -120,5 +120,5 @@ class Menon2007(Method):
     def arguments(self, context: Context) -> Arguments:
         return {"pattern": context.cfa}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return menon2007(image, given.context.pattern)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return menon2007(image, inputs.context.pattern)

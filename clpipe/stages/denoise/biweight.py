@@ -193,7 +193,7 @@ class Biweight(Denoiser):
             "offset": self.offset,
         }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         if self.is_off:
             return image
         luma_range, chroma_range = (np.float32(each) for each in self.ranges)

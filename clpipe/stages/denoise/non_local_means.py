@@ -89,8 +89,8 @@ class NonLocalMeans(WindowDenoiser):
             "chroma_scale": decay_of(FACTOR * self.chroma_strength),
         }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        n = self.numbers(given.context)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        n = self.numbers(inputs.context)
         units = np.array([n["luma_unit"], n["chroma_unit"], n["chroma_unit"]], np.float32)
         planes = rgb_to_ycbcr(image) / units
         level = np.maximum(patch_sum(planes[..., 0]), np.float32(0))

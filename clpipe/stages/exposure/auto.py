@@ -173,7 +173,7 @@ class Auto(Gain):
     def _millionths(self) -> int:
         return max(1, round(self.percentile * 10_000))
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         found = self._percentile(image) if self.rule == "percentile" else self._log_average(image)
         ev = 0
         if found is not None:
@@ -183,7 +183,7 @@ class Auto(Gain):
         stops = np.array([ev / STEPS], np.float32)
         whole, rest = power_of_two(stops)
         (gain,) = (whole + whole * rest) * self.gain
-        given.estimates["metered_ev"], given.estimates["gain"] = float(stops[0]), float(gain)
+        inputs.estimates["metered_ev"], inputs.estimates["gain"] = float(stops[0]), float(gain)
         return image * gain
 
     def _circle(self, image: Floats) -> Mask:

@@ -68,7 +68,7 @@ class Photometric(Gain):
 
     def next_context(self, context: Context) -> Context:
         headroom = context.headroom + self.headroom - math.log2(WHITE)
-        return context.but(headroom=headroom, exposure_time=self.time(self.exposure_time))
+        return context.replace(headroom=headroom, exposure_time=self.time(self.exposure_time))
 
     def factor(self, iso: float) -> np.float32:
         """Return the value of one unit of a render, over the sensor's full scale, at an ISO."""
@@ -82,5 +82,5 @@ class Photometric(Gain):
     def arguments(self, context: Context) -> Arguments:
         return {"gain": self.factor(context.iso)}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return image * self.factor(given.context.iso)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return image * self.factor(inputs.context.iso)

@@ -175,7 +175,7 @@ class SensorNoise(SignalMethod):
         return filled.with_defaults(full_well=camera.full_well)
 
     def next_context(self, context: Context) -> Context:
-        return context.but(noise=self.model(context))
+        return context.replace(noise=self.model(context))
 
     def without_noise(self) -> Method | None:
         full = self.full_signal
@@ -186,9 +186,9 @@ class SensorNoise(SignalMethod):
         """The signal at which the well is full; None without a full well, or if a is 0."""
         return self.full_well * self.a if self.full_well and self.a else None
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats | None:
         """The variance a*y + b, with y clipped to 0..full well, without the cut of noise there."""
-        return self.own_variance(np.maximum(signal, np.float32(0))) + before
+        return self.own_variance(np.maximum(signal, np.float32(0))) + input_variance
 
     def own_variance(self, signal: Floats) -> Floats:
         """The variance of this stage's noise, a*y + b, y at most the full well; signal squared."""

@@ -117,7 +117,7 @@ class Readouts(SensorNoise):
         return own
 
     def next_context(self, context: Context) -> Context:
-        return super().next_context(context).but(full_scale=self.full_scale)
+        return super().next_context(context).replace(full_scale=self.full_scale)
 
     def passes(self) -> tuple[Pass, ...]:
         function, *further = self.function
@@ -196,9 +196,9 @@ class Readouts(SensorNoise):
         """Return the weight of a readout in the merged signal, from its own signal."""
         return np.minimum(np.maximum((ENDS - read) * STEEP, np.float32(0)), np.float32(1))
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         def normals(draw: int) -> Floats:
-            return normal_at(image.shape, draw, given.stream[NoiseScope.IMAGE])
+            return normal_at(image.shape, draw, inputs.stream[NoiseScope.IMAGE])
 
         n = self.numbers()
         values, weights = [], []

@@ -79,5 +79,5 @@ class Staggered(Readouts):
     def seen(self, image: Floats, photodiode: int) -> Floats:
         return image if self._later is None or not photodiode else self._later[photodiode - 1]
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
-        return None if self._is_apart else super().variance(before, signal, context)
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats | None:
+        return None if self._is_apart else super().variance(input_variance, signal, context)

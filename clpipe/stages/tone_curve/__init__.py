@@ -68,7 +68,7 @@ class Linear(Method):
     def arguments(self, context: Context) -> Arguments:
         return {"gain": self.gain}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return image * self.gain
 
 

@@ -145,7 +145,7 @@ class Standard(Method):
         """Return the share of the distance from grey that remains, by the largest colour."""
         return np.asarray(np.float32(self.saturation) - np.float32(WHITER) * np.square(high * high))
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         inside = inside_of(image)
         high = inside.max(-1, keepdims=True)
         to_high = self.curve(high)

@@ -44,7 +44,7 @@ class EstimatedGains(Method):
     def next_context(self, context: Context) -> Context:
         # The estimates are known only when the image is processed; the as-shot gains replace them
         # here.
-        return context.but(applied_gains=context.gains, full_scale=1.0)
+        return context.replace(applied_gains=context.gains, full_scale=1.0)
 
     def search(self) -> Pass:
         """The pass that estimates "red_gain" and "blue_gain"."""
@@ -58,10 +58,10 @@ class EstimatedGains(Method):
         search = self.search()
         return search, APPLY
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        red, blue = self.gains(image, given.context.pattern)
-        given.estimates["red_gain"], given.estimates["blue_gain"] = float(red), float(blue)
-        return apply_gains(image, given.context, red, blue)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        red, blue = self.gains(image, inputs.context.pattern)
+        inputs.estimates["red_gain"], inputs.estimates["blue_gain"] = float(red), float(blue)
+        return apply_gains(image, inputs.context, red, blue)
 
 
 def gain_parameter(colour: str, text: str = "Gain", auto: str = "from the camera") -> Any:
@@ -104,7 +104,7 @@ class OfArray(CameraGains):
 
     def next_context(self, context: Context) -> Context:
         array = self._array.with_gains(self.gains, self.inverse)
-        return super().next_context(context).but(array=array)
+        return super().next_context(context).replace(array=array)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass(self.function, arguments=("factors", *PERIOD)),)
@@ -118,7 +118,7 @@ class OfArray(CameraGains):
         rows, columns = self._array.period
         return tiled(levels_table(self._array, self.inverse)[:rows, :columns], shape)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return np.minimum(image * self.factors_at(image.shape), np.float32(1))
 
 
@@ -141,7 +141,7 @@ class Gains(CameraGains):
         return ArrayGains.on(context.array, own) if context.array else own
 
     def next_context(self, context: Context) -> Context:
-        return context.but(applied_gains=self.gains, full_scale=1.0)
+        return context.replace(applied_gains=self.gains, full_scale=1.0)
 
     def passes(self) -> tuple[Pass, ...]:
         return (APPLY,)
@@ -150,8 +150,8 @@ class Gains(CameraGains):
         red, blue = map(float32, self.gains)
         return {"pattern": context.cfa, "red_gain": red, "blue_gain": blue}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return apply_gains(image, given.context, *map(np.float32, self.gains))
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return apply_gains(image, inputs.context, *map(np.float32, self.gains))
 
 
 class ArrayGains(OfArray, Gains):
@@ -181,7 +181,7 @@ class ArrayAsShot(OfArray, AsShot):
 
     def next_context(self, context: Context) -> Context:
         after = super().next_context(context)
-        return after.but(array=context.array) if self._array == ALIKE else after
+        return after.replace(array=context.array) if self._array == ALIKE else after
 
 
 class Unbalanced(Unchanged):
