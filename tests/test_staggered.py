@@ -116,7 +116,7 @@ def test_shares_of_frames_are_those_of_time():
     time = (np.arange(400_000) + 0.5) / 400_000 * (0.01 * 1.75 + 8e-3)
     frame = (time / time[-1] * 4.9999).astype(int)
     for number, span in enumerate(SPANS):
-        weights = shutter.during(SPANS, number).weights(5, 9)
+        weights = shutter.for_exposure(SPANS, number).weights(5, 9)
         for row in (0, 5, 8):
             begins = row * 1e-3 + 0.01 * span.start
             seen = (time >= begins) & (time < begins + 0.01 * span.length)

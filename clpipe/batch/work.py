@@ -103,7 +103,7 @@ class ImageWorker:
         results = min(len(writer.renditions_of(job)), most)
         beside = 2 * self.layers + self.later
         if shutter := self.loader.shutter(job):
-            beside += 1 + self.later + bool(shutter.layer_of_light)
+            beside += 1 + self.later + bool(shutter.light_layer)
         # The noise of baselines is measured on floats.
         formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
         kinds = results, formats, writer.request.keep, beside, in_numpy

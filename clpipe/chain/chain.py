@@ -153,7 +153,7 @@ class Chain:
     def lit_by_layers(self) -> tuple[str, ...]:
         """The names of the steps that need the light in a layer of the image's file."""
         named = ((step.name, step.method) for step in self.steps)
-        return tuple(n for n, each in named if isinstance(each, Rows) and each.layer_of_light)
+        return tuple(n for n, each in named if isinstance(each, Rows) and each.light_layer)
 
     @cached_property
     def maker_of_raw(self) -> str | None:

@@ -40,7 +40,7 @@ class Exposures:
 
     def _before(self, number: int) -> Chain:
         steps = tuple(
-            replace(step, method=step.method.during(self.spans, number))
+            replace(step, method=step.method.for_exposure(self.spans, number))
             if isinstance(step.method, Rows)
             else step
             for step in self.chain.steps[: self.place]
@@ -51,7 +51,7 @@ class Exposures:
         """Return the chain that merges ``images``, the results of the chains in :attr:`later`."""
         method = self.step.method
         assert isinstance(method, Staggered)
-        own = replace(self.step, method=method.with_later(np.stack(images)))
+        own = replace(self.step, method=method.with_later_images(np.stack(images)))
         before, after = self.chain.steps[: self.place], self.chain.steps[self.place + 1 :]
         return replace(self.chain, steps=(*before, own, *after))
 

@@ -26,7 +26,7 @@ from clpipe.stage import (
     StageRole,
     Unchanged,
 )
-from clpipe.stages.projection import Wide
+from clpipe.stages.projection import WideAngle
 
 
 def make_chain(
@@ -153,7 +153,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
             takes_lens |= isinstance(own, LensMethod) and not isinstance(method, Unchanged)
             if wide and is_resolved and method.passes():
                 _check_behind(wide, name, own)
-            if fits and isinstance(method, Wide):
+            if fits and isinstance(method, WideAngle):
                 wide = f"{name}.method={method.method}"
             if not fits:
                 if isinstance(method, Unchanged) and stage.reads is stage.writes:

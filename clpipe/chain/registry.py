@@ -21,7 +21,7 @@ from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.base.reading import check_exists, check_regular
 from clpipe.chain.keys import NOISE
 from clpipe.stage import CompileTime, Context, Method, Stage, StageRole, typed_arguments
-from clpipe.stages import own_stages
+from clpipe.stages import built_in_stages
 
 ARGUMENT_TYPES = (np.float32, np.int32, np.uint32, np.ndarray, CompileTime)
 
@@ -39,7 +39,11 @@ def all_stages() -> dict[str, Stage]:
 
 @lru_cache(maxsize=1)
 def _all_stages(from_files: tuple[Stage, ...]) -> dict[str, Stage]:
-    return {**own_stages(), **installed_stages(), **{stage.name: stage for stage in from_files}}
+    return {
+        **built_in_stages(),
+        **installed_stages(),
+        **{stage.name: stage for stage in from_files},
+    }
 
 
 @cache
@@ -53,7 +57,7 @@ def installed_stages() -> dict[str, Stage]:
     for entry in entry_points(group=ENTRY_POINTS):
         package = f"package {entry.dist.name}" if entry.dist else f"entry point {entry.name}"
         stage, file = _loaded(package, entry)
-        _check_stage_name(package, stage.name, own_stages() | stages)
+        _check_stage_name(package, stage.name, built_in_stages() | stages)
         stages[stage.name] = replace(stage, folder=file.parent)
     return stages
 

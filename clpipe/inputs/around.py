@@ -27,7 +27,7 @@ from clpipe.reference.panorama import (
     Views,
 )
 from clpipe.stage import StageRole
-from clpipe.stages.projection import Wide
+from clpipe.stages.projection import WideAngle
 
 FACES = 6
 RIGHT_ANGLE = 90.0
@@ -70,16 +70,16 @@ class Rig:
         return None
 
 
-def wide_of(settings: Settings) -> Wide | None:
+def wide_of(settings: Settings) -> WideAngle | None:
     """Return the wide lens of the chain, which views panoramas; None if there is none."""
     name = stage_in(StageRole.VIEW).name
     if name not in settings.step_names:
         return None
     method = settings.method(name)
-    return method if isinstance(method, Wide) else None
+    return method if isinstance(method, WideAngle) else None
 
 
-def rig_of(wide: Wide) -> Rig:
+def rig_of(wide: WideAngle) -> Rig:
     """Return the rig of a wide lens: the one in its file ``views``, or a cube.
 
     Raises:
@@ -114,11 +114,11 @@ def rig_of(wide: Wide) -> Rig:
     return Rig(views, source=str(path))
 
 
-def _angle(wide: Wide) -> float:
+def _angle(wide: WideAngle) -> float:
     return wide.face_angle or RIGHT_ANGLE
 
 
-def grouped(jobs: Sequence[Job], wide: Wide | None) -> list[Job]:
+def grouped(jobs: Sequence[Job], wide: WideAngle | None) -> list[Job]:
     """Return the jobs, with the files of one panorama joined into one job.
 
     That job has the files' name without the name of the view. A file that is not a view stays a job
@@ -162,7 +162,7 @@ def grouped(jobs: Sequence[Job], wide: Wide | None) -> list[Job]:
     return result
 
 
-def read_around(job: Job, read: Callable[[Path], SourceImage], wide: Wide) -> SourceImage:
+def read_around(job: Job, read: Callable[[Path], SourceImage], wide: WideAngle) -> SourceImage:
     """Return the image of a job for a wide lens: an atlas of all views, with its panorama.
 
     A render that is not a panorama, according to its header and name, is returned unchanged.
@@ -191,7 +191,7 @@ def read_around(job: Job, read: Callable[[Path], SourceImage], wide: Wide) -> So
 
 
 def panorama_of(
-    paths: Sequence[Path], wide: Wide, envmap: str, width: int, height: int
+    paths: Sequence[Path], wide: WideAngle, envmap: str, width: int, height: int
 ) -> Panorama | None:
     """Return the panorama that files form; None for a single view, which any render can be.
 

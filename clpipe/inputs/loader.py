@@ -163,10 +163,10 @@ class ImageLoader:
         if self.kept:
             return list(jobs)
         wide, shutter = wide_of(self.settings), shutter_of(self.settings)
-        if wide and shutter and shutter.layer_of_light:
+        if wide and shutter and shutter.light_layer:
             raise RequestError(
                 f"{stage_in(StageRole.SHUTTER).name}.flicker_layer: found "
-                f"{shutter.layer_of_light}, but panoramas have no light layers; remove this "
+                f"{shutter.light_layer}, but panoramas have no light layers; remove this "
                 "parameter, and all light flickers"
             )
         return grouped(exposures(jobs, self.settings), wide)
@@ -246,7 +246,7 @@ class ImageLoader:
         """Return the shutter that combines a job's files or layers; None if nothing is combined."""
         shutter = shutter_of(self.settings)
         is_render = self.kept is None and not self.raw.takes(job.path)
-        is_lit = shutter is not None and bool(shutter.layer_of_light) and is_render
+        is_lit = shutter is not None and bool(shutter.light_layer) and is_render
         return shutter if job.subframes or is_lit else None
 
     def _read(self, path: Path, layer: str | None = None) -> SourceImage:

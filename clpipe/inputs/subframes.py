@@ -38,7 +38,7 @@ def shutter_of(settings: Settings) -> Rows | None:
     shutter = settings.method(name)
     if not isinstance(shutter, Rows):
         return None
-    return shutter if shutter.subframes > 1 or shutter.layer_of_light else None
+    return shutter if shutter.subframes > 1 or shutter.light_layer else None
 
 
 def exposures(jobs: Sequence[Job], settings: Settings) -> list[Job]:
@@ -95,7 +95,7 @@ def average(
     for number, path in enumerate(job.paths):
         with unchanged(path):
             source = read(path, None)
-            light = read(path, shutter.layer_of_light) if shutter.layer_of_light else None
+            light = read(path, shutter.light_layer) if shutter.light_layer else None
         pixels = source.pixels
         if pixels.ndim != 3:
             raise ImageError(
@@ -107,7 +107,7 @@ def average(
             shutter = shutter.with_defaults(exposure_time=time)
             size = len(job.paths), pixels.shape[0], source.margins
             for each in range(len(spans)):
-                own = shutter.during(spans, each)
+                own = shutter.for_exposure(spans, each)
                 plain, lit = (weights_of(own, *size, lit=is_lit) for is_lit in (False, True))
                 weights.append((plain, lit - plain))
             totals = np.zeros((len(spans), *pixels.shape), np.float32)

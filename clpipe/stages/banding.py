@@ -75,9 +75,9 @@ class Sine(SignalMethod):
     def passes(self) -> tuple[Pass, ...]:
         if not self.amplitude:
             return ()
-        given = ("frequency", "amplitude")
+        names = ("frequency", "amplitude")
         return (
-            Pass("wave_of_lines", LineTable("rows"), given, writes="wave", random=NoiseScope.IMAGE),
+            Pass("wave_of_lines", LineTable("rows"), names, writes="wave", random=NoiseScope.IMAGE),
             Pass("banding", arguments=("wave",)),
         )
 

@@ -98,7 +98,7 @@ class Thermal(SignalMethod):
 
     def resolve(self, context: Context) -> "Thermal":
         camera = context.camera
-        own = self.with_defaults(
+        resolved = self.with_defaults(
             exposure_time=context.exposure_time or 0.0,
             reference_temperature=camera.dark_current_temperature,
             current=camera.dark_current,
@@ -106,7 +106,7 @@ class Thermal(SignalMethod):
             spread=camera.dark_current_spread,
             per_electron=camera.signal_of(1.0, context.iso),
         )
-        return own.with_defaults(temperature=own.reference_temperature)
+        return resolved.with_defaults(temperature=resolved.reference_temperature)
 
     @property
     def electrons(self) -> float:
@@ -155,9 +155,9 @@ class Thermal(SignalMethod):
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
-        more = backend.fixed(charge_of_sensor) * n["spread"]
-        shot = backend.square_root((more + n["mean"]).clip(min=0) * n["per_electron"])
-        return y + more + backend.normals(1) * shot
+        offset = backend.fixed(charge_of_sensor) * n["spread"]
+        shot = backend.square_root((offset + n["mean"]).clip(min=0) * n["per_electron"])
+        return y + offset + backend.normals(1) * shot
 
 
 def charge_of_sensor(height: int, width: int, stream: Stream) -> Floats:

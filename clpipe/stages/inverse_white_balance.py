@@ -8,7 +8,7 @@ from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import by_site
 from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stage, StageRole
-from clpipe.stages.white_balance.gains import CameraGains, OfArray
+from clpipe.stages.white_balance.gains import ArrayMethod, CameraGains
 
 
 class Gains(CameraGains):
@@ -31,8 +31,8 @@ class Gains(CameraGains):
         return float32(1 / red), float32(1 / blue)
 
     def resolve(self, context: Context) -> CameraGains:
-        own = super().resolve(context)
-        return ArrayGains.on(context.array, own) if context.array else own
+        resolved = super().resolve(context)
+        return ArrayGains.for_array(context.array, resolved) if context.array else resolved
 
     def next_context(self, context: Context) -> Context:
         return context.replace(gains=self.gains)
@@ -53,7 +53,7 @@ class Gains(CameraGains):
         return image * by_site(image.shape, inputs.context.pattern, red, np.float32(1), blue)
 
 
-class ArrayGains(OfArray, Gains):
+class ArrayGains(ArrayMethod, Gains):
     """Division by the gains on any filter array: white fills the most sensitive channel."""
 
     function: ClassVar = "white_to_level"

@@ -30,7 +30,7 @@ from clpipe.stage import (
 # highest PSNR for the image in tests/data, ISO 1600 to 12800. tools/pages/quality.py measures that
 # PSNR.
 FACTOR = 1.3
-LARGEST = 15  # px, of the window
+MAX_SIZE = 15  # px, of the window
 
 
 class NonLocalMeans(Method):
@@ -51,7 +51,7 @@ class NonLocalMeans(Method):
 
     size: int = parameter(
         13,
-        f"Width of the window: odd, 1 to {LARGEST}; 1 leaves the mosaic unchanged.",
+        f"Width of the window: odd, 1 to {MAX_SIZE}; 1 leaves the mosaic unchanged.",
         "px",
         structural=True,
     )
@@ -77,8 +77,8 @@ class NonLocalMeans(Method):
 
     @field_validator("size")
     @classmethod
-    def _odd(cls, size: int) -> int:
-        return odd_size(size, LARGEST)
+    def _check_odd(cls, size: int) -> int:
+        return odd_size(size, MAX_SIZE)
 
     def resolve(self, context: Context) -> "NonLocalMeans":
         if self.a is not None and self.b is not None:

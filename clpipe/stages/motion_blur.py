@@ -26,8 +26,8 @@ from clpipe.stage import (
     parameter,
 )
 
-LONGEST = 200.0  # px
-PARTS = 64  # per pixel of a streak's length, one tap each
+MAX_LENGTH = 200.0  # px
+TAPS_PER_PIXEL = 64  # per pixel of a streak's length, one tap each
 
 
 @traceable
@@ -44,17 +44,17 @@ def streak(length: float, angle: float) -> Floats:
     >>> streak(2.0, 0.0)[:, 2].round(3).tolist()
     [0.25, 0.5, 0.25]
     """
-    count = int(np.ceil(length * PARTS))
+    count = int(np.ceil(length * TAPS_PER_PIXEL))
     along = ((np.arange(count) + 0.5) / count - 0.5) * length
     x, y = along * np.cos(np.deg2rad(angle)), -along * np.sin(np.deg2rad(angle))
     reach = int(np.ceil(length / 2)) + 1
-    spread = np.zeros((2 * reach + 1, 2 * reach + 1))
+    image = np.zeros((2 * reach + 1, 2 * reach + 1))
     for dx in (0, 1):
         for dy in (0, 1):
             columns, rows = np.floor(x).astype(int) + dx, np.floor(y).astype(int) + dy
-            share = (1 - abs(x - columns)) * (1 - abs(y - rows))
-            np.add.at(spread, (rows + reach, columns + reach), share)
-    return taps_of(spread[..., None].repeat(3, 2) / count)
+            weight = (1 - abs(x - columns)) * (1 - abs(y - rows))
+            np.add.at(image, (rows + reach, columns + reach), weight)
+    return taps_of(image[..., None].repeat(3, 2) / count)
 
 
 class Linear(Method):
@@ -85,7 +85,7 @@ class Linear(Method):
         "px",
         "from rotation, else 0",
         ge=0,
-        le=LONGEST,
+        le=MAX_LENGTH,
     )
     angle: float = parameter(
         0.0, "Direction of the streak, from right towards up.", "degrees", ge=-360, le=360
@@ -109,7 +109,7 @@ class Linear(Method):
     )
 
     @model_validator(mode="after")
-    def _one_measure(self) -> "Linear":
+    def _check_length(self) -> "Linear":
         if self.length is not None and self.rotation is not None:
             raise ValueError("set either length or rotation: both define the length of the streak")
         return self
@@ -120,20 +120,20 @@ class Linear(Method):
         Raises:
             RequestError: the focal length is not known in px, or the streak is too long.
         """
-        own = self.with_optics(context)
-        if not own.rotation:
-            return own.with_defaults(length=0.0)
-        if not own.fx:
+        resolved = self.with_optics(context)
+        if not resolved.rotation:
+            return resolved.with_defaults(length=0.0)
+        if not resolved.fx:
             raise RequestError(
                 "motion_blur: rotation needs a focal length; set fx, in px, here or in render"
             )
-        length = float(own.fx * np.tan(np.deg2rad(own.rotation)))
-        if length > LONGEST:
+        length = float(resolved.fx * np.tan(np.deg2rad(resolved.rotation)))
+        if length > MAX_LENGTH:
             raise RequestError(
-                f"motion_blur: rotation {own.rotation:g} at fx {own.fx:g} makes a streak of "
-                f"{length:.0f} px; at most {LONGEST:g} px are allowed, so lower rotation"
+                f"motion_blur: rotation {resolved.rotation:g} at fx {resolved.fx:g} makes a streak "
+                f"of {length:.0f} px; at most {MAX_LENGTH:g} px are allowed, so lower rotation"
             )
-        return own.model_copy(update={"length": length, "rotation": None})
+        return resolved.model_copy(update={"length": length, "rotation": None})
 
     @property
     def pixels(self) -> float:
@@ -170,8 +170,8 @@ class Perspective(FocalLengthMethod, PrincipalPointMethod):
     >>> from clpipe.stage import run_reference
     >>> dots = np.zeros((1, 201, 3), np.float32)
     >>> dots[0, [30, 100]] = 1
-    >>> turning = Perspective(rotation=1.6, fx=100.0)
-    >>> streaks = run_reference(turning, dots)[0, :, 0].astype(float)  # 2.8 and 4.2 px long
+    >>> rotation_warp = Perspective(rotation=1.6, fx=100.0)
+    >>> streaks = run_reference(rotation_warp, dots)[0, :, 0].astype(float)  # 2.8 and 4.2 px long
     >>> streaks[98:103].round(2).tolist(), streaks[28:33].round(2).tolist()
     ([0.03, 0.29, 0.36, 0.29, 0.03], [0.14, 0.24, 0.24, 0.24, 0.13])
     """
@@ -200,13 +200,13 @@ class Perspective(FocalLengthMethod, PrincipalPointMethod):
         Raises:
             RequestError: the rotation is not 0, and the focal length is not known.
         """
-        own = self.with_optics(context)
-        if own.rotation:
-            own.check_focal_length("motion_blur")
-        return own
+        resolved = self.with_optics(context)
+        if resolved.rotation:
+            resolved.check_focal_length("motion_blur")
+        return resolved
 
     @property
-    def turning(self) -> Turning:
+    def rotation_warp(self) -> Turning:
         """The geometry from render to image."""
         centre = self.cx, self.cy
         return Turning(
@@ -216,14 +216,14 @@ class Perspective(FocalLengthMethod, PrincipalPointMethod):
     def passes(self) -> tuple[Pass, ...]:
         if not self.rotation:
             return ()
-        turning = self.turning
-        return (Pass("turned", Resample(turning, 1), ("filter",)),)
+        rotation_warp = self.rotation_warp
+        return (Pass("turned", Resample(rotation_warp, 1), ("filter",)),)
 
     def arguments(self, context: Context) -> Arguments:
         return {"filter": BILINEAR} if self.rotation else {}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        return self.turning.reference(image) if self.rotation else image
+        return self.rotation_warp.reference(image) if self.rotation else image
 
 
 STAGE = Stage(

@@ -59,7 +59,7 @@ class Linear(SignalMethod):
     )
 
     @model_validator(mode="after")
-    def _ordered(self) -> "Linear":
+    def _check_levels(self) -> "Linear":
         black, white = self.black_level, self.white_level
         if black is not None and white is not None and white <= black:
             raise ValueError(
@@ -86,15 +86,15 @@ class Linear(SignalMethod):
         black = camera.black_level if context.black_level is None else context.black_level
         white = camera.white_level if context.white_level is None else context.white_level
         first = black + (white - black) / context.full_scale
-        filled = self.with_defaults(black_level=black, white_level=first)
-        return type(self).model_validate(dict(filled))
+        resolved = self.with_defaults(black_level=black, white_level=first)
+        return type(self).model_validate(dict(resolved))
 
     def next_context(self, context: Context) -> Context:
         if context.full_scale == 1 or context.white_level is None or context.black_level is None:
             return context
         assert self.black_level is not None and self.white_level is not None
-        whole = context.white_level - context.black_level
-        return context.replace(full_scale=whole / (self.white_level - self.black_level))
+        full_range = context.white_level - context.black_level
+        return context.replace(full_scale=full_range / (self.white_level - self.black_level))
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("normalize_levels", arguments=("black_level", "scale")),)
@@ -133,7 +133,7 @@ class Pwl(Linear):
     )
 
     @model_validator(mode="after")
-    def _rising(self) -> "Pwl":
+    def _check_knots(self) -> "Pwl":
         if self.knots is not None:
             knots_in(self.knots)
         return self
@@ -144,7 +144,7 @@ class Pwl(Linear):
         Raises:
             RequestError: no knots are known, or those of quantize differ.
         """
-        filled = self._with_levels(context)
+        resolved = self._with_levels(context)
         if self.knots is None and not context.knots:
             raise RequestError(
                 "normalize.method=pwl: no knots are known; set normalize.knots, or use "
@@ -155,7 +155,7 @@ class Pwl(Linear):
                 f"normalize.knots: {self.knots} differ from those of quantize, "
                 f"{[list(pair) for pair in context.knots]}; remove normalize.knots"
             )
-        return filled.with_defaults(knots=[list(pair) for pair in context.knots])
+        return resolved.with_defaults(knots=[list(pair) for pair in context.knots])
 
     @property
     def _pieces(self) -> Floats:
@@ -176,7 +176,7 @@ class Pwl(Linear):
         return super().reference(along_pieces(image, self._pieces), inputs)
 
 
-def _of_curve(context: Context) -> Method | None:
+def _curve_default(context: Context) -> Method | None:
     return Pwl() if context.knots else None
 
 
@@ -187,5 +187,5 @@ STAGE = Stage(
     Kind.MOSAIC,
     (Linear, Pwl),
     role=StageRole.LEVELS,
-    default_method=_of_curve,
+    default_method=_curve_default,
 )

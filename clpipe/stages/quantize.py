@@ -65,7 +65,7 @@ class Linear(SignalMethod):
     )
 
     @model_validator(mode="after")
-    def _ordered(self) -> "Linear":
+    def _check_levels(self) -> "Linear":
         if None not in (self.black_level, self.white_level) and self._range <= 0:
             raise ValueError(
                 f"white_level must be above black_level; they are {self.white_level} and "
@@ -92,10 +92,10 @@ class Linear(SignalMethod):
         if bits and bits != camera.bits:
             scale = (2**bits - 1) / (2**camera.bits - 1)
             black, white = float(round(black * scale)), float(round(white * scale))
-        filled = self.with_defaults(black_level=black, white_level=white)
-        assert filled.white_level is not None
-        filled = filled.with_defaults(bits=max(int(filled.white_level).bit_length(), 8))
-        return type(self).model_validate(dict(filled))
+        resolved = self.with_defaults(black_level=black, white_level=white)
+        assert resolved.white_level is not None
+        resolved = resolved.with_defaults(bits=max(int(resolved.white_level).bit_length(), 8))
+        return type(self).model_validate(dict(resolved))
 
     def next_context(self, context: Context) -> Context:
         return context.replace(black_level=self.black_level, white_level=self.white_level)
@@ -146,7 +146,7 @@ class Pwl(Linear):
     )
 
     @model_validator(mode="after")
-    def _rising(self) -> "Pwl":
+    def _check_knots(self) -> "Pwl":
         if self.knots is None:
             return self
         last = knots_in(self.knots)[-1]
@@ -163,12 +163,12 @@ class Pwl(Linear):
         return self
 
     def resolve(self, context: Context) -> "Linear":
-        filled = super().resolve(context)
-        assert isinstance(filled, Pwl)
-        assert filled.white_level is not None
-        usual = usual_knots(filled.white_level, 2**self.result_bits - 1)
-        filled = filled.with_defaults(knots=[list(pair) for pair in usual])
-        return type(self).model_validate(dict(filled))
+        resolved = super().resolve(context)
+        assert isinstance(resolved, Pwl)
+        assert resolved.white_level is not None
+        default = usual_knots(resolved.white_level, 2**self.result_bits - 1)
+        resolved = resolved.with_defaults(knots=[list(pair) for pair in default])
+        return type(self).model_validate(dict(resolved))
 
     @property
     def _knots(self) -> Knots:

@@ -69,9 +69,11 @@ class Binning(Method):
     def next_context(self, context: Context) -> Context:
         array = binned(context.filter_array, self._factor)
         assert array
-        of_one, noise = self._factor**2, context.noise
-        less = noise and replace(noise, a=noise.a / of_one, b=noise.b / of_one)
-        return context.with_array(array).replace(noise=less)
+        pixels_per_cell, noise = self._factor**2, context.noise
+        binned_noise = noise and replace(
+            noise, a=noise.a / pixels_per_cell, b=noise.b / pixels_per_cell
+        )
+        return context.with_array(array).replace(noise=binned_noise)
 
     @property
     def bins(self) -> tuple[Bins, Bins]:
@@ -102,10 +104,10 @@ def binned(array: FilterArray, factor: int) -> FilterArray | None:
     rows, columns = array.period
     if rows % factor or columns % factor:
         return None
-    few = array.letters[::factor, ::factor]
-    if not (few.repeat(factor, 0).repeat(factor, 1) == array.letters).all():
+    reduced = array.letters[::factor, ::factor]
+    if not (reduced.repeat(factor, 0).repeat(factor, 1) == array.letters).all():
         return None
-    text = "/".join("".join(row) for row in few)
+    text = "/".join("".join(row) for row in reduced)
     return parse_array(text, array.gains)
 
 
@@ -137,20 +139,20 @@ class LinearMmse(Method):
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         array = inputs.context.filter_array
-        made = weights_of(array, self.pattern)
-        return filtered(image, array.period, made[..., None])[..., 0]
+        weights = weights_of(array, self.pattern)
+        return filtered(image, array.period, weights[..., None])[..., 0]
 
 
 @lru_cache(maxsize=16)
 def weights_of(array: FilterArray, pattern: Pattern) -> Floats:
     """Return the filter at each position of the common period: (row, column, tap)."""
-    wanted = parse_array(pattern)
-    rows, columns = (math.lcm(a, b) for a, b in zip(array.period, wanted.period, strict=True))
-    made = filters(array)
-    places = np.ix_(np.arange(rows) % array.period[0], np.arange(columns) % array.period[1])
-    channel = np.vectorize("RGB".index)(np.tile(wanted.letters, (rows // 2, columns // 2)))
-    chosen = np.take_along_axis(made[places], channel[..., None, None], axis=-1)
-    return np.ascontiguousarray(chosen[..., 0])
+    target = parse_array(pattern)
+    rows, columns = (math.lcm(a, b) for a, b in zip(array.period, target.period, strict=True))
+    array_filters = filters(array)
+    positions = np.ix_(np.arange(rows) % array.period[0], np.arange(columns) % array.period[1])
+    channel = np.vectorize("RGB".index)(np.tile(target.letters, (rows // 2, columns // 2)))
+    selected = np.take_along_axis(array_filters[positions], channel[..., None, None], axis=-1)
+    return np.ascontiguousarray(selected[..., 0])
 
 
 @lru_cache(maxsize=16)  # the same object for the same array, so that it is uploaded once

@@ -49,13 +49,13 @@ class DirectionalMmse(Method):
     any_array: ClassVar = True
 
     def passes(self) -> tuple[Pass, ...]:
-        foretold = (
+        error_passes = (
             Pass(name, Stencil(RADIUS), ("misses", *PERIOD), writes=name, kind=Kind.PAIR)
             for name in ERRORS
         )
         arguments = ("colours", *PERIOD, "unseen")
         blend = Pass("blend", Stencil(RADIUS), arguments, reads=("src", *ERRORS))
-        return (*foretold, blend)
+        return (*error_passes, blend)
 
     def arguments(self, context: Context) -> Arguments:
         array = context.filter_array

@@ -50,13 +50,13 @@ class NonLocalMeans(WindowDenoiser):
     )
     extra_reach: ClassVar = 1
     vectors_per_row: ClassVar = 4
-    enter: ClassVar = Pass(
+    first_pass: ClassVar = Pass(
         "to_noise_units",
         arguments=("luma_unit", "chroma_unit"),
         writes="planes",
         kind=Kind.YCBCR,
     )
-    leave: ClassVar = Pass(
+    last_pass: ClassVar = Pass(
         "from_noise_units", arguments=("luma_unit", "chroma_unit"), reads=("filtered",)
     )
 

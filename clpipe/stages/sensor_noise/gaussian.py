@@ -39,7 +39,7 @@ class Gaussian(SensorNoise):
 
     def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats | None:
         if self.tukey_lambda is None:  # here a negative signal lowers the variance below b
-            return np.maximum(self.own_variance(signal), np.float32(0)) + input_variance
+            return np.maximum(self.added_variance(signal), np.float32(0)) + input_variance
         return super().variance(input_variance, signal, context)
 
     def numbers(self) -> dict[str, np.float32]:

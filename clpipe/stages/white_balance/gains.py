@@ -24,7 +24,7 @@ from clpipe.stage import (
     period_of,
 )
 
-ALIKE = parse_array("G")  # a filter array whose pixels all have the same level
+UNIFORM_ARRAY = parse_array("G")  # a filter array whose pixels all have the same level
 
 
 def apply_gains(image: Floats, context: Context, red: np.float32, blue: np.float32) -> Floats:
@@ -46,7 +46,7 @@ class EstimatedGains(Method):
         # here.
         return context.replace(applied_gains=context.gains, full_scale=1.0)
 
-    def search(self) -> Pass:
+    def estimation_pass(self) -> Pass:
         """The pass that estimates "red_gain" and "blue_gain"."""
         raise NotImplementedError(type(self).__name__)
 
@@ -55,8 +55,8 @@ class EstimatedGains(Method):
         raise NotImplementedError(type(self).__name__)
 
     def passes(self) -> tuple[Pass, ...]:
-        search = self.search()
-        return search, APPLY
+        estimation_pass = self.estimation_pass()
+        return estimation_pass, APPLY
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         red, blue = self.gains(image, inputs.context.pattern)
@@ -86,7 +86,7 @@ class CameraGains(Method):
         return self.red_gain, self.blue_gain
 
 
-class OfArray(CameraGains):
+class ArrayMethod(CameraGains):
     """Gains on a filter array that is no Bayer pattern: one for each of its channels."""
 
     kernel: ClassVar = "filter_array"
@@ -96,11 +96,11 @@ class OfArray(CameraGains):
     _array: FilterArray = PrivateAttr()
 
     @classmethod
-    def on(cls, array: FilterArray, own: CameraGains) -> Self:
+    def for_array(cls, array: FilterArray, gains: CameraGains) -> Self:
         """The (resolved) gains on a filter array."""
-        made = cls(**dict(own))
-        made._array = replace(array, gains=own.gains)
-        return made
+        method = cls(**dict(gains))
+        method._array = replace(array, gains=gains.gains)
+        return method
 
     def next_context(self, context: Context) -> Context:
         array = self._array.with_gains(self.gains, self.inverse)
@@ -137,8 +137,8 @@ class Gains(CameraGains):
     any_array: ClassVar = True
 
     def resolve(self, context: Context) -> CameraGains:
-        own = super().resolve(context)
-        return ArrayGains.on(context.array, own) if context.array else own
+        resolved = super().resolve(context)
+        return ArrayGains.for_array(context.array, resolved) if context.array else resolved
 
     def next_context(self, context: Context) -> Context:
         return context.replace(applied_gains=self.gains, full_scale=1.0)
@@ -154,7 +154,7 @@ class Gains(CameraGains):
         return apply_gains(image, inputs.context, *map(np.float32, self.gains))
 
 
-class ArrayGains(OfArray, Gains):
+class ArrayGains(ArrayMethod, Gains):
     """Fixed gains on any filter array."""
 
 
@@ -169,19 +169,19 @@ class AsShot(Gains):
 
     def resolve(self, context: Context) -> CameraGains:
         red, blue = context.gains
-        own = self.with_defaults(red_gain=red, blue_gain=blue)
+        resolved = self.with_defaults(red_gain=red, blue_gain=blue)
         if context.array is None:
-            return own
-        is_white = context.array.is_balanced and own.gains == (1.0, 1.0)
-        return ArrayAsShot.on(ALIKE if is_white else context.array, own)
+            return resolved
+        is_white = context.array.is_balanced and resolved.gains == (1.0, 1.0)
+        return ArrayAsShot.for_array(UNIFORM_ARRAY if is_white else context.array, resolved)
 
 
-class ArrayAsShot(OfArray, AsShot):
+class ArrayAsShot(ArrayMethod, AsShot):
     """As-shot gains on any filter array; if white is 1 in the mosaic, no channel changes."""
 
     def next_context(self, context: Context) -> Context:
         after = super().next_context(context)
-        return after.replace(array=context.array) if self._array == ALIKE else after
+        return after.replace(array=context.array) if self._array == UNIFORM_ARRAY else after
 
 
 class Unbalanced(Unchanged):
