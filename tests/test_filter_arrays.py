@@ -29,7 +29,7 @@ from clpipe.pipeline import Pipeline
 from clpipe.reference.carried import Layer, warp
 from clpipe.reference.cfa import PATTERNS
 from clpipe.reference.directional_mmse import directional_mmse
-from clpipe.reference.filter_array import NAMED, PASSES, beyond, parse_array, tiled
+from clpipe.reference.filter_array import NAMED, TRANSMISSIONS, parse_array, periodic_indices, tiled
 from clpipe.reference.geometry import NO_MARGINS
 from clpipe.reference.linear_mmse import linear_mmse
 from clpipe.stages import DEFAULT_CHAIN
@@ -98,7 +98,7 @@ def test_a_clear_pixel_saturates_first(develop):
         inverse_color_matrix={"method": "none"},
     ).kept["normalize"]
     array = parse_array("RGBW", (2.77, 1.36))  # of the default camera
-    letters = tiled(array.by_place({"R": 0, "G": 1, "B": 2, "W": 3}), kept.shape)
+    letters = tiled(array.by_position({"R": 0, "G": 1, "B": 2, "W": 3}), kept.shape)
     assert (kept[letters == 3] == 1).all()
     for number, letter in enumerate("RGB"):
         expected = 0.9 * 2**0.5 * array.levels[letter]
@@ -211,7 +211,7 @@ def test_filters_of_several_colours_add_up_what_the_light_gives_each(device, lig
             assert (red, blue) == chain.camera.white_balance_gains
         own = parse_array(array)
         white, seen = ((np.array(each) / (red, 1, blue)) for each in ((1, 1, 1), (0.2, 0.3, 0.4)))
-        passed = {letter: np.array(PASSES[letter]) for letter in own.channels}
+        passed = {letter: np.array(TRANSMISSIONS[letter]) for letter in own.channels}
         largest = max(row @ white for row in passed.values())
         expected = own.spread({k: row @ seen / largest for k, row in passed.items()}, (8, 8))
         for each in (None, *([device] if array == "RGBW" else [])):
@@ -262,7 +262,7 @@ def test_flat_gray_stays_in_strips(method):
 def test_beyond_an_edge_an_array_goes_on():
     array = parse_array("x-trans")
     for size, period in product((6, 7, 11), (3, 6)):
-        place = beyond(size, period, 5)
+        place = periodic_indices(size, period, 5)
         assert ((place - np.arange(-5, size + 5)) % period == 0).all()
         assert place.min() >= 0
         assert place.max() < size

@@ -16,7 +16,7 @@ from clpipe.chain.settings import settings_from
 from clpipe.dataset import Dataset
 from clpipe.engine.runner import Runner
 from clpipe.images.read import read_image
-from clpipe.reference.companding import along_pieces, pieces_of, usual_knots
+from clpipe.reference.companding import apply_pieces, default_knots, pieces_of
 from tests.conftest import STILL_LIFE
 
 METHODS = {
@@ -116,13 +116,13 @@ def test_a_picture_of_the_first_range_is_as_ever(clpipe, part):
 
 @pytest.mark.parametrize(("white", "bits"), [(2**20 - 1, 12), (2**24 - 1, 16), (16383, 10)])
 def test_a_curve_of_pieces_goes_there_and_back(white, bits):
-    knots = usual_knots(white, 2**bits - 1)
+    knots = default_knots(white, 2**bits - 1)
     there, back = pieces_of(knots), pieces_of(knots, inverse=True)
     dn = np.unique(np.geomspace(1, white, 20_000).round()).astype(np.float32)
-    few = np.rint(along_pieces(dn, there))
+    few = np.rint(apply_pieces(dn, there))
     assert (np.diff(few) >= 0).all()
     assert few.max() == 2**bits - 1
-    again = along_pieces(few, back)
+    again = apply_pieces(few, back)
     slope = np.interp(dn, there[:, 0], there[:, 2])  # of the piece, or steeper
     steepest = np.array([there[there[:, 0] <= x][-1, 2] for x in dn[::97]])
     error = np.abs(again - dn)[::97]

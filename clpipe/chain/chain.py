@@ -206,7 +206,7 @@ class Chain:
         Raises:
             RequestError: the camera's values contradict each other.
         """
-        known = self.intrinsics_of_render(*self.margins.inside(width, height), shot)
+        known = self.intrinsics_of_render(*self.margins.frame_size(width, height), shot)
         return self.geometry.intrinsics(known, width, height) if self.geometry else known
 
     def intrinsics_of_render(

@@ -8,7 +8,7 @@ import numpy as np
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, of_structure
-from clpipe.reference.defocus import Depth, checked_depth
+from clpipe.reference.defocus import Depth, parse_depth
 from clpipe.stage import DepthMethod
 
 
@@ -77,4 +77,4 @@ def depth_of_array(pixels: Array | None, width: int, height: int) -> Depth:
             f"found depth of shape {found}, but the image has {(height, width)}; pass depth of the "
             "image's height and width"
         )
-    return Depth(checked_depth(pixels))
+    return Depth(parse_depth(pixels))

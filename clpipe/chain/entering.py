@@ -59,7 +59,7 @@ def enter(
         RequestError: the camera's values contradict each other, or a step cannot use the depth.
     """
     if chain.step_names[0] == chain.names[0] and pixels.ndim == 3:
-        width, height = margins.inside(*pixels.shape[1::-1])
+        width, height = margins.frame_size(*pixels.shape[1::-1])
         optics = chain.optics
         of_lens = ("sensor_width",) if optics.is_sensor_of_lens else ()
         own = optics.for_image(width, height)

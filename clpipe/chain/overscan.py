@@ -47,7 +47,7 @@ def margins_of_array(overscan: Sequence[int], image: Array) -> Margins:
         return NO_MARGINS
     if len(overscan) == len(NO_MARGINS) and min(overscan) >= 0 and image.ndim > 1:
         margins = Margins(*map(int, overscan))
-        if min(margins.inside(*image.shape[1::-1])) > 0:
+        if min(margins.frame_size(*image.shape[1::-1])) > 0:
             return margins
     raise ImageError(
         f"found overscan {tuple(overscan)}; expected four numbers of px (left, top, right, bottom) "

@@ -204,7 +204,7 @@ class Runner:
         """
         assert self.device
         if not self.device.is_compiled(plan):
-            width, height = self.chain.margins.around(8, 8)
+            width, height = self.chain.margins.image_size(8, 8)
             shape = (height, width, 3)[: 2 if len(self.chain.source.channels) == 1 else 3]
             tiny = np.zeros(shape, np.float16 if plan.half else np.float32)
             try:

@@ -338,7 +338,7 @@ def _decode_luminance_chroma(
     window = read_luminance_chroma(path, max_pixels)
     data, display = window.pixels.shape[1::-1], (window.width, window.height)
     margins = margins_of(window.x, window.y, data, display) if overscan else NO_MARGINS
-    width, height = margins.around(*display)
+    width, height = margins.image_size(*display)
     check_size(path, width, height, max_pixels)
     place = window.x + margins.left, window.y + margins.top
     pixels = display_window(window.pixels, *place, width, height)

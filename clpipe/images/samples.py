@@ -78,7 +78,7 @@ def read_part(
             "For a render, add --transfer srgb or linear (in Python, transfer='srgb'). For a "
             "photograph, use -c unprocess (config='unprocess')",
         )
-    width, height = margins.around(spec.full_width, spec.full_height)
+    width, height = margins.image_size(spec.full_width, spec.full_height)
     check_size(path, width, height, max_pixels)
     check_size(path, spec.width, spec.height, max_pixels)
     # Whole numbers keep their type, because OpenImageIO would scale them to 0..1 as floats.

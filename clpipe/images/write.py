@@ -106,7 +106,7 @@ def write_exr(
     height, width = pixels.shape[:2]
     spec = oiio.ImageSpec(width, height, len(channels), oiio.HALF if half else oiio.FLOAT)
     spec.x, spec.y = -margins.left, -margins.top
-    spec.full_width, spec.full_height = margins.inside(width, height)
+    spec.full_width, spec.full_height = margins.frame_size(width, height)
     spec.channelnames = tuple(channels)
     spec.attribute("compression", "zip")
     spec.attribute("DateTime", NO_TIME)

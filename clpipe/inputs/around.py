@@ -54,7 +54,7 @@ class Rig:
         """Return the view called ``name`` of a file with this width and height in px."""
         rotation, camera = self.views[name]
         if camera is None:
-            return View.of_angle(rotation, width, height, self.angle)
+            return View.from_angle(rotation, width, height, self.angle)
         return View(rotation, *camera, width, height)
 
     def called(self, path: Path) -> tuple[str, str] | None:

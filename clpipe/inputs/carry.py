@@ -109,7 +109,7 @@ def carry(
             its kind is not known.
     """
     whole = source.pixels.shape[1::-1]
-    width, height = source.margins.inside(*whole)
+    width, height = source.margins.frame_size(*whole)
     found = find_all(path, layers)
     read: list[Layer] = []
     attributes: dict[str, str] = {}

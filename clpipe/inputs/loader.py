@@ -233,7 +233,7 @@ class ImageLoader:
                 f"{job.path}: this is a cube map, not a picture. To view it through a wide lens, "
                 f"add --set {stage_in(StageRole.VIEW).name}.method=kannala_brandt"
             )
-        width, height = source.margins.inside(*source.pixels.shape[1::-1])
+        width, height = source.margins.frame_size(*source.pixels.shape[1::-1])
         if job.size and job.size != (width, height):
             raise ImageError(
                 f"{job.path}: this image has {width}x{height} pixels, but its camera in --poses "

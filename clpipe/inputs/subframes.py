@@ -183,13 +183,13 @@ def weights_of(
     Overscan rows have the weights of the picture's first or last row, because there are no frames
     from before or after.
     """
-    _, height = margins.inside(0, rows)
+    _, height = margins.frame_size(0, rows)
     in_picture = np.clip(np.arange(rows) - margins.top, 0, height - 1)
     return shutter.weights(frames, height, lit)[:, in_picture]
 
 
 def _size(source: SourceImage, pixels: Array) -> str:
     """Return the size of a picture and its overscan as text."""
-    width, height = source.margins.inside(*pixels.shape[1::-1])
+    width, height = source.margins.frame_size(*pixels.shape[1::-1])
     beyond = f" with {tuple(source.margins)} px of overscan" if source.margins else ""
     return f"{width}x{height}{beyond}"

@@ -53,7 +53,7 @@ class Way:
         at = (np.asarray(points, np.float64) + corner).T
         if self.geometry is None:
             return np.asarray(at.T)
-        whole = self.margins.around(self.width, self.height)
+        whole = self.margins.image_size(self.width, self.height)
         start = at * (np.array(self.after) / np.array(whole))[:, None]
         there = destinations(self.geometry, (at[0], at[1]), (start[0], start[1]), *whole)
         return np.stack(there, -1)
@@ -86,7 +86,7 @@ class Way:
         Raises:
             RequestError: a stage that moves pixels contradicts them.
         """
-        size = self.margins.around(self.width, self.height)
+        size = self.margins.image_size(self.width, self.height)
         return self.geometry.intrinsics(before, *size) if self.geometry else before
 
 
@@ -144,7 +144,7 @@ def _bounds(outlines: Sequence[Array]) -> list[float]:
 def moved_mask(mask: Array, way: Way) -> Array:
     """Return a mask of the render, (height, width) of 0 and 1, warped into the picture."""
     layer = Layer("label", mask[..., None], way.margins.left, way.margins.top)
-    (moved,), _ = warp([layer], way.geometry, *way.margins.around(way.width, way.height))
+    (moved,), _ = warp([layer], way.geometry, *way.margins.image_size(way.width, way.height))
     return np.asarray(moved[..., 0])
 
 

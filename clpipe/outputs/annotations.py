@@ -111,7 +111,7 @@ def _pictures(
     if "panorama" in values:
         raise ImageError("annotations of panoramas cannot be warped by a wide lens")
     parts = chain.geometry.parts if chain.geometry else ()
-    size = chain.size(*chain.margins.around(*own))
+    size = chain.size(*chain.margins.image_size(*own))
     if size != (values["width"], values["height"]):
         raise ImageError(
             f"the annotations are for a render of {own[0]}x{own[1]} pixels, whose picture would "

@@ -29,7 +29,7 @@ def motion_records(chain: Chain, source: SourceImage) -> dict[str, Any]:
         return {}
     exposures = exposures_of(chain)
     shutter = step.method.for_exposure(exposures.spans, 0) if exposures else step.method
-    _, rows = source.margins.inside(*source.pixels.shape[1::-1])
+    _, rows = source.margins.frame_size(*source.pixels.shape[1::-1])
     readout = float(shutter.times(rows)[-1])
     span = shutter.duration(rows)
     times = (np.arange(len(poses)) + 0.5) * span / len(poses)

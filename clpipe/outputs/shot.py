@@ -56,7 +56,7 @@ def sensor_of(chain: Chain, source: SourceImage, own: Mapping[str, float]) -> fl
     length = optics.focal_length or own.get("focal_length")
     if length is None or source.pixels.ndim != 3:
         return None
-    width, height = source.margins.inside(*source.pixels.shape[1::-1])
+    width, height = source.margins.frame_size(*source.pixels.shape[1::-1])
     camera = chain.intrinsics_of_render(width, height, source.shot)
     return length / camera.fx * max(width, height) if camera else None
 

@@ -8,7 +8,7 @@ from pydantic import field_validator, model_validator
 
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
-from clpipe.reference.defocus import NOWHERE, Depth, aperture_taps, defocus, reach_of
+from clpipe.reference.defocus import NO_SURFACE, Depth, aperture_taps, defocus, disc_reach
 from clpipe.stage import (
     Arguments,
     Context,
@@ -187,7 +187,7 @@ class ThinLens(FocalLengthMethod, DepthMethod):
 
     def camera(self, width: int, height: int) -> tuple[float, float]:
         """Return the focal length and the pixel pitch, in mm, for an image of this size."""
-        side = max(self.margins.inside(width, height))
+        side = max(self.margins.frame_size(width, height))
         pitch = self.sensor_width / side if self.sensor_width else (self.pixel_pitch or 0.0) / 1000
         return self.focal_length or (self.fx or 0.0) * pitch, pitch
 
@@ -227,7 +227,7 @@ class ThinLens(FocalLengthMethod, DepthMethod):
         """Return the radii with a border, the border's width, and the taps of the largest disc."""
         radii = self.limited_radii(depth)
         largest = float(np.ceil(abs(radii).max() * 4)) / 4  # so that many images share a few tables
-        reach = reach_of(largest)
+        reach = disc_reach(largest)
         border = ((reach, reach), (reach, reach + MAX_LANES))
         return np.pad(radii, border, "reflect"), reach, aperture_taps(self.blades, largest)
 
@@ -242,7 +242,7 @@ class ThinLens(FocalLengthMethod, DepthMethod):
 def _depth_of(context: Context) -> Depth:
     """Return the depth of the image. Without an image, everything is infinitely far."""
     if context.depth is None:
-        return NOWHERE
+        return NO_SURFACE
     depth: Any = context.depth()
     assert depth is not None, "the image is still there"
     return depth

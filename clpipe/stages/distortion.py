@@ -174,7 +174,7 @@ class FocalLengthDistortion(FocalLengthMethod, Distortion):
         lens = super().lens()
         if self.fx and self.fy:
             return replace(lens, focal=(self.fx, self.fy))
-        return replace(lens, share=self.relative_focal_length)
+        return replace(lens, relative_focal_length=self.relative_focal_length)
 
 
 class BrownConrady(FocalLengthDistortion):
@@ -209,7 +209,7 @@ class BrownConrady(FocalLengthDistortion):
 
     def radial(self) -> Radial:
         denominator = (0.0, self.k4, 0.0, self.k5, 0.0, self.k6)
-        return Radial.of(1.0, 0.0, self.k1, 0.0, self.k2, 0.0, self.k3, below=denominator)
+        return Radial.of(1.0, 0.0, self.k1, 0.0, self.k2, 0.0, self.k3, denominator=denominator)
 
     def lens(self) -> DistortionMap:
         return replace(super().lens(), tangential=(self.p1, self.p2))

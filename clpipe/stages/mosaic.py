@@ -126,7 +126,7 @@ class AnyArray(Method):
 def responses_of(array: FilterArray) -> Floats:
     """Return the transmission of the filter at each position: (row, colour, column)."""
     colours = [{k: float(v[c]) for k, v in array.responses.items()} for c in range(3)]
-    return np.stack([array.by_place(each) for each in colours], axis=1)
+    return np.stack([array.by_position(each) for each in colours], axis=1)
 
 
 @lru_cache(maxsize=64)  # the same object for the same array, so that it is uploaded once

@@ -9,8 +9,8 @@ from pydantic import model_validator
 from clpipe.base.errors import RequestError
 from clpipe.base.tracing import traceable
 from clpipe.base.types import Floats
-from clpipe.reference.convolve import convolve, reach_of, taps_of
-from clpipe.reference.turning import BILINEAR, Turning
+from clpipe.reference.convolve import convolve, tap_radius, taps_of
+from clpipe.reference.turning import BILINEAR, CameraRotation
 from clpipe.stage import (
     Arguments,
     Context,
@@ -148,7 +148,7 @@ class Linear(Method):
     def passes(self) -> tuple[Pass, ...]:
         if not self.pixels:
             return ()
-        radius = reach_of(self.taps)
+        radius = tap_radius(self.taps)
         return (Pass("convolve", Stencil(radius), ("taps", "count")),)
 
     def arguments(self, context: Context) -> Arguments:
@@ -165,7 +165,7 @@ class Perspective(FocalLengthMethod, PrincipalPointMethod):
 
     The camera rotates evenly about an axis in its image plane. It shows the render unchanged in the
     middle of the exposure. Each pixel is the mean of the light it received, from
-    :class:`clpipe.reference.turning.Turning`.
+    :class:`clpipe.reference.turning.CameraRotation`.
 
     >>> from clpipe.stage import run_reference
     >>> dots = np.zeros((1, 201, 3), np.float32)
@@ -206,10 +206,10 @@ class Perspective(FocalLengthMethod, PrincipalPointMethod):
         return resolved
 
     @property
-    def rotation_warp(self) -> Turning:
+    def rotation_warp(self) -> CameraRotation:
         """The geometry from render to image."""
         centre = self.cx, self.cy
-        return Turning(
+        return CameraRotation(
             self.rotation, self.angle, self.fx, self.relative_focal_length, centre, self.margins
         )
 

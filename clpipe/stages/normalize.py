@@ -8,7 +8,7 @@ from pydantic import model_validator
 from clpipe.base.errors import RequestError
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
-from clpipe.reference.companding import along_pieces, knots_in, pieces_of
+from clpipe.reference.companding import apply_pieces, parse_knots, pieces_of
 from clpipe.stage import (
     Arguments,
     Backend,
@@ -135,7 +135,7 @@ class Pwl(Linear):
     @model_validator(mode="after")
     def _check_knots(self) -> "Pwl":
         if self.knots is not None:
-            knots_in(self.knots)
+            parse_knots(self.knots)
         return self
 
     def resolve(self, context: Context) -> "Linear":
@@ -150,7 +150,7 @@ class Pwl(Linear):
                 "normalize.method=pwl: no knots are known; set normalize.knots, or use "
                 "quantize.method=pwl"
             )
-        if self.knots and context.knots and knots_in(self.knots) != context.knots:
+        if self.knots and context.knots and parse_knots(self.knots) != context.knots:
             raise RequestError(
                 f"normalize.knots: {self.knots} differ from those of quantize, "
                 f"{[list(pair) for pair in context.knots]}; remove normalize.knots"
@@ -160,7 +160,7 @@ class Pwl(Linear):
     @property
     def _pieces(self) -> Floats:
         assert self.knots is not None
-        return pieces_of(knots_in(self.knots), inverse=True)
+        return pieces_of(parse_knots(self.knots), inverse=True)
 
     def next_context(self, context: Context) -> Context:
         return super().next_context(context).replace(knots=())
@@ -173,7 +173,7 @@ class Pwl(Linear):
         return {**super().arguments(context), "pieces": self._pieces, "count": count}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        return super().reference(along_pieces(image, self._pieces), inputs)
+        return super().reference(apply_pieces(image, self._pieces), inputs)
 
 
 def _curve_default(context: Context) -> Method | None:

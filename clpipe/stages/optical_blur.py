@@ -11,7 +11,7 @@ from pydantic import field_validator
 from clpipe.base.errors import ImageError
 from clpipe.base.tracing import int32, traceable
 from clpipe.base.types import Doubles, Floats
-from clpipe.reference.convolve import NEGLIGIBLE, blur, convolve, reach_of, taps_of
+from clpipe.reference.convolve import NEGLIGIBLE, blur, convolve, tap_radius, taps_of
 from clpipe.stage import (
     Arguments,
     CompileTime,
@@ -277,7 +277,7 @@ class Lens(Method):
     def passes(self) -> tuple[Pass, ...]:
         lines = self._separable_arguments
         if lines is None:
-            radius = reach_of(self._taps)
+            radius = tap_radius(self._taps)
             return (Pass("convolve", Stencil(radius), ("taps", "count")),)
         reach = len(half_line_spread(*lines)) - 1
         if reach == 0:

@@ -9,10 +9,10 @@ from pydantic import model_validator
 from clpipe.base.types import Floats
 from clpipe.reference.companding import (
     Knots,
-    along_pieces,
-    knots_in,
+    apply_pieces,
+    default_knots,
+    parse_knots,
     pieces_of,
-    usual_knots,
 )
 from clpipe.stage import (
     Arguments,
@@ -149,7 +149,7 @@ class Pwl(Linear):
     def _check_knots(self) -> "Pwl":
         if self.knots is None:
             return self
-        last = knots_in(self.knots)[-1]
+        last = parse_knots(self.knots)[-1]
         if last[1] >= 2**self.result_bits:
             raise ValueError(
                 f"knots: the last output is {last[1]:g}, which does not fit in "
@@ -166,14 +166,14 @@ class Pwl(Linear):
         resolved = super().resolve(context)
         assert isinstance(resolved, Pwl)
         assert resolved.white_level is not None
-        default = usual_knots(resolved.white_level, 2**self.result_bits - 1)
+        default = default_knots(resolved.white_level, 2**self.result_bits - 1)
         resolved = resolved.with_defaults(knots=[list(pair) for pair in default])
         return type(self).model_validate(dict(resolved))
 
     @property
     def _knots(self) -> Knots:
         assert self.knots is not None
-        return knots_in(self.knots)
+        return parse_knots(self.knots)
 
     def next_context(self, context: Context) -> Context:
         return super().next_context(context).replace(knots=self._knots)
@@ -191,7 +191,7 @@ class Pwl(Linear):
         return None
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        return np.rint(along_pieces(super().reference(image, inputs), pieces_of(self._knots)))
+        return np.rint(apply_pieces(super().reference(image, inputs), pieces_of(self._knots)))
 
 
 STAGE = Stage(

@@ -13,7 +13,7 @@ from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern
 from clpipe.reference.filter_array import FilterArray, kernel_table, parse_array
 from clpipe.reference.geometry import Scaling
-from clpipe.reference.linear_mmse import RADIUS, filtered, filters
+from clpipe.reference.linear_mmse import RADIUS, apply_filters, filters
 from clpipe.reference.resample import Bins, resample
 from clpipe.stage import (
     PERIOD,
@@ -140,7 +140,7 @@ class LinearMmse(Method):
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         array = inputs.context.filter_array
         weights = weights_of(array, self.pattern)
-        return filtered(image, array.period, weights[..., None])[..., 0]
+        return apply_filters(image, array.period, weights[..., None])[..., 0]
 
 
 @lru_cache(maxsize=16)

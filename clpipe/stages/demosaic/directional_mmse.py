@@ -4,7 +4,7 @@ from functools import lru_cache
 from typing import ClassVar
 
 from clpipe.base.types import Floats
-from clpipe.reference.directional_mmse import MODELS, UNSEEN, directional_mmse, models
+from clpipe.reference.directional_mmse import ERROR_FLOOR, MODELS, directional_mmse, models
 from clpipe.reference.filter_array import FilterArray, kernel_table
 from clpipe.reference.linear_mmse import RADIUS
 from clpipe.stage import (
@@ -63,7 +63,7 @@ class DirectionalMmse(Method):
         return {
             "colours": colours,
             "misses": misses,
-            "unseen": UNSEEN,
+            "unseen": ERROR_FLOOR,
             **period_of(array.period),
         }
 
