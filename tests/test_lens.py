@@ -197,9 +197,9 @@ def test_lensfun_says_the_same(camera, name, setting, size):
     vignetting = next(s for s in steps if s.name == "vignetting")
     database, profile = lensfunpy.Database(), load_camera(camera)
     crop = by_name._crop_factor(database, profile.make, profile.model)
-    lens = by_name._found(database, name, crop)
+    lens = by_name._find_lens(database, name, crop)
     modifier = lensfunpy.Modifier(lens, crop or lens.crop_factor, *size)
-    arguments = setting["focal_length"], setting.get("aperture", 8), by_name.FAR
+    arguments = setting["focal_length"], setting.get("aperture", 8), by_name.INFINITY_DISTANCE
     modifier.initialize(*arguments, scale=1.0, pixel_format=np.float32)
     places = modifier.apply_subpixel_geometry_distortion()
     if places is None:  # without lateral colour
@@ -320,7 +320,7 @@ def test_an_aperture_of_a_lens_whose_range_is_not_all_known(low, high, aperture,
 
 
 def test_what_is_said_without_lensfunpy(clpipe, monkeypatch):
-    by_name._loaded.cache_clear()
+    by_name._load_database.cache_clear()
     monkeypatch.setitem(sys.modules, "lensfunpy", None)
     said = clpipe("plan", "--lens", "any", status=2).stderr
     assert "lensfunpy, which is not installed; pip install lensfunpy" in said

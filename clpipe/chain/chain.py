@@ -214,7 +214,7 @@ class Chain:
     ) -> Intrinsics | None:
         """Return the intrinsics of an input whose size excludes margins, see :meth:`intrinsics`."""
         known = {**shot, **self.optics.for_image(width, height)}
-        if self.optics.is_sensor_of_lens and "sensor_width" in shot:
+        if self.optics.has_lens_sensor and "sensor_width" in shot:
             known["sensor_width"] = shot["sensor_width"]
         return Intrinsics.of_render(width, height, known, self.optics.places)
 

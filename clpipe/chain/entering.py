@@ -61,7 +61,7 @@ def enter(
     if chain.step_names[0] == chain.names[0] and pixels.ndim == 3:
         width, height = margins.frame_size(*pixels.shape[1::-1])
         optics = chain.optics
-        of_lens = ("sensor_width",) if optics.is_sensor_of_lens else ()
+        of_lens = ("sensor_width",) if optics.has_lens_sensor else ()
         own = optics.for_image(width, height)
         said = {k: v for k, v in (shot or {}).items() if k not in own or k in of_lens}
         said |= {name: own[name] for name in of_lens if name not in said}

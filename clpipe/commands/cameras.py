@@ -11,7 +11,7 @@ from clpipe.camera.profile import (
     Camera,
     built_in_cameras,
     built_in_name,
-    cameras_called,
+    cameras_matching,
     load_camera,
 )
 from clpipe.commands.completion import cameras_or_import
@@ -121,7 +121,7 @@ def cameras(names: tuple[str, ...], iso: float | None, as_json: bool) -> None:
             )
         show_cameras(map(load_camera, built_in_cameras()), as_json)
         return
-    called = [] if built_in_name(name) else cameras_called(name)
+    called = [] if built_in_name(name) else cameras_matching(name)
     if iso is None and len(called) > 1:
         show_cameras(map(load_camera, called), as_json)
         return

@@ -50,7 +50,7 @@ def sensor_of(chain: Chain, source: SourceImage, own: Mapping[str, float]) -> fl
         own: values that the image states about its shot.
     """
     optics = chain.optics
-    stated = None if optics.is_sensor_of_lens else optics.sensor_width
+    stated = None if optics.has_lens_sensor else optics.sensor_width
     if stated := stated or own.get("sensor_width"):
         return stated
     length = optics.focal_length or own.get("focal_length")

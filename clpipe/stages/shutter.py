@@ -8,7 +8,7 @@ from pydantic import PrivateAttr
 
 from clpipe.base.tracing import float32, traceable
 from clpipe.base.types import Doubles, Floats
-from clpipe.camera.optics import USUAL_TIME
+from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
 from clpipe.stage import (
     Arguments,
     Context,
@@ -123,7 +123,7 @@ class Rows(Method):
     _end: float = PrivateAttr(1.0)  # of the last exposure, in exposures of the first
 
     def resolve(self, context: Context) -> Self:
-        resolved = self.with_optics(context).with_defaults(exposure_time=USUAL_TIME)
+        resolved = self.with_optics(context).with_defaults(exposure_time=DEFAULT_EXPOSURE_TIME)
         return resolved.with_defaults(flicker_depth=self.depth)
 
     def next_context(self, context: Context) -> Context:
@@ -153,7 +153,7 @@ class Rows(Method):
 
     @property
     def _first_exposure(self) -> float:
-        return self.exposure_time or USUAL_TIME
+        return self.exposure_time or DEFAULT_EXPOSURE_TIME
 
     @property
     def time(self) -> float:

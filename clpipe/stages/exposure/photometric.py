@@ -7,7 +7,7 @@ import numpy as np
 
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
-from clpipe.camera.optics import USUAL_TIME
+from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
 from clpipe.stage import Arguments, Context, ReferenceContext, parameter
 from clpipe.stages.exposure.gain import Gain
 
@@ -64,7 +64,9 @@ class Photometric(Gain):
     )
 
     def resolve(self, context: Context) -> Self:
-        return self.with_optics(context).with_defaults(f_number=8.0, exposure_time=USUAL_TIME)
+        return self.with_optics(context).with_defaults(
+            f_number=8.0, exposure_time=DEFAULT_EXPOSURE_TIME
+        )
 
     def next_context(self, context: Context) -> Context:
         headroom = context.headroom + self.headroom - math.log2(WHITE)
