@@ -17,7 +17,7 @@ from clpipe.base.types import Array, plain
 from clpipe.base.validation import typed
 from clpipe.chain.chain import Chain
 from clpipe.chain.depth import depth_of_array
-from clpipe.chain.entering import enter
+from clpipe.chain.entering import prepare_image
 from clpipe.chain.files import load_settings
 from clpipe.chain.identity import image_key, noise_key
 from clpipe.chain.making import make_chain
@@ -152,7 +152,7 @@ class Pipeline(ReadOnly):
             RequestError: a name or value is not allowed.
         """
         runner = self._runner_for(key, settings)
-        for name in runner.chain.lit_by_layers:
+        for name in runner.chain.light_layer_steps:
             raise RequestError(
                 f"{name}: it needs a layer of flickering light, which an array does not have. "
                 "Use clpipe run, which reads the layer from the render's file"
@@ -168,7 +168,7 @@ class Pipeline(ReadOnly):
             cropped = given if given is None or kept else margins.cropped(given)
             return depth_of_array(cropped, width, height)
 
-        own = enter(runner.chain, checked, margins, depth_of)
+        own = prepare_image(runner.chain, checked, margins, depth_of)
         if depth is not None and own.depth is None:
             unread = "no step reads the depth. Set defocus.method=thin_lens to use it"
             warnings.warn(f"{key}: {unread}", stacklevel=2)
@@ -236,7 +236,7 @@ class Pipeline(ReadOnly):
             raise ImageError(f"found {pixels.shape[2]} channels; {kind} has {least} or more")
         vectors = vectors_of("", ("",) * pixels.shape[2]) if kind == "flow" else ()
         margins = margins_of_array(overscan, layer)
-        own = enter(self._runner_for(key, settings).chain, pixels, margins)
+        own = prepare_image(self._runner_for(key, settings).chain, pixels, margins)
         along = Layer(kind, own.pixels, vectors=vectors)
         (moved,), valid = warp([along], own.chain.geometry, *own.pixels.shape[1::-1])
         return moved if layer.ndim == 3 else moved[..., 0], valid

@@ -12,7 +12,7 @@ import clpipe as clpipe_api
 from clpipe.base.errors import ImageError
 from clpipe.chain.depth import depth_of_array, with_depth
 from clpipe.chain.making import make_chain
-from clpipe.chain.overscan import steps_of_overscan, with_overscan
+from clpipe.chain.overscan import overscan_step_count, with_overscan
 from clpipe.chain.settings import settings_from
 from clpipe.engine.check import example
 from clpipe.engine.runner import Runner
@@ -163,7 +163,7 @@ def test_a_camera_turns_about_the_middle_of_the_picture():
 
 def test_where_it_is_of_use():
     def count(**settings):
-        return steps_of_overscan(make_chain(settings_from(settings)))
+        return overscan_step_count(make_chain(settings_from(settings)))
 
     assert count() == 0 and count(distortion={**BARREL, "k1": 0.0}) == 0
     assert count(distortion=BARREL) == 5

@@ -14,7 +14,7 @@ from clpipe.base.validation import typed
 from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
 from clpipe.chain.formats import format_named
-from clpipe.chain.options import OPTIONS, PER_IMAGE, Moments, RedoName, Transfer, check_option
+from clpipe.chain.options import DEFAULT_PATCHES, OPTIONS, Moments, RedoName, Transfer, check_option
 from clpipe.chain.rendition import parse_bracket
 from clpipe.chain.request import Request
 from clpipe.inputs.find import parse_shard
@@ -209,7 +209,7 @@ def run_of(
         given[name] = CONVERT[name](listed) if name in CONVERT else listed
         check_option(name, given[name])
     if "patch" in given:
-        given.setdefault("patches_per_image", PER_IMAGE)
+        given.setdefault("patches_per_image", DEFAULT_PATCHES)
     elif lost := [name for name in ("patches_per_image", "augment") if given.get(name)]:
         raise RequestError(f"--{lost[0].replace('_', '-')}: it needs patches; add --patch SIZE")
     dask = given.pop("dask", None)

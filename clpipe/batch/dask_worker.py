@@ -19,7 +19,7 @@ from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.spec import RunSpec, shifted
 from clpipe.batch.threads import Batch
-from clpipe.chain.paths import from_folder
+from clpipe.chain.paths import resolve_paths
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.discovery import DeviceInfo, choose_all, find_devices
 from clpipe.images.write import versions
@@ -49,16 +49,16 @@ class DaskSpec(RunSpec):
         folder, asked = self.folder, self.request
         request = replace(
             asked,
-            config=None if asked.config is None else from_folder(folder, asked.config),
-            options=from_folder(folder, asked.options),
-            image=from_folder(folder, asked.image),
+            config=None if asked.config is None else resolve_paths(folder, asked.config),
+            options=resolve_paths(folder, asked.options),
+            image=resolve_paths(folder, asked.image),
         )
         where = replace(self.where, output=folder / self.where.output)
         return replace(self, request=request, where=where)
 
     def anchored_job(self, job: Job) -> Job:
         """Return a job with absolute names of files."""
-        values = from_folder(self.folder, job.values)
+        values = resolve_paths(self.folder, job.values)
         first, *others = (self.folder / path for path in job.paths)
         return replace(job, path=first, subframes=tuple(others), values=values, written=job.input)
 

@@ -28,10 +28,10 @@ def base_name(step: str) -> str:
     return re.sub(r"_\d+$", "", step)
 
 
-def numbered(stages: Sequence[str]) -> list[str]:
+def step_names_of(stages: Sequence[str]) -> list[str]:
     """Return the names of the steps of stages. A repeated stage gets a number.
 
-    >>> numbered(["denoise", "gamma", "denoise"])
+    >>> step_names_of(["denoise", "gamma", "denoise"])
     ['denoise', 'gamma', 'denoise_2']
     """
     before = [stages[:place].count(stage) for place, stage in enumerate(stages)]
@@ -42,7 +42,7 @@ def numbered(stages: Sequence[str]) -> list[str]:
 @lru_cache(maxsize=64)
 def step_names(stages: tuple[str, ...], skip: tuple[str, ...]) -> tuple[str, ...]:
     """Return the names of the steps, see :attr:`clpipe.chain.settings.Settings.step_names`."""
-    return tuple(name for name in numbered(stages) if name not in skip)
+    return tuple(name for name in step_names_of(stages) if name not in skip)
 
 
 def stage_named(key: str, name: str) -> Stage:
@@ -58,8 +58,8 @@ def stage_named(key: str, name: str) -> Stage:
     if name not in all_stages():
         if base_name(name) in all_stages():
             stage = base_name(name)
-            again = f"{name}: this names a repeated stage; to repeat it, list {stage} again"
-            raise KeyedError(key, f"{again}. The second is then called {stage}_2")
+            message = f"{name}: this names a repeated stage; to repeat it, list {stage} again"
+            raise KeyedError(key, f"{message}. The second is then called {stage}_2")
         raise KeyedError(key, one_of("stage", name, all_stages()))
     return all_stages()[name]
 
@@ -73,7 +73,7 @@ def parameter_names() -> list[str]:
     )
 
 
-def chosen_method(name: str, table: Mapping[str, Any]) -> Any:
+def method_name(name: str, table: Mapping[str, Any]) -> Any:
     """Return the name of the method in a step's table; else of the stage's default method."""
     stage = all_stages().get(base_name(name))
     return table.get("method", stage.methods[0].method if stage else None)
@@ -104,7 +104,7 @@ def make_model(name: str, table: Mapping[str, Any]) -> Any:
     if name in TABLE_MODELS:
         model = TABLE_MODELS[name]
     elif table:
-        model = method_named(stage_of(name), name, chosen_method(name, table))
+        model = method_named(stage_of(name), name, method_name(name, table))
         table = {k: v for k, v in table.items() if k != "method"}
     else:
         return default_method(stage_of(name).methods[0], name)

@@ -115,7 +115,7 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
 )
 @options("config", "camera", "iso", *SETTINGS, "start_at", "until", CODE, "carry", "poses")
 @set_option
-@option(TRUTH, default=(TRUTH.usual,))
+@option(TRUTH, default=(TRUTH.default_text,))
 @option(OPTIONS["format"], "formats")
 @click.option(
     "--licence",

@@ -20,8 +20,8 @@ USUAL = SeriesSize()
 
 
 @click.command("emva", cls=Command)
-@option(KEYS["camera"]._replace(usual=""), required=True)
-@option(KEYS["iso"]._replace(text="The ISO.", usual="the camera's lowest"))
+@option(KEYS["camera"]._replace(default_text=""), required=True)
+@option(KEYS["iso"]._replace(text="The ISO.", default_text="the camera's lowest"))
 @output_option("DIR", "The directory of the series. It is created if it does not exist.")
 @click.option(
     "--size",

@@ -104,7 +104,7 @@ class Follower(Watch):
 @option(
     KEYS["iso"]._replace(
         text="The ISO, which sets the noise of the raw.",
-        usual="the search finds the strength",
+        default_text="the search finds the strength",
     )
 )
 @click.option(

@@ -76,7 +76,7 @@ def raw_step(chain: Chain, arrays: ArrayFormat) -> str:
     """
     if not arrays.is_in_dn:
         return noisy_mosaic(chain).steps[-1].name
-    maker, after = chain.maker_of_raw, chain.context_of_raw
+    maker, after = chain.raw_step_name, chain.raw_context
     if maker is None:
         raise RequestError(
             f"the chain {chain.label} makes no raw in DN. Add the stage quantize, or use "

@@ -9,7 +9,7 @@ import numpy as np
 from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array, Floats
-from clpipe.chain.chain import Chain, of_structure
+from clpipe.chain.chain import Chain, cached_by_structure
 from clpipe.chain.exposures import exposures_of
 from clpipe.chain.registry import user_code_errors
 from clpipe.engine.buffers import HostImages, allocate_results
@@ -88,7 +88,7 @@ def crop_patches(image: Array, boxes: Sequence[Box]) -> Array:
     return np.stack([image[box.top : box.bottom, box.left : box.right] for box in boxes])
 
 
-@of_structure
+@cached_by_structure
 def has_size_estimates(chain: Chain) -> bool:
     """Return whether a stage derives numbers from the size of the image."""
     return any(type(s.method).estimates_for is not Method.estimates_for for s in chain.steps)
@@ -302,7 +302,7 @@ class Runner:
             strict=True,
         )
         exposure_images = [runner.run(exposure, noise_key).image for runner, exposure in pairs]
-        return self.for_chain(self._exposures.merging(exposure_images))
+        return self.for_chain(self._exposures.merge_chain(exposure_images))
 
     def check(self, image: Array) -> None:
         """Check that an image has the shape that the chain starts on.
@@ -349,7 +349,7 @@ class Runner:
         kept: dict[str, Floats] = {}
         estimates: dict[str, dict[str, float]] = {}
         whole = self.encode or self.final
-        steps = (self.chain if whole else self.chain.through(self.keep)).steps
+        steps = (self.chain if whole else self.chain.up_to(self.keep)).steps
         for step in steps:
             from_size = dict(step.method.estimates_for(*image.shape[1::-1]))
             streams = {s: self.chain.stream(step.name, s, noise_key) for s in NoiseScope}

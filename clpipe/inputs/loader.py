@@ -12,14 +12,14 @@ from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, KindError, NoPictureError, RequestError
 from clpipe.base.reading import unchanged
 from clpipe.chain.chain import Chain
-from clpipe.chain.entering import enter
+from clpipe.chain.entering import prepare_image
 from clpipe.chain.exposures import exposures_of
 from clpipe.chain.identity import image_key
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import RENDER
-from clpipe.chain.making import entry
+from clpipe.chain.making import entry_kind
 from clpipe.chain.methods import base_name, stage_named
-from clpipe.chain.overscan import steps_of_overscan
+from clpipe.chain.overscan import overscan_step_count
 from clpipe.chain.registry import stage_in
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
@@ -112,7 +112,7 @@ class ImageLoader:
         """The kind of image that is read, except for raws."""
         start_at = self.request.start_at
         if start_at is None:
-            return entry(self.settings)
+            return entry_kind(self.settings)
         stage = stage_named("--start-at", base_name(start_at))
         try:
             return self.chain.source if stage.also_reads else stage.reads
@@ -127,7 +127,7 @@ class ImageLoader:
     @cached_property
     def reads_overscan(self) -> bool:
         """Whether the overscan of renders is read."""
-        return self.kept is not None or steps_of_overscan(self.chain) > 0
+        return self.kept is not None or overscan_step_count(self.chain) > 0
 
     @cached_property
     def raw(self) -> RawLoader:
@@ -280,7 +280,7 @@ class ImageLoader:
             return read_depth(job.at("middle"), chain, width, height, margins, carried, most)
 
         around = source.panorama
-        own = enter(loaded.chain, source.pixels, source.margins, depth, source.shot, around)
+        own = prepare_image(loaded.chain, source.pixels, source.margins, depth, source.shot, around)
         if own.pixels is source.pixels and not (own.margins or own.depth or own.warnings):
             return LoadedImage(own.chain, source, loaded.key)
         later = source.later

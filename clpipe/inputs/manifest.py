@@ -16,7 +16,7 @@ from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import TABLES, check_type
 from clpipe.chain.methods import TABLE_MODELS, base_name
 from clpipe.chain.options import OPTIONS
-from clpipe.chain.paths import from_folder
+from clpipe.chain.paths import resolve_paths
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import toml_value, value_text
@@ -114,7 +114,7 @@ def manifest_text(folder: Path, rows: Sequence[Row]) -> bytes:
         below = os.path.relpath(path, os.path.abspath(folder))
         cells = {"path": path if below.startswith("../") else below, "name": row.name}
         cells["frames"] = "" if row.frames is None else str(row.frames)
-        for key, value in from_folder(Path.cwd(), row.values).items():
+        for key, value in resolve_paths(Path.cwd(), row.values).items():
             table = value if key not in PLAIN and isinstance(value, Mapping) else None
             named = {key: value} if table is None else {f"{key}.{k}": v for k, v in table.items()}
             cells |= {name: _cell(each) for name, each in named.items()}
@@ -278,7 +278,7 @@ def _row(
             values[column] = value
     own = joined(folder, path)
     key = name or (own.name if is_url(path) else key_of(folder, own))
-    values = from_folder(folder, values)
+    values = resolve_paths(folder, values)
     return Row(own, key, name, alike.setdefault(repr(values), values), frames, place)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from clpipe.base.errors import ClpipeError, ImageError, RequestError
 from clpipe.chain.chain import Chain
-from clpipe.chain.formats import ending_of
+from clpipe.chain.formats import extension_of
 from clpipe.chain.overscan import with_overscan
 from clpipe.chain.rendition import NOISY, Rendition
 from clpipe.chain.request import Request
@@ -123,7 +123,7 @@ def _pictures(
             yield file, Way(Composition(parts) if parts else None, *own, chain.margins, size)
         return
     side = values["request"]["patch"]
-    ending, rendition = ending_of(values["request"]["formats"][0]), Rendition.from_record(values)
+    ending, rendition = extension_of(values["request"]["formats"][0]), Rendition.from_record(values)
     stem = Path(values["name"]).name
     for number, patch in enumerate(values["patches"]):
         left, top = patch["place"]

@@ -12,8 +12,8 @@ import numpy as np
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, Step
-from clpipe.chain.drawing import uniforms
-from clpipe.chain.options import PER_IMAGE
+from clpipe.chain.drawing import uniform_numbers
+from clpipe.chain.options import DEFAULT_PATCHES
 from clpipe.chain.truth import signal_and_noise, variance_of
 from clpipe.engine.extents import Box
 from clpipe.images.tags import FLIPS, upright
@@ -100,7 +100,7 @@ class Patches:
     """
 
     size: int
-    per_image: int | Literal["grid"] = PER_IMAGE
+    per_image: int | Literal["grid"] = DEFAULT_PATCHES
     augment: bool = False
 
     def __post_init__(self) -> None:
@@ -174,7 +174,7 @@ class Cutting:
         """
         size, is_grid = self.patches.size, self.patches.per_image == "grid"
         names = ("turn",) if is_grid else ("turn", "left", "top")
-        drawn = uniforms(
+        drawn = uniform_numbers(
             f"patch:{self.seed}:{key}:{epoch}",
             [f"{number}.{name}" for number in numbers for name in names],
         )

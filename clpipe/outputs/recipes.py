@@ -5,10 +5,10 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 from clpipe.base.errors import KeyedError, RequestError
-from clpipe.chain.baseline import baseline_of, matching_of
+from clpipe.chain.baseline import baseline_of, noise_matching
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.formats import DNG, FORMATS
-from clpipe.chain.identity import noise_key, of_bracket
+from clpipe.chain.identity import bracket_key, noise_key
 from clpipe.chain.registry import stage_in
 from clpipe.chain.rendition import (
     BASELINES,
@@ -138,10 +138,10 @@ def recipes(asked: Iterable[Rendition], chain: Chain, key: str) -> list[Recipe]:
     spreads: dict[float | None, Spread] = {}  # baselines of one exposure share theirs
     for each in asked:
         own = chain if each.ev is None else exposed(chain, each.ev)
-        own_key = of_bracket(key, each.ev or 0.0)
+        own_key = bracket_key(key, each.ev or 0.0)
         recipe = Recipe(each, *chain_and_noise(each.role, own), own_key)
         if each.role in BASELINES:
-            spread = Spread(measured_on(each), matching_of(own), own.settings.output)
+            spread = Spread(measured_on(each), noise_matching(own), own.settings.output)
             recipe = replace(recipe, spread=spreads.setdefault(each.ev, spread))
         found.append(recipe)
     return found
@@ -149,7 +149,7 @@ def recipes(asked: Iterable[Rendition], chain: Chain, key: str) -> list[Recipe]:
 
 def measured_on(baseline: Rendition) -> tuple[Rendition, Rendition, Rendition]:
     """Return the pictures on which a baseline is measured: the noisy one and two ground truths."""
-    return baseline.beside(NOISY), baseline.beside(DEVELOPMENT), baseline.beside(CLEAN)
+    return baseline.with_role(NOISY), baseline.with_role(DEVELOPMENT), baseline.with_role(CLEAN)
 
 
 @lru_cache(maxsize=64)  # for the same reason as chain_and_noise
@@ -177,7 +177,7 @@ def exposed(chain: Chain, ev: float) -> Chain:
             f"--bracket: {ev:+g} EV added to {step.name}.ev={before:g} is not allowed; {error}"
         ) from None
     if settings.noise_key:
-        settings = replace(settings, noise_key=of_bracket(settings.noise_key, ev))
+        settings = replace(settings, noise_key=bracket_key(settings.noise_key, ev))
     method = settings.method(step.name).resolve(step.context)
     steps = (replace(s, method=method) if s is step else s for s in chain.steps)
     return replace(chain, steps=tuple(steps), settings=settings)

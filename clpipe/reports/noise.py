@@ -100,7 +100,7 @@ def noises(run: Run, pictures: Sequence[Made], problems: list[str], most: int) -
     """
     found: list[Noise] = []
     for made in pictures:
-        truth = run.of_image(made.image).get(made.rendition.beside(DEVELOPMENT))
+        truth = run.of_image(made.image).get(made.rendition.with_role(DEVELOPMENT))
         pair = picture_file(made), truth and picture_file(truth)
         if len(found) == most or not pair[0] or not pair[1]:
             continue
@@ -123,7 +123,7 @@ def laws(run: Run, problems: list[str]) -> list[Law]:
     pictures = [made for made in run.pictures if NORMALIZED in made.files]
     step = max(len(pictures) // JUDGED, 1)
     for made in pictures[::step][:JUDGED]:
-        truth = run.of_image(made.image).get(made.rendition.beside(MOSAIC))
+        truth = run.of_image(made.image).get(made.rendition.with_role(MOSAIC))
         asked = made.value("noise", "signal")
         is_known = truth and "exr" in truth.files and isinstance(asked, dict)
         if not truth or not is_known or parameters_of(made, "prnu").get("sigma"):
