@@ -27,7 +27,7 @@ from clpipe.engine.clipping import WARNING_SHARE, clipped_share, clipping_text
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.arrays import as_array, as_image
-from clpipe.images.kinds import CHANNELS, vectors_of
+from clpipe.images.kinds import MIN_CHANNELS, flow_vectors
 from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
 from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import NO_MARGINS, Margins
@@ -232,9 +232,9 @@ class Pipeline(ReadOnly):
         if layer.ndim not in (2, 3) or not layer.size:
             raise ImageError(f"found a layer of {layer.shape}; expected (height, width[, channel])")
         pixels = layer.reshape(*layer.shape[:2], -1)
-        if pixels.shape[2] < (least := CHANNELS.get(kind, 1)):
+        if pixels.shape[2] < (least := MIN_CHANNELS.get(kind, 1)):
             raise ImageError(f"found {pixels.shape[2]} channels; {kind} has {least} or more")
-        vectors = vectors_of("", ("",) * pixels.shape[2]) if kind == "flow" else ()
+        vectors = flow_vectors("", ("",) * pixels.shape[2]) if kind == "flow" else ()
         margins = margins_of_array(overscan, layer)
         own = prepare_image(self._runner_for(key, settings).chain, pixels, margins)
         along = Layer(kind, own.pixels, vectors=vectors)

@@ -11,7 +11,7 @@ from PIL import Image
 
 from clpipe.batch.run_log import read_log
 from clpipe.chain.formats import ALL_FORMATS, extension_of
-from clpipe.images.whole import is_whole
+from clpipe.images.whole import is_complete
 from clpipe.outputs.existing import is_marked
 from clpipe.outputs.sidecar import outputs_in
 from tests.conftest import reseal
@@ -123,7 +123,7 @@ def test_of_every_format_what_is_not_whole_is_made_again(clpipe, write_exr, form
     for size in (0, 5, 1000, len(whole) // 2):
         for data in (whole[:size], bytes(len(whole[:size]))):
             path.write_bytes(data)
-            assert is_whole(path) is False
+            assert is_complete(path) is False
     path.write_bytes(whole[: len(whole) // 2])
     if is_marked(path):  # some of a format's tags are at its end
         clpipe(*run)

@@ -19,7 +19,7 @@ from clpipe.dataset import Dataset
 from clpipe.engine.check import ARRAYS, NOISE, compare, mosaic_parameters
 from clpipe.engine.runner import Runner
 from clpipe.images.dng import write_dng
-from clpipe.images.raw import read_facts, read_raw
+from clpipe.images.raw import read_raw, read_raw_info
 from clpipe.images.read import read_image
 from clpipe.images.tags import Tags
 from clpipe.outputs.annotated import Way
@@ -362,7 +362,7 @@ def test_a_dng_of_another_array(clpipe, half, array):
         result = clpipe("run", path, "-o", "again", "--device", "numpy", status=1)
         assert "its filter array is RW/WB" in result.stderr
         return
-    facts = read_facts(path)
+    facts = read_raw_info(path)
     assert facts.pattern == "/".join(parse_array(array).rows)
     assert np.array_equal(read_raw(path, facts), kept)
     clpipe("run", path, "-o", "again", "--format", "png", "--device", "numpy")

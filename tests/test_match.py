@@ -43,7 +43,7 @@ from clpipe.chain.files import load_config, load_settings
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings, overlay
 from clpipe.commands.match import Follower
-from clpipe.images.jpeg import JpegEncoding, jpeg_encoding, through_jpeg
+from clpipe.images.jpeg import JpegEncoding, jpeg_encoding, jpeg_round_trip
 from clpipe.pipeline import Pipeline
 from tests.conftest import DATA, ROOT, run_cli
 
@@ -329,7 +329,7 @@ def test_jpegs_say_their_quality_and_subsampling(burst, tmp_path):
             frame, quality=encoding.quality, subsampling=encoding.subsampling
         )
         assert jpeg_encoding(frame) == encoding
-        assert np.array_equal(through_jpeg(burst[0], encoding), np.asarray(Image.open(frame)))
+        assert np.array_equal(jpeg_round_trip(burst[0], encoding), np.asarray(Image.open(frame)))
     (png,) = saved(tmp_path, b=burst[0])
     assert jpeg_encoding(png) is None
 

@@ -11,7 +11,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import read_finished, read_image
-from clpipe.images.samples import holds_mosaic, photograph_facts
+from clpipe.images.samples import holds_mosaic, photograph_info
 from clpipe.inputs.kept import embedded_settings
 from clpipe.stage import Context, Kind
 
@@ -72,7 +72,7 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
             f"{path}: this is a camera raw, which this command does not read; run 'clpipe run' "
             "first: '--format png' develops it, '--keep normalize' keeps its mosaic"
         )
-    iso, bits = photograph_facts(path)
+    iso, bits = photograph_info(path)
     finished = read_finished(path, grey=bits == 8)  # grey of more bits may be a mosaic
     if finished is not None:
         step = 1 / (2**bits - 1)

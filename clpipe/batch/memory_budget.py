@@ -12,7 +12,7 @@ from clpipe.base.system import give_back_memory
 from clpipe.chain.chain import Chain
 from clpipe.chain.formats import DNG, FORMATS
 from clpipe.engine.device import Device
-from clpipe.images.claims import Claim
+from clpipe.images.claims import MemoryClaim
 
 FLOATS = 12  # bytes of a pixel of three floats
 IN_NUMPY = 16 * FLOATS  # bytes of a pixel while the chain runs in NumPy; measured: 152
@@ -34,7 +34,7 @@ def default_budget(sharing: int = 1) -> int | None:
 
 
 def host_bytes(
-    claim: Claim,
+    claim: MemoryClaim,
     chain: Chain,
     renditions: int,
     formats: Sequence[str],

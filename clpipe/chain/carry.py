@@ -6,7 +6,7 @@ from typing import cast, get_args
 
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
-from clpipe.images.kinds import kind_named
+from clpipe.images.kinds import kind_from_name
 from clpipe.reference.carried import LayerKind
 
 VALID = "valid"  # the channel that marks known pixels
@@ -64,7 +64,7 @@ def parse_carry(texts: Sequence[str]) -> tuple[AovSpec, ...]:
             )
         if name.lower() in found:
             raise RequestError(f"--carry {name}: the layer is named twice; name it once")
-        own = kind_named(name)
+        own = kind_from_name(name)
         known = (own if own == "label" else "depth") if kind == PNG else kind or own
         found[name.lower()] = AovSpec(name, cast("LayerKind | None", known), pattern, kind == PNG)
     return tuple(found.values())

@@ -14,7 +14,7 @@ from clpipe.chain.formats import ALL_FORMATS
 from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.keys import CODE, KEYS, Key
 from clpipe.chain.rendition import BASELINES, CLEAN, TRUTHS
-from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS
+from clpipe.images.pixels import DEFAULT_MAX_PIXELS, MAX_PIXELS
 from clpipe.reference.carried import RESAMPLING
 
 Moments = Literal["start", "middle", "end", "all"]
@@ -180,7 +180,7 @@ _ALL = (
         int,
         "The most pixels of an image. Larger images are rejected before memory is allocated.",
         "N",
-        f"{USUAL_MAX_PIXELS}",
+        f"{DEFAULT_MAX_PIXELS}",
         above=0,
         most=MAX_PIXELS,
     ),

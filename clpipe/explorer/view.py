@@ -12,7 +12,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain
 from clpipe.engine.runner import Result
-from clpipe.images.preview import encoded_light
+from clpipe.images.preview import light_to_srgb
 from clpipe.stage import Kind
 
 
@@ -53,7 +53,7 @@ def shown_of(chain: Chain, result: Result) -> Array:
     """Return a result for display, (height, width, 3) uint8."""
     image = result.image
     if result.encoded is None:
-        image = encoded_light(signal_of(image, chain))
+        image = light_to_srgb(signal_of(image, chain))
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
 

@@ -21,7 +21,7 @@ from clpipe.base.system import largest_file, passing_file
 from clpipe.base.types import Array, Floats
 from clpipe.images.attributes import PREFIX
 from clpipe.images.encoding import Encoding
-from clpipe.images.lens_tag import with_lens
+from clpipe.images.lens_tag import with_lens_model
 from clpipe.images.openexr import write_channels
 from clpipe.images.openimageio import error_text
 from clpipe.images.pixels import HALF_MAX
@@ -126,8 +126,8 @@ def write_npy(path: Path, array: Array) -> Stored:
     """
     array = np.ascontiguousarray(array)
     text = repr(np.lib.format.header_data_from_array_1_0(array)) + f"  # clpipe {__version__}"
-    before = len(np.lib.format.MAGIC_PREFIX) + 4  # the version, and the length of the header
-    padded = text + " " * (-(before + len(text) + 1) % 64) + "\n"
+    prefix_size = len(np.lib.format.MAGIC_PREFIX) + 4  # the version, and the length of the header
+    padded = text + " " * (-(prefix_size + len(text) + 1) % 64) + "\n"
     header = np.lib.format.magic(1, 0) + len(padded).to_bytes(2, "little") + padded.encode()
     return write_whole(path, header, array.data.cast("B"))
 
@@ -229,7 +229,7 @@ def _encode(format_: str, to: str, spec: Any, pixels: Array) -> None:
     if not file.close():
         raise OSError(0, error_text(file.geterror()))
     if format_ in NO_LENS and (lens := spec.getattribute(LENS)):
-        Path(to).write_bytes(with_lens(Path(to).read_bytes(), lens))
+        Path(to).write_bytes(with_lens_model(Path(to).read_bytes(), lens))
 
 
 @cache

@@ -11,8 +11,8 @@ from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.text import alike, either, one_line
 from clpipe.chain.carry import AovSpec
-from clpipe.images.kinds import CHANNELS, kind_named, vectors_of
-from clpipe.images.passes import LayerLocation, find_layers, kind_of
+from clpipe.images.kinds import MIN_CHANNELS, flow_vectors, kind_from_name
+from clpipe.images.passes import LayerLocation, find_layers, layer_kind
 from clpipe.reference.carried import RESAMPLING, LayerKind, Vector
 
 CARRIED = "carried"  # in file names: the carried layers of NAME are in NAME.carried.exr
@@ -35,7 +35,7 @@ class FoundLayer:
     @property
     def vectors(self) -> tuple[Vector, ...]:
         """The vectors that its channels hold; empty unless its kind is flow."""
-        own = vectors_of(self.location.name or self.name, self.location.channels)
+        own = flow_vectors(self.location.name or self.name, self.location.channels)
         return own if self.kind == "flow" else ()
 
 
@@ -166,22 +166,22 @@ class Finder:
         return self.layers[file]
 
     def _found(self, asked: AovSpec, file: Path, location: LayerLocation) -> FoundLayer:
-        kind = asked.kind or kind_of(asked.name, location)
+        kind = asked.kind or layer_kind(asked.name, location)
         if kind is None:
             raise ImageError(
                 f"{file}: the kind of its layer {asked.name} is not known from the name. Add it: "
                 f"--carry {asked.name}:KIND, where KIND is one of {', '.join(RESAMPLING)}"
             )
-        least = CHANNELS.get(kind, 1)
+        least = MIN_CHANNELS.get(kind, 1)
         if len(location.channels) < least:
             raise ImageError(
                 f"{file}: its layer {asked.name} has {len(location.channels)} "
                 f"channel{'s' * (len(location.channels) > 1)}, but a layer of {kind} needs {least} "
                 f"or more; choose another kind with --carry {asked.name}:KIND"
             )
-        is_named = location.name and not (location.is_alone and file != self.path)
+        is_named = location.name and not (location.is_bare_channel and file != self.path)
         layer = location.name if is_named else asked.name
-        alone = location.is_alone and file == self.path
+        alone = location.is_bare_channel and file == self.path
         channels = [name if alone else f"{layer}.{name}" for name in location.channels]
         return FoundLayer(asked.name, kind, file, location, tuple(channels))
 
@@ -192,7 +192,7 @@ def _named(file: Path, name: str, locations: Sequence[LayerLocation]) -> list[La
     Raises:
         ImageError: several layers have that name.
     """
-    found = [each for each in locations if each.answers_to(name)]
+    found = [each for each in locations if each.matches(name)]
     exact = [each for each in found if each.name.lower() == name.lower()]
     names = sorted({each.without_rank for each in found})
     if len(names) > 1 and len(exact) != 1:
@@ -258,5 +258,5 @@ def owner_of(path: Path) -> str | None:
     """
     stem = path.stem
     cut = max(map(stem.rfind, SEPARATORS))
-    is_companion = cut > 0 and (stem[cut + 1 :] == CARRIED or kind_named(stem[cut + 1 :]))
+    is_companion = cut > 0 and (stem[cut + 1 :] == CARRIED or kind_from_name(stem[cut + 1 :]))
     return str(path.with_name(stem[:cut])) if is_companion else None

@@ -23,8 +23,8 @@ from clpipe.chain.overscan import overscan_step_count
 from clpipe.chain.registry import stage_in
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
-from clpipe.images.claims import Claim, claim_of, plain_claim
-from clpipe.images.pixels import USUAL_MAX_PIXELS
+from clpipe.images.claims import MemoryClaim, claim_of, mosaic_claim
+from clpipe.images.pixels import DEFAULT_MAX_PIXELS
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import (
     PICTURE_SUFFIXES,
@@ -185,24 +185,26 @@ class ImageLoader:
         if not all(id(job) in checked or carries(job.path) for job in jobs):
             check_cameras(self.settings)
 
-    def claim(self, job: Job) -> Claim:
+    def claim(self, job: Job) -> MemoryClaim:
         """Return the size and memory that a job's files claim, without reading pixels.
 
         The claim is 0 if the file has too many pixels to be read. If the file cannot be opened, it
         counts one pixel for each byte.
         """
-        most = self.request.max_pixels or USUAL_MAX_PIXELS
+        most = self.request.max_pixels or DEFAULT_MAX_PIXELS
         dump = self.settings.dump_format
         if dump and may_be_dump(job.path):
-            claim = plain_claim(dump.width, dump.height)
+            claim = mosaic_claim(dump.width, dump.height)
         else:
             mosaic = len(self.reads.channels) == 1
             found = claim_of(job.path, mosaic)
-            claim = found or plain_claim(min(stamp_of(job.path)[0], most), 1)
+            claim = found or mosaic_claim(min(stamp_of(job.path)[0], most), 1)
         if claim.width * claim.height > most:
-            return plain_claim(0, 0)
+            return mosaic_claim(0, 0)
         files = len(job.paths) if job.around else 1
-        return Claim(claim.width, claim.height * files, claim.image * files, claim.reading * files)
+        return MemoryClaim(
+            claim.width, claim.height * files, claim.image * files, claim.reading * files
+        )
 
     def opens(self, job: Job) -> bool:
         """Return whether the header of a job's file can be read."""
@@ -255,7 +257,7 @@ class ImageLoader:
         request = self.request
         options = ReadOptions(
             layer or request.layer,
-            request.max_pixels or USUAL_MAX_PIXELS,
+            request.max_pixels or DEFAULT_MAX_PIXELS,
             request.transfer,
             self.reads_overscan,
         )
@@ -274,7 +276,7 @@ class ImageLoader:
         if loaded is None:
             return None
         source, request = loaded.source, self.request
-        carried, most = request.aov_specs(), request.max_pixels or USUAL_MAX_PIXELS
+        carried, most = request.aov_specs(), request.max_pixels or DEFAULT_MAX_PIXELS
 
         def depth(chain: Chain, width: int, height: int, margins: Margins) -> Depth:
             return read_depth(job.at("middle"), chain, width, height, margins, carried, most)
@@ -325,7 +327,7 @@ class ImageLoader:
             ImageError: a layer is missing, or does not fit the image.
         """
         request = self.request
-        most = request.max_pixels or USUAL_MAX_PIXELS
+        most = request.max_pixels or DEFAULT_MAX_PIXELS
         layers = request.aov_specs()
         moments = ("middle", "start", "end") if request.truth_at == "all" else (request.truth_at,)
         given = loaded.source, loaded.chain, layers, most, orientation

@@ -18,7 +18,7 @@ from clpipe.analysis.crops import HEIGHT, WIDTH, Place, choose_places
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
 from clpipe.chain.rendition import BASELINES, NOISY, PICTURES
-from clpipe.images.preview import decoded, jpeg_bytes, reduced, thumbnail_bytes
+from clpipe.images.preview import decode_8_bit, jpeg_bytes, reduce, thumbnail_bytes
 from clpipe.reports.figures import number, oddities
 from clpipe.reports.run import Blob, Made, Run
 
@@ -211,7 +211,7 @@ class Large:
             budget: the budget that the view uses.
         """
         if self.by > 1:
-            image = jpeg_uri(reduced(pixels, self.by), REDUCED_QUALITY)
+            image = jpeg_uri(reduce(pixels, self.by), REDUCED_QUALITY)
             crops = [jpeg_uri(place.of(pixels)) for place in self.places]
         else:
             image, crops = jpeg_uri(pixels), []
@@ -230,7 +230,7 @@ def places_of(pixels: Array, by: int) -> list[Place]:
             of reduced pictures are enlarged to CROP px.
     """
     height, width = pixels.shape[:2]
-    small = reduced(pixels, by)
+    small = reduce(pixels, by)
     if small.shape[1] < WIDTH or small.shape[0] < HEIGHT:
         found = [Place("middle", 0, 0, small.shape[1], small.shape[0])]
     else:
@@ -282,7 +282,7 @@ def large(
     views.sort(key=lambda view: not view[0].endswith(PICTURE))
     for label, file in views if len(views) > 1 else views + comparison:
         try:
-            pixels = decoded(checked(file), file.name)
+            pixels = decode_8_bit(checked(file), file.name)
         except ImageError as error:
             problems.append(str(error))
             continue
@@ -349,7 +349,7 @@ def add_stages(shown: Large, made: Made, budget: Budget) -> None:
     """
     for name, file in _kept(made):
         try:
-            pixels = decoded(checked(file), file.name)
+            pixels = decode_8_bit(checked(file), file.name)
         except ImageError:
             continue
         is_alike = pixels.shape[:2] == (shown.height, shown.width)

@@ -28,7 +28,7 @@ from clpipe.batch.bench import Load, bench_batch, write_renders
 from clpipe.batch.processes import usual_processes
 from clpipe.chain.request import Request
 from clpipe.engine.device import open_device
-from clpipe.images.claims import plain_claim
+from clpipe.images.claims import mosaic_claim
 
 COUNTS = (1, 2, 4)
 FEW = 40  # images, by which starting is measured
@@ -132,7 +132,7 @@ def main() -> None:
         for count, cost in costs.items():
             numbers = f"{cost.cpu:.2f} | {cost.handing:.2f} | {1e3 / cost.elapsed:.0f}"
             print(f"| {text} | {lock:.2f} | {count} | {numbers} |", flush=True)
-        claim = plain_claim(width, height)
+        claim = mosaic_claim(width, height)
         usual = usual_processes(10**6, claim, asked.processors)
         alone = modelled(costs[1], lock, asked.processors, 1)
         shared = modelled(costs[here if here in costs else 2], lock, asked.processors, usual)

@@ -20,7 +20,7 @@ from clpipe.analysis.spatial import LAGS, autocorrelation, count_pairs
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Runner
-from clpipe.images.jpeg import JpegEncoding, through_jpeg
+from clpipe.images.jpeg import JpegEncoding, jpeg_round_trip
 from tools.pages.side_by_side import COLUMNS, cells, sheet, telling_places
 
 ISOS = (800, 1600, 3200, 6400)
@@ -103,7 +103,7 @@ def develop(render: Floats, iso: float, device: str | None = None) -> Pair:
     output = pipeline.chain.settings.output
     written = JpegEncoding(output.jpeg_quality, output.jpeg_subsampling)
     picture = np.asarray(pipeline.process(render, "render").image)
-    return Pair(through_jpeg(picture, written), np.asarray(truth))
+    return Pair(jpeg_round_trip(picture, written), np.asarray(truth))
 
 
 def medians(pairs: Iterable[Pair]) -> dict[str, float]:
