@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from clpipe.analysis.emva.series import LEAST_EXPOSURES, SIDES
+from clpipe.analysis.emva.series import MIN_EXPOSURES, SIDES
 from clpipe.analysis.emva.simulation import SeriesSize, simulate
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
@@ -34,7 +34,7 @@ USUAL = SeriesSize()
     "--exposures",
     default=USUAL.exposures,
     show_default=True,
-    type=click.IntRange(LEAST_EXPOSURES, 10_000),
+    type=click.IntRange(MIN_EXPOSURES, 10_000),
     help="The number of exposures, evenly from dark to saturation. A tenth as many follow above "
     "saturation.",
 )

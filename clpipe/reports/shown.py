@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.analysis.crops import HEIGHT, WIDTH, Place, choose_places
+from clpipe.analysis.crops import HEIGHT, WIDTH, Crop, choose_crops
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
 from clpipe.chain.rendition import BASELINES, NOISY, PICTURES
@@ -185,7 +185,7 @@ class Large:
     width: int  # px, of the picture
     height: int
     by: int  # the reduction factor; 1 is full resolution
-    places: Sequence[Place]  # regions of interest; reduced images have these at full resolution
+    places: Sequence[Crop]  # regions of interest; reduced images have these at full resolution
     views: list[dict[str, Any]] = field(default_factory=list)  # label, image, crops
     strip: list[dict[str, str]] = field(default_factory=list)  # thumbnails of kept stages
 
@@ -221,7 +221,7 @@ class Large:
         return True
 
 
-def places_of(pixels: Array, by: int) -> list[Place]:
+def places_of(pixels: Array, by: int) -> list[Crop]:
     """Return regions of interest of a picture.
 
     Args:
@@ -232,9 +232,9 @@ def places_of(pixels: Array, by: int) -> list[Place]:
     height, width = pixels.shape[:2]
     small = reduce(pixels, by)
     if small.shape[1] < WIDTH or small.shape[0] < HEIGHT:
-        found = [Place("middle", 0, 0, small.shape[1], small.shape[0])]
+        found = [Crop("middle", 0, 0, small.shape[1], small.shape[0])]
     else:
-        found = choose_places((), small.astype(np.float32) / np.float32(255))
+        found = choose_crops((), small.astype(np.float32) / np.float32(255))
     if by == 1:
         return found
     wide, high = min(CROP[0], width), min(CROP[1], height)

@@ -27,7 +27,7 @@ import numpy as np
 
 from clpipe.analysis.matching.columns import (
     COLUMNS,
-    REACH,
+    MAX_LAG,
     Noise,
     autocorrelation,
     figures_of,
@@ -174,7 +174,7 @@ def shown(noises: Sequence[Noise], pairs: Sequence[Pair]) -> dict[str, float]:
         middle = figures[RELATIVE_TO]
         rows.append([figures[n] / middle if n.startswith("sigma") else figures[n] for n in SHOWN])
         _, cb, cr = noise.planes
-        rows[-1].append(float(autocorrelation(cb, places)[REACH, REACH + 2]))
+        rows[-1].append(float(autocorrelation(cb, places)[MAX_LAG, MAX_LAG + 2]))
         rows[-1].append(over_white(cr, places.bright, COARSE))
     with np.errstate(all="ignore"):
         medians = [

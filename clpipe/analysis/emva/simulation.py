@@ -78,14 +78,14 @@ def simulate(
     values = {"camera": camera, "iso": sensor.iso_range[0] if iso is None else iso, "seed": seed}
     settings = overlay(Settings(), values)
     efficiency = sensor.quantum_efficiency or 1.0
-    series = _planned(text, sensor, saturation_of(sensor, settings.iso) / efficiency, size)
+    series = _plan_exposures(text, sensor, saturation_of(sensor, settings.iso) / efficiency, size)
     photon = sensor.signal_of(efficiency, settings.iso)
     runner: Runner | None = None
     exposures = (*series.bright, *series.dark, series.bright_stack, series.dark_stack)
     total, done = sum(len(each.frames) for each in exposures), 0
     samples = np.uint8 if series.bits <= 8 else np.uint16
     for exposure in exposures:
-        chain = make_chain(_exposed(settings, exposure), start_at=FIRST, until=LAST)
+        chain = make_chain(_simulate_exposure(settings, exposure), start_at=FIRST, until=LAST)
         runner = (
             runner.for_chain(chain) if runner else Runner(chain, device, encode=False, final=True)
         )
@@ -103,12 +103,12 @@ def simulate(
     return series
 
 
-def _exposed(settings: Settings, exposure: Exposure) -> Settings:
+def _simulate_exposure(settings: Settings, exposure: Exposure) -> Settings:
     """Return the settings with an exposure's time, which determines the dark charge."""
     return overlay(settings, {"dark_current": {"exposure_time": exposure.time / NS}})
 
 
-def _planned(path: Path, camera: Camera, saturation: float, size: SeriesSize) -> Series:
+def _plan_exposures(path: Path, camera: Camera, saturation: float, size: SeriesSize) -> Series:
     """Return the exposures of a series, with the paths of its frames.
 
     Args:
