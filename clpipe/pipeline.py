@@ -12,22 +12,22 @@ from xxhash import xxh3_64_hexdigest
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
-from clpipe.base.text import one_of, several
+from clpipe.base.text import as_texts, unknown_name
 from clpipe.base.types import Array, plain
-from clpipe.base.validation import typed
+from clpipe.base.validation import check_argument_types
 from clpipe.chain.chain import Chain
 from clpipe.chain.depth import depth_of_array
-from clpipe.chain.entering import enter
+from clpipe.chain.entering import prepare_image
 from clpipe.chain.files import load_settings
 from clpipe.chain.identity import image_key, noise_key
 from clpipe.chain.making import make_chain
 from clpipe.chain.overscan import margins_of_array
 from clpipe.chain.settings import Settings, overlay
-from clpipe.engine.clipping import MUCH, clipped_share, clipping_text
+from clpipe.engine.clipping import WARNING_SHARE, clipped_share, clipping_text
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.arrays import as_array, as_image
-from clpipe.images.kinds import CHANNELS, vectors_of
+from clpipe.images.kinds import MIN_CHANNELS, flow_vectors
 from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
 from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import NO_MARGINS, Margins
@@ -66,7 +66,7 @@ class Pipeline(ReadOnly):
         DeviceError: there is no usable device.
     """
 
-    @typed
+    @check_argument_types
     def __init__(
         self,
         config: str | Path | Sequence[str | Path] = "default",
@@ -77,12 +77,12 @@ class Pipeline(ReadOnly):
         until: str | None = None,
         **settings: "Unpack[Keywords]",
     ) -> None:
-        self._settings = overlay(load_settings(*several(config)), plain(settings))
+        self._settings = overlay(load_settings(*as_texts(config)), plain(settings))
         self._chain_range = start_at, until
         self._numbers = itertools.count()
         self._lock = threading.Lock()  # lets one thread use the device at a time
         chain = self._chain(self._settings)
-        kept = chain.select(several(keep))
+        kept = chain.select(as_texts(keep))
         encode = chain.result is Kind.DISPLAY
         opened_device = open_device(None if device is None else str(device))
         self._runner = Runner(chain, opened_device, kept, encode=encode, final=not encode)
@@ -152,7 +152,7 @@ class Pipeline(ReadOnly):
             RequestError: a name or value is not allowed.
         """
         runner = self._runner_for(key, settings)
-        for name in runner.chain.lit_by_layers:
+        for name in runner.chain.light_layer_steps:
             raise RequestError(
                 f"{name}: it needs a layer of flickering light, which an array does not have. "
                 "Use clpipe run, which reads the layer from the render's file"
@@ -168,7 +168,7 @@ class Pipeline(ReadOnly):
             cropped = depth_map if depth_map is None or kept else margins.cropped(depth_map)
             return depth_of_array(cropped, width, height)
 
-        entered = enter(runner.chain, checked, margins, depth_of)
+        entered = prepare_image(runner.chain, checked, margins, depth_of)
         if depth is not None and entered.depth is None:
             message = "no step reads the depth. Set defocus.method=thin_lens to use it"
             warnings.warn(f"{key}: {message}", stacklevel=2)
@@ -180,7 +180,9 @@ class Pipeline(ReadOnly):
         with self._lock:
             result = runner.run(pixels, noise_key(chain.settings, own_key))
         share = clipped_share(result, chain) or 0.0
-        if share >= MUCH and chain.source is not Kind.DISPLAY:  # photographs are clipped already
+        if (
+            share >= WARNING_SHARE and chain.source is not Kind.DISPLAY
+        ):  # photographs are clipped already
             warnings.warn(f"{key}: {clipping_text(share)}", stacklevel=2)
         return result
 
@@ -225,16 +227,16 @@ class Pipeline(ReadOnly):
             RequestError: a name or value is not allowed.
         """
         if kind not in RESAMPLING:
-            raise RequestError(one_of("kind", str(kind), RESAMPLING))
+            raise RequestError(unknown_name("kind", str(kind), RESAMPLING))
         layer = as_array(layer, "layer")
         if layer.ndim not in (2, 3) or not layer.size:
             raise ImageError(f"found a layer of {layer.shape}; expected (height, width[, channel])")
         pixels = layer.reshape(*layer.shape[:2], -1)
-        if pixels.shape[2] < (least := CHANNELS.get(kind, 1)):
+        if pixels.shape[2] < (least := MIN_CHANNELS.get(kind, 1)):
             raise ImageError(f"found {pixels.shape[2]} channels; {kind} has {least} or more")
-        vectors = vectors_of("", ("",) * pixels.shape[2]) if kind == "flow" else ()
+        vectors = flow_vectors("", ("",) * pixels.shape[2]) if kind == "flow" else ()
         margins = margins_of_array(overscan, layer)
-        entered = enter(self._runner_for(key, settings).chain, pixels, margins)
+        entered = prepare_image(self._runner_for(key, settings).chain, pixels, margins)
         source_layer = Layer(kind, entered.pixels, vectors=vectors)
         size = entered.pixels.shape[1::-1]
         (warped,), valid = warp([source_layer], entered.chain.geometry, *size)

@@ -5,12 +5,12 @@ INLINE vf excess_at(image src, int row, float full) {
 }
 
 INLINE vf blooming(site at, image src, float full, float first, float spill) {
-    vf got = (vf)(0.0f);
+    vf received = (vf)(0.0f);
     float weight = first;
 #pragma unroll
     for (int k = 1; k <= 16; ++k) {
-        got = got + (excess_at(src, -k, full) + excess_at(src, k, full)) * weight;
+        received = received + (excess_at(src, -k, full) + excess_at(src, k, full)) * weight;
         weight = weight * spill;
     }
-    return vmin(vmin(tap_mosaic(src, 0, 0), (vf)(full)) + got, (vf)(full));
+    return vmin(vmin(tap_mosaic(src, 0, 0), (vf)(full)) + received, (vf)(full));
 }

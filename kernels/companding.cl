@@ -3,9 +3,9 @@
 INLINE vf along_pieces(vf x, __global const float *pieces, int count) {
     vf v = pieces[1] + (x - pieces[0]) * pieces[2];
     for (int i = 1; i < count; ++i) {
-        __global const float *own = pieces + 3 * i;
-        const vf beyond = own[1] + (x - own[0]) * own[2];
-        v = x >= own[0] ? beyond : v;
+        __global const float *piece = pieces + 3 * i;
+        const vf extended = piece[1] + (x - piece[0]) * piece[2];
+        v = x >= piece[0] ? extended : v;
     }
     return v;
 }

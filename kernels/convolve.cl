@@ -12,8 +12,8 @@ INLINE rgb convolve(site at, src_image src, __global const float *taps, int coun
     return sum;
 }
 
-// The same for equal weights along rows and columns: weights[k] is that of the pixels k to either
-// side. Rows of a work item share their sums along rows.
+// A symmetric blur with the same weights along rows and columns. weights[k] is the weight of the
+// pixels k to either side. The rows of a work item share their sums along rows.
 INLINE rgb blur(site at, src_image src, int reach, __global const float *weights) {
     rgb sum = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
 #pragma unroll

@@ -1,8 +1,9 @@
-// Light that is spread over discs, and hidden by nearer surfaces. Tap k is four numbers: its offset
-// to the right and down, the radius of a disc whose edge is there, and its weight for hidden
-// surfaces. `radii` has the radii of all pixels of the whole image, negative if nearer than the
-// focus distance. It has `reach` mirrored pixels on every side and one more vector at the right. An
-// image larger than it, for example in a check of the kernel, repeats its last row and vector.
+// Depth of field: light is spread over discs, and nearer surfaces occlude farther ones. Tap k is
+// four numbers: its offset to the right and down, the radius of a disc whose edge is there, and its
+// weight for hidden surfaces. `radii` has the radii of all pixels of the whole image, negative if
+// nearer than the focus distance. It has `reach` mirrored pixels on every side and one more vector
+// at the right. For an image larger than `radii`, as in a check of the kernel, the last row and
+// vector are repeated.
 typedef struct { rgb light; vf total; } surface;
 
 INLINE void add(surface *to, vf share, rgb c) {

@@ -46,9 +46,9 @@ INLINE vf green_at(image roots, image known, int dx, int dy) {
     return tap_mosaic(roots, dx, dy) - tap_mosaic(known, dx, dy);
 }
 
-// The bounds of red or blue: those of its neighbours, widened by the difference of green here and
-// green there, plus or minus noise. A line narrower than the pattern is an extreme of green. Where
-// a colour ends, green only rises or falls.
+// The bounds of red or blue: those of its neighbours, widened by the difference between green at
+// this pixel and green at these neighbours, plus or minus noise. A line narrower than the pattern
+// is an extreme of green. Where a colour ends, green only rises or falls.
 INLINE bounds with_excess(bounds colour, bounds green, vf here, float noise) {
     const bounds v = {colour.low + vmin(here + noise - green.low, (vf)(0.0f)),
                       colour.high + vmax(here - noise - green.high, (vf)(0.0f))};

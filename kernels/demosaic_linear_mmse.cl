@@ -4,16 +4,16 @@
 
 INLINE rgb linear_mmse(site at, src_image src, __global const float *weights, uint rows, uint columns) {
     const uint next = columns + TABLE_LANES;
-    __global const float *own = table_at(at, weights, rows, columns, 7 * 7 * 3);
+    __global const float *entry = table_at(at, weights, rows, columns, 7 * 7 * 3);
     rgb v = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
     UNROLL_ROWS
     for (int dy = -3; dy <= 3; ++dy) {
         for (int dx = -3; dx <= 3; ++dx) {
             const vf sample = src_tap(src, dx, dy);
-            v.r += load(own) * sample;
-            v.g += load(own + next) * sample;
-            v.b += load(own + 2 * next) * sample;
-            own += 3 * next;
+            v.r += load(entry) * sample;
+            v.g += load(entry + next) * sample;
+            v.b += load(entry + 2 * next) * sample;
+            entry += 3 * next;
         }
     }
     return v;

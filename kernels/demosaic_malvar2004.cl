@@ -1,6 +1,6 @@
 // Demosaicing with linear 5x5 filters (Malvar, He and Cutler 2004): bilinear, corrected by the
-// Laplacian of the site's own colour, with gains of 1/2 (green), 5/8 (red and blue at green sites) and
-// 3/4 (red at blue sites, blue at red sites).
+// Laplacian of the site's own colour, with gains of 1/2 (green), 5/8 (red and blue at green sites)
+// and 3/4 (red at blue sites, blue at red sites).
 INLINE rgb malvar2004(site at, src_image src, cfa pattern) {
     const vf centre = src_tap(src, 0, 0);
     const vf near_x = src_tap(src, -1, 0) + src_tap(src, 1, 0);

@@ -41,9 +41,9 @@ INLINE pair decide(site at, image both) {
 // Own minus green and own minus other at the two green sites next to a red or blue one, in its
 // chosen direction. The difference at a green site is the mean of those in `known` at its two
 // adjacent sites.
-typedef struct { vf own_green1, own_green2, own_other1, own_other2; } beside;
+typedef struct { vf own_green1, own_green2, own_other1, own_other2; } neighbours;
 
-INLINE beside along(image known, vi in_row) {
+INLINE neighbours at_neighbours(image known, vi in_row) {
     const vf centre = tap_mosaic(known, 0, 0);
     const vf west = (tap_mosaic(known, -2, 0) + centre) * 0.5f;
     const vf east = (centre + tap_mosaic(known, 2, 0)) * 0.5f;
@@ -51,7 +51,7 @@ INLINE beside along(image known, vi in_row) {
     const vf south = (centre + tap_mosaic(known, 0, 2)) * 0.5f;
     const vf nw = tap_mosaic(known, -1, -1), ne = tap_mosaic(known, 1, -1);
     const vf sw = tap_mosaic(known, -1, 1), se = tap_mosaic(known, 1, 1);
-    beside v;
+    neighbours v;
     v.own_green1 = in_row ? west : north;
     v.own_green2 = in_row ? east : south;
     v.own_other1 = v.own_green1 - (nw + (in_row ? sw : ne)) * 0.5f;
@@ -65,7 +65,7 @@ INLINE beside along(image known, vi in_row) {
 // first estimate of own minus other.
 INLINE pair refine(site at, image chosen, cfa pattern) {
     const vf centre = tap_mosaic(chosen, 0, 0);
-    const beside b = along(chosen, tap_pair(chosen, 0, 0).second > 0.5f);
+    const neighbours b = at_neighbours(chosen, tap_pair(chosen, 0, 0).second > 0.5f);
     const vf own_green = (b.own_green1 + centre + b.own_green2) * THIRD;
     const vf own_other = (b.own_other1 + b.own_other2) * 0.5f;
     const pair v = {by_site(at, pattern, own_green, centre, own_green), own_other};
@@ -78,7 +78,7 @@ INLINE pair refine(site at, image chosen, cfa pattern) {
 INLINE rgb interpolate(site at, src_image src, image chosen, image refined, cfa pattern) {
     const vf centre = src_tap(src, 0, 0);
     const pair here = tap_pair(refined, 0, 0);
-    const beside b = along(refined, tap_pair(chosen, 0, 0).second > 0.5f);
+    const neighbours b = at_neighbours(refined, tap_pair(chosen, 0, 0).second > 0.5f);
     const vf other = centre - (b.own_other1 + here.second + b.own_other2) * THIRD;
     const vf in_row = (tap_mosaic(refined, -1, 0) + tap_mosaic(refined, 1, 0)) * 0.5f;
     const vf in_column = (tap_mosaic(refined, 0, -1) + tap_mosaic(refined, 0, 1)) * 0.5f;

@@ -11,7 +11,7 @@
 // Positions are in half pixels from the centre.
 INLINE float half_pixels(uint place, uint size) { return (float)(2 * (int)place + 1 - (int)size); }
 
-// The square of the circle's diameter, times that of the share.
+// (diameter of the circle * share)^2.
 INLINE float circle(uint share, extent e) {
     const uint shorter = e.width < e.height ? e.width : e.height;
     const float diameter = (float)(shorter > 2 * share ? shorter : 2 * share);
@@ -35,8 +35,8 @@ INLINE int steps_of_one(float level) {
 // The last step of both rules: the stops from the measured level to the target, and the gain.
 INLINE void meter(bool lit, int level, int target, int lowest, int highest, float offset,
                   __global float *estimates) {
-    const int wanted = target - level;
-    const int inside = wanted < lowest ? lowest : wanted > highest ? highest : wanted;
+    const int steps = target - level;
+    const int inside = steps < lowest ? lowest : steps > highest ? highest : steps;
     const float ev = (float)(lit ? inside : 0) * (1.0f / METER_STEPS);
     vf e;
     const vf s = power_of_two((vf)(ev), &e);

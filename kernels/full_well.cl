@@ -1,2 +1,2 @@
-// The full well: the signal of a pixel is limited.
+// The full well limits the signal of a pixel.
 INLINE vf full_well(vf y, site at, float full_signal) { return vmin(y, (vf)(full_signal)); }

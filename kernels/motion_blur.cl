@@ -6,7 +6,7 @@
 
 // One plane, if all lanes have the same offset to their positions; `corner` is the pixel before the
 // first one's.
-INLINE vf side_by_side(__global const float *corner, uint pitch, vf u, vf v) {
+INLINE vf bilinear_row(__global const float *corner, uint pitch, vf u, vf v) {
     const vf above = (1.0f - u) * load(corner) + u * load(corner + 1);
     const vf below = (1.0f - u) * load(corner + pitch) + u * load(corner + pitch + 1);
     return (1.0f - v) * above + v * below;
@@ -19,7 +19,7 @@ INLINE rgb turned(site at, __global const float *r, __global const float *g, __g
     const float row = (float)at.y, right = (float)(from.width - 1), bottom = (float)(from.height - 1);
     const vf px = (column - middle_x) / focal;
     const float py = (row - middle_y) / focal;
-    const vf along = px * x + py * y, aside = py * x - px * y;
+    const vf along = px * x + py * y, perpendicular = py * x - px * y;
     const int border = (int)from.border;
     rgb sum = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
 #pragma unroll 1
@@ -27,7 +27,7 @@ INLINE rgb turned(site at, __global const float *r, __global const float *g, __g
         const float sine = turns[3 * k], cosine = turns[3 * k + 1], versine = turns[3 * k + 2];
         const vf scale = focal / (cosine + along * sine);
         const vf du = -sine * (1.0f + along * along) * scale;
-        const vf dv = aside * (versine - along * sine) * scale;
+        const vf dv = perpendicular * (versine - along * sine) * scale;
         const vf across = vmin(vmax(du * x - dv * y, -column), right - column);
         const vf down = vmin(vmax(du * y + dv * x, (vf)(-row)), (vf)(bottom - row));
         vf u, v;
@@ -40,15 +40,15 @@ INLINE rgb turned(site at, __global const float *r, __global const float *g, __g
             left + LANES < (int)(from.left + from.columns) + border &&
             top >= (int)from.top - border && top + 1 < (int)(from.top + from.rows) + border) {
             const long corner = (long)top * (long)from.pitch + left;
-            sum.r += side_by_side(r + corner, from.pitch, u, v);
-            sum.g += side_by_side(g + corner, from.pitch, u, v);
-            sum.b += side_by_side(b + corner, from.pitch, u, v);
+            sum.r += bilinear_row(r + corner, from.pitch, u, v);
+            sum.g += bilinear_row(g + corner, from.pitch, u, v);
+            sum.b += bilinear_row(b + corner, from.pitch, u, v);
         } else {
             // A loop, because three copies of its body take three times as long to compile.
             __global const float *planes[3] = {r, g, b};
             vf channels[3];
 #pragma unroll 1
-            for (int c = 0; c < 3; ++c) channels[c] = bent(at, planes[c], from, across, down, filter, 2, 2);
+            for (int c = 0; c < 3; ++c) channels[c] = sample_at_offset(at, planes[c], from, across, down, filter, 2, 2);
             sum.r += channels[0];
             sum.g += channels[1];
             sum.b += channels[2];

@@ -1,6 +1,6 @@
-// An image through a wide lens: each pixel is gathered with a filter at the position of the input
-// that it shows. `across` and `down` are the offsets to it, with `pitch` to a row of `lines`. Rows
-// and lanes outside the image read the last ones.
+// An image through a wide lens: each pixel is sampled with a filter at its position in the input.
+// `across` and `down` are the offsets to this position: `lines` rows of `pitch` values. Rows and
+// lanes outside the image read the last row and vector.
 #include "lib/gather.h"
 
 INLINE rgb projection(site at, __global const float *r, __global const float *g, __global const float *b,
@@ -13,7 +13,7 @@ INLINE rgb projection(site at, __global const float *r, __global const float *g,
     __global const float *planes[3] = {r, g, b};
     vf channels[3];
 #pragma unroll 1
-    for (int c = 0; c < 3; ++c) channels[c] = bent(at, planes[c], from, right, below, filter, taps, powers);
+    for (int c = 0; c < 3; ++c) channels[c] = sample_at_offset(at, planes[c], from, right, below, filter, taps, powers);
     const rgb v = {channels[0], channels[1], channels[2]};
     return v;
 }

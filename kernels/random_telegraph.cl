@@ -1,5 +1,5 @@
-// Pixels that jump between two levels: the distance is fixed for a pixel, and its level is new in
-// each frame.
+// Pixels that jump between two levels. The distance between the levels is fixed for a pixel, and
+// the level is random in each frame.
 #include "lib/random.h"
 
 INLINE pair telegraph_levels(vf y, site at, stream s, int limit, float scale, float amplitude) {

@@ -1,5 +1,5 @@
-// Raises red and blue of nearly white pixels, so that dividing by the gains leaves them white (Brooks
-// et al. 2019).
+// Raises red and blue of nearly white pixels, so that dividing by the gains leaves them white
+// (Brooks et al. 2019).
 INLINE rgb restore_highlights(rgb c, site at, float red_gain, float blue_gain) {
     const vf grey = ((c.r + c.g) + c.b) * 0.33333334f;
     const vf over = vmax(grey - 0.9f, (vf)(0.0f)) * 10.0f;

@@ -1,7 +1,7 @@
 // One exposure that is read several times, each less sensitive than the last, and merged.
 //
-// A readout has its own noise, whole DN and white level. When one comes close to its white level,
-// the next one takes over, over a tenth of the range.
+// Each readout has its own noise, rounding to whole DN, and white level. When a readout comes close
+// to its white level, the next one takes over, over a tenth of the range.
 #define HANDOVER_ENDS 0.95f
 #define READOUTS 4  // at most
 
@@ -11,8 +11,9 @@
 // -1.
 //
 // `later` has the light of all photodiodes but the first in their own exposures: planes of
-// `columns` by `rows` with one more vector at the right, or 0 if all see the same light. An image
-// larger than it, for example in a check of the kernel, repeats its last row and vector.
+// `columns` by `rows` with one more vector at the right, or 0 if all see the same light. For an
+// image larger than these planes, as in a check of the kernel, the last row and vector are
+// repeated.
 INLINE vf merged(vf y, site at, stream s, bool is_noisy, int count, int part, float a, float full_well, float range,
                  float unit, __global const float *table, __global const float *later, int columns, int rows) {
     const int last_x = columns - LANES, last_y = rows - 1;
@@ -20,23 +21,23 @@ INLINE vf merged(vf y, site at, stream s, bool is_noisy, int count, int part, fl
     vf values[READOUTS], weights[READOUTS], charge = y;
     int photodiode = -1;
     for (int i = 0; i < count; ++i) {
-        __global const float *own = table + 5 * i;
-        if ((int)own[0] != photodiode) {
-            photodiode = (int)own[0];
+        __global const float *readout = table + 5 * i;
+        if ((int)readout[0] != photodiode) {
+            photodiode = (int)readout[0];
             const bool is_later = later && photodiode;
-            const vf seen = is_later ? load(later + ((long)(photodiode - 1) * rows + line) * columns + x) : y;
-            vf light = seen * own[1];
+            const vf incident = is_later ? load(later + ((long)(photodiode - 1) * rows + line) * columns + x) : y;
+            vf light = incident * readout[1];
             if (is_noisy)
                 light += normal_at(at, (uint)photodiode, s) * square_root(vmax(a * light, (vf)(0.0f)));
             charge = vmin(light, (vf)(full_well));
         }
-        vf read = charge * own[2];
+        vf read = charge * readout[2];
         if (is_noisy) {
-            const vf noisy = read + normal_at(at, (uint)(READOUTS + i), s) * square_root((vf)(own[4]));
+            const vf noisy = read + normal_at(at, (uint)(READOUTS + i), s) * square_root((vf)(readout[4]));
             read = nearest(noisy * range) * unit;
         }
         read = vmin(read, (vf)(1.0f));
-        values[i] = read * own[3];
+        values[i] = read * readout[3];
         weights[i] = vmin(vmax((HANDOVER_ENDS - read) * 10.0f, (vf)(0.0f)), (vf)(1.0f));
     }
     if (part >= 0) return values[part];

@@ -20,8 +20,8 @@ INLINE rgb from_root_and_ratios(ycbcr c, site at, float offset) {
 }
 
 // Adds `amount` of the difference from a Gaussian blur, minus `threshold`, and at most `limit`. The
-// blur uses every `step`-th pixel, and weights[k] is that of a pixel k steps away. Four rows at
-// once share the sums along their rows.
+// blur uses every `step`-th pixel, and weights[k] is the weight of a pixel k steps away. Four rows
+// at once share the sums along their rows.
 INLINE void unsharp(site at, image planes, int reach, int step, __global const float *weights,
                     float amount, float threshold, float limit, ycbcr *out) {
 #pragma OPENCL FP_CONTRACT ON

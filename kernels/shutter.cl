@@ -1,6 +1,6 @@
 // Flickering light on rows that are exposed one after the other. One launch fills a table with the
 // gain of each row, 1 + swing * cos(2 pi (row * step + start)). The pixels are then multiplied by
-// that of their row.
+// the gain of their row.
 INLINE vf flicker_of_rows(vu row, float step, float start, float swing) {
     const vf turns = to_float(signed_bits(row)) * step + start;
     // cos(2 pi u) = sin(2 pi (1/4 - |u|)) for |u| <= 1/2, by Taylor's series to the ninth power.

@@ -192,9 +192,9 @@ def launches(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _compiling_is_not_announced() -> None:
+def _compiling_is_not_logged() -> None:
     # With a cold cache the line would stand in the output of whichever test comes first.
-    programs._announced.set()
+    programs._notice_logged.set()
 
 
 @pytest.fixture(scope="session")

@@ -29,7 +29,7 @@ from clpipe.batch.run_log import read_log
 from clpipe.batch.threads import Batch
 from clpipe.batch.trace import Trace
 from clpipe.batch.work import ImageWorker
-from clpipe.chain.formats import ending_of
+from clpipe.chain.formats import extension_of
 from clpipe.chain.request import Request
 from clpipe.commands.progress import Reporter
 from clpipe.engine.runner import Runner
@@ -652,7 +652,7 @@ def test_a_picture_of_another_hand_is_not_written_over(clpipe, renders, format_)
     Path("out/r000.json").unlink()
     clpipe(*run)  # as a killed run may have left it
     Path("out/r000.json").unlink()
-    picture = Path(f"out/r000.{ending_of(format_)}")
+    picture = Path(f"out/r000.{extension_of(format_)}")
     picture.write_bytes(b"somebody else's" * 20_000)
     assert f"{picture}: clpipe did not write this file" in clpipe(*run, status=1).stderr
     assert picture.read_bytes().startswith(b"somebody")

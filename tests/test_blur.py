@@ -10,7 +10,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.runner import Runner
 from clpipe.stages.motion_blur import streak
-from clpipe.stages.optical_blur import along, diffracted, lens_taps
+from clpipe.stages.optical_blur import diffraction_psf, lens_taps, line_spread
 
 
 def blurred(image, device=None, **stages):
@@ -56,7 +56,7 @@ def test_a_slanted_edge_is_as_sharp_as_the_lens_says(lens):
     edge = beyond.reshape(200, 16, 96, 16).mean((1, 3))[..., None].repeat(3, 2)
     frequency, sharp = edge_mtf(edge[..., 1], slope)
     _, found = edge_mtf(blurred(edge, None, optical_blur=lens)[..., 1], slope)
-    light = along(lens.get("sigma", 0.4), lens.get("low_pass", 0), lens.get("pixel_area", 0))
+    light = line_spread(lens.get("sigma", 0.4), lens.get("low_pass", 0), lens.get("pixel_area", 0))
     places = np.arange(len(light)) - len(light) // 2
     expected = np.cos(2 * np.pi * frequency[:, None] * places) @ light
     assert found / sharp == pytest.approx(expected, abs=0.02)
@@ -78,7 +78,7 @@ def test_light_is_moved_and_none_is_lost(device):
 
 
 def test_diffraction_is_widest_in_red_and_has_the_transfer_of_an_aperture():
-    spread = diffracted(0, 0, 0, 16.0, 4.5)
+    spread = diffraction_psf(0, 0, 0, 16.0, 4.5)
     peaks = spread.max((0, 1))
     assert peaks[0] < peaks[1] < peaks[2]
     line = spread[..., 1].sum(0)

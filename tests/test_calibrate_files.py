@@ -11,7 +11,7 @@ from PIL import Image
 
 from clpipe.analysis.calibration.frames import FrameOverrides, find_frames, read_frame
 from clpipe.camera.profile import load_camera
-from clpipe.images.raw import read_facts, read_raw
+from clpipe.images.raw import read_raw, read_raw_info
 from tests.conftest import DATA, WRITTEN
 from tests.conftest import run_cli as call
 from tests.test_calibrate import frames, scene
@@ -229,7 +229,7 @@ def test_options_win_over_what_the_file_says(shots):
 @pytest.mark.slow
 def test_a_real_raw(tmp_path):
     path = DATA / "raw" / "colorchart.dng"
-    facts = read_facts(path)
+    facts = read_raw_info(path)
     assert (facts.make, facts.model) == ("Canon", "Canon EOS Kiss X4")
     assert (facts.pattern, facts.black_level, facts.white_level) == ("RGGB", 2056, 15000)
     assert facts.iso is None and facts.gains == pytest.approx((2.477, 1.694), abs=1e-3)

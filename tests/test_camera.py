@@ -5,7 +5,7 @@ import pytest
 
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import built_in_cameras, built_in_name, load_camera
-from clpipe.camera.text import comparable
+from clpipe.camera.text import normalized_name
 from clpipe.chain.isos import check_cameras
 
 NAMES = tuple(built_in_cameras())
@@ -162,7 +162,7 @@ def test_no_two_cameras_are_called_alike():
     for name in NAMES:
         camera = load_camera(name)
         for model in (name, camera.model, *camera.aliases):
-            for called in (comparable(model), comparable(f"{camera.make} {model}")):
+            for called in (normalized_name(model), normalized_name(f"{camera.make} {model}")):
                 assert seen.setdefault(called, name) == name, called
 
 

@@ -32,7 +32,7 @@ from clpipe.batch.run_log import RunLog
 from clpipe.chain.request import ResolvedRequest
 from clpipe.commands.progress import Reporter
 from clpipe.engine.device import open_devices
-from clpipe.engine.discovery import shared_out
+from clpipe.engine.discovery import devices_of_process
 from clpipe.engine.hardware import Hardware
 from clpipe.inputs.find import Job
 from tests.conftest import ROOT
@@ -362,7 +362,7 @@ def test_workers_of_a_machine_share_its_devices(device):
     gpus = [replace(device.info, index=i, type="GPU", hardware=h) for i, h in enumerate(at)]
 
     def shared(of, devices=gpus):
-        return [[d.hardware.pci[1] for d in shared_out(devices, i, of)] for i in range(of)]
+        return [[d.hardware.pci[1] for d in devices_of_process(devices, i, of)] for i in range(of)]
 
     assert shared(1) == [[3, 1, 2]]
     assert shared(2) == [[1, 3], [2]]

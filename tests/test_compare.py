@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from clpipe.analysis.comparison import compare, displayed
-from clpipe.analysis.crops import FOUND, choose_places
+from clpipe.analysis.crops import FOUND, choose_crops
 from clpipe.analysis.pictures import Picture
 from clpipe.reference.transfer import srgb_curve
 
@@ -96,7 +96,7 @@ def test_each_kind_of_place_is_found_through_noise(scene):
     noise = np.random.default_rng(2).normal(0, 0.05, scene.shape)
     noisy = np.clip(scene + noise, 0, 1).astype(np.float32)
     corners = {"flat": (20, 20), "textured": (20, 180), "saturated": (130, 20), "dark": (130, 180)}
-    for place in choose_places((), noisy):
+    for place in choose_crops((), noisy):
         top, left = corners[place.name]
         inside = top <= place.top + 3 and place.top + place.height <= top + 83
         assert inside, place
@@ -114,7 +114,7 @@ def test_neither_order_nor_labels_change_the_places(scene, write_png):
 
 def test_places_that_are_found_do_not_overlap():
     grey = np.full((150, 200, 3), 0.5, np.float32)  # all places are alike, and four fit
-    boxes = [(place.left, place.top) for place in choose_places((), grey)]
+    boxes = [(place.left, place.top) for place in choose_crops((), grey)]
     for i, (x, y) in enumerate(boxes):
         assert all(abs(x - u) >= 96 or abs(y - v) >= 64 for u, v in boxes[:i])
 

@@ -9,14 +9,14 @@ import pytest
 from clpipe.base.errors import DeviceError
 from clpipe.engine import cpu_target
 from clpipe.engine.cpu_target import (
-    SAME_AS,
+    EQUIVALENT_CPUS,
     TARGETS,
     Target,
     candidates,
     compile_for,
     cpu_features,
-    own_target,
-    row_of,
+    driver_target,
+    equivalent_target,
     target_for,
 )
 from tests.conftest import ROOT, run_python
@@ -47,9 +47,9 @@ def test_the_target_follows_the_features(features, target):
 
 
 def test_names_are_of_one_target_each():
-    names = [*TARGETS, *(name for of in SAME_AS.values() for name in of)]
-    assert len(names) == len(set(names)) and set(SAME_AS) <= set(TARGETS)
-    assert [row_of(n) for n in ("znver5", "goldmont", "haswell", "generic")] == [
+    names = [*TARGETS, *(name for of in EQUIVALENT_CPUS.values() for name in of)]
+    assert len(names) == len(set(names)) and set(EQUIVALENT_CPUS) <= set(TARGETS)
+    assert [equivalent_target(n) for n in ("znver5", "goldmont", "haswell", "generic")] == [
         *("skx", "penryn", "haswell", None)
     ]
     assert Target("cascadelake", "").is_wide and not Target("alderlake", "").is_wide
@@ -71,7 +71,7 @@ def pocl(monkeypatch):
             monkeypatch.setenv(cpu_target.VARIABLE, forced)
         flags = None if features is None else frozenset(features.split())
         monkeypatch.setattr(cpu_target, "cpu_features", lambda: flags)
-        monkeypatch.setattr(cpu_target, "_place", lambda _: place)
+        monkeypatch.setattr(cpu_target, "_name_pointer", lambda _: place)
         hash_ = f"OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-{own}"
         platform = SimpleNamespace(name="Portable Computing Language", version=version)
         return candidates(platform, SimpleNamespace(version=hash_, int_ptr=0))
@@ -109,7 +109,7 @@ def test_what_agrees_or_cannot_be_proven_is_left_as_it_is(pocl):
 def test_a_pocl_that_names_no_cpu_chooses_by_itself():
     version = "OpenCL 3.0 PoCL HSTR: pthread-aarch64-unknown-linux-gnu-(null)"  # Debian 12's
     debian = SimpleNamespace(name="Portable Computing Language", version=POCL.replace("3.0", "3.1"))
-    assert own_target(version) is None
+    assert driver_target(version) is None
     assert candidates(debian, SimpleNamespace(version=version)) == [
         Target("", "the driver's choice")
     ]
@@ -144,7 +144,7 @@ def test_glibc_and_linux_agree_on_this_machine():
     usable, listed = cpu_target._usable(), cpu_target._listed()
     if usable is None or listed is None:
         pytest.skip("needs Linux on x86-64, and glibc 2.33 or newer")
-    assert listed & frozenset(cpu_target._ACTIVE) == usable
+    assert listed & frozenset(cpu_target._CPUID_BITS) == usable
 
 
 @pytest.fixture
@@ -156,16 +156,16 @@ def pip_pocl(device):
 
 
 def test_the_place_of_the_name_is_found_in_pips_pocl(pip_pocl):
-    place = cpu_target._place(pip_pocl.handle)
-    assert place is not None and 0 < place - pip_pocl.handle.int_ptr < cpu_target.RECORD
-    assert own_target(pip_pocl.version)[0].startswith("x86_64-")
+    place = cpu_target._name_pointer(pip_pocl.handle)
+    assert place is not None and 0 < place - pip_pocl.handle.int_ptr < cpu_target.RECORD_BYTES
+    assert driver_target(pip_pocl.version)[0].startswith("x86_64-")
     # Other texts are not there, so nothing is found, and nothing written.
     other = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-no-such-cpu"
     wrong = SimpleNamespace(version=other, int_ptr=pip_pocl.handle.int_ptr + 8)
-    assert cpu_target._place(wrong) is None
+    assert cpu_target._name_pointer(wrong) is None
     compile_for(wrong, Target("skx", ""))
     nowhere = SimpleNamespace(version=pip_pocl.version, int_ptr=2**46 + 8)
-    assert cpu_target._place(nowhere) is None
+    assert cpu_target._name_pointer(nowhere) is None
 
 
 def test_a_name_can_be_set_more_than_once(pip_pocl):

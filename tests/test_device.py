@@ -157,7 +157,7 @@ def test_buffers_are_used_again_and_go_when_memory_is_short():
 
 def test_what_drivers_say_of_hardware(device, monkeypatch):
     properties = {}
-    monkeypatch.setattr(hardware, "queried", lambda _, name: properties.get(name))
+    monkeypatch.setattr(hardware, "query_device", lambda _, name: properties.get(name))
     nvidia = FakeDevice(pci_domain_id_nv=1, pci_bus_id_nv=65, pci_slot_id_nv=3 << 3 | 1)
     assert hardware_of(nvidia) == Hardware(7, (1, 65, 3, 1))
     amd = FakeDevice(topology_amd=SimpleNamespace(bus=65, device=3, function=1))
@@ -166,9 +166,9 @@ def test_what_drivers_say_of_hardware(device, monkeypatch):
     properties.update({0x410F: struct.pack("4I", 1, 65, 3, 1), 0x106A: b"u" * 16})
     assert hardware_of(FakeDevice()) == Hardware(7, (1, 65, 3, 1), b"u" * 16)
     monkeypatch.undo()
-    version = hardware.queried(device.info.handle, cl.device_info.VENDOR_ID, 4)
+    version = hardware.query_device(device.info.handle, cl.device_info.VENDOR_ID, 4)
     assert version == struct.pack("I", device.info.handle.vendor_id)
-    assert hardware.queried(device.info.handle, 0xFFFF) is None
+    assert hardware.query_device(device.info.handle, 0xFFFF) is None
 
 
 def test_devices_are_opened():

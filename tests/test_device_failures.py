@@ -14,7 +14,7 @@ from clpipe.chain.settings import settings_from
 from clpipe.engine import programs
 from clpipe.engine.device import Device
 from clpipe.engine.programs import programs_of
-from clpipe.engine.recovery import FAILURES
+from clpipe.engine.recovery import MAX_FAILURES
 from clpipe.engine.runner import Runner
 from tests.conftest import fail_launches, worker_of
 
@@ -100,7 +100,7 @@ def test_an_image_that_fails_again_fails_alone(device, monkeypatch):
 def test_a_device_that_fails_at_everything_is_given_up(device, monkeypatch):
     runner = runner_on(device)
     Fault(monkeypatch, range(1000))
-    for _ in range(FAILURES - 1):
+    for _ in range(MAX_FAILURES - 1):
         with pytest.raises(DeviceFailedError):
             runner.run(IMAGE, "k")
     with pytest.raises(DeviceError, match="failed for 3 images in a row, so it is no longer used"):

@@ -17,7 +17,7 @@ from clpipe.camera.profile import SRGB_TO_XYZ, load_camera
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.images.dng import write_dng
-from clpipe.images.raw import read_facts, read_raw
+from clpipe.images.raw import read_raw, read_raw_info
 from clpipe.images.read import read_image
 from clpipe.images.tags import Tags
 from clpipe.images.write import write_display
@@ -77,7 +77,7 @@ def test_libraw_reads_the_very_dn(scene, tmp_path, pattern, size):
     path = tmp_path / "o" / "scene.dng"
     assert np.array_equal(read_dn(path), kept)
     assert kept.max() == 16383
-    facts = read_facts(path)
+    facts = read_raw_info(path)
     assert facts.pattern == pattern
     assert facts.black_levels == (512,) * 4
     assert facts.white_level == 16383
@@ -140,7 +140,7 @@ def test_it_has_every_tag_of_a_jpeg(tmp_path):
         assert one == other or float(one[0]) == pytest.approx(float(other[0])), name
     assert names >= {"EXIF FNumber", "EXIF DateTimeOriginal", "Image DateTime"}
     assert differing <= names
-    facts = read_facts(tmp_path / "a.dng")
+    facts = read_raw_info(tmp_path / "a.dng")
     assert (facts.aperture, facts.taken) == (2.8, tags.taken)
 
 
@@ -150,7 +150,7 @@ def test_its_matrix_is_read_as_that_of_a_camera(tmp_path, method):
     negative = negative_of(make_chain(settings_from(values)))
     mosaic = np.arange(4096, dtype=np.float32).reshape(64, 64)
     write_dng(tmp_path / "a.dng", mosaic, negative, Tags("Sony", "A", 100))
-    matrix = read_facts(tmp_path / "a.dng").xyz_to_camera
+    matrix = read_raw_info(tmp_path / "a.dng").xyz_to_camera
     assert np.array(matrix) == pytest.approx(negative.xyz_to_camera, abs=1e-6)
     if method == "camera":
         camera = load_camera("sony-a7r2")
@@ -314,7 +314,7 @@ def test_a_mosaic_from_elsewhere_as_a_dng(write_exr, tmp_path):
         "run", mosaic, "-o", tmp_path / "o", "--start-at", "normalize", "--format", "dng", *options
     )
     path = tmp_path / "o" / "m.dng"
-    facts = read_facts(path)
+    facts = read_raw_info(path)
     assert np.array_equal(read_dn(path), dn[..., 0])
     assert (facts.pattern, facts.black_levels, facts.white_level) == ("BGGR", (0,) * 4, 4000)
     assert facts.gains == pytest.approx((2, 3))

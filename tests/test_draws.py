@@ -10,7 +10,7 @@ from scipy import stats
 import clpipe
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import built_in_cameras, load_camera
-from clpipe.chain.draws import Limits, limits_of
+from clpipe.chain.draws import Limits, field_limits
 from clpipe.chain.files import load_settings, toml_text
 from clpipe.chain.isos import check_cameras, draw_note
 from clpipe.chain.making import make_chain
@@ -354,12 +354,12 @@ def test_an_iso_that_a_camera_has_not(values, message):
 
 def test_the_limits_of_a_parameter_are_its_own():
     sensor, exposure, bits = (all_stages()[n] for n in ("sensor_noise", "exposure", "quantize"))
-    assert limits_of(sensor.methods[0], "a") == Limits(0, 1)
-    above = limits_of(sensor.methods[0], "tukey_lambda").low
+    assert field_limits(sensor.methods[0], "a") == Limits(0, 1)
+    above = field_limits(sensor.methods[0], "tukey_lambda").low
     assert -0.5 < above < -0.4999
-    assert limits_of(exposure.methods[0], "ev") == Limits(-20, 20)
-    assert limits_of(bits.methods[0], "bits") == Limits(8, 24, whole=True)
-    assert limits_of(all_stages()["mosaic"].methods[0], "pattern") is None
+    assert field_limits(exposure.methods[0], "ev") == Limits(-20, 20)
+    assert field_limits(bits.methods[0], "bits") == Limits(8, 24, whole=True)
+    assert field_limits(all_stages()["mosaic"].methods[0], "pattern") is None
 
 
 @pytest.mark.slow

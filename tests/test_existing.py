@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from clpipe.batch.run_log import read_log
-from clpipe.chain.formats import EVERY_FORMAT, ending_of
-from clpipe.images.whole import is_whole
+from clpipe.chain.formats import ALL_FORMATS, extension_of
+from clpipe.images.whole import is_complete
 from clpipe.outputs.existing import is_marked
 from clpipe.outputs.sidecar import output_entries
 from tests.conftest import reseal
@@ -92,13 +92,13 @@ def test_what_is_whole_and_was_changed_is_somebodys(again, clpipe, name, how):
     assert path.read_bytes() == before
 
 
-@pytest.mark.parametrize("format_", [each for each in EVERY_FORMAT if each != "npy"])
+@pytest.mark.parametrize("format_", [each for each in ALL_FORMATS if each != "npy"])
 def test_a_picture_that_somebody_edited_is_kept(clpipe, write_exr, format_):
     write_exr("in/a.exr", np.random.default_rng(1).random((40, 60, 3)))
     write_exr("in/b.exr", np.full((20, 30, 3), 0.5, np.float32))
     run = ("run", "in", "-o", "out", "--device", "numpy", "--format", format_)
     clpipe(*run)
-    path = Path(f"out/a.{ending_of(format_)}")
+    path = Path(f"out/a.{extension_of(format_)}")
     if format_ in ("jpg", "png"):
         with Image.open(path) as picture:
             darker, exif = picture.point(lambda value: value // 2), picture.getexif()
@@ -113,17 +113,17 @@ def test_a_picture_that_somebody_edited_is_kept(clpipe, write_exr, format_):
     clpipe(*run, "--redo", "all")
 
 
-@pytest.mark.parametrize("format_", EVERY_FORMAT)
+@pytest.mark.parametrize("format_", ALL_FORMATS)
 def test_of_every_format_what_is_not_whole_is_made_again(clpipe, write_exr, format_):
     write_exr("in/a.exr", np.random.default_rng(1).random((60, 80, 3)))
     run = ("run", "in", "-o", "out", "--device", "numpy", "--format", format_)
     clpipe(*run)
-    path = Path(f"out/a.{ending_of(format_)}")
+    path = Path(f"out/a.{extension_of(format_)}")
     whole = path.read_bytes()
     for size in (0, 5, 1000, len(whole) // 2):
         for data in (whole[:size], bytes(len(whole[:size]))):
             path.write_bytes(data)
-            assert is_whole(path) is False
+            assert is_complete(path) is False
     path.write_bytes(whole[: len(whole) // 2])
     if is_marked(path):  # some of a format's tags are at its end
         clpipe(*run)

@@ -228,7 +228,7 @@ def test_lenses_are_listed_or_the_extra_is_named(monkeypatch):
     def missing():
         raise ImportError
 
-    monkeypatch.setattr("clpipe.camera.lens._loaded", missing)
+    monkeypatch.setattr("clpipe.camera.lens._load_database", missing)
     lens = key_controls()["lens"]
     assert "suggested" not in lens and "pip install lensfunpy" in lens["text"]
 

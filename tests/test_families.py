@@ -15,7 +15,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.tracing import NotTraceableError, Trace, call, float32, traceable
 from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.chain import COMPUTED, STRUCTURAL, Chain
-from clpipe.chain.draws import limits_of
+from clpipe.chain.draws import field_limits
 from clpipe.chain.families import ComputedChain
 from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
@@ -46,7 +46,7 @@ def made(settings, monkeypatch):
 def assert_equal(chain, other):
     assert len(chain.steps) == len(other.steps)
     for step, own in zip(chain.steps, other.steps, strict=True):
-        assert step.is_equal(own), step.name
+        assert step.equals(own), step.name
         assert step.arguments.keys() == own.arguments.keys()
         for name, value in step.arguments.items():
             expected = own.arguments[name]
@@ -90,7 +90,7 @@ def test_a_computed_chain_is_the_one_that_is_made(name, families, monkeypatch):
         settings = overlay(general, values)
         chain, expected = make_chain(settings), made(settings, monkeypatch)
         assert_equal(chain, expected)
-        assert_equal(chain.cleaned(), expected.cleaned())
+        assert_equal(chain.without_noise_or_denoising(), expected.without_noise_or_denoising())
         assert_equal(chain.without_noise(), expected.without_noise())
         assert chain.settings is settings
         arguments = [{s.name: s.arguments for s in c.steps} for c in (chain, expected)]
@@ -102,7 +102,7 @@ def numbers_of_stages():
     for stage in all_stages().values():
         for method in stage.methods:
             for name in method.model_fields:
-                if limits := limits_of(method, name):
+                if limits := field_limits(method, name):
                     yield stage.name, method, name, limits
 
 
@@ -146,7 +146,7 @@ def assert_alike(chain, expected):
     for name in STRUCTURAL[:-1]:
         assert getattr(chain, name) == getattr(expected, name)
     assert chain_ops(chain, chain.arguments) == chain_ops(expected, expected.arguments)
-    for derived in (Chain.cleaned, Chain.without_noise):
+    for derived in (Chain.without_noise_or_denoising, Chain.without_noise):
         try:
             truth = derived(expected)
         except RequestError:
@@ -174,7 +174,7 @@ def test_chains_of_one_structure_have_one_plan(families):
     chains = [make_chain(overlay(general, {"iso": iso})) for iso in (400.0, 500, 620, 710, 730)]
     one, other = chains[-2:]
     assert one.structure is other.structure
-    assert one.cleaned().structure is not one.structure
+    assert one.without_noise_or_denoising().structure is not one.structure
     ops = [chain_ops(c, {s.name: s.arguments for s in c.steps}) for c in (one, other)]
     assert ops[0] == ops[1]
 

@@ -16,10 +16,10 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import settings_from
 from clpipe.dataset import Dataset
-from clpipe.engine.check import ARRAYS, NOISE, compare, laid
+from clpipe.engine.check import ARRAYS, NOISE, compare, mosaic_parameters
 from clpipe.engine.runner import Runner
 from clpipe.images.dng import write_dng
-from clpipe.images.raw import read_facts, read_raw
+from clpipe.images.raw import read_raw, read_raw_info
 from clpipe.images.read import read_image
 from clpipe.images.tags import Tags
 from clpipe.outputs.annotation_warp import PixelMapping
@@ -29,7 +29,7 @@ from clpipe.pipeline import Pipeline
 from clpipe.reference.carried import Layer, warp
 from clpipe.reference.cfa import PATTERNS
 from clpipe.reference.directional_mmse import directional_mmse
-from clpipe.reference.filter_array import NAMED, PASSES, beyond, parse_array, tiled
+from clpipe.reference.filter_array import NAMED, TRANSMISSIONS, parse_array, periodic_indices, tiled
 from clpipe.reference.geometry import NO_MARGINS
 from clpipe.reference.linear_mmse import linear_mmse
 from clpipe.stages import DEFAULT_CHAIN
@@ -45,7 +45,7 @@ RAW = ("sensor_noise", "row_noise", "column_noise")
 
 def on(array: str, **settings):
     """A chain whose mosaic has that array."""
-    return make_chain(settings_from({"iso": 800, "mosaic": laid(array), **settings}))
+    return make_chain(settings_from({"iso": 800, "mosaic": mosaic_parameters(array), **settings}))
 
 
 @pytest.fixture
@@ -92,13 +92,13 @@ def test_a_clear_pixel_saturates_first(develop):
         light,
         numpy=True,
         keep=("normalize",),
-        mosaic=laid("RGBW"),
+        mosaic=mosaic_parameters("RGBW"),
         skip=["noise"],
         exposure={"ev": 1.5},
         inverse_color_matrix={"method": "none"},
     ).kept["normalize"]
     array = parse_array("RGBW", (2.77, 1.36))  # of the default camera
-    letters = tiled(array.by_place({"R": 0, "G": 1, "B": 2, "W": 3}), kept.shape)
+    letters = tiled(array.by_position({"R": 0, "G": 1, "B": 2, "W": 3}), kept.shape)
     assert (kept[letters == 3] == 1).all()
     for number, letter in enumerate("RGB"):
         expected = 0.9 * 2**0.5 * array.levels[letter]
@@ -133,7 +133,7 @@ def test_a_polarised_array_measures_degree_and_angle(device, method):
     off = np.rad2deg((off + np.pi / 2) % np.pi - np.pi / 2)
     assert np.abs(off)[inside].max() < 1.5
     # Each pixel by itself, written down once more: 90, 45 / 135, 0 degrees.
-    mosaic = Runner(chain.through(["mosaic"]), device, final=True, encode=False).run(image, "k")
+    mosaic = Runner(chain.up_to(["mosaic"]), device, final=True, encode=False).run(image, "k")
     for (row, column), degrees in {(0, 0): 90, (0, 1): 45, (1, 0): 135, (1, 1): 0}.items():
         turn = 2 * np.deg2rad(degrees)
         expected = s0 + s1 * np.cos(turn) + s2 * np.sin(turn)
@@ -150,7 +150,7 @@ def test_a_polarised_array_has_no_colours():
     ):
         on("polarised", skip=["inverse_color_matrix"], color_matrix={"method": "camera"})
     chain = on("polarised", skip=["inverse_color_matrix"])
-    assert chain.filters.name == "polarised"
+    assert chain.filter_array.name == "polarised"
     flat = np.full((12, 12, 3), 0.2, np.float32)  # unpolarised light is gray
     stages = ["mosaic", "inverse_white_balance", "white_balance", "demosaic"]
     gray = Runner(on("polarised", stages=stages), None, final=True, encode=False).run(flat, "k")
@@ -211,7 +211,7 @@ def test_filters_of_several_colours_add_up_what_the_light_gives_each(device, lig
             assert (red, blue) == chain.camera.white_balance_gains
         own = parse_array(array)
         white, seen = ((np.array(each) / (red, 1, blue)) for each in ((1, 1, 1), (0.2, 0.3, 0.4)))
-        passed = {letter: np.array(PASSES[letter]) for letter in own.channels}
+        passed = {letter: np.array(TRANSMISSIONS[letter]) for letter in own.channels}
         largest = max(row @ white for row in passed.values())
         expected = own.spread({k: row @ seen / largest for k, row in passed.items()}, (8, 8))
         for each in (None, *([device] if array == "RGBW" else [])):
@@ -262,7 +262,7 @@ def test_flat_gray_stays_in_strips(method):
 def test_beyond_an_edge_an_array_goes_on():
     array = parse_array("x-trans")
     for size, period in product((6, 7, 11), (3, 6)):
-        place = beyond(size, period, 5)
+        place = periodic_indices(size, period, 5)
         assert ((place - np.arange(-5, size + 5)) % period == 0).all()
         assert place.min() >= 0
         assert place.max() < size
@@ -362,7 +362,7 @@ def test_a_dng_of_another_array(clpipe, half, array):
         result = clpipe("run", path, "-o", "again", "--device", "numpy", status=1)
         assert "its filter array is RW/WB" in result.stderr
         return
-    facts = read_facts(path)
+    facts = read_raw_info(path)
     assert facts.pattern == "/".join(parse_array(array).rows)
     assert np.array_equal(read_raw(path, facts), kept)
     clpipe("run", path, "-o", "again", "--format", "png", "--device", "numpy")
@@ -396,7 +396,7 @@ def test_libraw_opens_the_dng_of_an_array(tmp_path, array):
 
 @pytest.mark.slow
 def test_a_dataset_of_another_array(half):
-    options = {"mosaic": laid("quad-RGGB"), "iso": 800, "device": "numpy"}
+    options = {"mosaic": mosaic_parameters("quad-RGGB"), "iso": 800, "device": "numpy"}
     data = Dataset(half, patch=32, raw="mosaic", variance=True, **options)
     sample = data[3]
     assert sample["cfa"] == "RRGG/RRGG/GGBB/GGBB"
@@ -463,7 +463,9 @@ def test_a_bayer_pattern_as_an_array_is_one(array):
     laid_as_array = {"method": "array", "array": array}
     settings = {"white_balance": {"method": "gray_world"}, "demosaic": {"method": "menon2007"}}
     for each in ({}, settings):
-        chains = [on(array, **each, mosaic=own) for own in (laid_as_array, laid("GBRG"))]
+        chains = [
+            on(array, **each, mosaic=own) for own in (laid_as_array, mosaic_parameters("GBRG"))
+        ]
         image = np.random.default_rng(0).random((12, 14, 3)).astype(np.float32)
         one, two = (Runner(chain, None, final=True).run(image, "k").final for chain in chains)
         np.testing.assert_allclose(one, two, rtol=1e-6)
@@ -574,7 +576,11 @@ def test_a_cell_of_charge_saturates_as_one_readout(develop):
     stages = [*DEFAULT_CHAIN]
     stages.insert(stages.index("mosaic") + 1, "remosaic")
     light = np.full((16, 16, 3), 0.3, np.float32)
-    options = {"mosaic": laid("quad-RGGB"), "remosaic": {"method": "binning"}, "skip": ["noise"]}
+    options = {
+        "mosaic": mosaic_parameters("quad-RGGB"),
+        "remosaic": {"method": "binning"},
+        "skip": ["noise"],
+    }
     result = develop(
         light, numpy=True, stages=stages, keep=("normalize",), exposure={"ev": 3}, **options
     )
@@ -606,7 +612,7 @@ def test_a_remosaiced_picture_is_as_the_array_saw_it(develop):
     light = read_image(STILL_LIFE).pixels.astype(np.float32)[100:356, 200:520]
     options = {"stages": ["mosaic", "remosaic", "demosaic"], "demosaic": {"method": "menon2007"}}
     for array, least in (("x-trans", 32.5), ("RGBW", 29), ("quad-RGGB", 26)):
-        mosaic, remosaic = laid(array), {"method": "linear_mmse", "pattern": "GBRG"}
+        mosaic, remosaic = mosaic_parameters(array), {"method": "linear_mmse", "pattern": "GBRG"}
         result = develop(light, mosaic=mosaic, remosaic=remosaic, numpy=True, **options).final
         error = np.mean((np.clip(result, 0, 1) - np.clip(light, 0, 1)) ** 2)
         assert -10 * np.log10(error) > least, array
@@ -614,12 +620,15 @@ def test_a_remosaiced_picture_is_as_the_array_saw_it(develop):
 
 def test_the_array_of_a_raw_is_that_of_its_pixels():
     quad, remosaic = "RRGG/RRGG/GGBB/GGBB", {"method": "linear_mmse", "pattern": "GBRG"}
-    assert remosaiced("quad-RGGB", "binning").filters.pattern == quad
-    assert remosaiced("quad-RGGB", "linear_mmse").filters.pattern == quad
-    assert on("RGGB", stages=WITH_REMOSAIC, remosaic=remosaic).filters.pattern == "RGGB"
+    assert remosaiced("quad-RGGB", "binning").filter_array.pattern == quad
+    assert remosaiced("quad-RGGB", "linear_mmse").filter_array.pattern == quad
+    assert on("RGGB", stages=WITH_REMOSAIC, remosaic=remosaic).filter_array.pattern == "RGGB"
     charge = [*DEFAULT_CHAIN]
     charge.insert(charge.index("mosaic") + 1, "remosaic")
-    assert on("quad-RGGB", stages=charge, remosaic={"method": "binning"}).filters.pattern == "RGGB"
+    assert (
+        on("quad-RGGB", stages=charge, remosaic={"method": "binning"}).filter_array.pattern
+        == "RGGB"
+    )
 
 
 @pytest.mark.parametrize("array", ["x-trans", "RGGB"])
@@ -631,7 +640,7 @@ def test_what_has_no_cells(array):
 @pytest.mark.slow
 def test_the_variance_of_each_channel_is_that_of_its_noise(write_exr):
     flat = write_exr("flat.exr", np.full((240, 240, 3), 0.5, np.float32))
-    settings = {"mosaic": laid("RGBW"), "iso": 1600}
+    settings = {"mosaic": mosaic_parameters("RGBW"), "iso": 1600}
     options = {"raw": "mosaic", "variance": True, "dtype": "float32", "truth": "clean"}
     sample = Dataset(flat, **options, **settings)[0]
     noise, array = sample["raw"] - sample["truth.raw"], parse_array("RGBW")

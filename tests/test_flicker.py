@@ -41,7 +41,7 @@ def test_rows_get_what_the_square_wave_gives(develop, lamp):
         expected = gains(own, 60)
         near = 2e-4 / own["flicker_duty"]  # as it was counted
         assert found[:, 1, 2] == pytest.approx(expected, abs=near)
-        assert Rows(**own).weights(1, 60, lit=True)[0] == pytest.approx(expected, abs=near)
+        assert Rows(**own).weights(1, 60, weighted=True)[0] == pytest.approx(expected, abs=near)
     assert np.ptp(found) > 0.05
 
 
@@ -62,7 +62,7 @@ def test_phases_stay_exact_in_the_last_of_many_rows():
     lamp = {"flicker_frequency": 97.0, "flicker_duty": 0.3, "exposure_time": 1e-3}
     shutter = Rows(**lamp, line_time=9.1e-3)
     found = run_reference(shutter, np.ones((30_000, 1, 3), np.float32))[:, 0, 0]
-    expected = shutter.weights(1, 30_000, lit=True)[0]
+    expected = shutter.weights(1, 30_000, weighted=True)[0]
     assert np.abs(found - expected).max() < 2e-4  # of up to 3.3
 
 

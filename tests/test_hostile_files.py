@@ -18,7 +18,7 @@ import pytest
 from clpipe.base.digests import digests
 from clpipe.base.errors import ClpipeError, ImageError, RequestError
 from clpipe.base.files import sha256_of
-from clpipe.base.reading import unchanged
+from clpipe.base.reading import check_unchanged
 from clpipe.batch.replay import replay_of
 from clpipe.batch.tars import Members, is_clpipe_tar
 from clpipe.camera.profile import load_camera
@@ -27,7 +27,7 @@ from clpipe.chain.isos import check_cameras
 from clpipe.chain.registry import load_stage_file
 from clpipe.chain.settings import settings_from
 from clpipe.images.dump import parse_dump, read_dump
-from clpipe.images.raw import EXIF_BYTES, MOST_READS, read_exif, read_facts
+from clpipe.images.raw import EXIF_BYTES, MAX_READS, read_exif, read_raw_info
 from clpipe.images.read import ReadOptions, read_source
 from clpipe.images.samples import holds_mosaic
 from clpipe.inputs.manifest import read_manifest
@@ -44,12 +44,12 @@ resource.setrlimit(resource.RLIMIT_AS, (3 << 29, 3 << 29))
 from clpipe.base.errors import ImageError
 from clpipe.images.attributes import read_attributes
 from clpipe.images.dump import parse_dump, read_dump
-from clpipe.images.raw import read_facts, read_raw
+from clpipe.images.raw import read_raw_info, read_raw
 from clpipe.images.read import ReadOptions, read_source
 from clpipe.stage import Kind
 
 WAYS = [
-    lambda path: read_raw(path, read_facts(path)),
+    lambda path: read_raw(path, read_raw_info(path)),
     lambda path: read_dump(path, parse_dump("60000x60000:uint8")),
     lambda path: read_source(path, Kind.RGB, ReadOptions()),
     lambda path: read_source(path, Kind.RGB, ReadOptions(transfer="srgb")),
@@ -224,7 +224,7 @@ def test_exif_that_repeats_itself_is_given_up(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "open", opened)
     assert read_exif(tmp_path / "a.dng").tags == {}
     # Without a limit there are more than 65 million reads.
-    assert 0 < len(sizes) <= MOST_READS + 1
+    assert 0 < len(sizes) <= MAX_READS + 1
     assert max(sizes) <= EXIF_BYTES
 
 
@@ -247,7 +247,7 @@ READERS = {
     ".exr": lambda path: read_source(path, Kind.RGB, ReadOptions()),
     "mosaic.exr": lambda path: read_source(path, Kind.RAW, ReadOptions()),
     ".png": lambda path: read_source(path, Kind.DISPLAY, ReadOptions()),
-    ".dng": read_facts,
+    ".dng": read_raw_info,
     ".raw": lambda path: read_dump(path, parse_dump("96x80:uint8")),
 }
 
@@ -298,12 +298,12 @@ def test_a_link_to_a_file_is_a_file(tmp_path):
 def test_a_file_that_changes_while_it_is_read_is_refused(tmp_path):
     path = tmp_path / "a.exr"
     path.write_bytes(b"1234")
-    with unchanged(path):
+    with check_unchanged(path):
         path.read_bytes()
     for change in (lambda: path.write_bytes(b"12345"), path.unlink):
         with (
             pytest.raises(ImageError, match=r"a\.exr: the file changed while it was read"),
-            unchanged(path),
+            check_unchanged(path),
         ):
             change()
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clpipe.analysis.crops import choose_places
+from clpipe.analysis.crops import choose_crops
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import parse_toml
 from clpipe.camera.profile import built_in_cameras, load_camera
@@ -144,7 +144,7 @@ LONG = "9" * 4400  # more digits than int() takes
         (parse_resolution, f"{LONG}x9", "expected WIDTHxHEIGHT"),
         (patch_count, LONG, "expected a whole number from 1 to 9999, or grid"),
         (
-            lambda text: choose_places((text,), np.zeros((9, 9, 3), np.float32)),
+            lambda text: choose_crops((text,), np.zeros((9, 9, 3), np.float32)),
             f"0,0,9x{LONG}",
             "expected X,Y,",
         ),

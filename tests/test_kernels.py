@@ -12,14 +12,14 @@ from clpipe.chain.settings import Settings
 from clpipe.engine.check import (
     SIZES,
     Difference,
-    arrays_of,
     chain_for,
-    check_ends,
+    check_formats,
     check_method,
     check_raw,
     compare,
     depends_on_pattern,
     example,
+    filter_arrays_for,
 )
 from clpipe.engine.runner import Runner
 from clpipe.engine.sources import kernel_folder
@@ -46,7 +46,7 @@ def on_one(device, stage, method, sizes=SIZES, values=MappingProxyType({})):
 
     The array is X-Trans, whose period fits no number of lanes.
     """
-    arrays, total = arrays_of(stage, method, values)[:1], Difference()
+    arrays, total = filter_arrays_for(stage, method, values)[:1], Difference()
     bayer = ("GRBG",) * (depends_on_pattern(stage, method, values) or not arrays)
     for pattern in method.only_arrays or (*bayer, *arrays):
         total += compare(device, chain_for(stage, method, values, pattern), sizes)
@@ -63,7 +63,7 @@ def test_kernel_agrees_with_its_reference(device, stage, method, values):
 ON_FILTERS = [
     pytest.param(stage, method, id=f"{stage.name}-{method.method}")
     for stage, method in methods.METHODS
-    if depends_on_pattern(stage, method, {}) or arrays_of(stage, method, {})
+    if depends_on_pattern(stage, method, {}) or filter_arrays_for(stage, method, {})
 ]
 
 
@@ -124,7 +124,7 @@ def test_raw_is_bit_for_bit_the_references(device, scalar_device, noise, pattern
 
 def test_images_enter_and_leave_as_the_references_say(device, scalar_device):
     for any_device, sizes in ((device, SIZES), (scalar_device, SMALL_SIZES)):
-        result = check_ends(any_device, sizes)
+        result = check_formats(any_device, sizes)
         assert result.passed, result
 
 

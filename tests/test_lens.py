@@ -76,7 +76,7 @@ def test_the_fisheye_is_that_of_opencv():
 def test_red_and_blue_part_from_green():
     x, y = some_places()
     lens = BROWN.lens()
-    u, v = lens.seen(x, y, 1200, 800, lens.blue)
+    u, v = lens.source_positions(x, y, 1200, 800, lens.blue)
     green = bent_by_opencv(u, v)
     side = 799 / 2  # of r = 1, between the centres of the outermost pixels
     r = np.hypot(green[0] - 610, green[1] - 400) / side
@@ -95,7 +95,7 @@ def test_what_kernels_interpolate_is_within_a_hundredth_of_a_pixel(lens, size):
     fields = Warp(lens, "bicubic").grid(width, height).fields(rows, columns)
     x, y = np.meshgrid(columns + 0.5, rows + 0.5)
     for lateral in (lens.red, Radial(), lens.blue):
-        u, v = lens.seen(x, y, width, height, lateral)
+        u, v = lens.source_positions(x, y, width, height, lateral)
         inside = (u > 0) & (u < width) & (v > 0) & (v < height)
         apart = np.hypot(next(fields) + x - u, next(fields) + y - v)[inside]
         assert apart.max() < 0.01
@@ -197,9 +197,9 @@ def test_lensfun_says_the_same(camera, name, setting, size):
     vignetting = next(s for s in steps if s.name == "vignetting")
     database, profile = lensfunpy.Database(), load_camera(camera)
     crop = by_name._crop_factor(database, profile.make, profile.model)
-    lens = by_name._found(database, name, crop)
+    lens = by_name._find_lens(database, name, crop)
     modifier = lensfunpy.Modifier(lens, crop or lens.crop_factor, *size)
-    arguments = setting["focal_length"], setting.get("aperture", 8), by_name.FAR
+    arguments = setting["focal_length"], setting.get("aperture", 8), by_name.INFINITY_DISTANCE
     modifier.initialize(*arguments, scale=1.0, pixel_format=np.float32)
     places = modifier.apply_subpixel_geometry_distortion()
     if places is None:  # without lateral colour
@@ -212,7 +212,9 @@ def test_lensfun_says_the_same(camera, name, setting, size):
         across, down = places[..., channel, 0] + 0.5, places[..., channel, 1] + 0.5
         inside = (across > 0) & (across < size[0]) & (down > 0) & (down < size[1])
         inside &= exact[:, None]
-        u, v = bend.seen(across[inside].astype(float), down[inside].astype(float), *size, lateral)
+        u, v = bend.source_positions(
+            across[inside].astype(float), down[inside].astype(float), *size, lateral
+        )
         assert np.hypot(u - 0.5 - x[inside], v - 0.5 - y[inside]).max() < 0.02
     if "aperture" in setting:
         white = np.ones((size[1], size[0], 3), np.float32)
@@ -318,7 +320,7 @@ def test_an_aperture_of_a_lens_whose_range_is_not_all_known(low, high, aperture,
 
 
 def test_what_is_said_without_lensfunpy(clpipe, monkeypatch):
-    by_name._loaded.cache_clear()
+    by_name._load_database.cache_clear()
     monkeypatch.setitem(sys.modules, "lensfunpy", None)
     stderr = clpipe("plan", "--lens", "any", status=2).stderr
     assert "lensfun's database needs lensfunpy. Run: pip install lensfunpy" in stderr

@@ -21,7 +21,7 @@ from clpipe.analysis.matching.ambiguity import Ambiguity, ambiguities
 from clpipe.analysis.matching.columns import (
     COLUMNS,
     TAILS,
-    Places,
+    ValidPixels,
     errors_of,
     figures_of,
     noise_of_frames,
@@ -38,12 +38,12 @@ from clpipe.analysis.matching.space import (
     space_for,
     variants_of,
 )
-from clpipe.analysis.signature import flat_places, luma
+from clpipe.analysis.signature import flat_mask, luma
 from clpipe.chain.files import load_config, load_settings
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings, overlay
 from clpipe.commands.match import SearchProgress
-from clpipe.images.jpeg import JpegEncoding, jpeg_encoding, through_jpeg
+from clpipe.images.jpeg import JpegEncoding, jpeg_encoding, jpeg_round_trip
 from clpipe.pipeline import Pipeline
 from tests.conftest import DATA, ROOT, run_cli
 
@@ -94,7 +94,7 @@ def saved(folder, **pictures):
 def test_independent_noise(grey):
     clean, noisy = (picture.astype(np.float64) for picture in grey)
     noise = noise_of_frames([noisy], clean)
-    places = Places(np.ones(clean.shape[:2], bool), noise.level)
+    places = ValidPixels(np.ones(clean.shape[:2], bool), noise.level)
     found = figures_of(noise, places)
     for name in ("right", "two_below", "chroma_right", "red_green", "green_blue"):
         assert abs(found[name]) < 0.03, name
@@ -112,7 +112,7 @@ def test_independent_noise(grey):
 def test_noise_against_the_mean_of_a_burst_is_that_of_a_frame(burst):
     frames = [frame.astype(np.float32) for frame in burst]
     mean = np.mean(burst, axis=0)
-    places = Places(flat_places(mean), luma(mean))
+    places = ValidPixels(flat_mask(mean), luma(mean))
     clean = Pipeline(device="numpy", **KNOWN, skip=["sensor_noise", "row_noise", "column_noise"])
     truth = clean.process(scene(), "").image.astype(np.float64)
     against_truth = figures_of(noise_of_frames(frames, truth), places)
@@ -138,7 +138,7 @@ def found(burst, tmp_path_factory):
     folder = tmp_path_factory.mktemp("match")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(match, "space_for", lambda *_: SMALL)
-        patch.setattr(search, "FULL", 4)
+        patch.setattr(search, "FINAL_STEPS", 4)
         return matched(burst, folder), load_settings(str(folder / "look.toml"))
 
 
@@ -281,8 +281,8 @@ def test_a_terminal_has_a_bar_with_the_share_and_the_time_left(burst, tmp_path):
 def quick(monkeypatch):
     """A search of one step in the small space."""
     monkeypatch.setattr(match, "space_for", lambda *_: replace(SMALL, strength=None))
-    monkeypatch.setattr(search, "QUICK", 1)
-    monkeypatch.setattr(search, "FULL", 1)
+    monkeypatch.setattr(search, "TRIAL_STEPS", 1)
+    monkeypatch.setattr(search, "FINAL_STEPS", 1)
 
 
 @pytest.mark.slow
@@ -331,7 +331,7 @@ def test_jpegs_say_their_quality_and_subsampling(burst, tmp_path):
             frame, quality=encoding.quality, subsampling=encoding.subsampling
         )
         assert jpeg_encoding(frame) == encoding
-        assert np.array_equal(through_jpeg(burst[0], encoding), np.asarray(Image.open(frame)))
+        assert np.array_equal(jpeg_round_trip(burst[0], encoding), np.asarray(Image.open(frame)))
     (png,) = saved(tmp_path, b=burst[0])
     assert jpeg_encoding(png) is None
 
@@ -343,7 +343,7 @@ def test_what_is_developed_goes_through_the_same_jpeg(burst, tmp_path):
     assert scenes.jpeg == JpegEncoding(50, "4:2:0")
     settings = overlay(Settings(), KNOWN)
     one, simulator = scenes.each[0], Simulator(None)
-    places = Places(one.mask, one.noise.level)
+    places = ValidPixels(one.mask, one.noise.level)
     ours = figures_of(simulator.noise(settings, one, "a"), places)
     without = figures_of(simulator.noise(settings, replace(one, jpeg=None), "a"), places)
     theirs = figures_of(one.noise, places)
@@ -395,14 +395,14 @@ def test_a_name_with_brackets_is_no_glob_where_it_exists(tmp_path):
 def test_a_third_is_kept_out_of_the_search(burst, tmp_path):
     names = saved(tmp_path, **{f"{k}": frame for k, frame in enumerate(burst)})
     (one,) = load_scenes(names, []).each
-    holdout = one.flat & one.kept_out
+    holdout = one.flat & one.holdout
     assert not (one.mask & holdout).any()
     assert holdout.sum() / one.flat.sum() == pytest.approx(1 / 3, abs=0.12)
-    whole = replace(one, kept_out=np.zeros_like(one.flat))
+    whole = replace(one, holdout=np.zeros_like(one.flat))
     kept = with_holdout([whole] * 6)
     assert [s.mask.any() for s in kept] == [True, True, False] * 2
     parts = with_holdout([whole] * 5)
-    assert [s.mask.any() and (s.flat & s.kept_out).any() for s in parts] == [True] * 5
+    assert [s.mask.any() and (s.flat & s.holdout).any() for s in parts] == [True] * 5
     assert isinstance(Scenes(kept, None, ()), Scenes)
 
 
@@ -496,7 +496,7 @@ def test_looks_have_the_figures_of_the_cameras(look, device):
         muted = np.asarray(ImageEnhance.Color(picture).enhance(0.5))
     clean = gaussian_filter(muted.astype(np.float64), (3, 3, 0))
     everywhere = np.ones(clean.shape[:2], bool)
-    one = Scene("coffee", (clean,), clean, False, everywhere, flat_places(clean), ~everywhere)
+    one = Scene("coffee", (clean,), clean, False, everywhere, flat_mask(clean), ~everywhere)
     ours = figures_of(Simulator(device).noise(load_settings(look), one, "test"), one.places())
     sizes, within = MEASURED[look]
     assert [ours[name] / size for name, size in zip(SIZES, sizes, strict=True)] == pytest.approx(

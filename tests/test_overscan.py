@@ -12,7 +12,7 @@ import clpipe as clpipe_api
 from clpipe.base.errors import ImageError
 from clpipe.chain.depth import depth_of_array, with_depth
 from clpipe.chain.making import make_chain
-from clpipe.chain.overscan import steps_of_overscan, with_overscan
+from clpipe.chain.overscan import overscan_step_count, with_overscan
 from clpipe.chain.settings import settings_from
 from clpipe.engine.check import example
 from clpipe.engine.runner import Runner
@@ -101,7 +101,7 @@ def test_tiles_have_the_same_bits(device, monkeypatch, k1):
     margins, size = Margins(40, 131, 97, 6), (301, 540)
     own = {**BARREL, "k1": k1, "fx": 430.0}
     runner = Runner(chain_of(margins, distortion=own), device, encode=False, final=True)
-    image = example(Kind.RGB, margins.around(*size)[::-1])
+    image = example(Kind.RGB, margins.image_size(*size)[::-1])
     whole = runner.run(image, "k")
     assert whole.final.shape == (540, 301, 3)
     assert np.array_equal(whole.final, bent(image, margins, distortion=own).final)
@@ -111,7 +111,7 @@ def test_tiles_have_the_same_bits(device, monkeypatch, k1):
 def test_fit_makes_no_use_of_more_than_fills_the_picture():
     def factor(margins, k1=K1):
         chain = chain_of(margins, distortion={**BARREL, "k1": k1, "fit": True})
-        return chain.steps[0].method.lens().scale(*margins.around(WIDTH, HEIGHT))
+        return chain.steps[0].method.lens().scale(*margins.image_size(WIDTH, HEIGHT))
 
     alone, few, many = (factor(Margins(n, n, n, n)) for n in (0, 3, 20))
     assert alone > few > many == 1
@@ -163,7 +163,7 @@ def test_a_camera_turns_about_the_middle_of_the_picture():
 
 def test_where_it_is_of_use():
     def count(**settings):
-        return steps_of_overscan(make_chain(settings_from(settings)))
+        return overscan_step_count(make_chain(settings_from(settings)))
 
     assert count() == 0 and count(distortion={**BARREL, "k1": 0.0}) == 0
     assert count(distortion=BARREL) == 5

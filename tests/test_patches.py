@@ -202,16 +202,16 @@ def test_no_buffer_is_replaced_while_an_image_is_on_the_device(device, monkeypat
         boxes = [Box(i, i, i + side // 2, i + side // 2) for i in range(patches)]
         images.append((np.full((side, side, 3), 0.2, np.float16), "k", RunOptions(boxes=boxes)))
     runner.run(*images[0])  # compiles
-    fresh.limit(fresh.memory)  # release all buffers
+    fresh.limit_memory(fresh.memory)  # release all buffers
     before, replaced = [], []
     make_way, reserve = Flow.reserve, Pool.reserve
 
     def recording_flow(flow, *arguments):
-        before.append(len(flow._sent))
+        before.append(len(flow._in_flight))
         return make_way(flow, *arguments)
 
     def recording_reserve(pool, *arguments):
-        held, tiles = dict(pool.buffers), len(fresh.flow._sent)
+        held, tiles = dict(pool.buffers), len(fresh.flow._in_flight)
         reserve(pool, *arguments)
         if pool.buffers != held:
             replaced.append(tiles)

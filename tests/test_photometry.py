@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clpipe.images.lens_tag import with_lens
+from clpipe.images.lens_tag import with_lens_model
 from clpipe.images.tags import Tags
 from clpipe.images.write import write_display
 
@@ -183,7 +183,7 @@ def test_the_lens_is_put_into_a_file_that_stays_as_it_was(tmp_path, ending):
     pixels = np.random.default_rng(1).integers(0, 256, (9, 14, 3), dtype=np.uint8)
     write_display(path, pixels, tags)
     before = path.read_bytes()
-    after = with_lens(before, "Lens 35mm")
+    after = with_lens_model(before, "Lens 35mm")
     path.with_stem("b").write_bytes(after)
     with Image.open(path) as one, Image.open(path.with_stem("b")) as other:
         assert np.array_equal(np.asarray(one), np.asarray(other))

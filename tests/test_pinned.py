@@ -18,7 +18,7 @@ import rawpy
 from click.testing import CliRunner
 
 from clpipe.commands.main import main
-from clpipe.engine.cpu_target import row_of
+from clpipe.engine.cpu_target import equivalent_target
 from clpipe.engine.device import Device
 
 PINNED = Path(__file__).with_name("pinned.json")
@@ -104,7 +104,7 @@ def test_a_run_makes_what_it_has_always_made(name: str, device: Device, tmp_path
     made = digests(RUNS[name], tmp_path)
     pinned = json.loads(PINNED.read_text())[name]
     assert made.keys() == pinned.keys()
-    if row_of(device.info.target.name) not in ("skx", "haswell"):
+    if equivalent_target(device.info.target.name) not in ("skx", "haswell"):
         # Pictures are pinned for CPUs that multiply and add in one instruction; raws for all.
         made, pinned = ({n: d for n, d in each.items() if is_raw(n)} for each in (made, pinned))
     assert made == pinned

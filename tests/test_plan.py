@@ -107,8 +107,8 @@ def test_the_border_is_as_wide_as_the_widest_stencil():
 
 
 def curves_of(kernel):
-    bound = (parameter.bound for parameter in kernel.parameters)
-    return [each.steps for each in bound if isinstance(each, EncodedCurves)]
+    bindings = (parameter.binding for parameter in kernel.parameters)
+    return [each.steps for each in bindings if isinstance(each, EncodedCurves)]
 
 
 def test_curves_before_eight_bits_become_one_table():

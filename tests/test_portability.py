@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from clpipe.engine.cpu_target import TARGETS, row_of
+from clpipe.engine.cpu_target import TARGETS, equivalent_target
 from tools.stress.emulated import EMULATED, measure_emulated, script
 from tools.stress.runtimes import UnavailableError
 
@@ -17,7 +17,7 @@ X86 = [cpu for cpu in EMULATED if cpu.machine == "x86_64"]
 
 @pytest.mark.parametrize("cpu", X86, ids=lambda cpu: cpu.name)
 def test_the_target_that_must_crash_needs_more_than_the_one_that_is_expected(cpu):
-    assert TARGETS[cpu.wider] - TARGETS[row_of(cpu.target)]
+    assert TARGETS[cpu.wider] - TARGETS[equivalent_target(cpu.target)]
 
 
 def test_a_program_that_stands_for_another_passes_its_name_and_all_arguments_on(tmp_path):

@@ -27,8 +27,8 @@ from tests.conftest import STILL_LIFE, run_python
 
 SMALL = {"stages": ["exposure", "gamma"]}
 FOLDER = (
-    "from clpipe.engine.cache_folder import cache_folder, later_runs;"
-    "print(cache_folder()); print(later_runs())"
+    "from clpipe.engine.cache_folder import cache_folder, cache_notice;"
+    "print(cache_folder()); print(cache_notice())"
 )
 DEVELOP = (
     "import numpy, clpipe; clpipe.Pipeline(stages=['exposure', 'gamma'], device='cpu')"
@@ -126,7 +126,7 @@ def test_a_pocl_with_other_headers_declares_the_functions_itself(device, monkeyp
     image = np.full((8, 8, 3), 0.5, np.float32)
     chain = make_chain(settings_from(SMALL))
     expected = Runner(chain, device).run(image, "a").image
-    monkeypatch.setattr(programs, "DECLARED_HERE", ("-D_OPENCL_H_", "-DOTHER_HEADERS"))
+    monkeypatch.setattr(programs, "BUILTIN_OPTIONS", ("-D_OPENCL_H_", "-DOTHER_HEADERS"))
     monkeypatch.setattr(programs, "_by_device", {})
     given = Runner(chain, Device(device.info)).run(image, "a").image
     np.testing.assert_array_equal(given, expected)
@@ -144,13 +144,13 @@ def test_devices_and_chains_share_programs(device):
 
 
 def test_slow_compiling_is_announced_once(device, monkeypatch, caplog):
-    monkeypatch.setattr(programs, "LONG", 0.01)
-    monkeypatch.setattr(programs, "_announced", programs.threading.Event())
+    monkeypatch.setattr(programs, "NOTICE_DELAY", 0.01)
+    monkeypatch.setattr(programs, "_notice_logged", programs.threading.Event())
     with caplog.at_level(logging.INFO, "clpipe"):
         for _ in range(2):
-            with programs.announced(device.info):
+            with programs.notice_if_slow(device.info):
                 time.sleep(0.1)
-        with programs.announced(device.info):
+        with programs.notice_if_slow(device.info):
             pass
     (record,) = caplog.records
     assert "compiling kernels for" in record.getMessage()
@@ -159,8 +159,8 @@ def test_slow_compiling_is_announced_once(device, monkeypatch, caplog):
 
 @pytest.mark.parametrize(("options", "count"), [((), 1), (("--quiet",), 0)])
 def test_the_command_line_prints_it(clpipe, monkeypatch, options, count):
-    monkeypatch.setattr(programs, "LONG", 0.0)
-    monkeypatch.setattr(programs, "_announced", programs.threading.Event())
+    monkeypatch.setattr(programs, "NOTICE_DELAY", 0.0)
+    monkeypatch.setattr(programs, "_notice_logged", programs.threading.Event())
     done = clpipe("run", STILL_LIFE, "-o", "out", "--stages", "exposure,gamma", *options)
     assert done.stderr.count("clpipe: compiling kernels for") == count
 
@@ -168,7 +168,7 @@ def test_the_command_line_prints_it(clpipe, monkeypatch, options, count):
 def test_who_watches_is_told_how_far_compiling_is(device):
     lines = []
     chain = make_chain(settings_from({"stages": ["exposure", "mosaic", "demosaic", "gamma"]}))
-    with programs.watched(lambda *counts: lines.append(counts)):
+    with programs.watching_compilation(lambda *counts: lines.append(counts)):
         Runner(chain, Device(device.info)).compile()
     count = lines[-1][1]
     assert count > 1 and lines == [(i, count) for i in range(count + 1)]
@@ -181,12 +181,12 @@ def test_compiling_is_a_step_of_the_live_display(monkeypatch):
     console = Console(file=io.StringIO(), force_terminal=True, width=80, color_system=None)
     run = SimpleNamespace(summary=Summary(6), writer=None, execution=ExecutionOptions(Path("out")))
     with progress.Reporter(run, console) as reporter:
-        programs.tell_watchers(2, 7)
+        programs.notify_watchers(2, 7)
         (task,) = reporter._bar.tasks
         assert task.description == "compiling 3 of 7"
         record = logging.LogRecord("clpipe", logging.INFO, "", 0, "compiling kernels", (), None)
         NOTICES.handle(record)
-        programs.tell_watchers(7, 7)
+        programs.notify_watchers(7, 7)
         assert task.description == "first launches"
     shown = console.file.getvalue()
     assert "clpipe: compiling kernels\n" in shown.replace("\r", "")

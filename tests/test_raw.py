@@ -7,7 +7,7 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
-from clpipe.images.raw import read_facts, read_raw
+from clpipe.images.raw import read_raw, read_raw_info
 from clpipe.images.read import read_image
 from clpipe.images.tags import upright
 from clpipe.images.write import write_exr
@@ -85,7 +85,7 @@ def test_the_matrix_of_the_file_takes_its_colours_to_srgb(tmp_path):
 def test_without_a_matrix_the_profile_has_one_or_colours_stay(tmp_path):
     write_dng(tmp_path / "a.dng", mosaic(), matrix=None)
     assert "warning" not in clpipe("run", tmp_path / "a.dng", "-o", tmp_path)
-    known = read_facts(write_dng(tmp_path / "b.dng", mosaic())).camera_to_srgb
+    known = read_raw_info(write_dng(tmp_path / "b.dng", mosaic())).camera_to_srgb
     assert np.allclose(parameters(tmp_path / "a.json")["color_matrix"]["matrix"], known, atol=2e-3)
     write_dng(tmp_path / "c.dng", mosaic(), matrix=None, model=b"Nonesuch")
     output = clpipe("run", tmp_path / "c.dng", "-o", tmp_path)
@@ -99,7 +99,7 @@ def test_each_channel_has_its_own_black_level_and_what_lies_below_stays(tmp_path
     black = (500, 520, 540, 480)
     dn = mosaic(black=512) + np.tile(np.reshape(black, (2, 2)) - 512, (24, 32))
     dn[10, 10] = 100
-    facts = read_facts(write_dng(tmp_path / "a.dng", dn, black=black))
+    facts = read_raw_info(write_dng(tmp_path / "a.dng", dn, black=black))
     assert (facts.black_levels, facts.black_level) == (black, 510)
     assert np.array_equal(read_raw(tmp_path / "a.dng", facts)[11:], mosaic(black=512)[11:] - 2)
     clpipe("run", tmp_path / "a.dng", "-o", tmp_path, *MEASURE, "--until", "normalize")
@@ -317,7 +317,7 @@ def test_an_x_trans_raw_of_another_program(tmp_path):
     own = np.rint(own * (16383 - 512) + 512)
     cfa = field(33422, 1, *("RGB".index(c) for c in XTRANS))
     path = write_dng(tmp_path / "a.dng", own, changes=(field(33421, 3, 6, 6), cfa))
-    facts = read_facts(path)
+    facts = read_raw_info(path)
     assert facts.pattern == "/".join("".join(row) for row in letters)
     assert np.array_equal(read_raw(path, facts), own)
     clpipe("run", path, "-o", tmp_path / "out", "--keep", "demosaic")

@@ -5,7 +5,7 @@ import pytest
 import rawpy
 
 from clpipe.base.errors import ImageError
-from clpipe.images.raw import read_facts
+from clpipe.images.raw import read_raw_info
 from clpipe.reference.cfa import PATTERNS
 from tests.conftest import DATA
 from tests.conftest import cli_output as clpipe
@@ -86,7 +86,7 @@ def test_a_dump_does_not_describe_itself(tmp_path):
     path = tmp_path / "a.raw"
     path.write_bytes(bytes(2 * 1920 * 1080))  # LibRaw takes files of this size for raws
     with pytest.raises(ImageError, match="states no camera, ISO or exposure"):
-        read_facts(path)
+        read_raw_info(path)
 
 
 def test_a_date_that_cannot_be_stops_nobody(tmp_path):

@@ -16,7 +16,7 @@ from clpipe.chain.settings import settings_from
 from clpipe.dataset import Dataset
 from clpipe.engine.runner import Runner
 from clpipe.images.read import read_image
-from clpipe.reference.companding import along_pieces, pieces_of, usual_knots
+from clpipe.reference.companding import apply_pieces, default_knots, pieces_of
 from tests.conftest import STILL_LIFE
 
 METHODS = {
@@ -60,7 +60,7 @@ def test_the_signal_to_noise_ratio_is_that_of_the_formulas(method):
         assert found.mean() == pytest.approx(light, rel=0.004)
         ratios = [decibels(light, sigma) for sigma in (found.std(), expected**0.5)]
         assert ratios[0] == pytest.approx(ratios[1], abs=0.15)
-        assert step.own_variance(np.float32([light])) == pytest.approx(expected, rel=0.04)
+        assert step.added_variance(np.float32([light])) == pytest.approx(expected, rel=0.04)
 
 
 def test_the_ratio_dips_where_a_readout_takes_over():
@@ -116,13 +116,13 @@ def test_a_picture_of_the_first_range_is_as_ever(clpipe, part):
 
 @pytest.mark.parametrize(("white", "bits"), [(2**20 - 1, 12), (2**24 - 1, 16), (16383, 10)])
 def test_a_curve_of_pieces_goes_there_and_back(white, bits):
-    knots = usual_knots(white, 2**bits - 1)
+    knots = default_knots(white, 2**bits - 1)
     there, back = pieces_of(knots), pieces_of(knots, inverse=True)
     dn = np.unique(np.geomspace(1, white, 20_000).round()).astype(np.float32)
-    few = np.rint(along_pieces(dn, there))
+    few = np.rint(apply_pieces(dn, there))
     assert (np.diff(few) >= 0).all()
     assert few.max() == 2**bits - 1
-    again = along_pieces(few, back)
+    again = apply_pieces(few, back)
     slope = np.interp(dn, there[:, 0], there[:, 2])  # of the piece, or steeper
     steepest = np.array([there[there[:, 0] <= x][-1, 2] for x in dn[::97]])
     error = np.abs(again - dn)[::97]
@@ -252,13 +252,13 @@ def test_light_leaks_into_the_small_photodiode(method):
     assert truth == pytest.approx(np.full_like(truth, light * 1.32), rel=2e-3)  # whole DN
     shot = step.a * light * (1 / 32 + 0.01) * 32**2
     assert seen.var() == pytest.approx(shot + step.b * (step.later_noise * 32) ** 2, rel=0.03)
-    assert step.own_variance(np.float32([light])) == pytest.approx(seen.var(), rel=0.03)
+    assert step.added_variance(np.float32([light])) == pytest.approx(seen.var(), rel=0.03)
     # The merged signal steps up where the large one ends.
     for light, expected in ((0.8, 0.8), (1.1, 1.32 * 1.1)):
         seen, truth, step = made(light * large_ends)
         assert seen.mean() == pytest.approx(expected * large_ends, rel=0.002)
         assert truth.mean() == pytest.approx(expected * large_ends, rel=0.001)
-        variance = step.own_variance(np.float32([light * large_ends]))
+        variance = step.added_variance(np.float32([light * large_ends]))
         assert variance == pytest.approx(seen.var(), rel=0.04)
 
 
@@ -280,5 +280,5 @@ def test_the_variance_beyond_the_first_white(clpipe, write_exr):
     clpipe("run", path, "-o", "out", *options, "--truth", "variance", "--format", "npy")
     found = np.load("out/light.truth_variance.npy")[0, ::4]
     step = chain_of("dual_gain").step_named("sensor_noise").method
-    expected = step.own_variance(np.float32([0.5, 4, 12, 16]))  # white is at 16
+    expected = step.added_variance(np.float32([0.5, 4, 12, 16]))  # white is at 16
     assert found == pytest.approx(expected, rel=0.02)

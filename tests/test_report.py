@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clpipe.chain.rendition import FIRST
+from clpipe.chain.rendition import DEFAULT_RENDITION
 from clpipe.images.write import write_exr as write
 from clpipe.reports.figures import last_failures, sessions
 from clpipe.reports.images import Budget, compared_image, places_of
@@ -427,7 +427,7 @@ def test_a_run_is_read_from_its_sidecars(out):
     run = read_run(out)
     assert [made.name for made in run.pictures] == [HOSTILE, "a", "b"]
     assert sorted(each.suffix for each in run.of_image("a")) == ["", ".truth", ".truth_mosaic"]
-    assert run.of_image("a")[FIRST].files.keys() == {"jpg", "normalize.exr"}
+    assert run.of_image("a")[DEFAULT_RENDITION].files.keys() == {"jpg", "normalize.exr"}
     steps = [{step["name"]: step for step in made.steps} for made in run.pictures]
     assert steps[0]["gamma"] is steps[1]["gamma"]  # lines that are alike are held once
     assert steps[0]["exposure"] != steps[1]["exposure"]
@@ -436,4 +436,4 @@ def test_a_run_is_read_from_its_sidecars(out):
     assert list(steps[1].values()) == whole["stages"]
     reseal(sidecar, {**whole, "stages": tuple(whole["stages"])})  # in one line
     again = next(made for made in read_run(out).pictures if made.name == "a")
-    assert again.record == run.of_image("a")[FIRST].record
+    assert again.record == run.of_image("a")[DEFAULT_RENDITION].record

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from clpipe.base.errors import RequestError
-from clpipe.chain.request import RECORDED, Request
+from clpipe.chain.request import RECORDED_FIELDS, Request
 from clpipe.chain.settings import settings_from
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
@@ -45,8 +45,8 @@ def test_a_record_makes_the_same_request_but_for_which_pictures_are_made():
     request = Request.from_options(**OPTIONS).for_image("a.exr", {"seed": 3})
     again = Request.from_record(json.loads(json.dumps(request.record())))
     assert again.record() == request.record()
-    assert {name: getattr(again, name) for name in RECORDED} == {
-        name: getattr(request, name) for name in RECORDED
+    assert {name: getattr(again, name) for name in RECORDED_FIELDS} == {
+        name: getattr(request, name) for name in RECORDED_FIELDS
     }
     assert again.frames is None and request.frames == 2
     assert again.settings() == request.settings()

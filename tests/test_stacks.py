@@ -15,7 +15,7 @@ from clpipe.engine.check import check_stack, example
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.options import DEFAULTS, RunOptions
-from clpipe.engine.runner import Result, Runner, cut_out, submit_together
+from clpipe.engine.runner import Result, Runner, crop_patches, submit_batch
 from clpipe.stage import Kind
 from tests.conftest import worker_of
 
@@ -78,7 +78,7 @@ def test_members_have_the_bits_that_they_have_alone(on, launches, name):
     submitted = submissions(on, CHAINS[name])
     alone = [each.runner.run(each.image, each.noise_key) for each in submitted]
     launches.clear()
-    for wait, expected in zip(submit_together(submitted), alone, strict=True):
+    for wait, expected in zip(submit_batch(submitted), alone, strict=True):
         equal(wait(), expected)
     assert {size[2:] for size in launches} == {(3,)}
     assert len(launches) < 20
@@ -90,10 +90,12 @@ def test_patches_of_one_image_and_of_others_go_together(on, launches):
     boxes = [Box(0, 0, 16, 20), Box(7, 3, 23, 23), Box(16, 1, 32, 21)]
     cut = [each._replace(options=RunOptions(boxes=boxes)) for each in submitted]
     launches.clear()
-    for wait, whole in zip(submit_together(cut), wholes, strict=True):
+    for wait, whole in zip(submit_batch(cut), wholes, strict=True):
         found = wait()
-        np.testing.assert_equal(found.encoded, cut_out(whole.encoded, boxes))
-        np.testing.assert_equal(found.kept["normalize"], cut_out(whole.kept["normalize"], boxes))
+        np.testing.assert_equal(found.encoded, crop_patches(whole.encoded, boxes))
+        np.testing.assert_equal(
+            found.kept["normalize"], crop_patches(whole.kept["normalize"], boxes)
+        )
     assert {size[2:] for size in launches} == {(9,)}
 
 
@@ -111,19 +113,19 @@ def test_lines_of_pixels(on, sizes):
     for runner in runners:
         runner.keep = ()
     alone = [each.runner.run(each.image, each.noise_key) for each in submitted]
-    for wait, expected in zip(submit_together(submitted), alone, strict=True):
+    for wait, expected in zip(submit_batch(submitted), alone, strict=True):
         equal(wait(), expected)
 
 
 def test_more_than_one_stack_where_memory_is_short(on, launches, monkeypatch):
     submitted = submissions(on, CHAINS["default"])
     alone = [each.runner.run(each.image, each.noise_key) for each in submitted]
-    monkeypatch.setattr(stack, "FEWEST", 2)
+    monkeypatch.setattr(stack, "MIN_MEMBERS", 2)
 
     def depths():
         """Submit the images and return how many of them each launch covers."""
         launches.clear()
-        for wait, expected in zip(submit_together(submitted), alone, strict=True):
+        for wait, expected in zip(submit_batch(submitted), alone, strict=True):
             equal(wait(), expected)
         return {size[2:] for size in launches}
 
@@ -132,7 +134,7 @@ def test_more_than_one_stack_where_memory_is_short(on, launches, monkeypatch):
     assert depths() == {(3,)}
     while (found := depths()) == {(3,)}:
         limit = limit * 4 // 5
-        monkeypatch.setattr(stack, "STACK_BYTES", dict.fromkeys((True, False), limit))
+        monkeypatch.setattr(stack, "MAX_STACK_BYTES", dict.fromkeys((True, False), limit))
     assert found == {(2,), (1,)}
     on.memory = limit // 3  # less than one member takes
     assert depths() == {(1,)}
@@ -144,7 +146,7 @@ def test_what_takes_other_kernels_goes_by_itself(on, launches):
     other = submitted[0]._replace(runner=Runner(chain, on))
     alone = [each.runner.run(each.image, each.noise_key) for each in (*submitted, other)]
     launches.clear()
-    waits = submit_together([submitted[0], other, *submitted[1:]])
+    waits = submit_batch([submitted[0], other, *submitted[1:]])
     found = [wait() for wait in waits]
     for result, expected in zip([found[0], *found[2:], found[1]], alone, strict=True):
         equal(result, expected)
@@ -155,7 +157,7 @@ def test_what_takes_other_kernels_goes_by_itself(on, launches):
 def test_a_stack_that_fails_is_done_image_by_image(on, monkeypatch, error):
     submitted = submissions(on, CHAINS["default"])
     alone = [each.runner.run(each.image, each.noise_key) for each in submitted]
-    before = submit_together(submitted)
+    before = submit_batch(submitted)
     launch = cl.enqueue_nd_range_kernel
 
     def launched(queue, kernel, size, *rest, **options):
@@ -164,7 +166,7 @@ def test_a_stack_that_fails_is_done_image_by_image(on, monkeypatch, error):
         return launch(queue, kernel, size, *rest, **options)
 
     monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
-    for wait, expected in zip([*before, *submit_together(submitted)], alone * 2, strict=True):
+    for wait, expected in zip([*before, *submit_batch(submitted)], alone * 2, strict=True):
         equal(wait(), expected)
 
 
@@ -197,7 +199,7 @@ def test_small_images_of_a_run_share_launches(
     launches.clear()
     together = made("together")
     most = max(size[2] for size in launches)
-    monkeypatch.setattr(stack, "FEWEST", 1000)
+    monkeypatch.setattr(stack, "MIN_MEMBERS", 1000)
     launches.clear()
     alone = made("alone")
     assert max(size[2] for size in launches) == 1

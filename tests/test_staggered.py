@@ -116,7 +116,7 @@ def test_shares_of_frames_are_those_of_time():
     time = (np.arange(400_000) + 0.5) / 400_000 * (0.01 * 1.75 + 8e-3)
     frame = (time / time[-1] * 4.9999).astype(int)
     for number, span in enumerate(SPANS):
-        weights = shutter.during(SPANS, number).weights(5, 9)
+        weights = shutter.for_exposure(SPANS, number).weights(5, 9)
         for row in (0, 5, 8):
             begins = row * 1e-3 + 0.01 * span.start
             seen = (time >= begins) & (time < begins + 0.01 * span.length)
@@ -133,14 +133,14 @@ def test_the_kernel_merges_as_numpy(device, scalar_device, is_clean):
     whole = {}
     for size in ((1, 1), (1, 9), (11, 1), (2, 3), (37, 53)):
         image, *later = (random.random((3, *size, 3)) ** 3 * 6).astype(np.float32)
-        options = RunOptions(later=later)
+        options = RunOptions(later_exposures=later)
         on = {d: Runner(chain, d, encode=False, final=True) for d in (device, scalar_device, None)}
         results = {d: runner.run(image, "k", options).final for d, runner in on.items()}
         assert difference(results[device], results[None]).largest == 0
         assert difference(results[scalar_device], results[None]).largest == 0
         whole[size] = results[None]
     boxes = [Box(3, 5, 19, 21), Box(30, 20, 46, 36)]
-    patches = on[device].run(image, "k", RunOptions(later=later, boxes=boxes)).final
+    patches = on[device].run(image, "k", RunOptions(later_exposures=later, boxes=boxes)).final
     cut = [whole[37, 53][b.top : b.bottom, b.left : b.right] for b in boxes]
     assert np.array_equal(patches, cut)
 

@@ -145,7 +145,7 @@ def test_clipped_intensities_do_not_count():
     assert kept.std() == pytest.approx(0.05, rel=0.01)
 
 
-def test_flat_places():
+def test_flat_mask():
     truth = np.zeros((100, 200, 3), np.float32)
     truth[:, 100:] = 0.5
     truth += np.linspace(0, 0.05, 200, dtype=np.float32)[:, None]

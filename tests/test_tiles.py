@@ -15,7 +15,7 @@ from clpipe.engine.check import NOISE, chain_for, example
 from clpipe.engine.extents import Box, whole_image
 from clpipe.engine.ir import Lines, Plan
 from clpipe.engine.options import RunOptions
-from clpipe.engine.runner import Result, Runner, cut_out
+from clpipe.engine.runner import Result, Runner, crop_patches
 from clpipe.engine.tiles import (
     LARGEST_TILE,
     buffer_sizes,
@@ -103,9 +103,10 @@ def patches_in(whole: Result) -> list[Box]:
 def cut(whole: Result, boxes: list[Box]) -> Result:
     """Return the result with parts of its images, one after another."""
     final, encoded = (
-        None if image is None else cut_out(image, boxes) for image in (whole.final, whole.encoded)
+        None if image is None else crop_patches(image, boxes)
+        for image in (whole.final, whole.encoded)
     )
-    kept = {name: cut_out(image, boxes) for name, image in whole.kept.items()}
+    kept = {name: crop_patches(image, boxes) for name, image in whole.kept.items()}
     return Result(final, encoded, kept, whole.estimates)
 
 

@@ -12,7 +12,7 @@ from clpipe.stage import run_reference
 from clpipe.stages.inverse_tone_curve import Standard as InverseStandard
 from clpipe.stages.tone_curve import CAMERA_RAW, Standard
 from clpipe.stages.tone_curve.standard import GREY, GREY_OUT
-from clpipe.stages.tone_curve.table import table_of
+from clpipe.stages.tone_curve.table import load_table
 
 RAMP = np.linspace(0, 1, 300, dtype=np.float32).reshape(10, 10, 3)
 
@@ -102,10 +102,10 @@ def test_a_file_that_cannot_be_read(tmp_path):
 def test_a_file_that_changed_is_read_again(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("0,0\n1,1\n")
-    one = table_of(str(path))
+    one = load_table(str(path))
     path.write_text("0,0\n1,0.5\n")
     assert one[-1] == 1
-    assert table_of(str(path))[-1] == 0.5
+    assert load_table(str(path))[-1] == 0.5
 
 
 def test_camera_raws_curve_is_a_file_of_the_same_form(develop):

@@ -15,7 +15,7 @@ from clpipe.engine.check import example
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.options import RunOptions, Timing
-from clpipe.engine.runner import Runner, cut_out
+from clpipe.engine.runner import Runner, crop_patches
 from clpipe.stage import Kind
 from tests.conftest import fail_launches
 
@@ -109,7 +109,7 @@ def test_both_ways_give_the_same(device, type_, memory):
             np.testing.assert_equal(getattr(found, name), getattr(expected, name))
         boxes = [Box(x, 2 * x, x + 20, 2 * x + 16) for x in (0, 7, 25)]
         patches = two.submit(image, "k", RunOptions(boxes=boxes))()
-        np.testing.assert_equal(patches.encoded, cut_out(expected.encoded, boxes))
+        np.testing.assert_equal(patches.encoded, crop_patches(expected.encoded, boxes))
 
 
 def queued(device: Device, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:

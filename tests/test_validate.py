@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from clpipe.analysis.matching.columns import Places, figures_of, noise_of_frames
-from clpipe.analysis.signature import flat_places, luma
+from clpipe.analysis.matching.columns import ValidPixels, figures_of, noise_of_frames
+from clpipe.analysis.signature import flat_mask, luma
 from clpipe.camera.profile import load_camera
 from clpipe.images.read import read_image
 from clpipe.pipeline import Pipeline
@@ -65,7 +65,7 @@ def test_noise_by_intensity_and_chroma_are_a_cameras(iso):
     pair = real_cameras.develop(read_image(validate.RENDER).pixels, iso)
     clean = pair.clean.astype(np.float64)
     noise = noise_of_frames([pair.noisy.astype(np.float32)], clean)
-    found = figures_of(noise, Places(flat_places(clean, 12), luma(clean)))
+    found = figures_of(noise, ValidPixels(flat_mask(clean, 12), luma(clean)))
     middle = found["sigma_64"]
     assert 0.45 < found["sigma_12"] / middle < 0.84
     assert 0.60 < found["sigma_24"] / middle < 0.92

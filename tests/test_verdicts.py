@@ -14,7 +14,7 @@ from clpipe.engine.cpu_target import Target, compile_for
 from clpipe.engine.discovery import choose, find_devices
 from clpipe.engine.runtimes import attempt, platform_id
 from clpipe.engine.store import Store
-from clpipe.engine.verdicts import Verdicts, tried
+from clpipe.engine.verdicts import Verdicts, run_tests
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def test_what_ends_the_process_is_passed_over_and_the_rest_tried(program):
         *SIGILL*) {say(at="attempt", name="b")}; {say(attempt="b", problem="", passing=False)};;
         *) {say(at="attempt", name="a")}; echo noise; echo no such instruction >&2; kill -ILL $$;;
         esac""")
-    found = tried(Verdicts())
+    found = run_tests(Verdicts())
     assert found.attempts == {
         "a": "it crashes the process (SIGILL): no such instruction",
         "b": "",
@@ -53,7 +53,7 @@ def test_a_platform_that_ends_the_process_is_named(program):
         *SIGABRT*) ;;
         *) {say(at="platform", name="A")}; kill -ABRT $$;;
         esac""")
-    assert tried(Verdicts()).platforms == {"A": "it crashes the process (SIGABRT)"}
+    assert run_tests(Verdicts()).platforms == {"A": "it crashes the process (SIGABRT)"}
 
 
 def test_the_driver_that_ends_the_listing_is_hidden(program, monkeypatch):
@@ -63,22 +63,22 @@ def test_the_driver_that_ends_the_listing_is_hidden(program, monkeypatch):
         *'"bad":'*) {say(at="list")};;
         *) {say(at="list")}; kill -SEGV $$;;
         esac""")
-    assert tried(Verdicts()).hidden == {"bad": "it crashes the process (SIGSEGV)"}
+    assert run_tests(Verdicts()).hidden == {"bad": "it crashes the process (SIGSEGV)"}
     monkeypatch.setattr(verdicts, "installed_drivers", list)
-    assert tried(Verdicts()).listing == "it crashes the process (SIGSEGV)"
+    assert run_tests(Verdicts()).listing == "it crashes the process (SIGSEGV)"
 
 
 @pytest.mark.parametrize("script", ["exit 1", "kill -KILL $$", f"{say(at='list')}; kill -KILL $$"])
 def test_what_says_nothing_of_runtimes_is_not_kept(program, tmp_path, script):
     program(script)
-    assert not tried(Verdicts()).lasting
+    assert not run_tests(Verdicts()).lasting
     assert not verdicts.verdicts().problems
     assert not (tmp_path / "known").exists()
 
 
 def test_a_program_that_cannot_be_started_says_nothing_either(monkeypatch):
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
-    assert tried(Verdicts()) == Verdicts(lasting=False)
+    assert run_tests(Verdicts()) == Verdicts(lasting=False)
 
 
 def test_a_runtime_that_hangs_is_passed_over(program, monkeypatch):
@@ -87,7 +87,7 @@ def test_a_runtime_that_hangs_is_passed_over(program, monkeypatch):
         *longer*) ;;
         *) {say(at="attempt", name="a")}; exec sleep 9;;
         esac""")
-    assert tried(Verdicts()).attempts["a"].startswith("it takes longer than 0.3 s")
+    assert run_tests(Verdicts()).attempts["a"].startswith("it takes longer than 0.3 s")
 
 
 def test_what_is_known_is_not_tried_again_unless_it_failed(program, tmp_path):
@@ -133,15 +133,15 @@ def test_a_device_is_tried_for_each_target_it_may_compile_for(device, monkeypatc
 @pytest.mark.slow
 def test_this_machines_device_computes_as_numpy_does(device, monkeypatch):
     info = device.info
-    assert trial.problem_of(info.handle, info.lanes) == ""
+    assert trial.find_problem(info.handle, info.lanes) == ""
     with monkeypatch.context() as patch:
-        patch.setattr(trial, "TEXT", trial.TEXT.replace("a / divisor", "a * divisor"))
+        patch.setattr(trial, "SOURCE", trial.SOURCE.replace("a / divisor", "a * divisor"))
         assert (
-            trial.problem_of(info.handle, info.lanes)
+            trial.find_problem(info.handle, info.lanes)
             == "1024 of 2048 numbers that it computes are wrong"
         )
-        patch.setattr(trial, "TEXT", "this is no C")
-        assert trial.problem_of(info.handle, info.lanes).startswith("it cannot compile kernels: ")
+        patch.setattr(trial, "SOURCE", "this is no C")
+        assert trial.find_problem(info.handle, info.lanes).startswith("it cannot compile kernels: ")
 
 
 def test_the_cpu_that_llvm_does_not_know_is_found(device):
@@ -150,7 +150,7 @@ def test_the_cpu_that_llvm_does_not_know_is_found(device):
         pytest.skip("needs version 3.0 of the package pocl-binary-distribution")
     compile_for(info.handle, Target("generic", "as on an AMD Zen 5"))
     try:
-        problem = trial.problem_of(info.handle, 8)
+        problem = trial.find_problem(info.handle, 8)
     finally:
         compile_for(info.handle, info.target)
     assert problem == "it cannot compile kernels: unknown target CPU 'generic'"
@@ -158,7 +158,7 @@ def test_the_cpu_that_llvm_does_not_know_is_found(device):
 
 @pytest.mark.slow
 def test_the_trial_as_a_program(device):
-    found = tried(Verdicts())
+    found = run_tests(Verdicts())
     info = device.info
     assert found.of(info.handle.platform, info.handle) == (info.target, "")
     assert found.lasting and not found.listing
@@ -215,10 +215,10 @@ def test_a_runtime_that_is_busy_is_not_blamed(monkeypatch, capfd):
     def busy(*_):
         raise cl.MemoryError("CL_OUT_OF_RESOURCES")
 
-    monkeypatch.setattr(trial, "problem_of", busy)
+    monkeypatch.setattr(trial, "find_problem", busy)
     monkeypatch.setattr(trial.os, "dup2", lambda *_: None)
     monkeypatch.setattr(trial, "sys", SimpleNamespace(stdout=sys.__stdout__, stderr=sys.stderr))
-    trial.try_all({"hidden": {}, "platforms": {}, "attempts": {}, "only_listing": False})
+    trial.test_all({"hidden": {}, "platforms": {}, "attempts": {}, "only_listing": False})
     lines = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
     results = [line for line in lines if "attempt" in line]
     assert results and all(r["problem"] == "" and r["passing"] for r in results)

@@ -21,7 +21,7 @@ from clpipe.reference.panorama import (
     View,
     Views,
 )
-from clpipe.reference.projection import seen_faces
+from clpipe.reference.projection import visible_faces
 from clpipe.reference.wide import WideLens
 from tests.test_tiles import in_tiles
 
@@ -66,15 +66,15 @@ def rays_of(view):
 
 
 def faces(turns, angle=90.0):
-    return [View.of_angle(turn, SIDE, SIDE, angle) for turn in turns]
+    return [View.from_angle(turn, SIDE, SIDE, angle) for turn in turns]
 
 
 OVERLAPPING = {
-    "left": View.of_angle(
+    "left": View.from_angle(
         ((0.5, 0.0, -(0.75**0.5)), (0.0, 1.0, 0.0), (0.75**0.5, 0.0, 0.5)), SIDE, SIDE, 110.0
     ),
-    "middle": View.of_angle(FRONT, SIDE, SIDE, 100.0),
-    "right": View.of_angle(
+    "middle": View.from_angle(FRONT, SIDE, SIDE, 100.0),
+    "right": View.from_angle(
         ((0.5, 0.0, 0.75**0.5), (0.0, 1.0, 0.0), (-(0.75**0.5), 0.0, 0.5)), SIDE, SIDE, 110.0
     ),
 }
@@ -158,25 +158,25 @@ def test_the_models_are_those_of_their_papers():
     ahead = rays[:, rays[2] > 0.1]
     lens = lens_of("kannala_brandt")
     (cx, cy) = lens.principal_point
-    assert np.allclose(lens.seen(ahead), opencv(ahead, 60, 62, cx, cy, (-0.02, 0.003, 0, 0)))
+    assert np.allclose(lens.project(ahead), opencv(ahead, 60, 62, cx, cy, (-0.02, 0.003, 0, 0)))
     x, y, z = rays
     wide = np.arccos(z) < np.radians(110)
     lens = lens_of("unified")
     depth = np.sqrt(1.1 * (x * x + y * y) + z * z)
     across = 60 * x / (0.6 * depth + 0.4 * z) + lens.principal_point[0]
-    assert np.allclose(lens.seen(rays)[0][wide], across[wide])
+    assert np.allclose(lens.project(rays)[0][wide], across[wide])
     lens = lens_of("double_sphere")
     second = np.sqrt(x * x + y * y + (-0.2 + z) ** 2)
     across = 55 * x / (0.59 * second + 0.41 * (-0.2 + z)) + lens.principal_point[0]
-    assert np.allclose(lens.seen(rays)[0][wide], across[wide])
-    assert not np.isfinite(lens.seen(rays)[0][~wide]).any()
+    assert np.allclose(lens.project(rays)[0][wide], across[wide])
+    assert not np.isfinite(lens.project(rays)[0][~wide]).any()
 
 
 @pytest.mark.parametrize("model", LENSES)
 def test_rays_and_places_are_inverse(model):
     lens = lens_of(model)
     x, y, rays = places_of(lens)
-    back = lens.seen(rays)
+    back = lens.project(rays)
     known = np.isfinite(rays[0])
     assert np.abs(back[0] - x)[known].max() < 1e-5
     assert np.abs(back[1] - y)[known].max() < 1e-5
@@ -191,7 +191,7 @@ def test_intrinsics_are_opencvs_with_what_they_leave(model):
     angles = np.linspace(0.01, np.radians(lens.field_of_view / 2) - 1e-6, 200)
     rays = np.stack([np.sin(angles), np.zeros(200), np.cos(angles)])
     middles = [each.principal_point[0] for each in (own, lens)]
-    off = (own.seen(rays)[0] - middles[0]) - (lens.seen(rays)[0] - middles[1])
+    off = (own.project(rays)[0] - middles[0]) - (lens.project(rays)[0] - middles[1])
     assert np.abs(off).max() <= found.residual * 1.02 + 1e-6
     assert found.residual == 0 if model == "kannala_brandt" else 0 < found.residual < 0.1
 
@@ -269,7 +269,7 @@ def test_overlapping_views_and_what_no_view_shows(write, clpipe):
 
 
 def test_one_render_is_a_view_of_its_own_focal_length(write, clpipe):
-    view = View.of_angle(FRONT, SIDE, SIDE, 100.0)
+    view = View.from_angle(FRONT, SIDE, SIDE, 100.0)
     write("a.exr", **colours(light(rays_of(view))))
     narrow = options_of("kannala_brandt", field_of_view=90.0)
     output = clpipe("run", "a.exr", "-o", "o", *RUN, *narrow, status=1).output
@@ -406,7 +406,7 @@ def test_layers_of_faces_go_along(write, clpipe):
     assert (found["Depth.Z"][inner] < 0).any()
     for i, c in enumerate("XYZ"):
         assert found[f"N.{c}"][inner] == pytest.approx(NORMALS[label][..., i][inner], abs=1e-6)
-    ends = lens.seen(moved(rays, distance, MOVE))
+    ends = lens.project(moved(rays, distance, MOVE))
     for name, start, end in zip("XY", (x, y), ends, strict=True):
         known = inner & np.isfinite(end) & np.isfinite(found[f"Flow.{name}"])
         assert known.mean() > 0.5
@@ -457,18 +457,18 @@ def test_a_dataset_of_faces_that_exist(write, clpipe):
 
 
 def test_only_faces_that_a_lens_sees_are_rendered():
-    side, names = seen_faces(lens_of("kannala_brandt", field_of_view=80.0))
+    side, names = visible_faces(lens_of("kannala_brandt", field_of_view=80.0))
     assert names == ["front"]
     assert side == 2 * 62
-    assert seen_faces(lens_of("unified", field_of_view=170.0))[1] == [
+    assert visible_faces(lens_of("unified", field_of_view=170.0))[1] == [
         "front",
         "right",
         "left",
         "up",
         "down",
     ]
-    assert len(seen_faces(lens_of("unified", field_of_view=220.0))[1]) == 5
-    assert len(seen_faces(lens_of("unified", field_of_view=200.0))[1]) == 5
+    assert len(visible_faces(lens_of("unified", field_of_view=220.0))[1]) == 5
+    assert len(visible_faces(lens_of("unified", field_of_view=200.0))[1]) == 5
 
 
 def test_a_cube_map_that_is_none(write, clpipe):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.analysis.crops import Place, choose_places
+from clpipe.analysis.crops import Crop, choose_crops
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import Picture, load_picture
 from clpipe.analysis.report import json_number
@@ -19,7 +19,7 @@ from clpipe.base.types import Doubles, Floats
 from clpipe.reference.transfer import srgb_curve
 
 LEVELS = 255  # sigmas are in 8-bit levels
-STRONGEST = 64  # the largest factor by which a difference is amplified
+MAX_GAIN = 64  # the largest factor by which a difference is amplified
 LEFT = "2x2 leaves: the share of its variance after averaging 2x2 (independent noise: 0.25)"
 SHOWN = 99  # percentile of the differences that are not clipped after amplification
 
@@ -52,7 +52,7 @@ class Comparison:
     """The content of a figure; ``notes`` explain its numbers and how pictures are shown."""
 
     labels: tuple[str, ...]
-    places: tuple[Place, ...]
+    places: tuple[Crop, ...]
     rows: tuple[Row, ...]
     noise: tuple[Noise, ...]  # of each picture; empty if not known
     notes: tuple[str, ...]
@@ -84,7 +84,7 @@ def compare(
 
     Args:
         paths: two or more pictures of one size: finished pictures, kept images or renders.
-        crops: see :func:`clpipe.analysis.crops.choose_places`.
+        crops: see :func:`clpipe.analysis.crops.choose_crops`.
         labels: labels of the pictures; without any, the parts in which their paths differ.
         truths: pictures without noise: none, one for all pictures, or one for each.
         difference: whether to add rows of differences from the ground truth, or from the first
@@ -105,7 +105,7 @@ def compare(
                 "pixels; give pictures of one size, which show the same scene"
             )
     pictures, references = list(map(displayed, loaded)), list(map(displayed, true))
-    places = choose_places(crops, np.mean([one.pixels for one in references or pictures], axis=0))
+    places = choose_crops(crops, np.mean([one.pixels for one in references or pictures], axis=0))
     if references:  # one for all, or one for each
         references *= len(pictures) // len(references)
     rows = [Row(place.name, tuple(place.of(one.pixels) for one in pictures)) for place in places]
@@ -122,7 +122,7 @@ def compare(
             f"levels of 255; rms: difference from the truth; sigma: of luma in flat places; {LEFT}"
         ]
     elif flat:
-        noise = [_in_flat_place(one, flat) for one in loaded]
+        noise = [_flat_noise(one, flat) for one in loaded]
         notes = [f"levels of 255; sigma: of luma in the flat place; {LEFT}"]
     if linear := [name for name, one in zip(names, loaded, strict=True) if one.kind != "display"]:
         notes.append(f"linear, shown through sRGB's curve: {', '.join(linear)}")
@@ -196,7 +196,7 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
 
 
 def _with_differences(
-    rows: Sequence[Row], places: Sequence[Place], against: Sequence[Floats]
+    rows: Sequence[Row], places: Sequence[Crop], against: Sequence[Floats]
 ) -> list[Row]:
     """Return the rows, each followed by a row of amplified differences from ``against``."""
     differences = [
@@ -204,7 +204,7 @@ def _with_differences(
         for row, place in zip(rows, places, strict=True)
     ]
     sizes = np.concatenate([np.abs(crop).ravel() for row in differences for crop in row])
-    largest = max(float(np.percentile(sizes, SHOWN)), 0.5 / STRONGEST)
+    largest = max(float(np.percentile(sizes, SHOWN)), 0.5 / MAX_GAIN)
     gain = 2 ** max(int(np.log2(0.5 / largest)), 0)
     found = []
     for row, crops in zip(rows, differences, strict=True):
@@ -222,7 +222,7 @@ def _against_truth(picture: Picture, truth: Picture) -> Noise:
     return Noise(rms * LEVELS, light.sigma * LEVELS, light.energy_left)
 
 
-def _in_flat_place(picture: Picture, place: Place) -> Noise:
+def _flat_noise(picture: Picture, place: Crop) -> Noise:
     """Return the noise of a picture as deviations from a plane in a flat crop."""
     if picture.pixels.ndim == 2:
         return Noise(np.nan, np.nan, np.nan)

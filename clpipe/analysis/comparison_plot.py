@@ -26,7 +26,7 @@ from clpipe.reference.curve import to_8_bit
 log = logging.getLogger(__name__)
 
 DPI = 300
-LARGEST = 1 << 26  # pixels of a figure, 256 MB while it is drawn
+MAX_PIXELS = 1 << 26  # pixels of a figure, 256 MB while it is drawn
 GAP = 12  # px, between crops and as the outer margin
 SIZE, SMALL = 7, 6  # points
 # In px, for text in DejaVu Sans of one point: the height of a line, and the width of a digit.
@@ -82,10 +82,10 @@ def draw(comparison: Comparison, path: Path, zoom: int = 4) -> None:
         bottom += row.crops[0].shape[0] * zoom + GAP
     below = bottom + _height(feet, SIZE)
     height = below + sum(_height([note], SMALL) for note in notes) + GAP
-    if width * height > LARGEST:
+    if width * height > MAX_PIXELS:
         raise RequestError(
-            f"{path}: the figure would have {width}x{height} pixels, more than {LARGEST:,}; give "
-            "smaller crops, fewer of them, or a smaller --zoom"
+            f"{path}: the figure would have {width}x{height} pixels, more than "
+            f"{MAX_PIXELS:,}; give smaller crops, fewer of them, or a smaller --zoom"
         )
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
     page = figure.add_axes((0, 0, 1, 1))

@@ -14,13 +14,13 @@ WIDTH, HEIGHT = 96, 64  # px, of an automatic crop
 SMOOTH = 5  # px: the window over which noise is averaged before the search
 MIDDLE = 0.2, 0.8  # the range of a flat crop's mean display value
 BLACK = 0.08  # display value of luma below which nothing is visible
-MOST_BLACK = 0.05  # the largest share of such pixels in a dark crop
+MAX_BLACK = 0.05  # the largest share of such pixels in a dark crop
 
-BY_HAND = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<box>\d{1,9},\d{1,9},\d{1,9}x\d{1,9})")
+MANUAL = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<box>\d{1,9},\d{1,9},\d{1,9}x\d{1,9})")
 
 
 @dataclass(frozen=True)
-class Place:
+class Crop:
     """A named rectangle of a picture, in px."""
 
     name: str
@@ -33,7 +33,7 @@ class Place:
     def box(self) -> str:
         """Its position and size, in the format of --crop.
 
-        >>> Place("sky", 10, 20, 96, 64).box
+        >>> Crop("sky", 10, 20, 96, 64).box
         '10,20,96x64'
         """
         return f"{self.left},{self.top},{self.width}x{self.height}"
@@ -48,7 +48,7 @@ class Place:
         return min(self.width, self.height) > 0 and right <= width and bottom <= height
 
 
-def choose_places(texts: Sequence[str], picture: Floats) -> list[Place]:
+def choose_crops(texts: Sequence[str], picture: Floats) -> list[Crop]:
     """Return the requested crops in order; without any, one of each kind in :data:`FOUND`.
 
     Args:
@@ -60,8 +60,8 @@ def choose_places(texts: Sequence[str], picture: Floats) -> list[Place]:
     Raises:
         RequestError: a text has another form, or its rectangle exceeds the picture.
 
-    >>> choose_places(["sky=10,20,30x40", "0,0,2x2"], np.zeros((99, 99, 3), np.float32))[0]
-    Place(name='sky', left=10, top=20, width=30, height=40)
+    >>> choose_crops(["sky=10,20,30x40", "0,0,2x2"], np.zeros((99, 99, 3), np.float32))[0]
+    Crop(name='sky', left=10, top=20, width=30, height=40)
     """
     height, width = picture.shape[:2]
     finder = _Finder(picture)
@@ -76,13 +76,13 @@ def choose_places(texts: Sequence[str], picture: Floats) -> list[Place]:
                 )
             places.append(finder.find(text))
             continue
-        match = BY_HAND.fullmatch(text)
+        match = MANUAL.fullmatch(text)
         if match is None:
             raise RequestError(
                 f"--crop: found {text!r}; expected X,Y,WxH in pixels from the left and the top, "
                 f"such as 120,80,96x64 or sky=120,80,96x64, or one of {', '.join(FOUND)}"
             )
-        place = Place(match["name"] or match["box"], *map(int, re.split("[,x]", match["box"])))
+        place = Crop(match["name"] or match["box"], *map(int, re.split("[,x]", match["box"])))
         if not place.within(width, height):
             raise RequestError(
                 f"--crop {text}: this crop is empty or exceeds the pictures, whose size is "
@@ -115,7 +115,7 @@ def saturated(picture: Floats) -> Doubles:
 def dark(picture: Floats) -> Doubles:
     """Score dark places that are hardly anywhere black."""
     light = luma(picture)
-    return _only(-window_means(light), window_means(light < BLACK) <= MOST_BLACK)
+    return _only(-window_means(light), window_means(light < BLACK) <= MAX_BLACK)
 
 
 # For each kind of crop, a function that scores the crop at each upper left corner.
@@ -132,7 +132,7 @@ class _Finder:
         self._smooth: Floats | None = None
         self._free: Mask | None = None
 
-    def find(self, name: str) -> Place:
+    def find(self, name: str) -> Crop:
         if self._smooth is None or self._free is None:
             from scipy import ndimage
 
@@ -144,7 +144,7 @@ class _Finder:
         self._free[
             max(top - HEIGHT + 1, 0) : top + HEIGHT, max(left - WIDTH + 1, 0) : left + WIDTH
         ] = False
-        return Place(name, left, top, WIDTH, HEIGHT)
+        return Crop(name, left, top, WIDTH, HEIGHT)
 
 
 def window_means(plane: Doubles | Mask) -> Doubles:

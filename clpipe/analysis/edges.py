@@ -12,7 +12,7 @@ from clpipe.base.types import Mask
 FLATTEST, STEEPEST = 25, 90  # percentiles of the gradient: flat below the first, steep above
 BINOMIAL = np.array([1, 4, 6, 4, 1]) / 16  # smooths luma like a Gaussian of 1 px
 REACH = len(BINOMIAL) // 2
-FEWEST = 500  # pixels of each
+MIN_SAMPLES = 500  # pixels of each
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Slopes:
         Args:
             noise: the noise of luma, (frame, height, width).
         """
-        if min(self.flat.sum(), self.steep.sum()) < FEWEST:
+        if min(self.flat.sum(), self.steep.sum()) < MIN_SAMPLES:
             return math.nan
         flat, steep = (float((noise[:, mask] ** 2).mean()) for mask in (self.flat, self.steep))
         return math.sqrt(steep / flat) if flat > 0 else math.nan

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from clpipe.base.types import Doubles, Floats, Mask
 
 BINS = 24
-FEWEST = 100  # samples in a bin, for which the standard error of sigma is 7 %
+MIN_SAMPLES = 100  # samples in a bin, for which the standard error of sigma is 7 %
 
 
 @dataclass(frozen=True)
@@ -84,11 +84,11 @@ def noise_by_intensity(
     values = intensity[mask].astype(np.float64)
     samples = noise[:, mask].astype(np.float64)
     index = bin_of(intensity[mask], edges)
-    if np.bincount(index).max() * len(noise) < FEWEST:
+    if np.bincount(index).max() * len(noise) < MIN_SAMPLES:
         edges, index = edges[[0, -1]], np.zeros_like(index)
     bins = len(edges) - 1
     count = np.bincount(index, minlength=bins) * len(noise)
-    used = np.flatnonzero(count >= min(FEWEST, count.max()))
+    used = np.flatnonzero(count >= min(MIN_SAMPLES, count.max()))
 
     def mean_in_bins(weights: Doubles, per: int) -> Doubles:
         return np.bincount(index, weights, minlength=bins)[used] * per / count[used]

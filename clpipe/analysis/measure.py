@@ -46,11 +46,11 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
             not repeats of one scene.
         ImageError: there are no valid pixels.
     """
-    clean, freedom, noise, clipped = against(images, truth)
+    clean, freedom, noise, clipped = measure_against(images, truth)
     first = images[0]
     start = ~truth.clipped() if truth else np.ones(clean.shape, bool)
     if not start.any():
-        raise nothing_counts(first)
+        raise no_valid_samples(first)
     span = clean[start]
     low, high = float(span.min()), float(span.max())
     if high > 0:  # values below black are in the first bin, so the shadows get enough bins
@@ -78,7 +78,9 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
     )
 
 
-def against(images: Sequence[Picture], truth: Picture | None) -> tuple[Floats, float, Floats, Mask]:
+def measure_against(
+    images: Sequence[Picture], truth: Picture | None
+) -> tuple[Floats, float, Floats, Mask]:
     """Return the clean image, its share of degrees of freedom, the noise, and clipped samples.
 
     The arguments and errors are those of :func:`measure`.
@@ -170,7 +172,7 @@ def notes_on(images: Sequence[Picture], truth: Picture | None, noise: Floats) ->
     return notes
 
 
-def nothing_counts(picture: Picture, where: str = "") -> ImageError:
+def no_valid_samples(picture: Picture, where: str = "") -> ImageError:
     """Return the error that there are no valid pixels, in the whole picture or at a site."""
     return ImageError(
         f"{picture.path}: there is nothing to measure{where}: all samples, or their noise, are "
@@ -192,7 +194,7 @@ def picture_channels(
     for c in range(3):
         mask = select_unclipped(clean[..., c], clipped[..., c], edges, mask)
     if not mask.any():
-        raise nothing_counts(first)
+        raise no_valid_samples(first)
     mask = select_flat(clean, noise, mask)
     everywhere = np.ones_like(mask)
     whole = covariance(noise)
@@ -249,7 +251,7 @@ def mosaic_channels(
     for name, at in slices.items():
         mask = select_unclipped(clean[at], clipped[at], edges, start[at])
         if not mask.any():
-            raise nothing_counts(first, f" at the sites of {name}")
+            raise no_valid_samples(first, f" at the sites of {name}")
         curve, centred[at], standard[at] = noise_by_intensity(
             clean[at], noise[at], mask, edges, 1 - freedom
         )

@@ -11,7 +11,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import read_finished, read_image
-from clpipe.images.samples import holds_mosaic, photograph_facts
+from clpipe.images.samples import holds_mosaic, photograph_info
 from clpipe.inputs.kept import embedded_settings
 from clpipe.stage import Context, Kind
 
@@ -72,7 +72,7 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
             f"{path}: this is a camera raw, which this command does not read; run 'clpipe run' "
             "first: '--format png' develops it, '--keep normalize' keeps its mosaic"
         )
-    iso, bits = photograph_facts(path)
+    iso, bits = photograph_info(path)
     finished = read_finished(path, grey=bits == 8)  # grey of more bits may be a mosaic
     if finished is not None:
         step = 1 / (2**bits - 1)
@@ -101,7 +101,7 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
     black, white = context.black_level, context.white_level
     if black is None or white is None:  # not digitised, so nothing is clipped at black
         highest = context.full_scale
-        clean = Picture(path, "mosaic", pixels, context.filters.pattern, white=highest)
+        clean = Picture(path, "mosaic", pixels, context.filter_array.pattern, white=highest)
         return replace(clean, balance=balance, iso=iso)
     full = np.float32(context.full_scale)
     lowest = float(-black / (white - black) * full)
@@ -113,7 +113,9 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
     if kind == Kind.RAW.label:
         pixels = (pixels - np.float32(black)) / np.float32(white - black) * full
     highest = float(full)
-    return Picture(path, "mosaic", pixels, context.filters.pattern, lowest, highest, balance, iso)
+    return Picture(
+        path, "mosaic", pixels, context.filter_array.pattern, lowest, highest, balance, iso
+    )
 
 
 def context_after(settings: Settings, stage: str | None) -> Context:

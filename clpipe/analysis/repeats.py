@@ -23,7 +23,7 @@ BLOCK = 32  # px
 # the mean's gradient. Noise has at most 0.001, and a shift by a pixel has 0.2 at ISO 12800.
 SHIFTED_SHARE = 0.02
 
-FEWEST = 1000  # samples that the checks need
+MIN_SAMPLES = 1000  # samples that the checks need
 
 
 def check_repeats(images: Sequence[Picture], mean: Floats, noise: Floats) -> None:
@@ -37,12 +37,12 @@ def check_repeats(images: Sequence[Picture], mean: Floats, noise: Floats) -> Non
     Raises:
         RequestError: an image shows another scene, is shifted, or has much less noise.
     """
-    refuse_other_scenes(images, noise)
-    refuse_shifted(images, mean, noise)
-    refuse_truth_among_repeats(images, noise)
+    reject_other_scenes(images, noise)
+    reject_shifted(images, mean, noise)
+    reject_truth_among_repeats(images, noise)
 
 
-def refuse_shifted(images: Sequence[Picture], mean: Floats, noise: Floats) -> None:
+def reject_shifted(images: Sequence[Picture], mean: Floats, noise: Floats) -> None:
     """Check that no repeat is shifted against the others, by least squares.
 
     A small shift changes a picture by its gradient times the shift (Lucas and Kanade, IJCAI 1981).
@@ -52,7 +52,7 @@ def refuse_shifted(images: Sequence[Picture], mean: Floats, noise: Floats) -> No
     """
     if mean.ndim == 2:  # neighbouring pixels of a mosaic have different colours
         mean, noise = halved(mean[None, ..., None])[0], halved(noise[..., None])
-    if min(mean.shape[:2]) < 2 or mean.size < FEWEST:
+    if min(mean.shape[:2]) < 2 or mean.size < MIN_SAMPLES:
         return
     gradients = np.gradient(mean, axis=(0, 1))
     table = np.array([[(a * b).sum(dtype=np.float64) for b in gradients] for a in gradients])
@@ -72,7 +72,7 @@ def refuse_shifted(images: Sequence[Picture], mean: Floats, noise: Floats) -> No
         )
 
 
-def refuse_other_scenes(images: Sequence[Picture], noise: Floats) -> None:
+def reject_other_scenes(images: Sequence[Picture], noise: Floats) -> None:
     """Check that no repeat differs from the others over wide areas, like another scene.
 
     Images of less than 2x2 blocks are not checked.
@@ -101,7 +101,7 @@ def refuse_other_scenes(images: Sequence[Picture], noise: Floats) -> None:
         )
 
 
-def refuse_truth_among_repeats(images: Sequence[Picture], noise: Floats) -> None:
+def reject_truth_among_repeats(images: Sequence[Picture], noise: Floats) -> None:
     """Check that no repeat has much less noise than the others, like a ground truth.
 
     Raises:
@@ -110,7 +110,7 @@ def refuse_truth_among_repeats(images: Sequence[Picture], noise: Floats) -> None
     energy = np.square(noise).mean(axis=tuple(range(1, noise.ndim)), dtype=np.float64)
     least = int(energy.argmin())
     others = float(np.median(np.delete(energy, least)))
-    if len(images) > 2 and noise[0].size >= FEWEST and energy[least] < TRUTH_SHARE * others:
+    if len(images) > 2 and noise[0].size >= MIN_SAMPLES and energy[least] < TRUTH_SHARE * others:
         raise RequestError(
             f"{images[least].path} has {energy[least] / others:.2g} times the others' noise; "
             "if it is their clean ground truth, pass it with --truth"

@@ -13,7 +13,7 @@ DRIFT = 12.0  # px; smoother differences are changes of light or focus, not nois
 SMOOTH = 3.0  # px: blur of the picture in which flat areas are found
 FLAT = 60  # percentile of the gradient
 BIN = 8  # levels per bin of intensity
-FEWEST = 200  # samples in a bin
+MIN_SAMPLES = 200  # samples in a bin
 DARKEST, BRIGHTEST = 30, 225  # luma
 
 LUMA = np.array([0.299, 0.587, 0.114])  # BT.601
@@ -29,7 +29,7 @@ def chroma(noise: Doubles, of_luma: Doubles) -> tuple[Doubles, Doubles]:
     return 0.564 * (noise[..., 2] - of_luma), 0.713 * (noise[..., 0] - of_luma)
 
 
-def flat_places(mean: NDArray[np.number], darkest: float = DARKEST) -> Mask:
+def flat_mask(mean: NDArray[np.number], darkest: float = DARKEST) -> Mask:
     """Return the pixels of a picture without noise that are flat, and not dark or bright.
 
     In flat pixels the gradient of smoothed luma is below its 60th percentile. They are at least two

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.analysis.measure import against
+from clpipe.analysis.measure import measure_against
 from clpipe.analysis.pictures import Picture
 
 PER_STOP = 2  # steps of intensity
-FEWEST = 400  # samples in a step, for which the standard error of the ratio is 0.3 dB
+MIN_SAMPLES = 400  # samples in a step, for which the standard error of the ratio is 0.3 dB
 STOPS = 24  # the lowest step is this far below the brightest
 
 
@@ -40,7 +40,7 @@ def snr_curve(images: Sequence[Picture], truth: Picture | None = None) -> list[S
     Raises:
         RequestError, ImageError: as there.
     """
-    clean, _, noise, clipped = against(images, truth)
+    clean, _, noise, clipped = measure_against(images, truth)
     counts = (clean > 0) & ~np.any(clipped, axis=0)
     if truth:
         counts &= ~truth.clipped()
@@ -52,7 +52,7 @@ def snr_curve(images: Sequence[Picture], truth: Picture | None = None) -> list[S
     curve = []
     for step in range(STOPS * PER_STOP, -1, -1):
         own = steps == step
-        if int(own.sum()) * len(noise) < FEWEST:
+        if int(own.sum()) * len(noise) < MIN_SAMPLES:
             continue
         mean = float(light[own].mean())
         # The mean is subtracted, because a difference of tone is not noise.

@@ -7,14 +7,14 @@ from typing import Any
 
 from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
-from clpipe.base.text import several
+from clpipe.base.text import as_texts
 from clpipe.base.types import plain
 from clpipe.base.urls import path_of
-from clpipe.base.validation import typed
+from clpipe.base.validation import check_argument_types
 from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.session import Images, Run
 from clpipe.chain.formats import format_named
-from clpipe.chain.options import OPTIONS, PER_IMAGE, Moments, RedoName, Transfer, check_option
+from clpipe.chain.options import DEFAULT_PATCHES, OPTIONS, Moments, RedoName, Transfer, check_option
 from clpipe.chain.rendition import parse_bracket
 from clpipe.chain.request import Request
 from clpipe.inputs.find import parse_shard
@@ -39,7 +39,7 @@ FIELD_NAMES = {"format": "formats", "webdataset": "per_tar", "device": "devices"
 Texts = str | Path | Sequence[str | Path]  # one or several
 
 
-@typed
+@check_argument_types
 def run(
     inputs: Texts,
     output: str | Path,
@@ -208,11 +208,11 @@ def run_of(
     }
     series, values = split_series(plain({**settings, **series_options}))
     for name, value in set_options.items():
-        converted = several(value) if OPTIONS[name].type_ is list else value
+        converted = as_texts(value) if OPTIONS[name].type_ is list else value
         set_options[name] = CONVERTERS[name](converted) if name in CONVERTERS else converted
         check_option(name, set_options[name])
     if "patch" in set_options:
-        set_options.setdefault("patches_per_image", PER_IMAGE)
+        set_options.setdefault("patches_per_image", DEFAULT_PATCHES)
     elif ignored := [name for name in ("patches_per_image", "augment") if set_options.get(name)]:
         raise RequestError(
             f"--{ignored[0].replace('_', '-')}: this option needs patches; add --patch SIZE"

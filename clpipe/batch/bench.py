@@ -22,7 +22,7 @@ from clpipe.batch.sinks import Folder
 from clpipe.batch.threads import Batch
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.request import Request
-from clpipe.engine.bench import input_of, scene
+from clpipe.engine.bench import benchmark_image, scene
 from clpipe.engine.device import Device
 from clpipe.images.write import write_exr
 from clpipe.inputs.find import find_jobs
@@ -103,7 +103,7 @@ def bench_batch(device: Device, request: Request, workload: Workload) -> BatchSp
     with tempfile.TemporaryDirectory(prefix="clpipe-bench-") as name:
         folder = Path(name)
         chain = request.chain()
-        picture = input_of(chain, workload.width, workload.height)
+        picture = benchmark_image(chain, workload.width, workload.height)
         write_images(folder / "in", workload, picture, chain.source)
         loader = ImageLoader(request)
         jobs = find_jobs([str(folder / "in")], folder / "out")

@@ -19,7 +19,7 @@ from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.spec import RunSpec, shifted
 from clpipe.batch.threads import Batch
-from clpipe.chain.paths import from_folder
+from clpipe.chain.paths import resolve_paths
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.discovery import DeviceInfo, choose_all, find_devices
 from clpipe.images.write import versions
@@ -49,16 +49,16 @@ class DaskSpec(RunSpec):
         folder, request_ = self.folder, self.request
         request = replace(
             request_,
-            config=None if request_.config is None else from_folder(folder, request_.config),
-            options=from_folder(folder, request_.options),
-            image=from_folder(folder, request_.image),
+            config=None if request_.config is None else resolve_paths(folder, request_.config),
+            options=resolve_paths(folder, request_.options),
+            image=resolve_paths(folder, request_.image),
         )
         execution = replace(self.execution, output=folder / self.execution.output)
         return replace(self, request=request, execution=execution)
 
     def absolute_job(self, job: Job) -> Job:
         """Return a job with absolute names of files."""
-        values = from_folder(self.folder, job.values)
+        values = resolve_paths(self.folder, job.values)
         first, *others = (self.folder / path for path in job.paths)
         return replace(
             job, path=first, subframes=tuple(others), values=values, as_written=job.input

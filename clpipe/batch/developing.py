@@ -115,7 +115,7 @@ class Developers:
     def is_small(self, state: JobState) -> bool:
         """Return whether a job's image is small enough to share launches with others."""
         size = state.source.pixels.shape[1::-1] if state.source else (0, 0)
-        return all(each is not None and each.stacks(*size) for each in self.devices)
+        return all(each is not None and each.can_stack(*size) for each in self.devices)
 
     def develop(self, states: Sequence[JobState]) -> list[list[RenditionTask]]:
         """Compute all renditions of jobs, some at a time, and return them by job when finished."""

@@ -7,12 +7,12 @@ from dataclasses import replace
 from math import prod
 
 from clpipe.base.errors import ImageError
-from clpipe.base.memory import Left, available_memory, in_words, memory_left
-from clpipe.base.system import give_back_memory
+from clpipe.base.memory import FreeMemory, available_memory, format_bytes, free_memory
+from clpipe.base.system import trim_memory
 from clpipe.chain.chain import Chain
 from clpipe.chain.formats import DNG, FORMATS
 from clpipe.engine.device import Device
-from clpipe.images.claims import Claim
+from clpipe.images.claims import MemoryClaim
 
 FLOAT_PIXEL = 12  # bytes of a pixel of three floats
 NUMPY_PIXEL = 16 * FLOAT_PIXEL  # bytes of a pixel while the chain runs in NumPy; measured: 152
@@ -34,7 +34,7 @@ def default_budget(sharing: int = 1) -> int | None:
 
 
 def host_bytes(
-    claim: Claim,
+    claim: MemoryClaim,
     chain: Chain,
     renditions: int,
     formats: Sequence[str],
@@ -94,18 +94,18 @@ class MemoryBudget:
         size: int | None,
         devices: Sequence[Device | None] = (),
         drop: Callable[[], None] = lambda: None,
-        left: Callable[[], Left | None] | None = None,
+        left: Callable[[], FreeMemory | None] | None = None,
     ) -> None:
         self._size = size
-        self._sharing = [each for each in devices if each and each.info.in_place]
-        has_staged = any(each and not each.info.in_place for each in devices)
+        self._sharing = [each for each in devices if each and each.info.zero_copy]
+        has_staged = any(each and not each.info.zero_copy for each in devices)
         self._staging = size or 0 if has_staged else 0  # for staging buffers of GPUs
         self._compiling = len(devices)
         self._drop = drop
-        self._left = left or memory_left
+        self._left = left or free_memory
         self._limits: dict[Device, int] = {}  # of devices that were given less for one image
         self._max_free = 0  # the most bytes that were ever free for one image and the devices
-        self._measured: tuple[float, Left | None] = 0.0, Left(0, "")
+        self._measured: tuple[float, FreeMemory | None] = 0.0, FreeMemory(0, "")
         self._taken: dict[str, int] = {}  # bytes, by the stem of an image
         self._queue = threading.Lock()  # lets one image wait at a time, so none overtakes it
         self._changed = threading.Condition()  # guards all of the above; notified when they change
@@ -161,7 +161,7 @@ class MemoryBudget:
         free = self._free(size)
         return free is None or needed(size) <= free.bytes
 
-    def _free(self, size: int) -> Left | None:
+    def _free(self, size: int) -> FreeMemory | None:
         """Return the memory for one more image. Small images may use a recent measurement."""
         when, free = self._measured
         now = time.monotonic()
@@ -183,7 +183,7 @@ class MemoryBudget:
             ImageError: there is not enough memory.
         """
         self._drop()
-        give_back_memory()
+        trim_memory()
         free = self._free(size)
         min_memory = min(
             MIN_DEVICE_MEMORY, 4 * size + UNCOUNTED // 2
@@ -193,7 +193,7 @@ class MemoryBudget:
             for device in self._sharing:
                 if device.memory > min_memory:
                     self._limits[device] = device.memory
-                    device.limit(min_memory)
+                    device.limit_memory(min_memory)
             deadline = time.monotonic() + WAIT_SECONDS
             while not (fits := self._fits(size)) and time.monotonic() < deadline:
                 time.sleep(WAIT_SECONDS / 20)
@@ -202,11 +202,11 @@ class MemoryBudget:
             free = self._free(size)
             possible = free.bytes if free else 0
             self._restore()
-        left = in_words(max(possible, 0))
+        left = format_bytes(max(possible, 0))
         raise ImageError(
-            f"it takes about {in_words(needed(size))} of memory; {left} are left by "
-            f"{free.by if free else 'this machine'}; allow more memory, or use less with --jobs 1 "
-            "or fewer pictures per image"
+            f"it takes about {format_bytes(needed(size))} of memory; {left} are left by "
+            f"{free.limit if free else 'this machine'}; allow more memory, or use less with "
+            "--jobs 1 or fewer pictures per image"
         )
 
     def _restore(self) -> None:

@@ -29,7 +29,7 @@ from clpipe.batch.interrupt import SIGNALS
 from clpipe.batch.local_worker import ProcessConfig
 from clpipe.batch.outcome import FAILED, Outcome
 from clpipe.batch.spec import RunSpec, shifted
-from clpipe.images.claims import Claim
+from clpipe.images.claims import MemoryClaim
 from clpipe.inputs.find import Job
 from clpipe.outputs.folder import remove_unfinished
 
@@ -56,7 +56,7 @@ START = "from clpipe.batch.local_worker import main; main(int(sys.argv[1]))"
 THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")  # up to PoCL 3.1, and from 4 on
 
 
-def default_processes(images: int, claim: Claim, processors: int) -> int:
+def default_processes(images: int, claim: MemoryClaim, processors: int) -> int:
     """Return the default number of processes of a run.
 
     Args:
@@ -111,7 +111,7 @@ class Processes:
         claim: the size of the first image, which stands for all.
     """
 
-    def __init__(self, spec: RunSpec, count: int, claim: Claim) -> None:
+    def __init__(self, spec: RunSpec, count: int, claim: MemoryClaim) -> None:
         self._spec = spec
         self._count = count
         self._is_small = claim.megapixels <= SMALL_MEGAPIXELS

@@ -18,7 +18,7 @@ from clpipe.base.memory import peak_memory
 from clpipe.base.system import open_plain
 from clpipe.batch.interrupt import INTERRUPTED
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS, Outcome
-from clpipe.engine.clipping import MUCH
+from clpipe.engine.clipping import WARNING_SHARE
 from clpipe.inputs.find import Shard
 
 
@@ -57,7 +57,7 @@ class Summary:
         self.old += outcome.old
         if outcome.status == DONE:
             self.megapixels += outcome.megapixels
-            self.much_clipped += outcome.clipped >= MUCH
+            self.much_clipped += outcome.clipped >= WARNING_SHARE
             if outcome.clipped > self.most_clipped[0]:
                 self.most_clipped = outcome.clipped, outcome.job.display_name
         if outcome.error:

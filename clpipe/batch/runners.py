@@ -6,7 +6,7 @@ from collections import deque
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
-from clpipe.chain.rendition import FIRST
+from clpipe.chain.rendition import DEFAULT_RENDITION
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
 from clpipe.outputs.recipes import Recipe
@@ -32,7 +32,7 @@ class Runners:
     ) -> None:
         self._writer = writer
         self._device = device
-        first = writer.runner(Recipe(FIRST, chain, (), ""), device)
+        first = writer.runner(Recipe(DEFAULT_RENDITION, chain, (), ""), device)
         try:
             first.compile(half)
         except ImageError as error:  # not even 8x8 pixels fit

@@ -11,7 +11,7 @@ from clpipe.base.digests import stamp_of
 from clpipe.base.errors import DeviceError, ImageError, NoPictureError, OutputError, RequestError
 from clpipe.base.files import FileGroup, deferred_files
 from clpipe.base.types import Array
-from clpipe.base.urls import fetched
+from clpipe.base.urls import fetched_files
 from clpipe.batch.job_state import JobState
 from clpipe.batch.memory_budget import host_bytes
 from clpipe.batch.outcome import LEFT_OUT, SKIPPED, Span
@@ -26,7 +26,7 @@ from clpipe.chain.rendition import Rendition
 from clpipe.engine.clipping import clipped_share
 from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions, Timing
-from clpipe.engine.runner import Result, Runner, submit_together
+from clpipe.engine.runner import Result, Runner, submit_batch
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.existing import ExistingFiles, Redo
@@ -103,7 +103,7 @@ class ImageWorker:
         results = min(len(writer.renditions_of(job)), most)
         extra_images = 2 * self.layer_count + self.later_exposures
         if shutter := self.loader.shutter(job):
-            extra_images += 1 + self.later_exposures + bool(shutter.layer_of_light)
+            extra_images += 1 + self.later_exposures + bool(shutter.light_layer)
         # The noise of baselines is measured on floats.
         formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
         kinds = results, formats, writer.request.keep, extra_images, in_numpy
@@ -135,7 +135,7 @@ class ImageWorker:
                 renditions = self._missing(state)
                 if renditions:
                     state.loader = self.loader.for_job(job)
-                    with fetched(job.paths) as (first, *others):
+                    with fetched_files(job.paths) as (first, *others):
                         if first != job.path:
                             here = replace(job, path=first, subframes=tuple(others))
                         admit(here)
@@ -237,11 +237,11 @@ class ImageWorker:
         waits: list[Callable[[], Result] | None]
         if len(requested) == 1:
             waits = [
-                self._attempt(requested[0][0], lambda: submit_together(ready)[0]) if ready else None
+                self._attempt(requested[0][0], lambda: submit_batch(ready)[0]) if ready else None
             ]
         else:
             try:
-                results = iter(submit_together(ready) if ready else ())
+                results = iter(submit_batch(ready) if ready else ())
                 waits = [next(results) if order else None for order in orders]
             except DeviceError:
                 raise
@@ -261,10 +261,14 @@ class ImageWorker:
         pixels, device = source.pixels, runner.device
         width, height = runner.chain.size(*pixels.shape[1::-1])
         boxes = [patch.box for patch in state.patches]
-        is_used_again = runner.encode and not boxes and device and not device.stacks(width, height)
+        is_used_again = (
+            runner.encode and not boxes and device and not device.can_stack(width, height)
+        )
         reused = self._spare.take((height, width, *pixels.shape[2:])) if is_used_again else None
         timings: list[Timing] | None = [] if self._trace and device else None
-        options = RunOptions(timings, into=reused, unchanged=True, boxes=boxes, later=source.later)
+        options = RunOptions(
+            timings, into=reused, unchanged=True, boxes=boxes, later_exposures=source.later
+        )
         return runner, pixels, recipe.noise_key, options
 
     def _finish(

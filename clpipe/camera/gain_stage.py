@@ -11,9 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from clpipe.base.tracing import call
 
-LARGEST = 1e9  # value of a sensor; its square must be finite as well
-Positive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
+MAX_VALUE = 1e9  # value of a sensor; its square must be finite as well
+Positive = Annotated[float, Field(gt=0, le=MAX_VALUE, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, le=MAX_VALUE, allow_inf_nan=False)]
 Offset = Annotated[float, Field(ge=-65535, le=65535, allow_inf_nan=False)]
 TukeyLambda = Annotated[float, Field(gt=-0.5, le=1)]
 Offsets = tuple[Offset, Offset, Offset, Offset]
@@ -37,7 +37,7 @@ class GainStage(BaseModel):
     black_level_error: tuple[NotNegative, ...] | None = None  # DN, of each of them, in each frame
 
     @model_validator(mode="after")
-    def _aligned(self) -> "GainStage":
+    def _check_lengths(self) -> "GainStage":
         for name in type(self).model_fields:
             values = getattr(self, name)
             if values is not None and len(values) != len(self.iso):
@@ -54,17 +54,17 @@ class GainStage(BaseModel):
         The table is converted to electrons and interpolated linearly in log ISO. Outside the table,
         the value in electrons is that of the nearest end.
         """
-        electrons = self.between(iso, _ratios(values, self.system_gain))
+        electrons = self.interpolate(iso, _ratios(values, self.system_gain))
         return electrons * self.gain_at(iso)
 
-    def between(self, iso: float, values: Sequence[float]) -> float:
+    def interpolate(self, iso: float, values: Sequence[float]) -> float:
         """Return the value of a unitless table at an ISO: linear in log ISO, level outside.
 
         >>> stage = GainStage(iso=(100, 400), system_gain=(1, 4), read_noise=(2, 3))
-        >>> round(stage.between(200, (0.1, 0.2)), 6), stage.between(800, (0.1, 0.2))
+        >>> round(stage.interpolate(200, (0.1, 0.2)), 6), stage.interpolate(800, (0.1, 0.2))
         (0.15, 0.2)
         """
-        return call(_interpolated, iso, self.iso, self._logs, values)
+        return call(_interpolate, iso, self.iso, self._logs, values)
 
     @cached_property
     def _logs(self) -> list[float]:
@@ -72,7 +72,7 @@ class GainStage(BaseModel):
 
     def gain_at(self, iso: float) -> float:
         """Return the system gain in DN/e-, interpolated in proportion to the ISO."""
-        return self.between(iso, _ratios(self.system_gain, self.iso)) * iso
+        return self.interpolate(iso, _ratios(self.system_gain, self.iso)) * iso
 
     @cached_property
     def adc_noise(self) -> float:
@@ -91,14 +91,14 @@ class GainStage(BaseModel):
 
 
 @lru_cache(maxsize=1024)  # the same object for the same tables, so that it is traced once
-def _ratios(values: tuple[float, ...], over: tuple[float, ...]) -> tuple[float, ...]:
-    return tuple(value / divisor for value, divisor in zip(values, over, strict=True))
+def _ratios(values: tuple[float, ...], divisors: tuple[float, ...]) -> tuple[float, ...]:
+    return tuple(value / divisor for value, divisor in zip(values, divisors, strict=True))
 
 
-def _interpolated(
+def _interpolate(
     iso: float, isos: Sequence[float], logs: Sequence[float], values: Sequence[float]
 ) -> float:
-    """Return the value at an ISO of a table; see :meth:`GainStage.between`."""
+    """Return the value at an ISO of a table; see :meth:`GainStage.interpolate`."""
     after = bisect_right(isos, iso)
     if after in (0, len(isos)):
         return values[0 if after == 0 else -1]

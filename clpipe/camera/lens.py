@@ -11,13 +11,13 @@ from typing import Any
 from xml.etree import ElementTree
 
 from clpipe.base.errors import KeyedError, RequestError
-from clpipe.base.extras import installing
+from clpipe.base.extras import install_command
 from clpipe.base.text import one_line
 from clpipe.camera.profile import Camera
 
-INSTALL = installing("lensfunpy")
-FAR = 1000.0  # m, for lensfun's calibrations at infinity
-OTHERS = 2  # words of a lens's name, besides the maker, that you may omit
+INSTALL = install_command("lensfunpy")
+INFINITY_DISTANCE = 1000.0  # m, for lensfun's calibrations at infinity
+MAX_EXTRA_WORDS = 2  # words of a lens's name, besides the maker, that you may omit
 RECTILINEAR = "RECTILINEAR"  # lensfun's type of the lenses that clpipe supports
 SAME_CROP = 1.01  # ratio of crop factors that count as equal
 ASPECT = 1.5  # of the images that a lens was calibrated with, if the database does not contain it
@@ -80,22 +80,24 @@ def _calibration(
 ) -> LensCalibration:
     database = _database()
     crop = _crop_factor(database, *models)
-    lens = _found(database, name, crop)
+    lens = _find_lens(database, name, crop)
     focal = _focal_length(lens, focal_length)
     ratio = lens.crop_factor / (crop or lens.crop_factor)
-    falloff: dict[str, Any] = {}
-    if bend := _bend(lens, focal):
+    vignetting: dict[str, Any] = {}
+    if distortion := _distortion(lens, focal):
         # lensfun's r = 1 is half the short side of the image that the lens was calibrated with.
-        bend |= {"unit": 1 / (hypot(1, _aspect(lens)) * ratio)}
+        distortion |= {"unit": 1 / (hypot(1, _aspect(lens)) * ratio)}
     if aperture is not None:
         _check_aperture(lens, aperture)
-        found = lens.interpolate_vignetting(focal, aperture, focus_distance or FAR)
-        if found and found.model.name == "PA":
-            terms = (term * ratio ** (2 * i) for i, term in enumerate(found.terms, 1))
-            falloff = {"method": "pa"} | dict(zip(("k1", "k2", "k3"), terms, strict=True))
+        correction = lens.interpolate_vignetting(
+            focal, aperture, focus_distance or INFINITY_DISTANCE
+        )
+        if correction and correction.model.name == "PA":
+            terms = (term * ratio ** (2 * i) for i, term in enumerate(correction.terms, 1))
+            vignetting = {"method": "pa"} | dict(zip(("k1", "k2", "k3"), terms, strict=True))
     is_smaller = crop is not None and lens.crop_factor > crop * SAME_CROP
-    own = crop or lens.crop_factor
-    return LensCalibration(_full(lens), focal, bend, falloff, own, is_smaller)
+    image_crop = crop or lens.crop_factor
+    return LensCalibration(_name(lens), focal, distortion, vignetting, image_crop, is_smaller)
 
 
 def name_note(name: str) -> str:
@@ -104,11 +106,11 @@ def name_note(name: str) -> str:
     Raises:
         KeyedError: lensfunpy is not installed, or there is no such lens, or several.
     """
-    lens = _found(_database(), name, None)
-    if not _left_out(lens, _words(name)):
+    lens = _find_lens(_database(), name, None)
+    if not _extra_words(lens, _words(name)):
         return ""
     return (
-        f"warning: lens: '{one_line(name)}' is a part of a name, and clpipe uses {_full(lens)}; "
+        f"warning: lens: '{one_line(name)}' is a part of a name, and clpipe uses {_name(lens)}; "
         "to be sure of the lens, use its full name"
     )
 
@@ -120,28 +122,28 @@ def lens_names() -> list[str]:
         KeyedError: lensfunpy is not installed.
     """
     lenses = _database().lenses
-    return sorted({_full(lens) for lens in lenses if lens.type.name == RECTILINEAR})
+    return sorted({_name(lens) for lens in lenses if lens.type.name == RECTILINEAR})
 
 
-def _bend(lens: Any, focal: float) -> dict[str, Any]:
+def _distortion(lens: Any, focal: float) -> dict[str, Any]:
     """Return the method of ``distortion`` and its coefficients; empty if lensfun has no data."""
-    bend = lens.interpolate_distortion(focal)
+    correction = lens.interpolate_distortion(focal)
     lateral = lens.interpolate_tca(focal)
     names = {"POLY3": ("k1",), "POLY5": ("k1", "k2"), "PTLENS": ("a", "b", "c")}
     table: dict[str, Any] = {}
-    if bend and bend.model.name in names:
-        table = {"method": bend.model.name.lower()}
-        table |= dict(zip(names[bend.model.name], bend.terms, strict=False))
+    if correction and correction.model.name in names:
+        table = {"method": correction.model.name.lower()}
+        table |= dict(zip(names[correction.model.name], correction.terms, strict=False))
     colours = {"LINEAR": ("kr", "kb"), "POLY3": ("vr", "vb", "cr", "cb", "br", "bb")}
     if lateral and lateral.model.name in colours:
-        own = dict(zip(colours[lateral.model.name], lateral.terms, strict=False))
-        table = {"method": "poly3", **table, **own}
+        coefficients = dict(zip(colours[lateral.model.name], lateral.terms, strict=False))
+        table = {"method": "poly3", **table, **coefficients}
     return table
 
 
 def _database() -> Any:
     try:
-        return _loaded()
+        return _load_database()
     except ImportError:
         raise KeyedError(
             "lens",
@@ -150,7 +152,7 @@ def _database() -> Any:
 
 
 @cache
-def _loaded() -> Any:
+def _load_database() -> Any:
     import lensfunpy
 
     return lensfunpy.Database()
@@ -166,16 +168,16 @@ def _words(text: str) -> list[str]:
     return [word for word in words if word not in ("mm", "f")]
 
 
-def _full(lens: Any) -> str:
+def _name(lens: Any) -> str:
     """Return maker and model, without repeating the maker."""
-    of_maker = lens.model.lower().startswith(lens.maker.lower())
-    return lens.model if of_maker else f"{lens.maker} {lens.model}"
+    has_maker = lens.model.lower().startswith(lens.maker.lower())
+    return lens.model if has_maker else f"{lens.maker} {lens.model}"
 
 
-def _found(database: Any, name: str, crop: float | None) -> Any:
+def _find_lens(database: Any, name: str, crop: float | None) -> Any:
     """Return the lens with this name, or the one with all its words and the fewest others.
 
-    It may have at most :data:`OTHERS` other words.
+    It may have at most :data:`MAX_EXTRA_WORDS` other words.
 
     If a lens has several calibrations, the one on the largest sensor that is not larger than the
     camera's is used, like in lensfun.
@@ -183,44 +185,46 @@ def _found(database: Any, name: str, crop: float | None) -> Any:
     Raises:
         KeyedError: there is no such lens, or several.
     """
-    wanted = _words(name)
-    having = [
-        (len(words) - len(wanted), lens)
+    words_wanted = _words(name)
+    matches = [
+        (len(words) - len(words_wanted), lens)
         for lens in database.lenses
-        if not _missing(wanted, words := _words(_full(lens)))
+        if not _lacks_word(words_wanted, words := _words(_name(lens)))
     ]
-    if not wanted or not having:
-        names = sorted({_full(lens) for lens in database.lenses})
+    if not words_wanted or not matches:
+        names = sorted({_name(lens) for lens in database.lenses})
         by_lower = {each.lower(): each for each in names}
-        near = [by_lower[each] for each in get_close_matches(name.lower(), by_lower, 3, 0.3)]
+        similar = [by_lower[each] for each in get_close_matches(name.lower(), by_lower, 3, 0.3)]
         nearest = (
-            f"the nearest are {', '.join(near)}" if near else "use a name with its maker and model"
+            f"the nearest are {', '.join(similar)}"
+            if similar
+            else "use a name with its maker and model"
         )
         raise KeyedError("lens", f"lens: lensfun has no lens '{one_line(name)}'; {nearest}")
-    fewest = min(count for count, _ in having)
-    best = [lens for count, lens in having if count == fewest]
-    models = sorted({_full(lens) for lens in best})
-    if len(models) > 1 or _left_out(best[0], wanted) > OTHERS:
-        models = sorted({_full(lens) for _, lens in having})
-        more = f", or {len(models) - 5} more" if len(models) > 5 else ""
+    fewest = min(count for count, _ in matches)
+    best = [lens for count, lens in matches if count == fewest]
+    models = sorted({_name(lens) for lens in best})
+    if len(models) > 1 or _extra_words(best[0], words_wanted) > MAX_EXTRA_WORDS:
+        models = sorted({_name(lens) for _, lens in matches})
+        others = f", or {len(models) - 5} more" if len(models) > 5 else ""
         listed = " or ".join(models[:5])
         raise KeyedError(
             "lens",
-            f"lens: '{one_line(name)}' may mean {listed}{more}; use the full name of one",
+            f"lens: '{one_line(name)}' may mean {listed}{others}; use the full name of one",
         )
     smaller = [lens for lens in best if crop and lens.crop_factor <= crop * SAME_CROP]
     return max(smaller or best, key=lambda lens: lens.crop_factor if smaller else -lens.crop_factor)
 
 
-def _left_out(lens: Any, wanted: Sequence[str]) -> int:
+def _extra_words(lens: Any, requested: Sequence[str]) -> int:
     """Return how many words of a lens's name, besides the maker, were not requested."""
-    maker = set(_words(lens.maker)) - set(wanted)
-    return len(_words(_full(lens))) - len(wanted) - len(maker)
+    maker = set(_words(lens.maker)) - set(requested)
+    return len(_words(_name(lens))) - len(requested) - len(maker)
 
 
-def _missing(wanted: Sequence[str], words: Sequence[str]) -> bool:
+def _lacks_word(requested: Sequence[str], words: Sequence[str]) -> bool:
     """Return whether a word is requested more often than it occurs."""
-    return any(words.count(word) < wanted.count(word) for word in wanted)
+    return any(words.count(word) < requested.count(word) for word in requested)
 
 
 def _crop_factor(database: Any, make: str, *models: str) -> float | None:
@@ -238,7 +242,7 @@ def _focal_length(lens: Any, focal: float | None) -> float:
         RequestError: the lens does not have this focal length, or it has several and none is set,
             or it is a fisheye.
     """
-    name, low, high = _full(lens), lens.min_focal, lens.max_focal or lens.min_focal
+    name, low, high = _name(lens), lens.min_focal, lens.max_focal or lens.min_focal
     if lens.type.name != RECTILINEAR:
         raise KeyedError(
             "lens",
@@ -269,7 +273,7 @@ def _check_aperture(lens: Any, aperture: float) -> None:
         most = f" to f/{high:g}" if high > low else " and above"
         raise KeyedError(
             "aperture",
-            f"aperture: f/{aperture:g} is not possible, because {_full(lens)} has f/{low:g}{most}",
+            f"aperture: f/{aperture:g} is not possible, because {_name(lens)} has f/{low:g}{most}",
         )
 
 

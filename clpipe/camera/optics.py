@@ -13,13 +13,13 @@ from typing import Any
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.camera.lens import LensCalibration
 
-ROUNDING = 0.01  # of a length or an f-number; those of lenses are nominal
-PLACES = 1e-4  # of lengths in px
+LENGTH_TOLERANCE = 0.01  # of a length or an f-number; those of lenses are nominal
+PIXEL_TOLERANCE = 1e-4  # of lengths in px
 
-NOMINAL = 0.1  # of a lens's focal length on a sensor; makers round, and image shapes differ
+FOCAL_TOLERANCE = 0.1  # of a lens's focal length on a sensor; makers round, and image shapes differ
 FILM_WIDTH, FILM_DIAGONAL = 36.0, math.hypot(36, 24)  # mm, of 35 mm film
 
-USUAL_TIME = 0.01  # s, default exposure time
+DEFAULT_EXPOSURE_TIME = 0.01  # s, default exposure time
 
 IN_PIXELS = ("fx", "fy", "cx", "cy")
 
@@ -39,7 +39,7 @@ class Optics:
         focus_distance: in m.
         exposure_time: in s.
         calibration: that of the lens with the given name.
-        is_sensor_of_lens: whether the sensor's width is not stated and is that of the lens's
+        has_lens_sensor: whether the sensor's width is not stated and is that of the lens's
             camera, for a 3:2 image; see :meth:`for_image`.
         places: where each of them is stated.
     """
@@ -56,7 +56,7 @@ class Optics:
     focus_distance: float | None = None
     exposure_time: float | None = None
     calibration: LensCalibration | None = None
-    is_sensor_of_lens: bool = False
+    has_lens_sensor: bool = False
     places: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
@@ -75,7 +75,7 @@ class Optics:
             known = values.setdefault(name, value)
             first = places.setdefault(name, place)
             in_px = name in IN_PIXELS
-            tolerance, least = (PLACES, 0.01) if in_px else (ROUNDING, 0.0)
+            tolerance, least = (PIXEL_TOLERANCE, 0.01) if in_px else (LENGTH_TOLERANCE, 0.0)
             if value is known or math.isclose(value, known, rel_tol=tolerance, abs_tol=least):
                 continue
             raise KeyedError(
@@ -90,13 +90,13 @@ class Optics:
         24.0
         """
         places = {"focal_length": "lens", **self.places}
-        own = replace(self, calibration=lens, focal_length=lens.focal_length, places=places)
+        updated = replace(self, calibration=lens, focal_length=lens.focal_length, places=places)
         stated = self.fx, self.sensor_width, self.pixel_pitch, self.camera_angle_x
         if any(each is not None for each in stated):
-            return own
+            return updated
         width = FILM_WIDTH / lens.crop_factor
         places = {**places, "sensor_width": "the sensor of its camera"}
-        return replace(own, sensor_width=width, is_sensor_of_lens=True, places=places)
+        return replace(updated, sensor_width=width, has_lens_sensor=True, places=places)
 
     def for_image(self, width: int, height: int) -> dict[str, float]:
         """Return the known facts for an image of this size in px, by the names of the fields.
@@ -110,18 +110,18 @@ class Optics:
         if lens is None:
             return known
         sensor = FILM_DIAGONAL / lens.crop_factor * max(width, height) / math.hypot(width, height)
-        if self.is_sensor_of_lens:
+        if self.has_lens_sensor:
             known["sensor_width"] = sensor
-        of_lens, fx = lens.focal_length / sensor * max(width, height), self.fx
+        lens_fx, fx = lens.focal_length / sensor * max(width, height), self.fx
         if self.camera_angle_x:
             fx = width / 2 / math.tan(self.camera_angle_x / 2)
-        stated = None if self.is_sensor_of_lens else self.sensor_width or self.pixel_pitch
-        if fx and not stated and abs(fx - of_lens) > NOMINAL * of_lens:
+        stated = None if self.has_lens_sensor else self.sensor_width or self.pixel_pitch
+        if fx and not stated and abs(fx - lens_fx) > FOCAL_TOLERANCE * lens_fx:
             place = self.places.get("fx") or self.places.get("camera_angle_x")
             raise RequestError(
                 f"{place}: the focal length of this render of {width}x{height} pixels is "
                 f"{fx:.0f} px, but lens: {lens.name} at {lens.focal_length:g} mm gives "
-                f"{of_lens:.0f} px on its camera's sensor, {sensor:.1f} mm wide. Use a matching "
+                f"{lens_fx:.0f} px on its camera's sensor, {sensor:.1f} mm wide. Use a matching "
                 "lens, or set render.sensor_width for another sensor"
             )
         return known
@@ -129,26 +129,26 @@ class Optics:
     @cached_property
     def known(self) -> dict[str, float]:
         """Return the known numbers, by their names."""
-        return {name: value for name in NUMBERS if (value := getattr(self, name)) is not None}
+        return {name: value for name in OPTICS_NAMES if (value := getattr(self, name)) is not None}
 
     def without_view(self) -> "Optics":
         """Return a copy without focal length, sensor and principal point."""
-        gone: dict[str, Any] = dict.fromkeys(
+        cleared: dict[str, Any] = dict.fromkeys(
             (*IN_PIXELS, "focal_length", "sensor_width", "camera_angle_x")
         )
-        return replace(self, **gone, is_sensor_of_lens=False)
+        return replace(self, **cleared, has_lens_sensor=False)
 
     def set_to(self, used: Mapping[str, float]) -> "Optics":
         """Return a copy with the aperture and focus of a step, unless others are known.
 
         A step's defaults are therefore also the defaults of later steps, and those in EXIF.
         """
-        own = {name: used.get(name) for name in ("f_number", "focus_distance")}
-        new: dict[str, Any] = {
-            name: v for name, v in own.items() if v and getattr(self, name) is None
+        used_values = {name: used.get(name) for name in ("f_number", "focus_distance")}
+        missing: dict[str, Any] = {
+            name: v for name, v in used_values.items() if v and getattr(self, name) is None
         }
-        return replace(self, **new) if new else self
+        return replace(self, **missing) if missing else self
 
 
-OTHERS = ("calibration", "is_sensor_of_lens", "places")
-NUMBERS = tuple(f.name for f in fields(Optics) if f.name not in OTHERS)
+NOT_NUMBERS = ("calibration", "has_lens_sensor", "places")
+OPTICS_NAMES = tuple(f.name for f in fields(Optics) if f.name not in NOT_NUMBERS)

@@ -11,16 +11,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import check_exists, parse_toml, read_text
-from clpipe.base.text import alike, one_line, one_of, with_words
+from clpipe.base.text import names_with_words, one_line, similar_names, unknown_name
 from clpipe.base.types import Doubles
 from clpipe.base.validation import first_fault
 from clpipe.camera.gain_stage import GainStage, NotNegative, Offsets, Positive, TukeyLambda
 from clpipe.camera.noise import NoiseModel
-from clpipe.camera.text import comparable
+from clpipe.camera.text import normalized_name
 
 DEFAULT_CAMERA = "sony-a7r2"
-MOST_NAMED = 5  # cameras in a message
-PUSHED = 4.0  # times the highest ISO of a camera: two stops
+MAX_LISTED = 5  # cameras in a message
+PUSH_FACTOR = 4.0  # times the highest ISO of a camera: two stops
 Coefficient = Annotated[float, Field(ge=-100, le=100)]
 Row = tuple[Coefficient, Coefficient, Coefficient]
 Matrix = tuple[Row, Row, Row]
@@ -39,7 +39,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 Temperature = Annotated[float, Field(ge=-100, le=150)]  # deg C
 
 # Keys that need another key, and its description.
-NEEDED = {
+REQUIRED_KEYS = {
     ("hot_pixel_share", "hot_pixel_level"): "the smallest extra charge of a hot pixel in e-",
     ("banding_amplitude", "banding_period"): "in rows",
     ("rts_share", "rts_amplitude"): "the mean distance of two levels in e-",
@@ -109,12 +109,12 @@ class Camera(BaseModel):
         return f"Camera({self.name}, ISO {low:g} to {high:g})"
 
     @model_validator(mode="after")
-    def _ordered(self) -> "Camera":
+    def _check_consistency(self) -> "Camera":
         if self.white_level <= self.black_level:
             raise ValueError("white_level must be above black_level")
         if self.xyz_to_camera and abs(np.linalg.det(self.xyz_to_camera)) < 1e-6:
             raise ValueError("xyz_to_camera is singular")
-        for (key, needed), text in NEEDED.items():
+        for (key, needed), text in REQUIRED_KEYS.items():
             if getattr(self, key) and not getattr(self, needed):
                 raise ValueError(f"{key} needs {needed}, {text}")
         if self.tukey_lambda is not None and any(s.tukey_lambda for s in self.gain_stages):
@@ -200,7 +200,7 @@ class Camera(BaseModel):
         """Return the shape of the read noise at an ISO; None is Gaussian. See :meth:`noise`."""
         stage = self.gain_stage(iso)
         table = stage.tukey_lambda
-        return stage.between(iso, table) if table else self.tukey_lambda
+        return stage.interpolate(iso, table) if table else self.tukey_lambda
 
     def color_bias(self, iso: float) -> Offsets:
         """Return fixed errors of the black level, in signal: R, G in R's rows, G in B's rows, B.
@@ -211,7 +211,8 @@ class Camera(BaseModel):
         if not stage.color_bias:
             return 0.0, 0.0, 0.0, 0.0
         one, two, three, four = (
-            stage.between(iso, of) / self.signal_range for of in zip(*stage.color_bias, strict=True)
+            stage.interpolate(iso, of) / self.signal_range
+            for of in zip(*stage.color_bias, strict=True)
         )
         return one, two, three, four
 
@@ -231,7 +232,7 @@ class Camera(BaseModel):
     def pushed_range(self) -> tuple[float, float]:
         """The range plus two stops, to which cameras push without more gain in the sensor."""
         low, high = self.iso_range
-        return low, high * PUSHED
+        return low, high * PUSH_FACTOR
 
     def check_iso(self, iso: float, pushed: bool = False) -> None:
         """Check that the camera has an ISO, or may be pushed to it.
@@ -244,7 +245,7 @@ class Camera(BaseModel):
             low, high = self.iso_range
             raise RequestError(
                 f"iso: found {iso:g}, but camera {self.name} goes from {low:g} to "
-                f"{high:g}; use {min(max(iso, low), high):g}{_cameras_beyond(self, iso)}"
+                f"{high:g}; use {min(max(iso, low), high):g}{_cameras_with_iso(self, iso)}"
             )
 
     def gain_stage(self, iso: float) -> GainStage:
@@ -271,13 +272,13 @@ def built_in_cameras() -> dict[str, Path]:
 
 @cache
 def camera_names() -> dict[str, str]:
-    """Return the built-in cameras by all their names, in the form of :func:`comparable`."""
+    """Return the built-in cameras by all their names, in the form of :func:`normalized_name`."""
     names: dict[str, str] = {}
     for name in built_in_cameras():
         camera = load_camera(name)
         for model in (camera.model, camera.model.removeprefix(camera.make), *camera.aliases):
-            names |= {comparable(model): name, comparable(f"{camera.make} {model}"): name}
-    return names | {comparable(name): name for name in built_in_cameras()}
+            names |= {normalized_name(model): name, normalized_name(f"{camera.make} {model}"): name}
+    return names | {normalized_name(name): name for name in built_in_cameras()}
 
 
 def built_in_name(name: str) -> str | None:
@@ -288,24 +289,24 @@ def built_in_name(name: str) -> str | None:
     """
     if name in built_in_cameras():
         return name
-    return None if name.endswith(".toml") else camera_names().get(comparable(name))
+    return None if name.endswith(".toml") else camera_names().get(normalized_name(name))
 
 
-def cameras_called(name: str) -> list[str]:
+def cameras_matching(name: str) -> list[str]:
     """Return the built-in cameras that have all words of a text in one of their names.
 
-    >>> cameras_called("nikon d8"), cameras_called("canon 5d mark")
+    >>> cameras_matching("nikon d8"), cameras_matching("canon 5d mark")
     ([], ['canon-5d2', 'canon-5d3', 'canon-5d4'])
     """
     names = _full_names()
-    return list(dict.fromkeys(names[each] for each in with_words(name, names)))
+    return list(dict.fromkeys(names[each] for each in names_with_words(name, names)))
 
 
 def similar_cameras(name: str) -> list[str]:
     """Return the built-in cameras that a shortened or misspelt name may mean."""
     by_name = camera_names()
-    near = (by_name[found] for found in alike(comparable(name), by_name))
-    return cameras_called(name) or list(dict.fromkeys(near))
+    near = (by_name[found] for found in similar_names(normalized_name(name), by_name))
+    return cameras_matching(name) or list(dict.fromkeys(near))
 
 
 @cache
@@ -319,18 +320,18 @@ def _full_names() -> dict[str, str]:
     return full
 
 
-def _cameras_beyond(camera: Camera, iso: float) -> str:
+def _cameras_with_iso(camera: Camera, iso: float) -> str:
     """Return the part of a message that lists cameras with an ISO, or the nearest one."""
     others = [load_camera(name) for name in built_in_cameras() if name != camera.name]
-    having = [o.name for o in others if o.iso_range[0] <= iso <= o.iso_range[1]]
-    if having:
-        more = f" or {len(having) - MOST_NAMED} others" if len(having) > MOST_NAMED else ""
-        return f", or a camera that has this ISO: {', '.join(having[:MOST_NAMED])}{more}"
+    matching = [o.name for o in others if o.iso_range[0] <= iso <= o.iso_range[1]]
+    if matching:
+        more = f" or {len(matching) - MAX_LISTED} others" if len(matching) > MAX_LISTED else ""
+        return f", or a camera that has this ISO: {', '.join(matching[:MAX_LISTED])}{more}"
     is_high = iso > camera.iso_range[1]
-    furthest = (max if is_high else min)(others, key=lambda other: other.iso_range[is_high])
-    end = furthest.iso_range[is_high]
+    closest = (max if is_high else min)(others, key=lambda other: other.iso_range[is_high])
+    end = closest.iso_range[is_high]
     if (end > camera.iso_range[1]) if is_high else (end < camera.iso_range[0]):
-        return f"; the built-in camera that comes closest is {furthest.name}, with ISO {end:g}"
+        return f"; the built-in camera that comes closest is {closest.name}, with ISO {end:g}"
     return "; no built-in camera comes closer"
 
 
@@ -344,8 +345,8 @@ def load_camera(name: str) -> Camera:
         RequestError: there is no such camera or file, or the file is not a valid profile.
     """
     built_in = built_in_cameras()
-    if own := built_in.get(built_in_name(name) or ""):
-        return _built_in(own)
+    if built_in_path := built_in.get(built_in_name(name) or ""):
+        return _built_in(built_in_path)
     path = Path(name)
     if path.suffix != ".toml" and os.path.isfile(path):
         raise RequestError(
@@ -353,8 +354,8 @@ def load_camera(name: str) -> Camera:
             "or a noise model, use 'clpipe cameras import'"
         )
     if path.suffix != ".toml":
-        near = similar_cameras(name)
-        hint = f" (most similar: {', '.join(near)})" if near else ""
+        similar = similar_cameras(name)
+        hint = f" (most similar: {', '.join(similar)})" if similar else ""
         raise RequestError(
             f"unknown camera '{one_line(name)}': it is not built in{hint}. 'clpipe cameras' "
             "lists those that are. For another camera, make a profile with 'clpipe cameras "
@@ -394,7 +395,9 @@ def _reason(error: ValidationError) -> str:
     fault = first_fault(error)
     if fault.problem == "unknown":
         model = GainStage if "." in fault.key else Camera
-        return fault.key.removesuffix(fault.name) + one_of("key", fault.name, model.model_fields)
+        return fault.key.removesuffix(fault.name) + unknown_name(
+            "key", fault.name, model.model_fields
+        )
     if fault.problem == "missing":
         return f"{fault.key}: missing; every profile needs this key"
     return f"{fault.key}: {fault.text}" if fault.path else fault.text

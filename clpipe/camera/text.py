@@ -57,11 +57,11 @@ def check_profile_name(path: Path) -> None:
         )
 
 
-def comparable(name: str) -> str:
+def normalized_name(name: str) -> str:
     """Return the name of a camera in a form that makers, people and files share.
 
-    >>> comparable("NIKON CORPORATION NIKON D850") == comparable("nikon-d850") == "nikond850"
-    True
+    >>> normalized_name("NIKON CORPORATION NIKON D850"), normalized_name("nikon-d850")
+    ('nikond850', 'nikond850')
     """
     words = re.findall(r"[^\W_]+", name.casefold())
     return "".join(word for word in dict.fromkeys(words) if word != "corporation")

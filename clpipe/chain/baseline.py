@@ -43,7 +43,7 @@ def baseline_of(chain: Chain) -> Chain:
     return with_noise(replace(clean, steps=steps), IidGaussian(sigma=(0.0, 0.0, 0.0)))
 
 
-def matching_of(chain: Chain) -> NoNoise:
+def noise_matching(chain: Chain) -> NoNoise:
     """Return the method that sets how a baseline's noise is matched to the picture's noise."""
     step = chain.step_in(StageRole.BASELINE)
     assert step and isinstance(step.method, NoNoise)  # checked by baseline_of

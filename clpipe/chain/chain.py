@@ -6,8 +6,8 @@ from functools import cached_property, wraps
 from typing import Any, TypeVar
 
 from clpipe.base.errors import RequestError
-from clpipe.base.text import one_of
-from clpipe.base.tracing import NotTraceableError, Trace, altered
+from clpipe.base.text import unknown_name
+from clpipe.base.tracing import NotTraceableError, Trace, with_changes
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.optics import Optics
 from clpipe.camera.profile import Camera
@@ -37,8 +37,15 @@ from clpipe.stage import (
 from clpipe.stages.shutter import Rows
 
 # Computed properties of a chain; the second tuple has those that depend only on its structure.
-COMPUTED = "optics", "filters", "context_after", "context_of_raw", "geometry"
-STRUCTURAL = "is_noisy", "lit_by_layers", "maker_of_raw", "result", "step_names", "_resamplings"
+COMPUTED = "optics", "filter_array", "context_after", "raw_context", "geometry"
+STRUCTURAL = (
+    "is_noisy",
+    "light_layer_steps",
+    "raw_step_name",
+    "result",
+    "step_names",
+    "_resamplings",
+)
 
 T = TypeVar("T")
 
@@ -67,15 +74,15 @@ class Step:
         """Whether the step's method adds noise."""
         return self.method.without_noise() is not self.method
 
-    def is_equal(self, other: "Step") -> bool:
+    def equals(self, other: "Step") -> bool:
         """Return whether another step does the same with the same numbers."""
         optics = self.context.optics, other.context.optics
-        is_equal = self == other and optics[0] == optics[1] and self.passes == other.passes
-        if not is_equal or "arguments" not in vars(self):  # then there is nothing else to compare
-            return is_equal
-        own, others = self.arguments, other.arguments
-        return own.keys() == others.keys() and all(
-            bytes_of(value) == bytes_of(others[name]) for name, value in own.items()
+        equals = self == other and optics[0] == optics[1] and self.passes == other.passes
+        if not equals or "arguments" not in vars(self):  # then there is nothing else to compare
+            return equals
+        mine, theirs = self.arguments, other.arguments
+        return mine.keys() == theirs.keys() and all(
+            bytes_of(value) == bytes_of(theirs[name]) for name, value in mine.items()
         )
 
     def __repr__(self) -> str:
@@ -150,36 +157,36 @@ class Chain:
         return tuple(step.name for step in self.steps)
 
     @cached_property
-    def lit_by_layers(self) -> tuple[str, ...]:
+    def light_layer_steps(self) -> tuple[str, ...]:
         """The names of the steps that need the light in a layer of the image's file."""
         named = ((step.name, step.method) for step in self.steps)
-        return tuple(n for n, each in named if isinstance(each, Rows) and each.layer_of_light)
+        return tuple(n for n, each in named if isinstance(each, Rows) and each.light_layer)
 
     @cached_property
-    def maker_of_raw(self) -> str | None:
+    def raw_step_name(self) -> str | None:
         """The name of the last step that makes a raw in DN; None if there is none."""
         raws = [step.name for step in self.steps if step.stage.writes is Kind.RAW]
         return raws[-1] if raws else None
 
     @cached_property
-    def context_of_raw(self) -> Context:
+    def raw_context(self) -> Context:
         """The context of the raw in DN; without a raw, of the image that enters."""
-        if self.maker_of_raw is None:
+        if self.raw_step_name is None:
             return self.steps[0].context
-        maker = self.step_named(self.maker_of_raw)
+        maker = self.step_named(self.raw_step_name)
         return maker.method.next_context(maker.context)
 
     @cached_property
-    def filters(self) -> FilterArray:
+    def filter_array(self) -> FilterArray:
         """The filter array of the raw, or of the mosaic if the chain makes no raw."""
-        if self.maker_of_raw:
-            return self.context_of_raw.filters
+        if self.raw_step_name:
+            return self.raw_context.filter_array
         if self.result is Kind.MOSAIC:
-            return self.context_after.filters
+            return self.context_after.filter_array
         if self.source in (Kind.RAW, Kind.MOSAIC):
-            return self.steps[0].context.filters
+            return self.steps[0].context.filter_array
         step = self.step_in(StageRole.PATTERN) or self.steps[-1]
-        return step.method.next_context(step.context).filters
+        return step.method.next_context(step.context).filter_array
 
     @cached_property
     def result(self) -> Kind:
@@ -206,7 +213,7 @@ class Chain:
         Raises:
             RequestError: the camera's values contradict each other.
         """
-        known = self.intrinsics_of_render(*self.margins.inside(width, height), shot)
+        known = self.intrinsics_of_render(*self.margins.frame_size(width, height), shot)
         return self.geometry.intrinsics(known, width, height) if self.geometry else known
 
     def intrinsics_of_render(
@@ -214,7 +221,7 @@ class Chain:
     ) -> Intrinsics | None:
         """Return the intrinsics of an input whose size excludes margins, see :meth:`intrinsics`."""
         known = {**shot, **self.optics.for_image(width, height)}
-        if self.optics.is_sensor_of_lens and "sensor_width" in shot:
+        if self.optics.has_lens_sensor and "sensor_width" in shot:
             known["sensor_width"] = shot["sensor_width"]
         return Intrinsics.of_render(width, height, known, self.optics.places)
 
@@ -235,33 +242,33 @@ class Chain:
 
     def with_settings(self, settings: Settings) -> "Chain":
         """Return the chain with other settings, which resolve to the same steps."""
-        return altered(self, {"settings": settings})
+        return with_changes(self, {"settings": settings})
 
-    def settled(self, trace: Trace) -> "Chain":
+    def traced(self, trace: Trace) -> "Chain":
         """Return the chain with all properties computed, as far as they can be traced."""
-        whole = True
+        is_complete = True
         for step in self.steps:
-            whole &= not trace.holds(step.passes)
+            is_complete &= not trace.contains_traced(step.passes)
             _ = step.adds_noise
             try:
                 with trace.attempt():
                     _ = step.arguments
             except NotTraceableError:
                 vars(step).pop("arguments", None)
-                whole = False
+                is_complete = False
         for name in (*COMPUTED, *STRUCTURAL):
             getattr(self, name)
-        _ = whole and self.arguments
-        return altered(self, {"structure": {} if whole else None})
+        _ = is_complete and self.arguments
+        return with_changes(self, {"structure": {} if is_complete else None})
 
-    def is_equal(self, other: "Chain") -> bool:
+    def equals(self, other: "Chain") -> bool:
         """Return whether another chain has the same steps with the same numbers."""
         pairs = list(zip(self.steps, other.steps, strict=False))
         return len(self.steps) == len(other.steps) and all(
-            own.is_equal(step) for own, step in pairs
+            mine.equals(step) for mine, step in pairs
         )
 
-    def derived(self, make: Callable[["Chain"], "Chain"]) -> "Chain":
+    def derive(self, make: Callable[["Chain"], "Chain"]) -> "Chain":
         """Return ``make(self)``; subclasses may compute it."""
         return make(self)
 
@@ -273,36 +280,36 @@ class Chain:
         Raises:
             RequestError: no step adds noise.
         """
-        return self.derived(Chain._without_noise)
+        return self.derive(Chain._without_noise)
 
     def _without_noise(self) -> "Chain":
-        left = [(step, step.method.without_noise()) for step in self.steps]
-        if all(method is step.method for step, method in left):
+        methods = [(step, step.method.without_noise()) for step in self.steps]
+        if all(method is step.method for step, method in methods):
             raise RequestError(
                 "no stage of this chain adds noise, so frames would be identical and there is no "
                 "ground truth to write; add a noise stage, or remove --frames and --truth"
             )
-        return self._with(left, clean=False)
+        return self._with(methods, clean=False)
 
-    def cleaned(self) -> "Chain":
+    def without_noise_or_denoising(self) -> "Chain":
         """Return the chain without noise, and without denoising chosen by the strength of noise.
 
         Raises:
             RequestError: a user's stage raises an error.
         """
-        return self.derived(Chain._cleaned)
+        return self.derive(Chain._without_noise_or_denoising)
 
-    def _cleaned(self) -> "Chain":
-        left = []
+    def _without_noise_or_denoising(self) -> "Chain":
+        methods = []
         for step in self.steps:
             name, folder = step.name, step.stage.folder
             is_set = bool(self.settings.parameters.get(name))
-            method = step.stage.chosen(self.settings.method(name), is_set, step.context)
-            context = step.context.but(clean=True)
+            method = step.stage.method_at_step(self.settings.method(name), is_set, step.context)
+            context = step.context.replace(clean=True)
             with validation_errors(name, type(method)), user_code_errors(f"stage {name}", folder):
-                own = method.noise_free(context)
-                left.append((step, own and own.as_for(step.method)))
-        return self._with(left, clean=True)
+                noise_free = method.noise_free(context)
+                methods.append((step, noise_free and noise_free.with_image_state_of(step.method)))
+        return self._with(methods, clean=True)
 
     def _with(self, methods: Sequence[tuple[Step, Method | None]], clean: bool) -> "Chain":
         """Return the chain with other methods and without noise; see :meth:`without_noise`."""
@@ -312,7 +319,7 @@ class Chain:
         def context_of(step: Step) -> Context:
             key = id(step.context)
             if key not in contexts:
-                contexts[key] = step.context.but(noise=None, clean=clean)
+                contexts[key] = step.context.replace(noise=None, clean=clean)
             return contexts[key]
 
         steps = tuple(
@@ -332,10 +339,10 @@ class Chain:
             return tuple(step.name for step in self.steps)
         return tuple(self.step_named(name).name for name in dict.fromkeys(names))
 
-    def through(self, names: Sequence[str]) -> "Chain":
+    def up_to(self, names: Sequence[str]) -> "Chain":
         """Return the chain up to the last of these steps; the whole chain if none is named."""
-        places = [place for place, step in enumerate(self.steps) if step.name in names]
-        return replace(self, steps=self.steps[: places[-1] + 1]) if places else self
+        indices = [place for place, step in enumerate(self.steps) if step.name in names]
+        return replace(self, steps=self.steps[: indices[-1] + 1]) if indices else self
 
     def step_in(self, role: StageRole) -> Step | None:
         """Return the first step whose stage has a role; None if there is none."""
@@ -350,17 +357,17 @@ class Chain:
         for step in self.steps:
             if step.name == name:
                 return step
-        raise RequestError(one_of("stage in this chain", name, [s.name for s in self.steps]))
+        raise RequestError(unknown_name("stage in this chain", name, [s.name for s in self.steps]))
 
 
-def of_structure(function: Callable[[Chain], T]) -> Callable[[Chain], T]:
+def cached_by_structure(function: Callable[[Chain], T]) -> Callable[[Chain], T]:
     """Return a function that is computed once for all chains that differ only in numbers.
 
     Its result must depend only on names, stages and passes.
     """
 
     @wraps(function)
-    def known(chain: Chain) -> T:
+    def cached(chain: Chain) -> T:
         if chain.structure is None:
             return function(chain)
         if function not in chain.structure:
@@ -368,4 +375,4 @@ def of_structure(function: Callable[[Chain], T]) -> Callable[[Chain], T]:
         found: T = chain.structure[function]
         return found
 
-    return known
+    return cached

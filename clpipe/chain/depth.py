@@ -7,17 +7,17 @@ import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
-from clpipe.chain.chain import Chain, of_structure
-from clpipe.reference.defocus import Depth, checked_depth
-from clpipe.stage import OfDepth
+from clpipe.chain.chain import Chain, cached_by_structure
+from clpipe.reference.defocus import Depth, parse_depth
+from clpipe.stage import DepthMethod
 
 
-def depth_steps(chain: Chain) -> dict[str, OfDepth]:
+def depth_steps(chain: Chain) -> dict[str, DepthMethod]:
     """Return the methods of the steps that need depth, by step name."""
-    return {s.name: s.method for s in chain.steps if isinstance(s.method, OfDepth)}
+    return {s.name: s.method for s in chain.steps if isinstance(s.method, DepthMethod)}
 
 
-@of_structure
+@cached_by_structure
 def needs_depth(chain: Chain) -> bool:
     """Return whether a step of a chain needs the image's depth."""
     return bool(depth_steps(chain))
@@ -33,22 +33,24 @@ def with_depth(chain: Chain, depth: Depth) -> Chain:
         RequestError: an earlier step moves pixels, which would misalign the depth.
     """
     reference = weakref.ref(depth)
-    needing = depth_steps(chain)
+    methods = depth_steps(chain)
     names = [step.name for step in chain.steps]
-    for step in chain.steps[: max(map(names.index, needing))]:
+    for step in chain.steps[: max(map(names.index, methods))]:
         if step.method.geometry():
             raise RequestError(
-                f"stages: {step.name} moves pixels before {[*needing][-1]}, but does not move the "
-                f"depth that {[*needing][-1]} needs; list {step.name} after {[*needing][-1]}"
+                f"stages: {step.name} moves pixels before {[*methods][-1]}, but does not move the "
+                f"depth that {[*methods][-1]} needs; list {step.name} after {[*methods][-1]}"
             )
     steps = tuple(
-        replace(step, context=step.context.but(depth=reference)) if step.name in needing else step
+        replace(step, context=step.context.replace(depth=reference))
+        if step.name in methods
+        else step
         for step in chain.steps
     )
     return replace(chain, steps=steps)
 
 
-def warnings_of(chain: Chain, depth: Depth) -> list[str]:
+def depth_warnings(chain: Chain, depth: Depth) -> list[str]:
     """Return the warnings of the steps that need depth about an image's depth.
 
     Raises:
@@ -75,4 +77,4 @@ def depth_of_array(pixels: Array | None, width: int, height: int) -> Depth:
             f"found depth of shape {found}, but the image has {(height, width)}; pass depth of the "
             "image's height and width"
         )
-    return Depth(checked_depth(pixels))
+    return Depth(parse_depth(pixels))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from clpipe.base.errors import KeyedError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.chain.draws import Choice, Draw, Limits, parse_draw
 from clpipe.chain.keys import KEYS
 from clpipe.reference.random import philox_rounds, stream_of
@@ -16,7 +16,7 @@ from clpipe.reference.random import philox_rounds, stream_of
 LimitsOf = Callable[[str], Limits | None]  # by the dotted name of a value
 
 
-def draw_of(key: str, table: Mapping[str, Any]) -> Draw:
+def parse_drawn(key: str, table: Mapping[str, Any]) -> Draw:
     """Return the draw that a table declares in place of a value.
 
     Raises:
@@ -38,7 +38,7 @@ def draw_of(key: str, table: Mapping[str, Any]) -> Draw:
     return draw
 
 
-def ordered(draws: Mapping[str, Draw], constants: Mapping[str, Any]) -> list[str]:
+def draw_order(draws: Mapping[str, Draw], constants: Mapping[str, Any]) -> list[str]:
     """Return the names of the draws, each after the value that it follows.
 
     Args:
@@ -61,29 +61,29 @@ def ordered(draws: Mapping[str, Draw], constants: Mapping[str, Any]) -> list[str
                 )
         if leader and leader not in constants:
             names = sorted({*constants, *draws} - {path[-1]})
-            unknown = one_of("value", leader, names).replace("allowed", "set or drawn are")
+            unknown = unknown_name("value", leader, names).replace("allowed", "set or drawn are")
             raise KeyedError(path[-1], f"{path[-1]}: {unknown}")
         return len(path)
 
     return sorted(draws, key=depth)
 
 
-def extremes_of(
+def draw_extremes(
     draws: Mapping[str, Draw], constants: Mapping[str, Any], limits: LimitsOf
 ) -> dict[str, Sequence[Any]]:
     """Return the extreme values of each draw. If they are allowed, every drawn value is.
 
     Args:
-        draws: as for :func:`ordered`.
-        constants: as for :func:`ordered`.
+        draws: as for :func:`draw_order`.
+        constants: as for :func:`draw_order`.
         limits: returns the limits of a value by its dotted name.
 
     Raises:
         KeyedError: a draw does not fit its limits or the value that it follows, or as for
-            :func:`ordered`.
+            :func:`draw_order`.
     """
     extremes: dict[str, Sequence[Any]] = {}
-    for key in ordered(draws, constants):
+    for key in draw_order(draws, constants):
         draw, leader = draws[key], draws[key].follows
         followed: Sequence[Any] = []
         if leader:
@@ -95,28 +95,36 @@ def extremes_of(
     return extremes
 
 
-def values_of(
-    draws: Mapping[str, Draw], constants: Mapping[str, Any], limits: LimitsOf, owner: str
+def draw_values(
+    draws: Mapping[str, Draw], constants: Mapping[str, Any], limits: LimitsOf, seed_text: str
 ) -> dict[str, Any]:
-    """Return a value for each draw, by name. Arguments and errors are those of :func:`extremes_of`.
+    """Return a value for each draw, by name.
 
-    ``owner`` seeds the draws; it is a text made of the seed and the image key.
+    Args:
+        draws: as for :func:`draw_order`.
+        constants: as for :func:`draw_order`.
+        limits: returns the limits of a value by its dotted name.
+        seed_text: the text that seeds the draws, made of the seed and the image key.
+
+    Raises:
+        KeyedError: as for :func:`draw_extremes`.
     """
     values = dict(constants)
-    numbers = uniforms(owner, draws)
-    for key in ordered(draws, constants):
+    numbers = uniform_numbers(seed_text, draws)
+    for key in draw_order(draws, constants):
         draw = draws[key]
         values[key] = draw.value(numbers[key], limits(key), values.get(draw.follows))
     return {key: values[key] for key in draws}
 
 
-def uniforms(owner: str, names: Iterable[str]) -> dict[str, float]:
+def uniform_numbers(seed_text: str, names: Iterable[str]) -> dict[str, float]:
     """Return a number above 0 and below 1 for each name, of 52 bits, by Philox keyed on the owner.
 
-    >>> {name: round(u, 3) for name, u in uniforms("draw:0:a.exr", ["iso", "camera"]).items()}
+    >>> numbers = uniform_numbers("draw:0:a.exr", ["iso", "camera"])
+    >>> {name: round(u, 3) for name, u in numbers.items()}
     {'iso': 0.282, 'camera': 0.608}
     """
-    stream, numbers = stream_of(owner, ""), {}
+    stream, numbers = stream_of(seed_text, ""), {}
     for name in names:
         high, low, *_ = philox_rounds(0, 0, 0, zlib.crc32(name.encode()), stream)
         numbers[name] = ((high << 20 | low >> 12) + 0.5) * 2.0**-52

@@ -14,14 +14,14 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from clpipe.base.errors import KeyedError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.base.validation import first_fault
 
-TINY = math.ulp(0.0)  # the least number above 0
+SMALLEST_FLOAT = math.ulp(0.0)  # the least number above 0
 
-FAR = 9.0  # standard deviations; a uniform number of 52 bits gives no normal beyond 8.3
+MAX_SIGMAS = 9.0  # standard deviations; a uniform number of 52 bits gives no normal beyond 8.3
 
-MAX_TRIED = 64  # whole numbers of a range that are validated
+MAX_VALIDATED = 64  # whole numbers of a range that are validated
 
 
 @dataclass(frozen=True)
@@ -51,23 +51,23 @@ class Limits:
         ends = max(low, self.low), min(high, self.high)
         return ends if ends[0] <= ends[1] else None
 
-    def between(self, low: float, high: float) -> list[float]:
+    def validation_samples(self, low: float, high: float) -> list[float]:
         """Return numbers of a range to validate: its ends, and whole numbers between them.
 
-        >>> Limits().between(1, 3), Limits(whole=True).between(1, 3)
+        >>> Limits().validation_samples(1, 3), Limits(whole=True).validation_samples(1, 3)
         ([1, 3], [1, 2, 3, 3])
         """
         if not (self.whole and float(low).is_integer() and float(high).is_integer()):
             return [low, high]
-        return [*range(int(low), int(high) + 1)[:MAX_TRIED], int(high)]
+        return [*range(int(low), int(high) + 1)[:MAX_VALIDATED], int(high)]
 
 
 @cache
-def limits_of(model: type[BaseModel], name: str) -> Limits | None:
+def field_limits(model: type[BaseModel], name: str) -> Limits | None:
     """Return the limits of a field of a model; None if the field holds no number.
 
     >>> from clpipe.images.encoding import Encoding
-    >>> limits_of(Encoding, "jpeg_quality"), limits_of(Encoding, "jpeg_subsampling")
+    >>> field_limits(Encoding, "jpeg_quality"), field_limits(Encoding, "jpeg_subsampling")
     (Limits(low=1, high=100, whole=True), None)
     """
     schema = model.model_json_schema()["properties"][name]
@@ -111,7 +111,7 @@ class Draw(BaseModel):
         """
         raise NotImplementedError(type(self).__name__)
 
-    def within(self, limits: Limits) -> "Draw | None":
+    def truncated(self, limits: Limits) -> "Draw | None":
         """Return the distribution truncated to limits, so that no values pile up at a limit.
 
         Returns None if the limits allow no value, or exclude the mean. A draw that follows another
@@ -139,7 +139,7 @@ class Choice(Draw):
     choice: Annotated[list[Any], Field(strict=False, min_length=1)]
 
     @model_validator(mode="after")
-    def _plain(self) -> "Choice":
+    def _check_plain(self) -> "Choice":
         for item in self.choice:
             if item is None or isinstance(item, Mapping):
                 raise ValueError(f"found {item!r} in the list; list plain values only")
@@ -148,7 +148,7 @@ class Choice(Draw):
     def extremes(self, limits: Limits | None, followed: Sequence[Any]) -> Sequence[Any]:
         return self.choice
 
-    def within(self, limits: Limits) -> "Choice | None":
+    def truncated(self, limits: Limits) -> "Choice | None":
         left = [each for each in self.choice if limits.low <= each <= limits.high]
         return Choice(choice=left) if left else None
 
@@ -162,13 +162,13 @@ class NumberDraw(Draw):
     def extremes(self, limits: Limits | None, followed: Sequence[Any]) -> Sequence[Any]:
         if limits is None:
             raise ValueError("the value is no single number; draw it by choice or same_as")
-        return limits.between(*self.reach(limits, followed))
+        return limits.validation_samples(*self.range_of(limits, followed))
 
     def value(self, uniform: float, limits: Limits | None, followed: Any) -> Any:
         assert limits
         return limits.nearest(self.number(uniform, limits, followed))
 
-    def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
+    def range_of(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
         """Return the lowest and the highest value. Arguments and errors as :meth:`extremes`."""
         raise NotImplementedError(type(self).__name__)
 
@@ -187,14 +187,14 @@ class Uniform(NumberDraw):
     uniform: Ends
 
     @model_validator(mode="after")
-    def _ordered(self) -> "Uniform":
+    def _check_order(self) -> "Uniform":
         _check_ascending(*self.uniform)
         return self
 
-    def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
+    def range_of(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
         return self.uniform
 
-    def within(self, limits: Limits) -> "Uniform | None":
+    def truncated(self, limits: Limits) -> "Uniform | None":
         ends = limits.overlap(*self.uniform)
         return Uniform(uniform=ends) if ends else None
 
@@ -215,16 +215,16 @@ class LogUniform(NumberDraw):
     log_uniform: Ends
 
     @model_validator(mode="after")
-    def _ordered(self) -> "LogUniform":
+    def _check_order(self) -> "LogUniform":
         if self.log_uniform[0] <= 0:
             raise ValueError(f"found {list(self.log_uniform)}, but both ends must be above 0")
         _check_ascending(*self.log_uniform)
         return self
 
-    def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
+    def range_of(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
         return self.log_uniform
 
-    def within(self, limits: Limits) -> "LogUniform | None":
+    def truncated(self, limits: Limits) -> "LogUniform | None":
         ends = limits.overlap(*self.log_uniform)
         return LogUniform(log_uniform=ends) if ends else None
 
@@ -244,18 +244,18 @@ class Normal(NumberDraw):
     normal: Ends
 
     @model_validator(mode="after")
-    def _spread(self) -> "Normal":
+    def _check_sigma(self) -> "Normal":
         if self.normal[1] < 0:
             raise ValueError(f"found {list(self.normal)}, but a standard deviation is 0 or more")
         return self
 
-    def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
+    def range_of(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
         mean, sigma = self.normal
         if not limits.low <= mean <= limits.high:
             return mean, mean  # validation will reject it
-        return limits.nearest(mean - FAR * sigma), limits.nearest(mean + FAR * sigma)
+        return limits.nearest(mean - MAX_SIGMAS * sigma), limits.nearest(mean + MAX_SIGMAS * sigma)
 
-    def within(self, limits: Limits) -> "Truncated | None":
+    def truncated(self, limits: Limits) -> "Truncated | None":
         if not limits.low <= self.normal[0] <= limits.high:
             return None
         return Truncated(normal=self.normal, ends=(limits.low, limits.high))
@@ -319,24 +319,28 @@ class LogNormalOf(NumberDraw):
     def follows(self) -> str:
         return self.log_normal_of
 
-    def _at(self, normal: float, followed: float) -> float:
+    def _value_at(self, normal: float, followed: float) -> float:
         log = self.slope * math.log(followed) + self.intercept + self.sigma * normal
-        return max(_exp(log), TINY)
+        return max(_exp(log), SMALLEST_FLOAT)
 
-    def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
+    def range_of(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
         for one in followed:
             if isinstance(one, bool) or not isinstance(one, int | float) or not one > 0:
                 raise ValueError(
                     f"{self.follows}, which it follows, must be above 0, but can be {one!r}"
                 )
-        all_ = [limits.nearest(self._at(z, one)) for z in (-FAR, FAR) for one in followed]
-        return min(all_), max(all_)
+        extremes = [
+            limits.nearest(self._value_at(z, one))
+            for z in (-MAX_SIGMAS, MAX_SIGMAS)
+            for one in followed
+        ]
+        return min(extremes), max(extremes)
 
     def number(self, uniform: float, limits: Limits, followed: Any) -> float:
-        return self._at(_normal(uniform), followed)
+        return self._value_at(_normal(uniform), followed)
 
 
-LAWS: dict[str, type[Draw]] = {
+DISTRIBUTIONS: dict[str, type[Draw]] = {
     "choice": Choice,
     "uniform": Uniform,
     "log_uniform": LogUniform,
@@ -355,23 +359,23 @@ def parse_draw(key: str, table: Mapping[str, Any]) -> Draw:
     Raises:
         KeyedError: the table is no draw. The message begins with ``key``, the name of the value.
     """
-    laws = [law for law in LAWS if law in table]
-    if len(laws) != 1:
-        wrong = one_of("draw", next((str(k) for k in table), ""), LAWS)
-        if laws:
-            wrong = f"a draw has one distribution, but these are {' and '.join(laws)}; use one"
-        raise KeyedError(key, f"{key}: found {dict(table)!r}: {wrong}")
-    law = LAWS[laws[0]]
+    names = [distribution for distribution in DISTRIBUTIONS if distribution in table]
+    if len(names) != 1:
+        problem = unknown_name("draw", next((str(k) for k in table), ""), DISTRIBUTIONS)
+        if names:
+            problem = f"a draw has one distribution, but these are {' and '.join(names)}; use one"
+        raise KeyedError(key, f"{key}: found {dict(table)!r}: {problem}")
+    distribution = DISTRIBUTIONS[names[0]]
     try:
-        return law.model_validate(dict(table))
+        return distribution.model_validate(dict(table))
     except ValidationError as error:
         fault = first_fault(error)
-        field = str(fault.path[0]) if fault.path else laws[0]
+        field = str(fault.path[0]) if fault.path else names[0]
         reason = fault.text
         if fault.problem == "unknown":
-            reason = one_of(f"key of {laws[0]}", field, law.model_fields)
+            reason = unknown_name(f"key of {names[0]}", field, distribution.model_fields)
         elif fault.problem == "missing":
-            reason = f"the draw {laws[0]} needs this key; add it"
+            reason = f"the draw {names[0]} needs this key; add it"
         raise KeyedError(key, f"{key}: {field}: {reason}") from None
 
 

@@ -14,18 +14,18 @@ from typing import Any
 
 from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.digests import stamp_of
-from clpipe.base.tracing import Trace, altered, with_attributes
+from clpipe.base.tracing import Trace, with_attributes, with_changes
 from clpipe.camera.profile import Camera
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.stage import Method
 
-MOST_FAMILIES = 16  # per settings that differ in numbers, such as ISOs of different gain stages
-MOST_SETTINGS = 256
+MAX_FAMILIES = 16  # per settings that differ in numbers, such as ISOs of different gain stages
+MAX_SETTINGS = 256
 
 Numbers = Sequence[Any]  # floats, or the objects that replace them while code is traced
-Making = Callable[[Numbers], Chain]
+MakeChain = Callable[[Numbers], Chain]
 
 
 class Family:
@@ -39,13 +39,13 @@ class Family:
         NotTraceableError: the computation cannot be traced.
     """
 
-    def __init__(self, make: Making, numbers: Numbers) -> None:
+    def __init__(self, make: MakeChain, numbers: Numbers) -> None:
         self._make = make
         self._traced = numbers
         self._is_checked = False
         self._derived: dict[Callable[[Chain], Chain], Families] = {}
         trace = Trace(numbers)
-        chain = make(trace.inputs).settled(trace)
+        chain = make(trace.inputs).traced(trace)
         self._steps = trace.repeat(chain.steps)
         self._attributes = trace.repeat({**vars(chain), "steps": None, "settings": None})
 
@@ -76,11 +76,11 @@ class Family:
 
     def _is_equal(self, chain: Chain, numbers: Numbers) -> bool:
         try:
-            return chain.is_equal(self._make(numbers))
+            return chain.equals(self._make(numbers))
         except Exception:  # the arguments' error is reported when they are needed
             return False
 
-    def derived(self, make: Callable[[Chain], Chain], chain: Chain, numbers: Numbers) -> Chain:
+    def derive(self, make: Callable[[Chain], Chain], chain: Chain, numbers: Numbers) -> Chain:
         """Return ``make(chain)`` for the chain of these numbers."""
         families = self._derived.setdefault(make, Families())
         return families.chain(
@@ -100,10 +100,10 @@ class ComputedChain(Chain):
         assert self.family
         return self.family.steps(self.numbers)
 
-    def derived(self, make: Callable[[Chain], Chain]) -> Chain:
+    def derive(self, make: Callable[[Chain], Chain]) -> Chain:
         if not self.family:
             return make(self)
-        found = self.family.derived(make, self, self.numbers)
+        found = self.family.derive(make, self, self.numbers)
         return found.with_settings(self.settings)
 
 
@@ -115,7 +115,7 @@ class Families:
         self._is_new = True
         self._may_trace = True
 
-    def chain(self, numbers: Numbers, make: Making, plain: Callable[[], Chain]) -> Chain:
+    def chain(self, numbers: Numbers, make: MakeChain, plain: Callable[[], Chain]) -> Chain:
         """Return the chain for these numbers.
 
         Args:
@@ -135,20 +135,20 @@ class Families:
         self._is_new = False
         return chain
 
-    def _add(self, numbers: Numbers, make: Making, chain: Chain) -> None:
+    def _add(self, numbers: Numbers, make: MakeChain, chain: Chain) -> None:
         try:
             family = Family(make, numbers)
             computed = family.chain(numbers)
         except Exception:  # a stage's code may raise anything when its numbers are no floats
             computed = None
-        if computed and computed.is_equal(chain):
+        if computed and computed.equals(chain):
             self._known.append(family)
         else:
             self._may_trace = False
-        self._may_trace &= len(self._known) < MOST_FAMILIES
+        self._may_trace &= len(self._known) < MAX_FAMILIES
 
 
-FAMILIES: BoundedCache[Families] = BoundedCache(MOST_SETTINGS)
+FAMILIES: BoundedCache[Families] = BoundedCache(MAX_SETTINGS)
 
 
 def chain_of_family(
@@ -170,7 +170,7 @@ def chain_of_family(
         ends,
         Identity(camera),
         Identity(all_stages()),
-        *(getattr(settings, name) for name in SHARED),
+        *(getattr(settings, name) for name in KEY_SETTINGS),
         others,
         *((file, stamp_of(Path(file))) for file in settings.files()),
     )
@@ -184,13 +184,13 @@ def chain_of_family(
     return chain.with_settings(settings)
 
 
-SHARED = ("stages", "skip", "lens", "focal_length", "aperture", "focus_distance", "render")
+KEY_SETTINGS = ("stages", "skip", "lens", "focal_length", "aperture", "focus_distance", "render")
 
 
 def numbers_of(settings: Settings) -> tuple[Hashable, tuple[float, ...]]:
     """Return all values that are not floats, and the floats among the values that are set."""
     numbers, others = [settings.iso], []
-    for step, method in _set_methods(settings):
+    for step, method in _methods_with_values(settings):
         table = settings.parameters[step]
         values = [getattr(method, name) for name in table]
         kinds = [None if type(value) is float else value for value in values]
@@ -201,18 +201,18 @@ def numbers_of(settings: Settings) -> tuple[Hashable, tuple[float, ...]]:
 
 def with_numbers(settings: Settings, numbers: Numbers) -> Settings:
     """Return settings with other floats, in the order of :func:`numbers_of`."""
-    left = iter(numbers)
-    iso = next(left)
+    remaining = iter(numbers)
+    iso = next(remaining)
     parameters, validated = dict(settings.parameters), dict(settings.validated)
-    for step, method in _set_methods(settings):
+    for step, method in _methods_with_values(settings):
         table = settings.parameters[step]
-        floats = {name: next(left) for name in table if type(getattr(method, name)) is float}
+        floats = {name: next(remaining) for name in table if type(getattr(method, name)) is float}
         parameters[step] = {**table, **floats}
-        validated[step] = parameters[step], altered(method, floats) if floats else method
+        validated[step] = parameters[step], with_changes(method, floats) if floats else method
     return replace(settings, iso=iso, parameters=parameters, validated=validated)
 
 
-def _set_methods(settings: Settings) -> list[tuple[str, Method]]:
+def _methods_with_values(settings: Settings) -> list[tuple[str, Method]]:
     """Return the methods of the steps that have a value set, with the steps' names."""
     set_ = (step for step in settings.step_names if step in settings.parameters)
     return [(step, settings.method(step)) for step in set_]

@@ -10,11 +10,11 @@ from typing import Any
 
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.reading import check_exists, parse_toml, read_text
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.chain.chain import Chain, Step
-from clpipe.chain.keys import CODE, KEYS, LENS, TABLES, names_in
-from clpipe.chain.looks import laid_over
-from clpipe.chain.paths import from_folder
+from clpipe.chain.keys import CODE, KEYS, LENS, TABLES, string_list
+from clpipe.chain.looks import override_settings
+from clpipe.chain.paths import resolve_paths
 from clpipe.chain.registry import load_stage_file
 from clpipe.chain.settings import Settings, settings_from
 from clpipe.chain.toml import line_of, value_text
@@ -51,7 +51,7 @@ def load_settings(*names: str) -> Settings:
 def load_configs(names: Sequence[str]) -> Config:
     """Load configurations, each of which overrides those before it.
 
-    See :func:`clpipe.chain.looks.laid_over`.
+    See :func:`clpipe.chain.looks.override_settings`.
 
     Args:
         names: at least one name, as for :func:`load_config`.
@@ -59,19 +59,19 @@ def load_configs(names: Sequence[str]) -> Config:
     Raises:
         RequestError: as :func:`load_config`, or if one cannot override those before it.
     """
-    found = load_config(names[0])
+    combined = load_config(names[0])
     for before, name in pairwise(names):
-        over = load_config(name)
+        override = load_config(name)
         try:
-            settings = laid_over(found.settings, over.values)
+            settings = override_settings(combined.settings, override.values)
         except KeyedError as error:
             raise RequestError(f"{name} over {before}: {error}") from None
-        named = found.values.keys() | over.values.keys()
+        named = combined.values.keys() | override.values.keys()
         record = settings.record()
-        own = {key: v for key, v in record.items() if key in named or isinstance(v, Mapping)}
-        code = dict.fromkeys((*found.stage_files, *over.stage_files))
-        found = Config(own, settings, tuple(code))
-    return found
+        values = {key: v for key, v in record.items() if key in named or isinstance(v, Mapping)}
+        code = dict.fromkeys((*combined.stage_files, *override.stage_files))
+        combined = Config(values, settings, tuple(code))
+    return combined
 
 
 def load_config(name: str) -> Config:
@@ -87,7 +87,7 @@ def load_config(name: str) -> Config:
     built_in = built_in_configs()
     path = built_in.get(name, Path(name))
     if path.suffix != ".toml" and not os.path.isfile(path):
-        raise RequestError(one_of("configuration", name, built_in) + ", or a .toml file")
+        raise RequestError(unknown_name("configuration", name, built_in) + ", or a .toml file")
     check_exists(path)
     try:
         text = read_text(path)
@@ -101,18 +101,18 @@ def load_config(name: str) -> Config:
     except ValueError as error:
         raise RequestError(f"{path}: the configuration is not valid TOML: {error}") from None
     try:
-        stage_files = [path.parent / file for file in names_in(values, CODE, "files")]
+        stage_files = [path.parent / file for file in string_list(values, CODE, "files")]
         for file in stage_files:
             load_stage_file(file)
         values.pop(CODE, None)
         settings = settings_from(values, path.parent)
     except KeyedError as error:
         line = line_of(text, error.key)
-        place = f"{path}, line {line}" if line else str(path)
-        raise RequestError(f"{place}: {error}") from None
+        location = f"{path}, line {line}" if line else str(path)
+        raise RequestError(f"{location}: {error}") from None
     record = settings.record()
-    own = {key: record[key] for key in values if key in record}
-    return Config(own, settings, tuple(file.resolve() for file in stage_files))
+    set_values = {key: record[key] for key in values if key in record}
+    return Config(set_values, settings, tuple(file.resolve() for file in stage_files))
 
 
 def toml_text(chain: Chain) -> str:
@@ -154,7 +154,7 @@ def config_text(values: Mapping[str, Any], stage_files: Sequence[Path] = ()) -> 
     [denoise]
     method = "mean"
     """
-    values = from_folder(Path.cwd(), values)
+    values = resolve_paths(Path.cwd(), values)
     code = {CODE: [str(file.resolve()) for file in stage_files]} if stage_files else {}
     is_table = {key: isinstance(v, Mapping) and key not in KEYS for key, v in values.items()}
     plain = {key: value for key, value in values.items() if not is_table[key]}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 class Format:
     """A file format: its extension, the bits per sample, and whether samples are floats."""
 
-    ending: str
+    extension: str
     bits: int
     floats: bool = False
 
@@ -27,10 +27,10 @@ FORMATS = {  # of the picture
 NPY = "npy"  # also a format of kept images
 DNG = "dng"  # holds the raw instead of the picture
 
-EVERY_FORMAT = (*FORMATS, DNG)
+ALL_FORMATS = (*FORMATS, DNG)
 
 # Aliases of formats.
-OTHER_NAMES = {"jpeg": "jpg", "tiff": "tif", "tiff16": "tif16", "tiff32": "tif32"}
+ALIASES = {"jpeg": "jpg", "tiff": "tif", "tiff16": "tif16", "tiff32": "tif32"}
 
 
 def format_named(text: str) -> str:
@@ -40,13 +40,13 @@ def format_named(text: str) -> str:
     ('jpg', 'tif16', 'webp')
     """
     name = text.lower().removeprefix(".")
-    return OTHER_NAMES.get(name, name if name in EVERY_FORMAT else text)
+    return ALIASES.get(name, name if name in ALL_FORMATS else text)
 
 
-def ending_of(format_: str) -> str:
+def extension_of(format_: str) -> str:
     """Return the extension of a format, without the dot.
 
-    >>> ending_of("png16"), ending_of("dng")
+    >>> extension_of("png16"), extension_of("dng")
     ('png', 'dng')
     """
-    return DNG if format_ == DNG else FORMATS[format_].ending
+    return DNG if format_ == DNG else FORMATS[format_].extension

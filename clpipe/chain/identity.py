@@ -21,29 +21,29 @@ def image_key(name: str, digest: str) -> str:
     return f"{name}@{digest[:DIGITS]}"
 
 
-def name_in(key: str) -> str:
+def name_of_key(key: str) -> str:
     """Return the name in an image key, which seeds draws; all frames of a burst have the same one.
 
-    >>> name_in("left/0001.exr@9f86d081884c7d65#3"), name_in("0001.exr")
+    >>> name_of_key("left/0001.exr@9f86d081884c7d65#3"), name_of_key("0001.exr")
     ('left/0001.exr', '0001.exr')
     """
     name, at, _ = key.rpartition("@")
     return name if at else key
 
 
-def of_frame(key: str, frame: int | None) -> str:
+def frame_key(key: str, frame: int | None) -> str:
     """Return the key of a burst's frame, counted from 0; None for an image without a burst.
 
-    >>> of_frame("a.exr@9f86d081884c7d65", None), of_frame("a.exr@9f86d081884c7d65", 0)
+    >>> frame_key("a.exr@9f86d081884c7d65", None), frame_key("a.exr@9f86d081884c7d65", 0)
     ('a.exr@9f86d081884c7d65', 'a.exr@9f86d081884c7d65#0')
     """
     return key if frame is None else f"{key}#{frame}"
 
 
-def of_bracket(key: str, ev: float) -> str:
+def bracket_key(key: str, ev: float) -> str:
     """Return the key of an image's exposure in a bracket. At 0 EV it is the image's key.
 
-    >>> of_bracket("a.exr@9f86d081884c7d65", -2), of_bracket("a.exr@9f86d081884c7d65", 0)
+    >>> bracket_key("a.exr@9f86d081884c7d65", -2), bracket_key("a.exr@9f86d081884c7d65", 0)
     ('a.exr@9f86d081884c7d65#ev-2', 'a.exr@9f86d081884c7d65')
     """
     return f"{key}#ev{ev:+g}" if ev else key
@@ -63,5 +63,5 @@ def noise_key(settings: "Settings", key: str, frame: int | None = None) -> str:
     >>> noise_key(Settings(noise_key="pair 7"), "a.exr@9f86d081884c7d65", 1)
     'pair 7#1'
     """
-    own = of_frame(settings.noise_key or key, frame or None).removesuffix("#0")
-    return own if settings.noise_key else f"{own}@ISO{settings.iso:.9g}"
+    key_of_frame = frame_key(settings.noise_key or key, frame or None).removesuffix("#0")
+    return key_of_frame if settings.noise_key else f"{key_of_frame}@ISO{settings.iso:.9g}"

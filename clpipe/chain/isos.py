@@ -6,7 +6,7 @@ from itertools import product
 
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import load_camera
-from clpipe.chain.drawing import extremes_of
+from clpipe.chain.drawing import draw_extremes
 from clpipe.chain.draws import Limits, Truncated
 from clpipe.chain.settings import Settings
 
@@ -26,18 +26,18 @@ def check_cameras(settings: Settings) -> None:
         isos: Sequence[float] = [settings.iso]
         if draw:
             limits = partial(settings.limits, isos=settings.isos())
-            isos = extremes_of(settings.draws, settings.constants(), limits)["iso"]
+            isos = draw_extremes(settings.draws, settings.constants(), limits)["iso"]
         for camera, iso in product(cameras, isos):
             camera.check_iso(iso, settings.pushed)
         return
     ranges = [settings.drawn_isos(camera) for camera in cameras]
-    lows, highs = [own.low for own in ranges], [own.high for own in ranges]
+    lows, highs = [limits_.low for limits_ in ranges], [limits_.high for limits_ in ranges]
     for iso in draw.extremes(Limits(min(lows), max(highs)), ()):
         if not any(low <= iso <= high for low, high in zip(lows, highs, strict=True)):
             lowest, highest = lows.index(min(lows)), highs.index(max(highs))
             cameras[lowest if iso < min(lows) else highest].check_iso(iso)
-    for camera, own in zip(cameras, ranges, strict=True):
-        if draw.within(own) is None:
+    for camera, limits_ in zip(cameras, ranges, strict=True):
+        if draw.truncated(limits_) is None:
             low, high = camera.iso_range
             raise RequestError(
                 f"iso: found {draw.record()}, but none of these ISOs is in the range of camera "
@@ -58,7 +58,9 @@ def draw_note(settings: Settings) -> str:
             "grows with the ISO as in a picture that is pushed"
         )
     for camera in map(load_camera, settings.names_of("camera")) if draw else ():
-        own = draw and draw.within(Limits(*camera.iso_range))
-        if own != draw and not isinstance(own, Truncated):  # a normal loses only its tails
+        truncated = draw and draw.truncated(Limits(*camera.iso_range))
+        if truncated != draw and not isinstance(
+            truncated, Truncated
+        ):  # a normal loses only its tails
             parts.append("{} from {:g} to {:g}".format(camera.name, *camera.iso_range))
     return f"iso: drawn within each camera's range: {', '.join(parts)}" if parts else ""

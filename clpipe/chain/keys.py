@@ -32,7 +32,7 @@ class Key(NamedTuple):
         type_: the type of the value. :class:`list` is a list of texts.
         text: sentences for help and documentation. Brief help shows the start of the first one.
         metavar: what the help of a command writes in place of the value.
-        usual: the default in words; "" if there is none.
+        default_text: the default in words; "" if there is none.
         choices: the texts that are allowed; () is any text.
         unit: the unit of the value.
         above: the value must be larger than this number.
@@ -44,7 +44,7 @@ class Key(NamedTuple):
     type_: type
     text: str
     metavar: str | None = None
-    usual: str = ""
+    default_text: str = ""
     choices: Sequence[str] = ()
     unit: str = ""
     above: float = -math.inf
@@ -76,7 +76,7 @@ class Key(NamedTuple):
         return isinstance(value, str) or self.above < value <= self.most
 
 
-def _of_lens(name: str, text: str, unit: str = "") -> Key:
+def _lens_key(name: str, text: str, unit: str = "") -> Key:
     """Return the key of a lens setting."""
     return Key(name, float, text, unit=unit, above=0, most=10**6, is_drawn=True)
 
@@ -94,7 +94,7 @@ _ALL = (
         "iso",
         float,
         "The ISO. Noise and denoising depend on it.",
-        usual=f"{DEFAULT_ISO:g}",
+        default_text=f"{DEFAULT_ISO:g}",
         most=10**9,
         is_drawn=True,
     ),
@@ -106,18 +106,18 @@ _ALL = (
         "none",
         is_drawn=True,
     ),
-    _of_lens("focal_length", "The focal length of the lens.", "mm"),
-    _of_lens(
+    _lens_key("focal_length", "The focal length of the lens.", "mm"),
+    _lens_key(
         "aperture",
         "The f-number of the lens. Without it, a lens from lensfun's database has no vignetting.",
     ),
-    _of_lens(
+    _lens_key(
         "focus_distance",
         "The distance to the plane in focus. By default, vignetting is that at infinity, and "
         "the stage defocus uses 3.",
         "m",
     ),
-    Key("seed", int, "The seed of the noise.", usual="0"),
+    Key("seed", int, "The seed of the noise.", default_text="0"),
     Key(
         "noise_key",
         str,
@@ -157,7 +157,7 @@ def check_type(key: str, value: Any) -> None:
         raise KeyedError(key, f"{key}: found {value!r}, but expected {known.allowed}")
 
 
-def names_in(values: Mapping[str, Any], key: str, what: str) -> tuple[str, ...]:
+def string_list(values: Mapping[str, Any], key: str, what: str) -> tuple[str, ...]:
     """Return the list of texts under a key; empty if the key is missing.
 
     Args:

@@ -9,13 +9,13 @@ from dataclasses import replace
 from typing import Any
 
 from clpipe.base.errors import KeyedError
-from clpipe.chain.keys import KEYS, NOISE, TABLES, names_in
-from clpipe.chain.methods import numbered, stage_named
+from clpipe.chain.keys import KEYS, NOISE, TABLES, string_list
+from clpipe.chain.methods import stage_named, step_names_of
 from clpipe.chain.settings import Settings, overlay
 from clpipe.stage import Kind
 
 
-def laid_over(before: Settings, values: Mapping[str, Any]) -> Settings:
+def override_settings(base: Settings, values: Mapping[str, Any]) -> Settings:
     """Return settings overridden by a configuration, or by its development if it has ``stages``.
 
     With ``stages``, the steps after the raw are those of the configuration, with their values,
@@ -24,25 +24,27 @@ def laid_over(before: Settings, values: Mapping[str, Any]) -> Settings:
     :func:`~clpipe.chain.settings.overlay`. So do all values of a configuration without ``stages``.
 
     Args:
-        before: the settings to override.
+        base: the settings to override.
         values: the values of a configuration, nested as in its file.
 
     Raises:
         KeyedError: one of the two chains has no raw, or a value is not allowed.
     """
     if "stages" not in values:
-        return overlay(before, values)
-    own = names_in(values, "stages", "stage names")
-    raw, first = before.stages[: behind_raw(before.stages)], behind_raw(own)
-    stages = (*raw, *own[first:])
-    developing = dict(zip(numbered(own)[first:], numbered(stages)[len(raw) :], strict=True))
-    return overlay(_raw_alone(before, raw, stages), _development(values, developing))
+        return overlay(base, values)
+    override_stages = string_list(values, "stages", "stage names")
+    raw, first = base.stages[: first_after_raw(base.stages)], first_after_raw(override_stages)
+    stages = (*raw, *override_stages[first:])
+    developing = dict(
+        zip(step_names_of(override_stages)[first:], step_names_of(stages)[len(raw) :], strict=True)
+    )
+    return overlay(_raw_settings(base, raw, stages), _development_values(values, developing))
 
 
-def behind_raw(stages: Sequence[str]) -> int:
+def first_after_raw(stages: Sequence[str]) -> int:
     """Return the index of the first stage after the raw in a chain's stages.
 
-    >>> behind_raw(["exposure", "mosaic", "quantize", "normalize", "demosaic"])
+    >>> first_after_raw(["exposure", "mosaic", "quantize", "normalize", "demosaic"])
     3
 
     Raises:
@@ -58,9 +60,9 @@ def behind_raw(stages: Sequence[str]) -> int:
     return makers[-1] + 1
 
 
-def _raw_alone(settings: Settings, raw: Sequence[str], stages: tuple[str, ...]) -> Settings:
+def _raw_settings(settings: Settings, raw: Sequence[str], stages: tuple[str, ...]) -> Settings:
     """Return settings with other stages. Only values of the steps that make the raw are kept."""
-    names = {*numbered(raw), *TABLES, ""}
+    names = {*step_names_of(raw), *TABLES, ""}
     skip = tuple(name for name in settings.skip if name in names or name == NOISE)
     parameters = {step: table for step, table in settings.parameters.items() if step in names}
     validated = {step: table for step, table in settings.validated.items() if step in names}
@@ -75,28 +77,28 @@ def _raw_alone(settings: Settings, raw: Sequence[str], stages: tuple[str, ...]) 
     )
 
 
-def _development(values: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
+def _development_values(values: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
     """Return the values of a configuration, without its stages and the values of its raw.
 
     Args:
         values: the values, nested as in its file.
         names: the new names of the steps after the raw, by their names in its own chain.
     """
-    taken: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for key, value in values.items():
         if key == "skip":
-            skipped = names_in(values, key, "stage names")
-            taken[key] = [names.get(n, n) for n in skipped if n in names or n == NOISE]
+            skipped = string_list(values, key, "stage names")
+            result[key] = [names.get(n, n) for n in skipped if n in names or n == NOISE]
         elif key in names:
-            taken[names[key]] = {k: _following(v, names) for k, v in value.items()}
+            result[names[key]] = {k: _renamed_followers(v, names) for k, v in value.items()}
         elif key in KEYS and key != "stages":
-            taken[key] = value
+            result[key] = value
         elif key in TABLES:
-            taken[key] = {k: _following(v, names) for k, v in value.items()}
-    return taken
+            result[key] = {k: _renamed_followers(v, names) for k, v in value.items()}
+    return result
 
 
-def _following(value: Any, names: Mapping[str, str]) -> Any:
+def _renamed_followers(value: Any, names: Mapping[str, str]) -> Any:
     """Return a value. A draw that follows a parameter of a renamed step follows the new name."""
     if not isinstance(value, Mapping):
         return value

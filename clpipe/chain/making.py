@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 
 from clpipe.base.errors import KeyedError, RequestError
-from clpipe.base.text import one_of
-from clpipe.base.tracing import Traced, altered
+from clpipe.base.text import unknown_name
+from clpipe.base.tracing import Traced, with_changes
 from clpipe.camera.lens import calibration_of
 from clpipe.camera.optics import IN_PIXELS, Optics
 from clpipe.camera.profile import Camera, load_camera
@@ -19,14 +19,14 @@ from clpipe.chain.settings import Settings
 from clpipe.reference.geometry import Scaling
 from clpipe.stage import (
     Context,
-    FromLens,
     Kind,
+    LensMethod,
     Method,
     Stage,
     StageRole,
     Unchanged,
 )
-from clpipe.stages.projection import Wide
+from clpipe.stages.projection import WideAngle
 
 
 def make_chain(
@@ -43,8 +43,8 @@ def make_chain(
 
     Args:
         settings: all values that are set.
-        source: the kind of image that enters. None is the kind of :func:`entry`, or the kind that
-            ``start_at`` reads.
+        source: the kind of image that enters. None is the kind of :func:`entry_kind`, or the kind
+            that ``start_at`` reads.
         start_at: the first step to run. Earlier steps are resolved as well, because the image has
             been through them (pattern, gains, noise, levels).
         until: the last step to run.
@@ -58,14 +58,14 @@ def make_chain(
     camera = load_camera(settings.camera)
     ends = source, start_at, until
 
-    def made(settings: Settings) -> Chain:
-        return _made(settings, camera, *ends)
+    def build(settings: Settings) -> Chain:
+        return _build_chain(settings, camera, *ends)
 
-    chain = chain_of_family(settings, camera, ends, made)
-    return altered(chain, {"draws": draws}) if draws else chain
+    chain = chain_of_family(settings, camera, ends, build)
+    return with_changes(chain, {"draws": draws}) if draws else chain
 
 
-def _made(
+def _build_chain(
     settings: Settings,
     camera: Camera,
     source: Kind | None,
@@ -73,15 +73,15 @@ def _made(
     until: str | None,
 ) -> Chain:
     """Return the chain of settings without draws, see :func:`make_chain`."""
-    steps = resolved_steps(settings, camera, source or (None if start_at else entry(settings)))
+    steps = resolve_steps(settings, camera, source or (None if start_at else entry_kind(settings)))
     names = [step.name for step in steps]
     for name in settings.parameters:
         if name not in names and name not in all_stages():
-            raise KeyedError(name, one_of("stage in this chain", name, names))
+            raise KeyedError(name, unknown_name("stage in this chain", name, names))
     first, last = 0, len(steps)
     for name in (n for n in (start_at, until) if n is not None):
         if name not in names:
-            raise RequestError(one_of("stage in this chain", name, names))
+            raise RequestError(unknown_name("stage in this chain", name, names))
     if start_at is not None:
         first = names.index(start_at)
     if until is not None:
@@ -102,12 +102,12 @@ def _made(
     return chain.without_noise() if noiseless else chain
 
 
-def entry(settings: Settings) -> Kind:
+def entry_kind(settings: Settings) -> Kind:
     """Return the kind of image that enters a whole chain: linear RGB, or display values.
 
     Display values enter if the first stage reads them.
 
-    >>> entry(Settings(stages=("inverse_gamma", "mosaic"))).label, entry(Settings()).label
+    >>> entry_kind(Settings(stages=("inverse_gamma", "mosaic"))).label, entry_kind(Settings()).label
     ('display', 'rgb')
     """
     stages = (all_stages().get(base_name(name)) for name in settings.stages)
@@ -115,7 +115,7 @@ def entry(settings: Settings) -> Kind:
     return Kind.DISPLAY if first and first.reads is Kind.DISPLAY else Kind.RGB
 
 
-def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:
+def resolve_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:
     """Return the steps of settings in order, each resolved in the context after the earlier steps.
 
     A step that does nothing is skipped if its image kind does not fit.
@@ -131,50 +131,53 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     methods = {name: settings.method(name) for name in settings.step_names}
     optics = optics_of(settings, camera, methods)
     time = optics.exposure_time
-    light = light_of(methods, camera)
+    light = illuminant_gains(methods, camera)
     context = Context(camera, settings.iso, light=light, optics=optics, exposure_time=time)
     steps: list[Step] = []
-    before, takes_lens = "the input", not settings.lens
-    wide = ""  # the step after which the picture is no longer in perspective
-    for name, as_set in methods.items():
-        stage = all_stages()[base_name(name)].reading(kind)
-        own = stage.chosen(as_set, bool(settings.parameters.get(name)), context)
-        with validation_errors(name, type(own)), user_code_errors(f"stage {name}", stage.folder):
+    previous, takes_lens = "the input", not settings.lens
+    wide_step = ""  # the step after which the picture is no longer in perspective
+    for name, configured in methods.items():
+        stage = all_stages()[base_name(name)].for_kind(kind)
+        selected = stage.method_at_step(configured, bool(settings.parameters.get(name)), context)
+        with (
+            validation_errors(name, type(selected)),
+            user_code_errors(f"stage {name}", stage.folder),
+        ):
             fits = stage.reads is (kind or stage.reads)
-            method = own
-            is_resolved = fits or isinstance(own, FromLens)
+            method = selected
+            is_resolved = fits or isinstance(selected, LensMethod)
             if is_resolved:
                 try:
-                    method = own.resolve(context)
+                    method = selected.resolve(context)
                 except RequestError:
-                    if wide:
-                        _check_behind(wide, name, own)
+                    if wide_step:
+                        _check_after_wide(wide_step, name, selected)
                     raise
-            takes_lens |= isinstance(own, FromLens) and not isinstance(method, Unchanged)
-            if wide and is_resolved and method.passes():
-                _check_behind(wide, name, own)
-            if fits and isinstance(method, Wide):
-                wide = f"{name}.method={method.method}"
+            takes_lens |= isinstance(selected, LensMethod) and not isinstance(method, Unchanged)
+            if wide_step and is_resolved and method.passes():
+                _check_after_wide(wide_step, name, selected)
+            if fits and isinstance(method, WideAngle):
+                wide_step = f"{name}.method={method.method}"
             if not fits:
                 if isinstance(method, Unchanged) and stage.reads is stage.writes:
                     continue  # so that --skip gamma need not skip later idle stages as well
-                raise RequestError(misfit(name, stage, before, kind or stage.reads))
+                raise RequestError(misfit_message(name, stage, previous, kind or stage.reads))
             _check_array(name, method, context)
             after = method.next_context(context)
-            if (states := method.optics()) and method.passes():
-                after = after.but(optics=after.optics.set_to(states))
+            if (optics_set := method.optics()) and method.passes():
+                after = after.replace(optics=after.optics.set_to(optics_set))
         if stage.folder and not isinstance(context.iso, Traced):  # else it has been checked
             check_passes(name, stage, method, context)
         steps.append(Step(name, stage, method, context))
         context = after
-        kind, before = stage.writes, name
+        kind, previous = stage.writes, name
     if not takes_lens:
         raise KeyedError("lens", _unused_lens(settings, methods))
     _check_pixels(steps)
     return steps
 
 
-def light_of(methods: Mapping[str, Method], camera: Camera) -> tuple[float, float]:
+def illuminant_gains(methods: Mapping[str, Method], camera: Camera) -> tuple[float, float]:
     """Return the gains of red and blue that balance the light: the set ones, else the camera's."""
     method = methods.get(stage_in(StageRole.BALANCE_OF_LIGHT).name)
     red, blue = camera.white_balance_gains
@@ -190,7 +193,7 @@ def optics_of(settings: Settings, camera: Camera, methods: Mapping[str, Method])
     """
     stated = [
         (key, name, value)
-        for key, name in SETTINGS.items()
+        for key, name in OPTICS_SETTINGS.items()
         if (value := getattr(settings, key)) is not None
     ]
     stated += [(f"{RENDER}.{name}", name, v) for name, v in settings.render.optics.items()]
@@ -205,10 +208,10 @@ def optics_of(settings: Settings, camera: Camera, methods: Mapping[str, Method])
 
 
 # The optics that keys of settings set, by the keys.
-SETTINGS = dict(zip(LENS[1:], ("focal_length", "f_number", "focus_distance"), strict=True))
+OPTICS_SETTINGS = dict(zip(LENS[1:], ("focal_length", "f_number", "focus_distance"), strict=True))
 
 
-def _check_behind(wide: str, name: str, method: Method) -> None:
+def _check_after_wide(wide: str, name: str, method: Method) -> None:
     """Check that a step can follow one that makes the picture of a wide lens.
 
     Args:
@@ -219,7 +222,7 @@ def _check_behind(wide: str, name: str, method: Method) -> None:
     Raises:
         RequestError: the step needs a picture in perspective.
     """
-    if isinstance(method, FromLens):
+    if isinstance(method, LensMethod):
         raise KeyedError(
             "lens",
             f"lens: a lens from lensfun needs a picture in perspective, but {wide} is a lens as "
@@ -244,11 +247,11 @@ def _check_curve(chain: Chain) -> None:
     for step in chain.steps:
         is_levels = step.stage.role is StageRole.LEVELS and not step.context.knots
         if maker and is_levels and getattr(step.method, "knots", None):
-            made = maker.name
+            raw = maker.name
             raise KeyedError(
                 f"{step.name}.knots",
-                f"{step.name}.knots: found a curve, but {made}.method={maker.method.method} has "
-                f"none; set {made}.method=pwl and {made}.knots, and remove {step.name}.knots",
+                f"{step.name}.knots: found a curve, but {raw}.method={maker.method.method} has "
+                f"none; set {raw}.method=pwl and {raw}.knots, and remove {step.name}.knots",
             )
         maker = step if step.stage.writes is Kind.RAW else maker
 
@@ -283,8 +286,8 @@ def _check_array(name: str, method: Method, context: Context) -> None:
     array = context.array
     if array and any("pattern" in pass_.all_arguments for pass_ in method.passes()):
         stage = all_stages()[base_name(name)]
-        usual = stage.usual and stage.usual(context)
-        fitting = [m.method for m in ((usual,) if usual else stage.methods) if m.any_array]
+        default = stage.default_method and stage.default_method(context)
+        fitting = [m.method for m in ((default,) if default else stage.methods) if m.any_array]
         rest = f"use {name}.method={' or '.join(fitting)}" if fitting else f"skip {name}"
         raise KeyedError(
             name,
@@ -297,12 +300,12 @@ def _unused_lens(settings: Settings, methods: Mapping[str, Method]) -> str:
     """Return the message for a lens that is set, but that no step uses."""
     known = "lensfun has neither distortion nor vignetting for it at these settings; remove it"
     stages = " or ".join(s.name for s in all_stages().values() if "lens" in s.by_name)
-    takes_it = any(isinstance(method, FromLens) for method in methods.values())
+    takes_it = any(isinstance(method, LensMethod) for method in methods.values())
     why = known if takes_it else f"no step uses it; set the method of {stages} to lens"
     return f"lens: found {settings.lens}, but {why}"
 
 
-def misfit(name: str, stage: Stage, before: str, kind: Kind) -> str:
+def misfit_message(name: str, stage: Stage, before: str, kind: Kind) -> str:
     """Return the message for a stage that does not fit: why, and which stages could precede it."""
     bridges = [s.name for s in all_stages().values() if (s.reads, s.writes) == (kind, stage.reads)]
     help_ = f"list {' or '.join(bridges)} between them" if bridges else f"skip {name} as well"

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from clpipe.base.errors import KeyedError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.base.validation import first_fault
 from clpipe.chain.keys import OUTPUT, RENDER
 from clpipe.chain.registry import all_stages
@@ -28,10 +28,10 @@ def base_name(step: str) -> str:
     return re.sub(r"_\d+$", "", step)
 
 
-def numbered(stages: Sequence[str]) -> list[str]:
+def step_names_of(stages: Sequence[str]) -> list[str]:
     """Return the names of the steps of stages. A repeated stage gets a number.
 
-    >>> numbered(["denoise", "gamma", "denoise"])
+    >>> step_names_of(["denoise", "gamma", "denoise"])
     ['denoise', 'gamma', 'denoise_2']
     """
     before = [stages[:place].count(stage) for place, stage in enumerate(stages)]
@@ -42,7 +42,7 @@ def numbered(stages: Sequence[str]) -> list[str]:
 @lru_cache(maxsize=64)
 def step_names(stages: tuple[str, ...], skip: tuple[str, ...]) -> tuple[str, ...]:
     """Return the names of the steps, see :attr:`clpipe.chain.settings.Settings.step_names`."""
-    return tuple(name for name in numbered(stages) if name not in skip)
+    return tuple(name for name in step_names_of(stages) if name not in skip)
 
 
 def stage_named(key: str, name: str) -> Stage:
@@ -58,9 +58,9 @@ def stage_named(key: str, name: str) -> Stage:
     if name not in all_stages():
         if base_name(name) in all_stages():
             stage = base_name(name)
-            again = f"{name}: this names a repeated stage; to repeat it, list {stage} again"
-            raise KeyedError(key, f"{again}. The second is then called {stage}_2")
-        raise KeyedError(key, one_of("stage", name, all_stages()))
+            message = f"{name}: this names a repeated stage; to repeat it, list {stage} again"
+            raise KeyedError(key, f"{message}. The second is then called {stage}_2")
+        raise KeyedError(key, unknown_name("stage", name, all_stages()))
     return all_stages()[name]
 
 
@@ -73,7 +73,7 @@ def parameter_names() -> list[str]:
     )
 
 
-def chosen_method(name: str, table: Mapping[str, Any]) -> Any:
+def method_name(name: str, table: Mapping[str, Any]) -> Any:
     """Return the name of the method in a step's table; else of the stage's default method."""
     stage = all_stages().get(base_name(name))
     return table.get("method", stage.methods[0].method if stage else None)
@@ -104,7 +104,7 @@ def make_model(name: str, table: Mapping[str, Any]) -> Any:
     if name in TABLE_MODELS:
         model = TABLE_MODELS[name]
     elif table:
-        model = method_named(stage_of(name), name, chosen_method(name, table))
+        model = method_named(stage_of(name), name, method_name(name, table))
         table = {k: v for k, v in table.items() if k != "method"}
     else:
         return default_method(stage_of(name).methods[0], name)
@@ -135,7 +135,7 @@ def method_named(stage: Stage, name: str, chosen: Any) -> type[Method]:
         KeyedError: the stage has no such method.
     """
     if not isinstance(chosen, str) or chosen not in stage.by_name:
-        message = one_of("method", str(chosen), stage.by_name)
+        message = unknown_name("method", str(chosen), stage.by_name)
         raise KeyedError(f"{name}.method", f"{name}.method: {message}")
     return stage.by_name[chosen]
 
@@ -170,9 +170,9 @@ def unknown_parameter(step: str, model: type[BaseModel], parameter: str) -> Keye
     """Return the error for a parameter that a step, or another table, does not have."""
     key = f"{step}.{parameter}"
     if not issubclass(model, Method):
-        return KeyedError(key, one_of(f"key of {step}", parameter, model.model_fields))
+        return KeyedError(key, unknown_name(f"key of {step}", parameter, model.model_fields))
     what = f"parameter of {step} ({model.method})"
-    message = one_of(what, parameter, ["method", *model.model_fields])
+    message = unknown_name(what, parameter, ["method", *model.model_fields])
     stage = all_stages()[base_name(step)]
     others = [m for m, other in stage.by_name.items() if parameter in other.model_fields]
     if others:

@@ -8,21 +8,21 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from clpipe.base.errors import RequestError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.chain.files import built_in_configs
-from clpipe.chain.formats import EVERY_FORMAT
+from clpipe.chain.formats import ALL_FORMATS
 from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.keys import CODE, KEYS, Key
 from clpipe.chain.rendition import BASELINES, CLEAN, TRUTHS
-from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS
+from clpipe.images.pixels import DEFAULT_MAX_PIXELS, MAX_PIXELS
 from clpipe.reference.carried import RESAMPLING
 
 Moments = Literal["start", "middle", "end", "all"]
 Transfer = Literal["srgb", "linear"]
 RedoName = Literal["missing", "old", "damaged", "all"]
 
-MOST_PATCHES = 9999  # per image, because file names have four digits
-PER_IMAGE = 16  # patches by default
+MAX_PATCHES = 9999  # per image, because file names have four digits
+DEFAULT_PATCHES = 16  # patches by default
 
 DEVICE = Key(
     "device",
@@ -37,7 +37,7 @@ TRUTH = Key(
     list,
     "Write the picture without noise (development), without noise and denoising (clean), the clean "
     "mosaic (mosaic), or its noise variance (variance).",
-    usual=CLEAN,
+    default_text=CLEAN,
     choices=TRUTHS,
 )
 
@@ -76,8 +76,8 @@ _ALL = (
         list,
         "The format of the pictures, or dng for the raw that quantize makes. npy holds float16, "
         "and DN as uint16; it also makes the images of --keep .npy.",
-        usual="jpg; exr, or npy for patches, if --until ends the chain earlier",
-        choices=EVERY_FORMAT,
+        default_text="jpg; exr, or npy for patches, if --until ends the chain earlier",
+        choices=ALL_FORMATS,
     ),
     Key(
         "keep", list, "A stage whose image is also written, or all. It is a float EXR.", "STAGE|all"
@@ -100,7 +100,7 @@ _ALL = (
         "uniform (iid) or intensity-dependent (intensity) noise. The noise of iid and intensity is "
         "independent and as strong as the picture's. These two also write the ground truth from "
         "which they are made.",
-        usual="",
+        default_text="",
         choices=(*TRUTHS, *BASELINES),
     ),
     Key(
@@ -108,7 +108,7 @@ _ALL = (
         str,
         "The moment of an exposure of several files whose pose and layers are written with the "
         "picture. all also writes the layers of its start and end.",
-        usual="middle",
+        default_text="middle",
         choices=get_args(Moments),
     ),
     Key(
@@ -142,9 +142,9 @@ _ALL = (
         "The number of patches at random places, or grid for adjacent patches that cover the "
         "picture.",
         "N|grid",
-        f"{PER_IMAGE}",
+        f"{DEFAULT_PATCHES}",
         above=0,
-        most=MOST_PATCHES,
+        most=MAX_PATCHES,
     ),
     Key(
         "augment",
@@ -180,7 +180,7 @@ _ALL = (
         int,
         "The most pixels of an image. Larger images are rejected before memory is allocated.",
         "N",
-        f"{USUAL_MAX_PIXELS}",
+        f"{DEFAULT_MAX_PIXELS}",
         above=0,
         most=MAX_PIXELS,
     ),
@@ -190,7 +190,7 @@ _ALL = (
         "Recompute no existing picture (missing), those of another version of clpipe (old), also "
         "damaged ones (damaged), or all, even files of other programs (all). Pictures that are "
         "missing or whose request has changed are always made. damaged reads all files.",
-        usual="old",
+        default_text="old",
         choices=get_args(RedoName),
     ),
     Key(
@@ -202,7 +202,7 @@ _ALL = (
         most=10**6,
     ),
     Key("shard", str, "The part of the images to make, such as 2/8, for job arrays.", "I/N"),
-    DEVICE._replace(type_=list, usual="the first GPU and all GPUs like it, else the CPU"),
+    DEVICE._replace(type_=list, default_text="the first GPU and all GPUs like it, else the CPU"),
     Key(
         "memory",
         str,
@@ -258,4 +258,4 @@ def check_option(name: str, value: Any) -> None:
         raise RequestError(f"found {name} {value}; expected {key.allowed}")
     for each in value if key.choices and key.type_ is list else ():
         if each not in key.choices:
-            raise RequestError(one_of(name, each, key.choices))
+            raise RequestError(unknown_name(name, each, key.choices))

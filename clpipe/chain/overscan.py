@@ -9,12 +9,12 @@ from dataclasses import replace
 
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
-from clpipe.chain.chain import Chain, of_structure
+from clpipe.chain.chain import Chain, cached_by_structure
 from clpipe.reference.geometry import NO_MARGINS, Margins
 
 
-@of_structure
-def steps_of_overscan(chain: Chain) -> int:
+@cached_by_structure
+def overscan_step_count(chain: Chain) -> int:
     """Return how many steps of a chain get an image with overscan; 0 if the chain cannot use it."""
     for count, step in enumerate(chain.steps, 1):
         if step.passes and not step.method.overscan:
@@ -29,7 +29,7 @@ def with_overscan(chain: Chain, margins: Margins) -> Chain:
 
     Plans and kernels differ from those of ``chain`` only in numbers.
     """
-    count = steps_of_overscan(chain)
+    count = overscan_step_count(chain)
     steps = tuple(
         replace(step, method=step.method.with_margins(margins)) if number < count else step
         for number, step in enumerate(chain.steps)
@@ -47,7 +47,7 @@ def margins_of_array(overscan: Sequence[int], image: Array) -> Margins:
         return NO_MARGINS
     if len(overscan) == len(NO_MARGINS) and min(overscan) >= 0 and image.ndim > 1:
         margins = Margins(*map(int, overscan))
-        if min(margins.inside(*image.shape[1::-1])) > 0:
+        if min(margins.frame_size(*image.shape[1::-1])) > 0:
             return margins
     raise ImageError(
         f"found overscan {tuple(overscan)}; expected four numbers of px (left, top, right, bottom) "

@@ -5,7 +5,7 @@ from dataclasses import replace
 from clpipe.chain.chain import Chain
 from clpipe.reference.panorama import Panorama
 from clpipe.reference.projection import Projection
-from clpipe.stages.projection import Wide
+from clpipe.stages.projection import WideAngle
 
 
 def with_panorama(chain: Chain, panorama: Panorama) -> Chain:
@@ -15,7 +15,7 @@ def with_panorama(chain: Chain, panorama: Panorama) -> Chain:
     """
     steps = tuple(
         replace(step, method=step.method.with_panorama(panorama))
-        if isinstance(step.method, Wide)
+        if isinstance(step.method, WideAngle)
         else step
         for step in chain.steps
     )

@@ -12,8 +12,8 @@ from clpipe.chain.chain import Chain, Step
 from clpipe.stage import Kind, Method, ReferenceContext, StageRole, Unchanged
 from clpipe.stages.exposure.gain import Gain
 
-CODES = 256  # entries of a table of the response, and of its inverse
-FINE = 64  # steps between two entries, for the inversion
+RESPONSE_SIZE = 256  # entries of a table of the response, and of its inverse
+INVERSION_STEPS = 64  # steps between two entries, for the inversion
 DIGITS = 6  # significant digits of written numbers
 METERED = "metered_ev"  # among the estimates of exposure
 
@@ -116,19 +116,21 @@ def response_of(chain: Chain) -> Tables | None:
 
 
 def _tables(steps: Sequence[Step]) -> Tables:
-    grey = np.arange(FINE * (CODES - 1) + 1, dtype=np.float32) / np.float32(FINE * (CODES - 1))
+    grey = np.arange(INVERSION_STEPS * (RESPONSE_SIZE - 1) + 1, dtype=np.float32) / np.float32(
+        INVERSION_STEPS * (RESPONSE_SIZE - 1)
+    )
     image: Floats = np.repeat(grey[None, :, None], 3, 2)
     for step in steps:
         image = step.method.reference(image, ReferenceContext(step.context, {}, {}))
     curve = np.maximum.accumulate(np.clip(image[0, :, 1].astype(np.float64), 0, 1))
-    codes = np.arange(CODES) / (CODES - 1)
+    codes = np.arange(RESPONSE_SIZE) / (RESPONSE_SIZE - 1)
     first = np.searchsorted(curve, codes)  # the smallest x of each code
     at = np.clip(first, 1, len(curve) - 1)
     rise = curve[at] - curve[at - 1]
     part = np.where(rise > 0, (codes - curve[at - 1]) / np.where(rise > 0, rise, 1), 1.0)
     inverse = (at - 1 + np.clip(part, 0, 1)) / (len(curve) - 1)
     return {
-        "table": [_rounded(v) for v in curve[::FINE]],
+        "table": [_rounded(v) for v in curve[::INVERSION_STEPS]],
         "inverse": [_rounded(v) for v in inverse],
     }
 

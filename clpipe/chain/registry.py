@@ -21,7 +21,7 @@ from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.base.reading import check_exists, check_regular
 from clpipe.chain.keys import NOISE
 from clpipe.stage import CompileTime, Context, Method, Stage, StageRole, typed_arguments
-from clpipe.stages import own_stages
+from clpipe.stages import built_in_stages
 
 ARGUMENT_TYPES = (np.float32, np.int32, np.uint32, np.ndarray, CompileTime)
 
@@ -39,7 +39,11 @@ def all_stages() -> dict[str, Stage]:
 
 @lru_cache(maxsize=1)
 def _all_stages(from_files: tuple[Stage, ...]) -> dict[str, Stage]:
-    return {**own_stages(), **installed_stages(), **{stage.name: stage for stage in from_files}}
+    return {
+        **built_in_stages(),
+        **installed_stages(),
+        **{stage.name: stage for stage in from_files},
+    }
 
 
 @cache
@@ -52,8 +56,8 @@ def installed_stages() -> dict[str, Stage]:
     stages: dict[str, Stage] = {}
     for entry in entry_points(group=ENTRY_POINTS):
         package = f"package {entry.dist.name}" if entry.dist else f"entry point {entry.name}"
-        stage, file = _loaded(package, entry)
-        _check_stage_name(package, stage.name, own_stages() | stages)
+        stage, file = _load_stage(package, entry)
+        _check_stage_name(package, stage.name, built_in_stages() | stages)
         stages[stage.name] = replace(stage, folder=file.parent)
     return stages
 
@@ -71,7 +75,7 @@ def load_stage_file(path: Path) -> Stage:
             name of another stage.
     """
     with _loading:
-        return _loaded_file(path, Path(os.path.realpath(path)))
+        return _load_file(path, Path(os.path.realpath(path)))
 
 
 def code_files(stage_files: Iterable[Path]) -> list[Path]:
@@ -88,24 +92,24 @@ def code_files(stage_files: Iterable[Path]) -> list[Path]:
     return files
 
 
-def _loaded_file(path: Path, where: Path) -> Stage:
-    if where not in _from_files:
-        spec = spec_from_file_location(f"clpipe_stage_{path.stem}", where)
+def _load_file(path: Path, real_path: Path) -> Stage:
+    if real_path not in _from_files:
+        spec = spec_from_file_location(f"clpipe_stage_{path.stem}", real_path)
         if path.suffix != ".py" or spec is None or spec.loader is None:
             raise RequestError(f"{path}: a stage file is a Python file; use one that ends in .py")
         check_exists(path)
         try:
-            check_regular(where)
+            check_regular(real_path)
         except OSError as error:
             raise RequestError(f"{path}: cannot read the stage file: {error.strerror}") from None
         module = module_from_spec(spec)
-        stage, _ = _loaded(str(path), module)
+        stage, _ = _load_stage(str(path), module)
         _check_stage_name(str(path), stage.name, all_stages())
-        _from_files[where] = replace(stage, folder=where.parent)
-    return _from_files[where]
+        _from_files[real_path] = replace(stage, folder=real_path.parent)
+    return _from_files[real_path]
 
 
-def _loaded(place: str, source: EntryPoint | ModuleType) -> tuple[Stage, Path]:
+def _load_stage(place: str, source: EntryPoint | ModuleType) -> tuple[Stage, Path]:
     """Return the stage of an entry point, or of a module that this function runs, and its file.
 
     Args:
@@ -167,11 +171,11 @@ def user_code_errors(place: str, folder: Path | None) -> Iterator[None]:
         raise RequestError(f"{error.filename}, line {error.lineno}: {error.msg}") from None
     except Exception as error:
         frames = traceback.extract_tb(error.__traceback__)
-        own = [f for f in frames if folder and Path(f.filename).resolve().parent == folder]
-        at = (own or frames)[-1]
-        where = f"{at.filename}, line {at.lineno}: {type(error).__name__}: {error}"
+        user_frames = [f for f in frames if folder and Path(f.filename).resolve().parent == folder]
+        at = (user_frames or frames)[-1]
+        location = f"{at.filename}, line {at.lineno}: {type(error).__name__}: {error}"
         named = Path(place).resolve() == Path(at.filename).resolve()
-        raise RequestError(where if named else f"{place}: {where}") from None
+        raise RequestError(location if named else f"{place}: {location}") from None
 
 
 def check_passes(name: str, stage: Stage, method: Method, context: Context) -> None:
@@ -185,7 +189,7 @@ def check_passes(name: str, stage: Stage, method: Method, context: Context) -> N
     with user_code_errors(f"stage {name}", stage.folder):
         passes, arguments = method.passes(), typed_arguments(method.arguments(context))
         for pass_ in passes:
-            names = [*arguments, *(name for p in passes for name in p.gives)]
+            names = [*arguments, *(name for p in passes for name in p.provides)]
             for argument in pass_.all_arguments:
                 if argument not in names:
                     raise RequestError(
@@ -207,7 +211,7 @@ def check_passes(name: str, stage: Stage, method: Method, context: Context) -> N
                 )
 
 
-def _check_stage_name(place: str, name: str, taken: dict[str, Stage]) -> None:
+def _check_stage_name(place: str, name: str, existing: dict[str, Stage]) -> None:
     if not name.isidentifier() or name[-1].isdecimal():
         raise RequestError(
             f"{place}: its stage is called '{name}', but a name has only letters, digits and _, "
@@ -218,8 +222,8 @@ def _check_stage_name(place: str, name: str, taken: dict[str, Stage]) -> None:
             f"{place}: its stage is called '{name}', which stands for all noise under --skip; "
             "choose another name"
         )
-    if name in taken:
-        owner = taken[name].folder or "clpipe itself"
+    if name in existing:
+        owner = existing[name].folder or "clpipe itself"
         raise RequestError(
             f"{place}: its stage is called '{name}', but that name is taken ({owner}); "
             "choose another name"

@@ -67,8 +67,8 @@ class RenderCamera(BaseModel):
         >>> camera.with_defaults({"focal_length": 50.0, "exposure_time": 0.5}).focal_length
         24.0
         """
-        own = self.model_dump(exclude_none=True)
-        return self.model_copy(update={k: v for k, v in shot.items() if k not in own})
+        set_fields = self.model_dump(exclude_none=True)
+        return self.model_copy(update={k: v for k, v in shot.items() if k not in set_fields})
 
 
 POSE = {"rotation", "translation", "motion"}

@@ -76,15 +76,15 @@ class Rendition:
         Raises:
             KeyError, TypeError, ValueError: the values are damaged.
         """
-        own = {each.name: values[each.name] for each in fields(cls)}
+        record = {each.name: values[each.name] for each in fields(cls)}
         try:
-            found = _adapter().validate_python(own)
+            found = _adapter().validate_python(record)
         except ValidationError:
-            raise ValueError(f"found {own}") from None
+            raise ValueError(f"found {record}") from None
         numbers = range(found.frames or 0) if found.role == NOISY and found.frames else (None,)
         is_possible = 0 < (found.frames or 1) <= MAX_FRAMES and found.frame in numbers
         if not is_possible or values["picture"] != found.suffix:
-            raise ValueError(f"found picture {values['picture']!r} of {own}")
+            raise ValueError(f"found picture {values['picture']!r} of {record}")
         return found
 
 
@@ -93,7 +93,7 @@ def _adapter() -> TypeAdapter[Rendition]:
     return TypeAdapter(Rendition)  # takes 10 ms
 
 
-FIRST = Rendition()
+DEFAULT_RENDITION = Rendition()
 
 
 def parse_bracket(evs: str | Sequence[float]) -> tuple[float, ...]:

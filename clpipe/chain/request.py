@@ -12,16 +12,16 @@ from pydantic import Field, TypeAdapter, ValidationError
 from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
-from clpipe.base.text import one_of, several
-from clpipe.base.tracing import altered
+from clpipe.base.text import as_texts, unknown_name
+from clpipe.base.tracing import with_changes
 from clpipe.base.validation import first_fault
 from clpipe.chain.carry import AovSpec, parse_carry
 from clpipe.chain.chain import Chain
 from clpipe.chain.files import load_configs
-from clpipe.chain.formats import EVERY_FORMAT, NPY
+from clpipe.chain.formats import ALL_FORMATS, NPY
 from clpipe.chain.keys import KEYS, TABLES
 from clpipe.chain.making import make_chain
-from clpipe.chain.options import MOST_PATCHES, Moments
+from clpipe.chain.options import MAX_PATCHES, Moments
 from clpipe.chain.registry import code_files, load_stage_file
 from clpipe.chain.rendition import BASELINES, MOSAIC
 from clpipe.chain.settings import Settings, overlay
@@ -30,11 +30,11 @@ from clpipe.stage import Kind
 
 DEFAULTS = Settings()
 
-MADE = 8  # settings that a request and its copies cache
+SETTINGS_CACHE_SIZE = 8  # settings that a request and its copies cache
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RecordedRequest:
     """The part of a request that determines a picture's bytes, as a sidecar stores it.
 
     The rest of a request determines which pictures are made.
@@ -64,25 +64,26 @@ class Recorded:
     formats: tuple[str, ...] = ()
     keep: tuple[str, ...] = ()
     patch: Annotated[int, Field(gt=0)] | None = None
-    patches_per_image: Annotated[int, Field(ge=0, le=MOST_PATCHES)] | Literal["grid"] = 0
+    patches_per_image: Annotated[int, Field(ge=0, le=MAX_PATCHES)] | Literal["grid"] = 0
     augment: bool = False
     carry: tuple[str, ...] = ()
     truth_at: Moments = "middle"
 
 
-RECORDED = tuple(each.name for each in fields(Recorded))
+RECORDED_FIELDS = tuple(each.name for each in fields(RecordedRequest))
 
 
 @dataclass(frozen=True)
-class Request(Recorded):
+class Request(RecordedRequest):
     """A request: plain values of all options, which can be stored and sent to other processes.
 
     Args:
         truths: which of :data:`clpipe.chain.rendition.TRUTHS` are written next to each picture.
         baselines: which of :data:`clpipe.chain.rendition.BASELINES` are made next to each picture.
-        made: a cache of the settings made of ``config`` and ``options``, which copies share.
+        settings_cache: a cache of the settings made of ``config`` and ``options``, which copies
+        share.
 
-    The other fields are those of :class:`Recorded`, and options.
+    The other fields are those of :class:`RecordedRequest`, and options.
     """
 
     max_pixels: int | None = None
@@ -90,8 +91,8 @@ class Request(Recorded):
     truths: tuple[str, ...] = ()
     bracket: tuple[float, ...] = ()
     baselines: tuple[str, ...] = ()
-    made: BoundedCache[Settings] = field(
-        default_factory=lambda: BoundedCache(MADE), compare=False, repr=False
+    settings_cache: BoundedCache[Settings] = field(
+        default_factory=lambda: BoundedCache(SETTINGS_CACHE_SIZE), compare=False, repr=False
     )
 
     @classmethod
@@ -118,7 +119,7 @@ class Request(Recorded):
         """
         for file in stage_files:
             load_stage_file(Path(file))
-        configuration = load_configs(several(config)) if config else None
+        configuration = load_configs(as_texts(config)) if config else None
         code = (*(configuration.stage_files if configuration else ()), *map(Path, stage_files))
         request = cls(
             config=configuration.values if configuration else None,
@@ -130,7 +131,7 @@ class Request(Recorded):
         )
         if configuration:
             # These settings are already validated.
-            request.made.get(Identity(request.config), lambda: configuration.settings)
+            request.settings_cache.get(Identity(request.config), lambda: configuration.settings)
         request.settings()
         request.aov_specs()  # rejects wrong texts
         return request
@@ -143,21 +144,21 @@ class Request(Recorded):
             RequestError: the record does not have this form.
         """
         damaged = "the request in it is damaged: "
-        known = {name: record[name] for name in RECORDED if name in record}
-        for name in RECORDED:
+        known = {name: record[name] for name in RECORDED_FIELDS if name in record}
+        for name in RECORDED_FIELDS:
             if name not in known and name != "truth_at":  # older sidecars lack it
                 raise RequestError(f"{damaged}{name} is missing")
         try:
-            found = _recorded().validate_json(json.dumps(known), strict=True)
+            found = _record_adapter().validate_json(json.dumps(known), strict=True)
         except ValidationError as error:
             fault = first_fault(error)
             raise RequestError(damaged + f"{fault.key}: {fault.text}".removeprefix(": ")) from None
         if (found.patch is None) != (found.patches_per_image == 0):
             raise RequestError(f"{damaged}patch and patches_per_image contradict each other")
-        if not set(found.formats) <= set(EVERY_FORMAT):
+        if not set(found.formats) <= set(ALL_FORMATS):
             raise RequestError(
                 f"{damaged}formats: found {', '.join(found.formats)}; expected some of "
-                f"{', '.join(EVERY_FORMAT)}"
+                f"{', '.join(ALL_FORMATS)}"
             )
         request = cls(**vars(found))
         request.aov_specs()  # rejects wrong texts
@@ -165,7 +166,7 @@ class Request(Recorded):
 
     def for_image(self, name: str, values: Mapping[str, Any]) -> Self:
         """Return the request for one image: with its name, and values that only it has."""
-        return altered(self, {"image_name": name, "image": values})
+        return with_changes(self, {"image_name": name, "image": values})
 
     def with_outputs(self, chain: Chain) -> "ResolvedRequest":
         """Return the request with every output named, for a chain.
@@ -177,11 +178,11 @@ class Request(Recorded):
             RequestError: the chain lacks a step of ``keep``, or a mosaic that the truths need.
         """
         is_whole = self.until is None or chain.result is Kind.DISPLAY
-        usual = "jpg" if is_whole else "exr" if self.patch is None else NPY
-        formats = tuple(dict.fromkeys(self.formats)) or (usual,)
+        default = "jpg" if is_whole else "exr" if self.patch is None else NPY
+        formats = tuple(dict.fromkeys(self.formats)) or (default,)
         keep = chain.select(self.keep)
-        own = noisy_mosaic(chain).steps[-1].name if MOSAIC in self.truths else ""
-        truth_keep = tuple(step for step in keep if step != own)
+        mosaic_step = noisy_mosaic(chain).steps[-1].name if MOSAIC in self.truths else ""
+        truth_keep = tuple(step for step in keep if step != mosaic_step)
         known = {each.name: getattr(self, each.name) for each in fields(Request)}
         known |= {"formats": formats, "keep": keep, "truth_keep": truth_keep}
         return ResolvedRequest(**known)
@@ -205,7 +206,7 @@ class Request(Recorded):
         """
         for file in self.stage_files:
             load_stage_file(Path(file))
-        settings = self._general()
+        settings = self._settings_of_all()
         if embedded is not None:
             for values in (self.config, self.options):
                 embedded = overlay(embedded, values) if values else embedded
@@ -233,20 +234,20 @@ class Request(Recorded):
         for step, value in self.options.items():
             is_table = isinstance(value, Mapping) and step not in KEYS  # there it is a draw
             if is_table and step not in known:
-                raise RequestError(one_of("stage in this chain", step, chain.names))
+                raise RequestError(unknown_name("stage in this chain", step, chain.names))
         return chain
 
     def record(self) -> dict[str, Any]:
         """Return the request as a sidecar stores it, in JSON values.
 
-        It contains :data:`RECORDED`, and under "files" the SHA-256 of all files that are named.
-        Equal records of the same image produce the same bytes.
+        It contains :data:`RECORDED_FIELDS`, and under "files" the SHA-256 of all files that are
+        named. Equal records of the same image produce the same bytes.
 
         Raises:
             RequestError: as :meth:`settings`.
         """
-        return _as_read_back(
-            {**{name: getattr(self, name) for name in RECORDED}, "files": self._files()}
+        return _through_json(
+            {**{name: getattr(self, name) for name in RECORDED_FIELDS}, "files": self._files()}
         )
 
     def record_over(self, record: Mapping[str, Any]) -> dict[str, Any]:
@@ -255,30 +256,30 @@ class Request(Recorded):
         Raises:
             RequestError: as :meth:`settings`.
         """
-        own = {"image": self.image, "image_name": self.image_name, "files": self._files()}
-        return {**record, **_as_read_back(own)}
+        changed = {"image": self.image, "image_name": self.image_name, "files": self._files()}
+        return {**record, **_through_json(changed)}
 
     def _files(self) -> dict[str, str]:
         """Return the SHA-256 of all files that the request names, by name."""
         code = code_files([Path(file) for file in self.stage_files])
         return digests([*self.settings().files(), *map(str, code)])
 
-    def _general(self) -> Settings:
+    def _settings_of_all(self) -> Settings:
         """Return the settings of all images, without draws: options override the configuration."""
         config, options = Identity(self.config), Identity(self.options)
         configured = (
-            self.made.get(config, lambda: overlay(DEFAULTS, self.config or {}))
+            self.settings_cache.get(config, lambda: overlay(DEFAULTS, self.config or {}))
             if self.config
             else DEFAULTS
         )
         if not self.options:
             return configured
-        return self.made.get((config, options), lambda: overlay(configured, self.options))
+        return self.settings_cache.get((config, options), lambda: overlay(configured, self.options))
 
 
 @cache
-def _recorded() -> TypeAdapter[Recorded]:
-    return TypeAdapter(Recorded)
+def _record_adapter() -> TypeAdapter[RecordedRequest]:
+    return TypeAdapter(RecordedRequest)
 
 
 @dataclass(frozen=True)
@@ -292,7 +293,7 @@ class ResolvedRequest(Request):
     truth_keep: tuple[str, ...] = ()
 
 
-def _as_read_back(values: Mapping[str, Any]) -> dict[str, Any]:
+def _through_json(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return values as they are after a round trip through JSON."""
     read: dict[str, Any] = json.loads(json.dumps(values))
     return read

@@ -14,11 +14,11 @@ from typing import Any
 from pydantic import BaseModel
 
 from clpipe.base.errors import KeyedError, RequestError
-from clpipe.base.text import either, one_of
-from clpipe.base.tracing import altered
+from clpipe.base.text import quote_alternatives, unknown_name
+from clpipe.base.tracing import with_changes
 from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_name, load_camera
-from clpipe.chain.drawing import draw_of, extremes_of, values_of
-from clpipe.chain.draws import TINY, Choice, Draw, Limits, limits_of
+from clpipe.chain.drawing import draw_extremes, draw_values, parse_drawn
+from clpipe.chain.draws import SMALLEST_FLOAT, Choice, Draw, Limits, field_limits
 from clpipe.chain.keys import (
     CODE,
     DEFAULT_ISO,
@@ -28,13 +28,13 @@ from clpipe.chain.keys import (
     NOISE,
     TABLES,
     check_type,
-    names_in,
+    string_list,
 )
 from clpipe.chain.methods import (
     TABLE_MODELS,
     base_name,
-    chosen_method,
     make_model,
+    method_name,
     method_named,
     parameter_names,
     stage_named,
@@ -42,7 +42,7 @@ from clpipe.chain.methods import (
     step_names,
     unknown_parameter,
 )
-from clpipe.chain.paths import file_parameters, from_folder
+from clpipe.chain.paths import file_parameters, resolve_paths
 from clpipe.chain.registry import all_stages
 from clpipe.chain.render_camera import RenderCamera
 from clpipe.images.dump import Dump, parse_dump
@@ -113,12 +113,12 @@ class Settings:
         if "iso" in draws:
             first = {key: draw for key, draw in draws.items() if key == "camera"}
             limits = partial(self.limits, isos=isos)
-            own = values_of(first, self.constants(), limits, owner).get("camera", self.camera)
+            own = draw_values(first, self.constants(), limits, owner).get("camera", self.camera)
             isos = self.drawn_isos(load_camera(own))
-            draws["iso"] = draws["iso"].within(isos) or draws["iso"]
+            draws["iso"] = draws["iso"].truncated(isos) or draws["iso"]
         limits = partial(self.limits, isos=isos)
         values: dict[str, Any] = {}
-        for key, value in values_of(draws, self.constants(), limits, owner).items():
+        for key, value in draw_values(draws, self.constants(), limits, owner).items():
             step, _, name = key.rpartition(".")
             if step:
                 values.setdefault(step, dict(self.parameters.get(step, {})))[name] = value
@@ -126,7 +126,7 @@ class Settings:
                 values[name] = value
         pushed = "iso" in self.draws and "camera" not in self.draws
         drawn = overlay(self, values)
-        return altered(drawn, {"pushed": True}) if pushed else drawn
+        return with_changes(drawn, {"pushed": True}) if pushed else drawn
 
     def constants(self) -> dict[str, Any]:
         """Return the values that are set and not drawn, by dotted name."""
@@ -191,7 +191,7 @@ class Settings:
         if step in TABLE_MODELS:
             return [TABLE_MODELS[step]]
         stage, draw = stage_of(step), self.draws.get(f"{step}.method")
-        chosen = chosen_method(step, self.parameters.get(step, {}))
+        chosen = method_name(step, self.parameters.get(step, {}))
         names = draw.choice if isinstance(draw, Choice) else [chosen]
         return [method_named(stage, step, name) for name in names]
 
@@ -205,10 +205,10 @@ class Settings:
         """
         step, _, name = key.partition(".")
         if key in LENS:
-            return None if key == "lens" else Limits(low=TINY)
+            return None if key == "lens" else Limits(low=SMALLEST_FLOAT)
         if key in ("iso", "camera") or name == "method":
             return isos if key == "iso" else None
-        return limits_of(self.models(step)[0], name)
+        return field_limits(self.models(step)[0], name)
 
     def names_of(self, key: str) -> list[str]:
         """Return the names of the camera or lens, or of all that are drawn; [] without a lens."""
@@ -259,15 +259,15 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
         KeyedError: as :func:`settings_from`.
     """
     if folder is not None:
-        values = from_folder(folder, values)
+        values = resolve_paths(folder, values)
     tables = {key: value for key, value in values.items() if isinstance(value, Mapping)}
     plain = {k: v for k, v in values.items() if k not in tables}
-    plain = _checked_plain(settings, plain)
+    plain = _check_plain_values(settings, plain)
     draws = {k: draw for k, draw in settings.draws.items() if k.partition(".")[0] not in values}
-    draws |= {key: draw_of(key, tables.pop(key)) for key in KEYS if key in tables}
+    draws |= {key: parse_drawn(key, tables.pop(key)) for key in KEYS if key in tables}
     parameters, validated = dict(settings.parameters), dict(settings.validated)
     for step, table in tables.items():
-        merged = _merged(settings, step, table)
+        merged = _merge_table(settings, step, table)
         step_draws = {f"{step}.{k}": v for k, v in merged.items() if isinstance(v, Draw)}
         draws |= step_draws
         constants = {k: v for k, v in merged.items() if not isinstance(v, Draw)}
@@ -278,7 +278,7 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
         if not step_draws:
             validated[step] = constants, make_model(step, constants)
     tables_now = {"parameters": parameters, "validated": validated, "draws": draws}
-    changed = altered(settings, {**plain, **tables_now})
+    changed = with_changes(settings, {**plain, **tables_now})
     if draws:
         _check_draws(changed, values)
     return changed
@@ -292,7 +292,7 @@ CONVERSIONS: dict[str, Callable[[Any], Any]] = {
 }
 
 
-def _checked_plain(settings: Settings, plain: Mapping[str, Any]) -> dict[str, Any]:
+def _check_plain_values(settings: Settings, plain: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values outside tables, each checked, as fields of :class:`Settings`.
 
     Raises:
@@ -307,13 +307,13 @@ def _checked_plain(settings: Settings, plain: Mapping[str, Any]) -> dict[str, An
         if key == CODE:
             raise KeyedError(key, f"{key}: set it in a configuration file, or use --stage-file")
         if key not in KEYS:
-            having = [each for each in parameter_names() if each.endswith(f".{key}")]
-            hint = f"; did you mean {either(having)}?" if having else ""
-            raise KeyedError(key, one_of("key", key, (*KEYS, *TABLES, *all_stages())) + hint)
+            similar = [each for each in parameter_names() if each.endswith(f".{key}")]
+            hint = f"; did you mean {quote_alternatives(similar)}?" if similar else ""
+            raise KeyedError(key, unknown_name("key", key, (*KEYS, *TABLES, *all_stages())) + hint)
         check_type(key, value)
     for key in ("stages", "skip"):
         if key in plain:
-            names = names_in(plain, key, "stage names")
+            names = string_list(plain, key, "stage names")
             if key == "stages" and len(names) > MAX_STAGES:
                 raise KeyedError(
                     key, f"{key}: found {len(names)} stages; list at most {MAX_STAGES}"
@@ -339,24 +339,26 @@ def _check_step(key: str, name: str) -> None:
     if key == "stages":
         stage_named(key, name)
     elif name != NOISE and base_name(name) not in all_stages():
-        raise KeyedError(key, f"skip: {one_of('stage', name, (NOISE, *all_stages()))}")
+        raise KeyedError(key, f"skip: {unknown_name('stage', name, (NOISE, *all_stages()))}")
 
 
-def _merged(settings: Settings, step: str, table: Mapping[str, Any]) -> dict[str, Any]:
+def _merge_table(settings: Settings, step: str, table: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values and draws of a step, overridden by a table.
 
     Raises:
         KeyedError: there is no such stage, or a table inside the table is no draw.
     """
     methods = () if step in TABLES else stage_of(step).methods
-    own = {k: draw_of(f"{step}.{k}", v) if isinstance(v, Mapping) else v for k, v in table.items()}
-    before = settings.table(step)
-    if "method" in own and own["method"] != chosen_method(step, before):
-        return own
+    values = {
+        k: parse_drawn(f"{step}.{k}", v) if isinstance(v, Mapping) else v for k, v in table.items()
+    }
+    existing = settings.table(step)
+    if "method" in values and values["method"] != method_name(step, existing):
+        return values
     for method in methods:
-        if own.keys() & method.alternatives:
-            before = {k: v for k, v in before.items() if k not in method.alternatives}
-    return {**before, **own}
+        if values.keys() & method.alternatives:
+            existing = {k: v for k, v in existing.items() if k not in method.alternatives}
+    return {**existing, **values}
 
 
 def _check_draws(settings: Settings, changed: Container[str]) -> None:
@@ -376,9 +378,9 @@ def _check_draws(settings: Settings, changed: Container[str]) -> None:
         for model in settings.models(step) if name and step in changed else ():
             if name not in ("method", *model.model_fields):
                 raise unknown_parameter(step, model, name)
-    limits = partial(settings.limits, isos=Limits(low=TINY))
+    limits = partial(settings.limits, isos=Limits(low=SMALLEST_FLOAT))
     by_step: dict[str, dict[str, Sequence[Any]]] = {}
-    for key, extremes in extremes_of(settings.draws, settings.constants(), limits).items():
+    for key, extremes in draw_extremes(settings.draws, settings.constants(), limits).items():
         step, _, name = key.partition(".")
         if not name:
             for value in extremes:

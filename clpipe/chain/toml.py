@@ -11,7 +11,7 @@ from clpipe.base.reading import parse_toml
 def line_of(text: str, key: str) -> int | None:
     """Return the line (from 1) that sets a key such as ``stage.parameter``; None if none does."""
     table = ""
-    within = None
+    first_in_table = None
     for number, line in enumerate(text.splitlines(), 1):
         if match := re.match(r"\s*\[\s*([\w.-]+)\s*\]", line):
             name, table = match[1], match[1] + "."
@@ -21,12 +21,12 @@ def line_of(text: str, key: str) -> int | None:
                 return number
         else:
             continue
-        if within is None and f"{name}.".startswith(f"{key}."):
-            within = number
-    return within
+        if first_in_table is None and f"{name}.".startswith(f"{key}."):
+            first_in_table = number
+    return first_in_table
 
 
-POINTED = re.compile(r"[+-]?(\d+\.|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
+DECIMAL_POINT = re.compile(r"[+-]?(\d+\.|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 PLAIN_NUMBER = re.compile(r"[+-]?(?:0|[1-9]\d{0,99})(\.\d+)?", re.ASCII)
 
 
@@ -45,7 +45,7 @@ def toml_value(text: str) -> Any:
     try:
         table = parse_toml(f"value = {text}")
     except ValueError:
-        return float(text) if POINTED.fullmatch(text) else text
+        return float(text) if DECIMAL_POINT.fullmatch(text) else text
     return table["value"] if len(table) == 1 else text
 
 

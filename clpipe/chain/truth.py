@@ -25,7 +25,7 @@ def picture_without_noise(truth: str, chain: Chain) -> Chain:
         RequestError: the chain adds no noise.
     """
     if truth == CLEAN and any(step.adds_noise for step in chain.steps):
-        return chain.cleaned()
+        return chain.without_noise_or_denoising()
     return chain.without_noise()
 
 

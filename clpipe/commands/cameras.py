@@ -11,7 +11,7 @@ from clpipe.camera.profile import (
     Camera,
     built_in_cameras,
     built_in_name,
-    cameras_called,
+    cameras_matching,
     load_camera,
 )
 from clpipe.commands.completion import cameras_or_import
@@ -123,7 +123,7 @@ def cameras(names: tuple[str, ...], iso: float | None, as_json: bool) -> None:
             )
         show_cameras(map(load_camera, built_in_cameras()), as_json)
         return
-    matches = [] if built_in_name(name) else cameras_called(name)
+    matches = [] if built_in_name(name) else cameras_matching(name)
     if iso is None and len(matches) > 1:
         show_cameras(map(load_camera, matches), as_json)
         return

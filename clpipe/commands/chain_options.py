@@ -73,7 +73,9 @@ def option(key: Key, parameter: str = "", **others: Any) -> Callable[[F], F]:
         "metavar": key.metavar,
         "multiple": multiple,
         "shell_complete": COMPLETIONS.get(key.name),
-        "help": " ".join(filter(None, [*texts, f"[default: {key.usual}]" * bool(key.usual)])),
+        "help": " ".join(
+            filter(None, [*texts, f"[default: {key.default_text}]" * bool(key.default_text)])
+        ),
     }
     if key.type_ is bool:
         attributes["is_flag"] = True

@@ -16,10 +16,10 @@ from clpipe.base.errors import ClpipeError
 def cameras(context: click.Context, option: click.Parameter, text: str) -> list[CompletionItem]:
     """Complete built-in cameras, by name or alias, and files."""
     from clpipe.camera.profile import built_in_cameras, camera_names
-    from clpipe.camera.text import comparable
+    from clpipe.camera.text import normalized_name
 
     names = [name for name in built_in_cameras() if name.startswith(text)]
-    if not names and (start := comparable(text)):
+    if not names and (start := normalized_name(text)):
         names = sorted({name for key, name in camera_names().items() if key.startswith(start)})
     return _names(names, "") or _file(text)
 

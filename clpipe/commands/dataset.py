@@ -40,7 +40,7 @@ from clpipe.commands.progress import Reporter, follow, print_line
 from clpipe.inputs.panoramas import wide_lens_of
 from clpipe.inputs.series import Series, split_series
 from clpipe.reference.panorama import CUBE
-from clpipe.reference.projection import seen_faces
+from clpipe.reference.projection import visible_faces
 from clpipe.reference.wide import MODELS
 from clpipe.scenes.blender import Rendering
 from clpipe.scenes.card import CardContents, write_card
@@ -121,7 +121,7 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
 )
 @options("config", "camera", "iso", *SETTINGS, "start_at", "until", CODE, "carry", "poses")
 @set_option
-@option(TRUTH, default=(TRUTH.usual,))
+@option(TRUTH, default=(TRUTH.default_text,))
 @option(OPTIONS["format"], "formats")
 @click.option(
     "--licence",
@@ -232,7 +232,7 @@ def cube_faces(request: Request, resolution: tuple[int, int] | None) -> dict[str
     projection = projection_of(request.chain()) if wide_lens_of(request.settings()) else None
     if projection is None:
         return None
-    side, names = seen_faces(projection.lens)
+    side, names = visible_faces(projection.lens)
     if resolution and resolution[0] != resolution[1]:
         raise RequestError(
             f"--resolution: found {resolution[0]}x{resolution[1]}, but a wide lens needs the faces "

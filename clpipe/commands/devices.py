@@ -15,7 +15,7 @@ from clpipe.engine.discovery import DeviceInfo, choose, find_devices
 @json_option
 def devices(as_json: bool) -> None:
     """List the OpenCL devices, which one is used by default, and why the others are not."""
-    rows = device_rows(find_devices(again=True))
+    rows = device_rows(find_devices(retest=True))
     if as_json:
         show_json(rows)
         return

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from clpipe.analysis.emva.series import LEAST_EXPOSURES, SIDES
+from clpipe.analysis.emva.series import MIN_EXPOSURES, SIDES
 from clpipe.analysis.emva.simulation import SeriesSize, simulate
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
@@ -20,8 +20,8 @@ DEFAULT = SeriesSize()
 
 
 @click.command("emva", cls=Command)
-@option(KEYS["camera"]._replace(usual=""), required=True)
-@option(KEYS["iso"]._replace(text="The ISO.", usual="the camera's lowest"))
+@option(KEYS["camera"]._replace(default_text=""), required=True)
+@option(KEYS["iso"]._replace(text="The ISO.", default_text="the camera's lowest"))
 @output_option("DIR", "The directory of the series. It is created if it does not exist.")
 @click.option(
     "--size",
@@ -34,7 +34,7 @@ DEFAULT = SeriesSize()
     "--exposures",
     default=DEFAULT.exposures,
     show_default=True,
-    type=click.IntRange(LEAST_EXPOSURES, 10_000),
+    type=click.IntRange(MIN_EXPOSURES, 10_000),
     help="The number of exposures, evenly from dark to saturation. A tenth as many follow above "
     "saturation.",
 )

@@ -11,7 +11,7 @@ from clpipe.analysis.measure import measure as measure_images
 from clpipe.analysis.pictures import load_picture
 from clpipe.analysis.pooling import pool_by_iso
 from clpipe.analysis.report import UNITS, NoiseReport
-from clpipe.analysis.snr import FEWEST, SnrStep, record_of, snr_curve
+from clpipe.analysis.snr import MIN_SAMPLES, SnrStep, record_of, snr_curve
 from clpipe.analysis.spatial import LAGS, LineNoise
 from clpipe.analysis.statistics import SIGMAS, gaussian_beyond
 from clpipe.base.errors import RequestError
@@ -113,7 +113,8 @@ def show_snr(curve: Sequence[SnrStep], as_json: bool) -> None:
     """
     if not curve:
         raise RequestError(
-            f"--snr: no step of half a stop has {FEWEST} usable samples; name more or larger images"
+            f"--snr: no step of half a stop has {MIN_SAMPLES} usable samples; "
+            "name more or larger images"
         )
     if as_json:
         show_json({"snr": record_of(curve)})

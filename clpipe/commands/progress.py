@@ -14,14 +14,14 @@ import click
 from rich.console import Console
 from rich.text import Text
 
-from clpipe.base.text import duration, one_line
+from clpipe.base.text import format_duration, one_line
 from clpipe.base.urls import url_of
 from clpipe.batch.interrupt import interruptible
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
 from clpipe.batch.session import Run
 from clpipe.commands.notices import NOTICES
 from clpipe.engine.clipping import clipping_text
-from clpipe.engine.programs import watched
+from clpipe.engine.programs import watching_compilation
 from clpipe.outputs.existing import Redo
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ class Reporter:
 
     def __enter__(self) -> Self:
         self._live.enter_context(NOTICES.printed_by(self.print))
-        self._live.enter_context(watched(self._compiling))
+        self._live.enter_context(watching_compilation(self._compiling))
         if self._is_live and self._several:
             self._show("")
         return self
@@ -161,7 +161,7 @@ class Reporter:
         if not with_count:
             return "  ".join(parts)
         left = summary.total - summary.finished
-        remaining = duration(summary.elapsed * left / summary.finished)
+        remaining = format_duration(summary.elapsed * left / summary.finished)
         count = f"{summary.finished} of {summary.total} images"
         return "; ".join([count, *parts, f"about {remaining} left"])
 

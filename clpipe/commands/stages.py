@@ -8,7 +8,7 @@ import click
 from pydantic import ValidationError
 
 from clpipe.base.errors import ClpipeError, RequestError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.chain.keys import CODE, KEYS
 from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages, load_stage_file
@@ -41,7 +41,7 @@ def stages(
     for file in stage_files:
         load_stage_file(file)
     if name is not None and name not in all_stages():
-        raise RequestError(one_of("stage", name, all_stages()))
+        raise RequestError(unknown_name("stage", name, all_stages()))
     settings = overlay(DEFAULTS, settings_in(values))
     selected = [all_stages()[name]] if name else list(all_stages().values())
     if as_json:
@@ -139,7 +139,7 @@ def stage_row(stage: Stage) -> tuple[str, ...]:
 
 def kinds_text(kind: Kind, stage: Stage) -> str:
     """Return the kind of image that a stage reads or writes, and the kinds allowed instead."""
-    return " or ".join(each.label for each in (kind, *stage.also))
+    return " or ".join(each.label for each in (kind, *stage.also_reads))
 
 
 def explain_stage(stage: Stage, settings: Settings) -> None:

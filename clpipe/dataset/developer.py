@@ -18,7 +18,7 @@ from clpipe.chain.truth import noisy_mosaic, picture_without_noise
 from clpipe.dataset.arrays import UINT16_MAX, ArrayFormat
 from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions
-from clpipe.engine.runner import Result, Runner, submit_together
+from clpipe.engine.runner import Result, Runner, submit_batch
 from clpipe.images.read import SourceImage
 from clpipe.outputs.patches import Patch, Patches, metadata_of, variance_at, variance_steps
 from clpipe.stage import Kind
@@ -54,10 +54,10 @@ class SampleSpec:
                 f"found patch {patches.size}, but a packed raw has planes of half the size. Use an "
                 "even size"
             )
-        if self.arrays.raw == "packed" and not chain.filters.bayer:
+        if self.arrays.raw == "packed" and not chain.filter_array.bayer:
             raise RequestError(
                 f"raw='packed': planes need a Bayer pattern, but the mosaic is "
-                f"{chain.filters.name}. Use raw='mosaic'"
+                f"{chain.filter_array.name}. Use raw='mosaic'"
             )
         self.arrays.check(chain.result)
         if self.truth:
@@ -76,7 +76,7 @@ def raw_step(chain: Chain, arrays: ArrayFormat) -> str:
     """
     if not arrays.is_in_dn:
         return noisy_mosaic(chain).steps[-1].name
-    producer, context = chain.maker_of_raw, chain.context_of_raw
+    producer, context = chain.raw_step_name, chain.raw_context
     if producer is None:
         raise RequestError(
             f"the chain {chain.label} makes no raw in DN. Add the stage quantize, or use "
@@ -110,7 +110,7 @@ class DevelopTask:
     def options(self) -> RunOptions:
         """The options of the run."""
         boxes = [patch.box for patch in self.patches]
-        return RunOptions(unchanged=True, boxes=boxes, later=self.source.later)
+        return RunOptions(unchanged=True, boxes=boxes, later_exposures=self.source.later)
 
 
 class Developer:
@@ -142,7 +142,7 @@ class Developer:
         with self._lock:
             raws = [self._raws_of(task.chain) for task in tasks]
             runs = [self._runs(o.chain, runners) for o, runners in zip(tasks, raws, strict=True)]
-            pending = submit_together(
+            pending = submit_batch(
                 [
                     (runner, task.source.pixels, task.noise_key, task.options)
                     for task, runners in zip(tasks, runs, strict=True)
@@ -248,7 +248,7 @@ class Developer:
             part: returns the part of an image that belongs to the sample.
         """
         arrays = self._spec.arrays
-        pattern = chain.filters.pattern
+        pattern = chain.filter_array.pattern
 
         def orient(image: Array) -> Array:
             return patch.orient(part(image)) if patch else image

@@ -10,7 +10,7 @@ import numpy as np
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.types import Array
-from clpipe.base.validation import typed
+from clpipe.base.validation import check_argument_types
 from clpipe.dataset.arrays import packed, unpacked
 from clpipe.images.arrays import as_array
 from clpipe.pipeline import Pipeline
@@ -50,7 +50,7 @@ class RawNoise(ReadOnly):
         RequestError: a name or value is not allowed.
     """
 
-    @typed
+    @check_argument_types
     def __init__(
         self,
         camera: str | Path,
@@ -68,7 +68,7 @@ class RawNoise(ReadOnly):
         self._settings = {**settings, "camera": str(camera), "iso": iso, "seed": seed or 0}
         self._seed = seed
         self._device = device
-        self._pattern = self._pipeline("numpy").chain.filters.pattern
+        self._pattern = self._pipeline("numpy").chain.filter_array.pattern
         self._opened: tuple[int, Pipeline, np.random.Generator] | None = None
 
     def __getstate__(self) -> Mapping[str, Any]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.files import passing_files, whole_file
+from clpipe.base.files import atomic_file, unsynced_files
 from clpipe.engine.runner import is_planar
 from clpipe.images.read import SourceImage
 
@@ -109,10 +109,10 @@ def _write(path: Path, source: SourceImage) -> bool:
         source, pixels=np.broadcast_to(pixels[:1, :1], (1, 1, *pixels.shape[2:]))
     )
     try:
-        with passing_files():
-            with whole_file(path.with_suffix(".npy")) as file:
+        with unsynced_files():
+            with atomic_file(path.with_suffix(".npy")) as file:
                 np.save(file, pixels.transpose(2, 0, 1) if planar else pixels)
-            with whole_file(
+            with atomic_file(
                 path.with_suffix(".pickle")
             ) as file:  # last, so the other file is complete
                 pickle.dump((without_pixels, planar), file)

@@ -12,7 +12,7 @@ from typing import Any
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.carry import VALID
-from clpipe.chain.identity import noise_key, of_frame
+from clpipe.chain.identity import frame_key, noise_key
 from clpipe.dataset.developer import Developer, DevelopTask, Sample, SampleSpec
 from clpipe.dataset.render_cache import RenderCache
 from clpipe.engine.device import open_device
@@ -44,7 +44,7 @@ class SampleBatch:
     @property
     def draw_key(self) -> str:
         """The key of draws."""
-        key = of_frame(self.job.key, self.epoch or None)
+        key = frame_key(self.job.key, self.epoch or None)
         return key if self.drawn is None else f"{key}, patch {self.drawn}"
 
 

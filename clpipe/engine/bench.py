@@ -75,7 +75,7 @@ def scene(width: int, height: int) -> Array:
     return ((shade + texture)[..., None] * colour).astype(np.float16)
 
 
-def input_of(chain: Chain, width: int, height: int) -> Array:
+def benchmark_image(chain: Chain, width: int, height: int) -> Array:
     """Return a test image of the kind that a chain starts on, (height, width[, 3]).
 
     It is float16, or float32 for a chain that starts on a raw in DN.
@@ -93,53 +93,53 @@ def input_of(chain: Chain, width: int, height: int) -> Array:
 def bench(
     device: Device, chain: Chain, width: int = 6000, height: int = 4000, repeat: int = 7
 ) -> BenchReport:
-    """Time a chain on the device, from its input (see :func:`input_of`) to eight-bit RGB.
+    """Time a chain on the device, from its input (see :func:`benchmark_image`) to eight-bit RGB.
 
     The time of the chain includes one wait at its end. The device's events time the launches. Each
     figure is the best of ``repeat`` runs after a first run, which compiles.
     """
     runner = Runner(chain, device)
-    image = input_of(chain, width, height)
+    image = benchmark_image(chain, width, height)
     pixels = width * height
     start = time.perf_counter()
     runner.run(image, "bench")
-    first = time.perf_counter() - start
-    whole = float("inf")
+    first_run = time.perf_counter() - start
+    chain_seconds = float("inf")
     best: list[Timing] = []
     for _ in range(repeat):
         timings: list[Timing] = []
         start = time.perf_counter()
         runner.run(image, "bench", RunOptions(timings, download=False))
-        whole = min(whole, time.perf_counter() - start)
+        chain_seconds = min(chain_seconds, time.perf_counter() - start)
         timings = [t for t in timings if not t.transfer]
         best = [
             min(a, b, key=lambda t: t.seconds)
             for a, b in zip(timings, best or timings, strict=True)
         ]
-    copy = device.copy_speed()
+    copy_bytes_per_s = device.copy_speed()
     plan = runner.plan_for(image)
 
-    def speed(name: str, seconds: float, touched: float) -> Speed:
+    def speed(name: str, seconds: float, traffic: float) -> Speed:
         seconds = max(seconds, 1e-9)
         return Speed(
             name,
             seconds * 1e3,
             pixels / seconds / 1e6,
-            touched / seconds / 1e9,
-            touched / seconds / copy,
+            traffic / seconds / 1e9,
+            traffic / seconds / copy_bytes_per_s,
         )
 
     lanes = device.info.lanes
-    touched = [launch_bytes(plan, launch, lanes) * pixels for launch in plan.launches]
+    traffic = [launch_bytes(plan, launch, lanes) * pixels for launch in plan.launches]
     return BenchReport(
         device=device.info.label,
         width=width,
         height=height,
-        copy_gb_per_s=copy / 1e9,
+        copy_gb_per_s=copy_bytes_per_s / 1e9,
         bytes_per_pixel=bytes_per_pixel(plan, lanes),
-        first_run_s=first,
-        chain=speed("chain", whole, sum(touched)),
-        launches=tuple(speed(t.name, t.seconds, b) for t, b in zip(best, touched, strict=True)),
+        first_run_s=first_run,
+        chain=speed("chain", chain_seconds, sum(traffic)),
+        launches=tuple(speed(t.name, t.seconds, b) for t, b in zip(best, traffic, strict=True)),
     )
 
 
@@ -161,14 +161,18 @@ def bench_methods(
     picture = scene(width, height).astype(np.float32)
     image = picture if len(stage.reads.channels) == 3 else np.ascontiguousarray(picture[..., 1])
     settings = settings.drawn("")
-    given = settings.parameters.get(stage.name, {})
+    stage_parameters = settings.parameters.get(stage.name, {})
     speeds = []
-    methods = [m for m in stage.methods if given.get("method", m.method) == m.method]
-    for method, choice in ((m, choice) for m in methods for choice in variants(m)):
-        own = {name: value for name, value in given.items() if name in method.model_fields}
-        table = {"method": method.method, **method.example, **own, **choice}
-        alone = replace(settings, stages=(stage.name,), skip=(), parameters={stage.name: table})
-        runner = Runner(make_chain(alone, stage.reads), device, encode=False, final=True)
+    methods = [m for m in stage.methods if stage_parameters.get("method", m.method) == m.method]
+    for method, variant in ((m, variant) for m in methods for variant in variants(m)):
+        method_parameters = {
+            name: value for name, value in stage_parameters.items() if name in method.model_fields
+        }
+        parameters = {"method": method.method, **method.example, **method_parameters, **variant}
+        single_stage = replace(
+            settings, stages=(stage.name,), skip=(), parameters={stage.name: parameters}
+        )
+        runner = Runner(make_chain(single_stage, stage.reads), device, encode=False, final=True)
         runner.run(image, "bench")
         best: list[float] = []
         for _ in range(repeat):
@@ -180,6 +184,6 @@ def bench_methods(
         if len(best) > 1 and isinstance(first, Launch) and not first.reads:
             del best[0]
         ms = max(sum(best), 1e-9) * 1e3
-        label = variant_label(method, own | choice)
+        label = variant_label(method, method_parameters | variant)
         speeds.append(MethodSpeed(label, len(best), ms, width * height / ms / 1e3))
     return speeds

@@ -23,10 +23,10 @@ class Buffer(NamedTuple):
 
 
 class ExtentNumber(NamedTuple):
-    """A number of the tile's extent or, if ``larger``, of the image from which it is resampled."""
+    """A number of the tile's extent or, if ``of_input``, of the extent that is resampled."""
 
     name: str
-    larger: bool = False
+    of_input: bool = False
 
 
 class TileNumber(NamedTuple):
@@ -67,7 +67,7 @@ Value = ArgumentValue | StreamWord | EncodedCurves | ResamplingValue
 Bind = Callable[[Sequence[Value]], list[Any]]  # returns NumPy scalars and arrays
 
 
-Bound = Buffer | ExtentNumber | TileNumber | Value
+Binding = Buffer | ExtentNumber | TileNumber | Value
 
 
 class Parameter(NamedTuple):
@@ -77,7 +77,7 @@ class Parameter(NamedTuple):
     """
 
     declaration: str
-    bound: Bound
+    binding: Binding
 
 
 def slot_buffer(number: int) -> str:

@@ -40,12 +40,12 @@ def aligned_empty(shape: tuple[int, ...], dtype: Any) -> Array:
     ((3, 5), 0)
     """
     size = prod(shape) * np.dtype(dtype).itemsize
-    room = np.empty(size + PAGE, np.uint8)
-    start = -room.ctypes.data % PAGE
-    return room[start : start + size].view(dtype).reshape(shape)
+    buffer = np.empty(size + PAGE, np.uint8)
+    start = -buffer.ctypes.data % PAGE
+    return buffer[start : start + size].view(dtype).reshape(shape)
 
 
-def room_for(
+def allocate_results(
     plan: Plan, width: int, height: int, into: Array | None, boxes: Sequence[Box] = ()
 ) -> HostImages:
     """Return uninitialised arrays for all results of a plan.
@@ -72,12 +72,12 @@ def room_for(
     images = [image for _, image in plan.kept] + ([plan.final] if plan.final else [])
     encoded = None
     if plan.encoded:
-        own = shape(plan.encoded, len(sizes) - 1)
-        encoded = aligned_empty(own, np.uint8) if into is None else into
-        if encoded.shape != own or encoded.dtype != np.uint8:
+        expected_shape = shape(plan.encoded, len(sizes) - 1)
+        encoded = aligned_empty(expected_shape, np.uint8) if into is None else into
+        if encoded.shape != expected_shape or encoded.dtype != np.uint8:
             raise ValueError(
                 f"into has shape {encoded.shape} and type {encoded.dtype}, but the result has "
-                f"shape {own} and type uint8"
+                f"shape {expected_shape} and type uint8"
             )
     return HostImages(
         images={i.number: np.empty(shape(i.kind, i.level), np.float32) for i in images},
@@ -86,46 +86,48 @@ def room_for(
     )
 
 
-def core_of(extent: Extent, whole: Array) -> Array:
+def core_view(extent: Extent, image: Array) -> Array:
     """Return the part of an image, (height, width[, channel]), that a tile computes."""
     core = extent.core
-    return whole[core.top : core.bottom, core.left : core.right]
+    return image[core.top : core.bottom, core.left : core.right]
 
 
-def copy_encoded(extent: Extent, pixels: Array, room: Array) -> None:
+def copy_encoded(extent: Extent, pixels: Array, target: Array) -> None:
     """Copy the core of a tile's eight-bit pixels, unless both arrays share memory."""
-    if not np.may_share_memory(pixels, room):
+    if not np.may_share_memory(pixels, target):
         core, stored = extent.core, extent.stored
-        part = pixels.reshape(stored.height, stored.width, *room.shape[2:])
+        part = pixels.reshape(stored.height, stored.width, *target.shape[2:])
         rows = slice(core.top - stored.top, core.bottom - stored.top)
         columns = slice(core.left - stored.left, core.right - stored.left)
-        room[:] = part[rows, columns]
+        target[:] = part[rows, columns]
 
 
-def copy_plane(extent: Extent, plane: Array, room: Array, channel: int) -> None:
+def copy_plane(extent: Extent, plane: Array, target: Array, channel: int) -> None:
     """Copy the core of a tile's plane to a channel of an image, (height, width[, channel])."""
     core, stored, border = extent.core, extent.stored, extent.border
     height = extent.padded_height + 2 * border
     top = border + core.top - stored.top
     left = round_up(border, extent.lanes) + core.left - stored.left
     rows = plane[: height * extent.pitch].reshape(height, extent.pitch)
-    image = room if room.ndim == 2 else room[..., channel]
+    image = target if target.ndim == 2 else target[..., channel]
     image[:] = rows[top : top + core.height, left : left + core.width]
 
 
 class Pool:
     """Device buffers by name, which later images reuse if they are large enough."""
 
-    def __init__(self, make: Callable[[int], Any]) -> None:
-        self._make = make
+    def __init__(self, allocate: Callable[[int], Any]) -> None:
+        self._allocate = allocate
         self.buffers: dict[str, Any] = {}
         self._sizes: dict[str, int] = {}  # querying a buffer's size is slower
 
     def has(self, sizes: Mapping[str, int], memory: int) -> bool:
         """Return whether :meth:`reserve` would neither release nor allocate a buffer."""
-        held = self._sizes
-        is_there = all(name in held and held[name] >= size for name, size in sizes.items())
-        return is_there and self.bytes <= memory
+        allocated = self._sizes
+        all_present = all(
+            name in allocated and allocated[name] >= size for name, size in sizes.items()
+        )
+        return all_present and self.bytes <= memory
 
     def reserve(self, sizes: Mapping[str, int], memory: int) -> None:
         """Allocate buffers of at least these sizes (bytes by name), if they are missing.
@@ -135,19 +137,19 @@ class Pool:
         """
         if self.has(sizes, memory):
             return
-        enough = {name: size for name, size in self._sizes.items() if size >= sizes.get(name, 0)}
-        missing = sum(size for name, size in sizes.items() if name not in enough)
-        for spare in (lambda name, _: name not in sizes, lambda name, size: size > sizes[name]):
-            if sum(enough.values()) + missing > memory:
-                dropped = [name for name, size in enough.items() if spare(name, size)]
+        reusable = {name: size for name, size in self._sizes.items() if size >= sizes.get(name, 0)}
+        missing = sum(size for name, size in sizes.items() if name not in reusable)
+        for can_drop in (lambda name, _: name not in sizes, lambda name, size: size > sizes[name]):
+            if sum(reusable.values()) + missing > memory:
+                dropped = [name for name, size in reusable.items() if can_drop(name, size)]
                 missing += sum(sizes.get(name, 0) for name in dropped)
-                enough = {name: size for name, size in enough.items() if name not in dropped}
-        for name in self.buffers.keys() - enough.keys():
+                reusable = {name: size for name, size in reusable.items() if name not in dropped}
+        for name in self.buffers.keys() - reusable.keys():
             self.buffers.pop(name).release()
             del self._sizes[name]
         for name, size in sizes.items():
-            if name not in enough:
-                self.buffers[name], self._sizes[name] = self._make(size), size
+            if name not in reusable:
+                self.buffers[name], self._sizes[name] = self._allocate(size), size
 
     @property
     def bytes(self) -> int:

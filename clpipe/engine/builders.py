@@ -18,12 +18,12 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError, ImageError
-from clpipe.base.files import passing_files, write_new
-from clpipe.base.memory import in_words, memory_left
-from clpipe.base.process_folder import ROOM, has_room
+from clpipe.base.files import unsynced_files, write_new
+from clpipe.base.memory import format_bytes, free_memory
+from clpipe.base.process_folder import MIN_FREE_SPACE, has_free_space
 from clpipe.engine.store import Store
 
-COMPILER = 112 << 20  # bytes of memory; measured: 86 to 105 MiB for the default chain
+COMPILER_MEMORY = 112 << 20  # bytes of memory; measured: 86 to 105 MiB for the default chain
 
 
 class BinaryBuilder:
@@ -46,9 +46,9 @@ class BinaryBuilder:
         """
         import pyopencl as cl
 
-        if kept := self._store.load(source, *options):
+        if cached := self._store.load(source, *options):
             with suppress(cl.Error):
-                program = cl.Program(self._context, self._context.devices, [kept])
+                program = cl.Program(self._context, self._context.devices, [cached])
                 return program.build(options, cache_dir=False)
         program = cl.Program(self._context, source).build(options, cache_dir=False)
         with suppress(cl.Error):
@@ -74,7 +74,7 @@ class PoclBuilder:
     """
 
     # One build at a time, because what a build added to the folder is found by comparing listings.
-    _one_at_a_time = threading.Lock()
+    _build_lock = threading.Lock()
     _has_compiled = False  # whether this process has already allocated the compiler's memory
 
     def __init__(self, context: Any, store: Store, folder: Path) -> None:
@@ -93,88 +93,89 @@ class PoclBuilder:
         """
         import pyopencl as cl
 
-        with self._one_at_a_time:
-            before = _programs_in(self._folder)
-            if kept := self._store.load(source, *options):
-                _unpack(kept, self._folder)
-            unpacked = _programs_in(self._folder) - before
+        with self._build_lock:
+            before = _list_programs(self._folder)
+            if cached := self._store.load(source, *options):
+                _unpack(cached, self._folder)
+            unpacked = _list_programs(self._folder) - before
             if not unpacked:
-                self._check_room()
+                self._check_resources()
             program = cl.Program(self._context, source).build(options, cache_dir=False)
-            added = _programs_in(self._folder) - before
+            added = _list_programs(self._folder) - before
             if len(added) == 1:
                 (name,) = added
-                files = _files_of(self._folder / name) if unpacked == added else frozenset()
+                files = _list_files(self._folder / name) if unpacked == added else frozenset()
                 self._built[source, tuple(options)] = name, files
         return program
 
-    def _check_room(self) -> None:
+    def _check_resources(self) -> None:
         """Check that PoCL can compile. PoCL crashes the process if the disk or memory is full.
 
         Raises:
             DeviceError: there is too little disk space or memory, or the folder was removed.
         """
         try:
-            enough = has_room(self._folder.parent)
+            has_space = has_free_space(self._folder.parent)
         except OSError as error:
             raise DeviceError(
                 f"{self._folder.parent}: PoCL's folder was removed while this process used it "
                 f"({error.strerror}). Exclude it from clean-ups of temporary files and start again."
             ) from None
-        if not enough:
+        if not has_space:
             raise DeviceError(
-                f"{self._folder}: PoCL needs {ROOM >> 20} MiB of free space there to compile. Free "
-                "some space, or set TMPDIR to another folder for temporary files."
+                f"{self._folder}: PoCL needs {MIN_FREE_SPACE >> 20} MiB of free space there to "
+                "compile. Free some space, or set TMPDIR to another folder for temporary files."
             )
-        left = None if self._has_compiled else memory_left()
-        if left and left.bytes < COMPILER:
+        free = None if self._has_compiled else free_memory()
+        if free and free.bytes < COMPILER_MEMORY:
             raise DeviceError(
-                f"PoCL's compiler needs about {in_words(COMPILER)} of memory, but "
-                f"{in_words(left.bytes)} are left by {left.by}. Allow more for the first run."
+                f"PoCL's compiler needs about {format_bytes(COMPILER_MEMORY)} of memory, but "
+                f"{format_bytes(free.bytes)} are left by {free.limit}. "
+                "Allow more for the first run."
             )
         PoclBuilder._has_compiled = True
 
     def keep(self) -> None:
         """Store the files that PoCL has compiled since the programs were built."""
-        with self._one_at_a_time:
-            for (source, options), (name, kept) in list(self._built.items()):
-                files = _files_of(self._folder / name)
-                if files - kept:
-                    data = _packed(self._folder, name, files)
+        with self._build_lock:
+            for (source, options), (name, stored) in list(self._built.items()):
+                files = _list_files(self._folder / name)
+                if files - stored:
+                    data = _pack(self._folder, name, files)
                     self._store.keep(data, source, *options)
                     self._built[source, options] = name, files
 
 
-PROGRAM = re.compile(r"[A-Z]{2}/[A-Z]+")
-FILE = re.compile(rf"{PROGRAM.pattern}(/(?!\.\.?/)[^/\\\0]+)+")
-TOUCHED = "last_accessed"  # PoCL writes this file at each use, and never reads it
+PROGRAM_NAME = re.compile(r"[A-Z]{2}/[A-Z]+")
+FILE_NAME = re.compile(rf"{PROGRAM_NAME.pattern}(/(?!\.\.?/)[^/\\\0]+)+")
+ACCESS_TIME_FILE = "last_accessed"  # PoCL writes this file at each use, and never reads it
 
 
-def _programs_in(folder: Path) -> frozenset[str]:
+def _list_programs(folder: Path) -> frozenset[str]:
     """Return the names of the programs in PoCL's folder, in the form "AB/CDE..."."""
-    groups = _names(folder)
-    found = (f"{group}/{name}" for group in groups for name in _names(folder / group))
-    return frozenset(name for name in found if PROGRAM.fullmatch(name))
+    groups = _list_directory(folder)
+    found = (f"{group}/{name}" for group in groups for name in _list_directory(folder / group))
+    return frozenset(name for name in found if PROGRAM_NAME.fullmatch(name))
 
 
-def _names(folder: Path) -> list[str]:
+def _list_directory(folder: Path) -> list[str]:
     try:
         return os.listdir(folder)
     except OSError:  # it is a file, or does not exist yet
         return []
 
 
-def _files_of(program: Path) -> frozenset[str]:
+def _list_files(program: Path) -> frozenset[str]:
     """Return the names of a program's files, relative to its folder."""
     return frozenset(
-        os.path.relpath(os.path.join(place, name), program)
-        for place, _, names in os.walk(program)
+        os.path.relpath(os.path.join(directory, name), program)
+        for directory, _, names in os.walk(program)
         for name in names
-        if name != TOUCHED
+        if name != ACCESS_TIME_FILE
     )
 
 
-def _packed(folder: Path, program: str, files: frozenset[str]) -> bytes:
+def _pack(folder: Path, program: str, files: frozenset[str]) -> bytes:
     """Return the files of a program as a ZIP archive, with names relative to PoCL's folder."""
     memory = io.BytesIO()
     with zipfile.ZipFile(memory, "w") as archive:
@@ -192,16 +193,16 @@ def _unpack(data: bytes, folder: Path) -> None:
     """
     with (
         suppress(ImageError, zipfile.BadZipFile),
-        passing_files(),
+        unsynced_files(),
         zipfile.ZipFile(io.BytesIO(data)) as archive,
     ):
-        for name, content in _contents(archive):
+        for name, content in _valid_files(archive):
             if not (folder / name).exists():
                 write_new(folder / name, content)
 
 
-def _contents(archive: zipfile.ZipFile) -> Iterator[tuple[str, bytes]]:
+def _valid_files(archive: zipfile.ZipFile) -> Iterator[tuple[str, bytes]]:
     """Yield the name and the bytes of each file with a valid name in PoCL's folder."""
     for info in archive.infolist():
-        if FILE.fullmatch(info.filename):
+        if FILE_NAME.fullmatch(info.filename):
             yield info.filename, archive.read(info)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import platformdirs
 
-from clpipe.base.process_folder import ROOM, process_folder
+from clpipe.base.process_folder import MIN_FREE_SPACE, process_folder
 from clpipe.base.system import writable_by_others
 
 VARIABLE = "CLPIPE_CACHE_DIR"  # names another folder
@@ -44,19 +44,19 @@ def user_folder(name: str | None = None) -> Path | None:
 
 
 # Read when this module is loaded, because prepare_environment changes XDG_CACHE_HOME later.
-OWN_FOLDER = user_folder("clpipe")
+DEFAULT_FOLDER = user_folder("clpipe")
 
 
-def wanted_folder() -> Path | None:
+def configured_folder() -> Path | None:
     """Return the folder that ``CLPIPE_CACHE_DIR`` names, or the user's cache folder for clpipe."""
     named = os.environ.get(VARIABLE)
-    return Path(named) if named else OWN_FOLDER
+    return Path(named) if named else DEFAULT_FOLDER
 
 
 @cache
 def cache_folder() -> Path | None:
     """Return the folder for kernels, or None if it is unusable or others may write to it."""
-    folder = wanted_folder()
+    folder = configured_folder()
     return folder.resolve() if folder and is_usable(folder) and is_private(folder) else None
 
 
@@ -75,12 +75,12 @@ def is_private(folder: Path) -> bool:
     return not reason
 
 
-def later_runs() -> str:
+def cache_notice() -> str:
     """Return in words where later runs find the kernels compiled now."""
     if folder := cache_folder():
         return f"later runs find them in {folder}"
-    place = wanted_folder() or "the home directory"
-    return f"later runs compile them again, because they cannot be cached in {place}"
+    location = configured_folder() or "the home directory"
+    return f"later runs compile them again, because they cannot be cached in {location}"
 
 
 def pocl_folder() -> Path | None:
@@ -106,6 +106,6 @@ def pocl_problem() -> str:
     if process_folder():
         return ""
     return (
-        f"PoCL needs a writable folder for temporary files with {ROOM >> 20} MiB of free space, "
-        "mounted without 'noexec'. Set TMPDIR to such a folder"
+        f"PoCL needs a writable folder for temporary files with {MIN_FREE_SPACE >> 20} MiB of free "
+        "space, mounted without 'noexec'. Set TMPDIR to such a folder"
     )

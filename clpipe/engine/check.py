@@ -13,7 +13,7 @@ from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
 from clpipe.engine.options import DEFAULTS
-from clpipe.engine.runner import Runner, submit_together
+from clpipe.engine.runner import Runner, submit_batch
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.stage import PERIOD, Kind, Method, Stage, variant_label, variants
 
@@ -78,17 +78,19 @@ def example(kind: Kind, size: tuple[int, int], half: bool = False, seed: int = 0
     return values.astype(np.float16 if half else np.float32)
 
 
-def difference(one: Array | None, two: Array | None) -> Difference:
+def difference(first: Array | None, second: Array | None) -> Difference:
     """Return the difference of two images. NaN differs infinitely from any value.
 
     Raises:
         ValueError: an image is missing, or the shapes differ.
     """
-    if one is None or two is None or one.shape != two.shape:
-        shapes = [None if image is None else image.shape for image in (one, two)]
+    if first is None or second is None or first.shape != second.shape:
+        shapes = [None if image is None else image.shape for image in (first, second)]
         raise ValueError(f"the images have the shapes {shapes}, but both must have one shape")
-    apart = np.nan_to_num(np.abs(one.astype(np.float64) - two), nan=np.inf)
-    return Difference(apart.size, int(np.count_nonzero(apart)), float(apart.max()))
+    differences = np.nan_to_num(np.abs(first.astype(np.float64) - second), nan=np.inf)
+    return Difference(
+        differences.size, int(np.count_nonzero(differences)), float(differences.max())
+    )
 
 
 def compare(
@@ -102,8 +104,8 @@ def compare(
     total = Difference()
     for seed, size in enumerate(sizes):
         image = example(chain.source, size, half, seed)
-        one, two = (runner.run(image, "check").final for runner in (on_device, in_numpy))
-        total += difference(one, two)
+        result, expected = (runner.run(image, "check").final for runner in (on_device, in_numpy))
+        total += difference(result, expected)
     return total
 
 
@@ -111,7 +113,7 @@ def compare(
 ARRAYS = ("x-trans", "RGBW", "RCCB", "RGB/GBR/BRG")
 
 
-def laid(pattern: str) -> dict[str, str]:
+def mosaic_parameters(pattern: str) -> dict[str, str]:
     """Return the parameters of the stage mosaic for a Bayer pattern or another filter array."""
     return {"pattern": pattern} if pattern in PATTERNS else {"method": "array", "array": pattern}
 
@@ -120,12 +122,16 @@ def chain_for(stage: Stage, method: type[Method], values: Mapping[str, Any], pat
     """Return a chain of one method that starts on its input, with a pattern or filter array."""
     if method.only_arrays and pattern not in method.only_arrays:
         pattern = method.only_arrays[0]
-    before = {Kind.MOSAIC: ("mosaic",), Kind.RAW: ("mosaic", "quantize")}.get(stage.reads, ())
-    parameters: dict[str, dict[str, Any]] = {"mosaic": dict(laid(pattern))}
-    own = {"method": method.method, **method.example, **values}
-    others = parameters.get(stage.name, {})
-    parameters[stage.name] = {k: v for k, v in others.items() if k in method.model_fields} | own
-    settings = Settings(iso=ISO, stages=(*before, stage.name), parameters=parameters)
+    earlier_stages = {Kind.MOSAIC: ("mosaic",), Kind.RAW: ("mosaic", "quantize")}.get(
+        stage.reads, ()
+    )
+    parameters: dict[str, dict[str, Any]] = {"mosaic": dict(mosaic_parameters(pattern))}
+    method_parameters = {"method": method.method, **method.example, **values}
+    stage_parameters = parameters.get(stage.name, {})
+    parameters[stage.name] = {
+        k: v for k, v in stage_parameters.items() if k in method.model_fields
+    } | method_parameters
+    settings = Settings(iso=ISO, stages=(*earlier_stages, stage.name), parameters=parameters)
     return make_chain(settings, start_at=stage.name)
 
 
@@ -135,13 +141,15 @@ def depends_on_pattern(stage: Stage, method: type[Method], values: Mapping[str, 
     return any("pattern" in pass_.all_arguments for pass_ in step.passes)
 
 
-def arrays_of(stage: Stage, method: type[Method], values: Mapping[str, Any]) -> tuple[str, ...]:
+def filter_arrays_for(
+    stage: Stage, method: type[Method], values: Mapping[str, Any]
+) -> tuple[str, ...]:
     """Return the filter arrays to check in addition to Bayer patterns, if the method uses them."""
     if values or not method.any_array or stage.reads is not Kind.MOSAIC or method.only_arrays:
         return ()
     step = chain_for(stage, method, values, ARRAYS[0]).steps[0]
-    tells = any(set(PERIOD) <= {*pass_.all_arguments} for pass_ in step.passes)
-    return ARRAYS if tells else ()
+    uses_array = any(set(PERIOD) <= {*pass_.all_arguments} for pass_ in step.passes)
+    return ARRAYS if uses_array else ()
 
 
 def check_method(
@@ -170,12 +178,12 @@ def check_method(
     # A variant reads the pattern through the same functions as the method's default.
     if values or not depends_on_pattern(stage, method, values):
         patterns = patterns[:1]
-    total, every = Difference(), (*patterns, *arrays_of(stage, method, values))
-    every = method.only_arrays or every
-    for pattern in every:
+    total, all_patterns = Difference(), (*patterns, *filter_arrays_for(stage, method, values))
+    all_patterns = method.only_arrays or all_patterns
+    for pattern in all_patterns:
         total += compare(device, chain_for(stage, method, values, pattern), sizes)
     label = variant_label(method, values)
-    return Check(stage.name, label, len(every) * len(sizes), total, method.tolerance)
+    return Check(stage.name, label, len(all_patterns) * len(sizes), total, method.tolerance)
 
 
 # Parameters that enable every source of noise.
@@ -202,15 +210,15 @@ def check_raw(
     stages = tuple(names[: names.index("quantize") + 1])
     total = Difference()
     for pattern in patterns:
-        own: dict[str, dict[str, Any]] = {"mosaic": {"pattern": pattern}}
-        own["sensor_noise"] = {"method": noise}
-        settings = Settings(iso=ISO, stages=stages, parameters={**NOISE, **own})
+        parameters: dict[str, dict[str, Any]] = {"mosaic": {"pattern": pattern}}
+        parameters["sensor_noise"] = {"method": noise}
+        settings = Settings(iso=ISO, stages=stages, parameters={**NOISE, **parameters})
         total += compare(device, make_chain(settings), sizes, half=True)
     cases = len(patterns) * len(sizes)
     return Check("exposure..quantize", f"the raw, {noise}", cases, total, 0.0)
 
 
-def check_ends(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Check:
+def check_formats(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Check:
     """Check the input and output formats: half and float, RGB and mosaic; eight-bit results.
 
     Eight-bit pixels result from a conversion, or from a table if the chain ends in curves. A
@@ -226,18 +234,18 @@ def check_ends(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Chec
         make_chain(mosaic, start_at="inverse_white_balance"),
     ):
         for half in (False, True):
-            both, alone = Runner(chain, device, final=True), Runner(chain, device)
+            with_final, encoded_only = Runner(chain, device, final=True), Runner(chain, device)
             in_numpy = Runner(chain, None, final=True)
             for seed, size in enumerate(sizes):
                 image = example(chain.source, size, half, seed)
-                one, two = alone.run(image, "check"), in_numpy.run(image, "check")
-                levels = difference(one.encoded, two.encoded)
+                result, expected = encoded_only.run(image, "check"), in_numpy.run(image, "check")
+                levels = difference(result.encoded, expected.encoded)
                 wrong = levels.largest if levels.largest > 1 else 0.0
                 total += Difference(levels.samples, 0, wrong)
                 if half:  # storing and encoding do not depend on the source's type
-                    beside = both.run(image, "check")
-                    total += difference(beside.encoded, one.encoded)
-                    total += difference(beside.final, two.final)
+                    both = with_final.run(image, "check")
+                    total += difference(both.encoded, result.encoded)
+                    total += difference(both.final, expected.final)
                 cases += 1
     return Check("source..8 bit", "half, float", cases, total, 0.0)
 
@@ -247,14 +255,14 @@ def check_stack(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Che
 
     The results must equal those of separate launches, bit for bit.
     """
-    total, images, alone = Difference(), [], []
+    total, images, separate = Difference(), [], []
     for seed, size in enumerate(sizes):
         chain = make_chain(Settings(iso=ISO + 100 * seed, parameters=NOISE))
         image = example(chain.source, size, half=True, seed=seed)
         runner = Runner(chain, device, final=True)
-        alone.append(runner.run(image, "check").final)
+        separate.append(runner.run(image, "check").final)
         images.append((runner, image, "check", DEFAULTS))
-    for wait, expected in zip(submit_together(images), alone, strict=True):
+    for wait, expected in zip(submit_batch(images), separate, strict=True):
         total += difference(wait().final, expected)
     return Check("exposure..gamma", "common launches", len(sizes), total, 0.0)
 
@@ -273,5 +281,5 @@ def check_all(
     if not stages:
         for noise in all_stages()["sensor_noise"].by_name:
             yield check_raw(device, noise, sizes)
-        yield check_ends(device, sizes)
+        yield check_formats(device, sizes)
         yield check_stack(device, sizes)

@@ -8,9 +8,9 @@ from clpipe.chain.chain import Chain
 from clpipe.engine.runner import Result
 from clpipe.stage import Kind
 
-MUCH = 0.25  # the smallest share of clipped pixels that causes a warning
+WARNING_SHARE = 0.25  # the smallest share of clipped pixels that causes a warning
 
-COUNTED = 1 << 18  # the fewest pixels to count in large images; counting all would take too long
+MIN_PIXELS = 1 << 18  # the fewest pixels to count in large images; counting all would take too long
 
 
 def clipped_share(result: Result, chain: Chain) -> float | None:
@@ -30,22 +30,22 @@ def clipped_share(result: Result, chain: Chain) -> float | None:
     # If only a raw is requested, the chain ends there: the raw is both final and kept.
     kept = [chain.step_named(name) for name, each in result.kept.items() if each is image]
     kind = kept[0].stage.writes if kept else chain.result
-    top: float | None = None
+    clip_level: float | None = None
     if kind is Kind.DISPLAY:
-        top = 255 if result.encoded is not None else 1
+        clip_level = 255 if result.encoded is not None else 1
     elif kind is Kind.RAW:
-        after = kept[0].method.next_context(kept[0].context) if kept else chain.context_after
-        top = after.white_level
-    if image is None or top is None:
+        context = kept[0].method.next_context(kept[0].context) if kept else chain.context_after
+        clip_level = context.white_level
+    if image is None or clip_level is None:
         return None
     has_channels = len(kind.channels) > 1
     image = image.reshape(-1, *image.shape[-1 - has_channels :])  # patches below each other
-    step = max(math.isqrt(image.shape[0] * image.shape[1] // COUNTED), 1)
-    counted = image[::step, ::step]
-    channels = counted.reshape(*counted.shape[:2], -1)
+    step = max(math.isqrt(image.shape[0] * image.shape[1] // MIN_PIXELS), 1)
+    sampled = image[::step, ::step]
+    channels = sampled.reshape(*sampled.shape[:2], -1)
     # NumPy takes the largest of two arrays many times faster than that along a short axis.
     brightest = np.maximum.reduce([channels[..., i] for i in range(channels.shape[2])])
-    return float(np.mean(brightest >= top))
+    return float(np.mean(brightest >= clip_level))
 
 
 def clipping_text(share: float) -> str:

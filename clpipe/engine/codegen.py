@@ -25,7 +25,7 @@ from clpipe.engine.ir import (
     Read,
     Reduce,
 )
-from clpipe.engine.kernel_builder import KernelBuilder, in_order, opening
+from clpipe.engine.kernel_builder import KernelBuilder, kernel_opening, sort_parameters
 from clpipe.engine.ops import Op
 from clpipe.engine.sources import LIBRARY, files_text
 from clpipe.engine.work_items import PARTIALS, RUN, columns_of, local_size, summed_together
@@ -35,7 +35,7 @@ from clpipe.stage import Kind, LineTable, TableLookup
 # The compiler knows that the origin is a whole number of blocks. Therefore it also knows which rows
 # share a Philox call, and the phase of a Bayer pattern.
 EXTENT = "{width, height, pitch, left * LANES, top * 4, columns, rows, border}"
-UNNAMED = "kernel_without_a_name_yet"
+PLACEHOLDER_NAME = "kernel_without_a_name_yet"
 
 
 def call(op: Op, arguments: Sequence[str]) -> str:
@@ -63,37 +63,39 @@ def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
             body = _lines(builder, launch)
             text += files_text(kernels_of(launch.ops), seen)
         case Histogram():
-            body = _count(builder, launch)
+            body = _histogram(builder, launch)
             text += files_text(kernels_of([launch.op]), seen)
         case Reduce():
-            body = _add_up(builder, launch)
+            body = _reduce(builder, launch)
         case Finalize():
-            body = _find(builder, launch)
+            body = _finalize(builder, launch)
             text += files_text(kernels_of([launch.op]), seen)
         case Border():
             at = "(uint)get_global_id(0), (uint)get_global_id(1)"
-            down, across = (n if n > MIRRORED else 0 for n in launch.period or (0, 0))
+            period_rows, period_columns = (
+                n if n > MIRRORED else 0 for n in launch.period or (0, 0)
+            )
             plane = builder.slot(launch.slot, True)
             # The members of a stack may differ in size.
             body = (
                 "    if (get_global_id(1) >= rows + 2 * border) return;\n"
-                f"    fill_border({plane}, {at}, {down}, {across}, e);\n"
+                f"    fill_border({plane}, {at}, {period_rows}, {period_columns}, e);\n"
             )
-    parameters = in_order(builder.parameters)
-    declared, first = opening(parameters)
+    parameters = sort_parameters(builder.parameters)
+    declared, table_reads = kernel_opening(parameters)
     signature = ",\n    ".join(declared)
     size = 1 if isinstance(launch, Finalize) else local_size(lanes)
     setup = "".join(f"    {line}\n" for line in builder.setup)
-    start = "".join(f"    {line}\n" for line in first)
+    opening_lines = "".join(f"    {line}\n" for line in table_reads)
     # The hint prevents Intel's compiler from vectorising our vectors, up to nine times slower.
     text += (
         '#line 1 "launch"\n'
         f"__kernel __attribute__((vec_type_hint(vf), reqd_work_group_size({size}, 1, 1)))\n"
-        f"void {UNNAMED}(\n    {signature})\n{{\n{start}"
+        f"void {PLACEHOLDER_NAME}(\n    {signature})\n{{\n{opening_lines}"
         f"    const extent e = {EXTENT};\n{setup}{body}}}\n"
     )
     name = f"launch_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
-    source = text.replace(UNNAMED, name)
+    source = text.replace(PLACEHOLDER_NAME, name)
     return Kernel(name, source, tuple(parameters.values()), launch, tuple(sorted(seen)))
 
 
@@ -159,26 +161,33 @@ def _load(builder: KernelBuilder, launch: Launch) -> tuple[list[str], list[str],
         kind = launch.reads[0].image.kind
         return [], [f"const {kind.c_type} v0 = tap_{kind.c_name}({images[0]}, 0, 0);"], kind
     if not launch.stencil:
-        larger = builder.larger()
+        larger = builder.input_extent()
         planes = [f"image_origin({p}, {larger})" for p in builder.planes(launch.reads[0])]
-        made = call(
-            op, ["at", *planes, larger, *builder.taps(launch.level - 1), *builder.arguments(op)]
+        expression = call(
+            op,
+            [
+                "at",
+                *planes,
+                larger,
+                *builder.resampling_arguments(launch.level - 1),
+                *builder.arguments(op),
+            ],
         )
-        return [], [f"const {op.kind.c_type} v0 = {made};"], op.kind
+        return [], [f"const {op.kind.c_type} v0 = {expression};"], op.kind
     lines = []
     for name, read, stored in zip(op.pass_.reads, launch.reads, images, strict=True):
-        values = [v for _, _, own in _prologue(builder, read) for v in own]
+        values = [v for _, _, tap_values in _prologue(builder, read) for v in tap_values]
         type_ = "src_image" if name == "src" else "image"
-        made = f"{{{', '.join([stored, *values])}}}" if values else stored
-        lines.append(f"const {type_} {name} = {made};")
-    kind, given = op.kind, [*op.pass_.reads, *builder.arguments(op)]
+        expression = f"{{{', '.join([stored, *values])}}}" if values else stored
+        lines.append(f"const {type_} {name} = {expression};")
+    kind, arguments = op.kind, [*op.pass_.reads, *builder.arguments(op)]
     if not fills_block:
-        return [], [*lines, f"const {kind.c_type} v0 = {call(op, ['at', *given])};"], kind
-    lines.append(f"{call(op, ['first', *given, 'block'])};")
+        return [], [*lines, f"const {kind.c_type} v0 = {call(op, ['at', *arguments])};"], kind
+    lines.append(f"{call(op, ['first', *arguments, 'block'])};")
     size = launch.rows * columns_of(launch, builder.lanes)
-    once = [f"{kind.c_type} block[{size}];", "{", *(f"    {x}" for x in lines), "}"]
-    place = "ROW" if builder.lanes == 1 else "row * COLUMNS + column"
-    return once, [f"const {kind.c_type} v0 = block[{place}];"], kind
+    per_item = [f"{kind.c_type} block[{size}];", "{", *(f"    {x}" for x in lines), "}"]
+    index = "ROW" if builder.lanes == 1 else "row * COLUMNS + column"
+    return per_item, [f"const {kind.c_type} v0 = block[{index}];"], kind
 
 
 def _encode(builder: KernelBuilder, value: str, kind: Kind, curves: Sequence[Op]) -> str:
@@ -192,7 +201,7 @@ def _encode(builder: KernelBuilder, value: str, kind: Kind, curves: Sequence[Op]
 def _pixels(builder: KernelBuilder, launch: Launch) -> str:
     """Return the body of a kernel over the image: it loads, calls the stages and stores."""
     plan = builder.plan
-    once, lines, kind = _load(builder, launch)
+    per_item, lines, kind = _load(builder, launch)
     ops = list(launch.ops[1:] if launch.opener else launch.ops)
     curves: list[Op] = []
     if launch.encodes and not launch.writes:
@@ -200,20 +209,22 @@ def _pixels(builder: KernelBuilder, launch: Launch) -> str:
             curves.insert(0, ops.pop())
     for i, op in enumerate(ops):
         kind = op.kind
-        made = call(op, [f"v{i}", "at", *builder.arguments(op)])
-        lines.append(f"const {kind.c_type} v{i + 1} = {made};")
+        expression = call(op, [f"v{i}", "at", *builder.arguments(op)])
+        lines.append(f"const {kind.c_type} v{i + 1} = {expression};")
     value = f"v{len(ops)}"
     if launch.sums:
         builder.buffer("sums", "int4", step_buffer("sums", launch.sums.step), written=True)
         sample = call(launch.sums, [value, "at", *builder.arguments(launch.sums)])
         lines.append(f"const vi sample = only_inside({sample}, at, {builder.core()});")
         lines.append("if (ROW & 1) odd_rows += sample; else even_rows += sample;")
-        once.append("vi even_rows = (vi)(0), odd_rows = (vi)(0);")
+        per_item.append("vi even_rows = (vi)(0), odd_rows = (vi)(0);")
     wide = launch.stencil and launch.stencil.vectors_per_row and builder.lanes > 1
     if not wide:
         # Compute all rows before the first store. The compiler can then share work between rows,
         # because no store can change their inputs.
-        once.append(f"{kind.c_type} {', '.join(f'values_{row}' for row in range(launch.rows))};")
+        per_item.append(
+            f"{kind.c_type} {', '.join(f'values_{row}' for row in range(launch.rows))};"
+        )
         lines.append(f"values_ROW = {value};")
         value = "values_ROW"
     writes, encodes = [], []
@@ -223,33 +234,33 @@ def _pixels(builder: KernelBuilder, launch: Launch) -> str:
     if launch.encodes:
         encodes.append(_encode(builder, value, kind, curves))
     if wide:
-        body = _over_block([*lines, *writes, *encodes], launch)
+        body = _block_loop([*lines, *writes, *encodes], launch)
     else:
-        body = _each_row(lines, launch.rows) + _store(writes, kind, launch.rows)
-        body += _each_row(encodes, launch.rows)
-    place = (
+        body = _unrolled_rows(lines, launch.rows) + _store(writes, kind, launch.rows)
+        body += _unrolled_rows(encodes, launch.rows)
+    position = (
         f"    const uint x = left * LANES + (uint)get_global_id(0) * (COLUMNS * LANES);\n"
         f"    const uint y = top * 4 + (uint)get_global_id(1) * {launch.rows};\n"
     )
-    rows = "".join(f"    {line}\n" for line in [*once, *body])
+    rows = "".join(f"    {line}\n" for line in [*per_item, *body])
     rows = f"    const site first = site_at(x, y);\n{rows}"
     inside = "x - e.left < columns && y - e.top < rows"  # members of a stack may differ in size
     outside = "x - e.left >= columns || y - e.top >= rows"
     if not launch.sums:
-        return f"{place}    if ({outside}) return;\n{rows}"
-    own = "(int4)(fold_columns(even_rows, first), fold_columns(odd_rows, first))"
-    if (together := summed_together(builder.lanes)) == 1:
-        store = f"    store_sums({own}, sums, e);\n"
-        return f"{place}    if ({outside}) return;\n{rows}{store}"
+        return f"{position}    if ({outside}) return;\n{rows}"
+    item_sums = "(int4)(fold_columns(even_rows, first), fold_columns(odd_rows, first))"
+    if (group_size := summed_together(builder.lanes)) == 1:
+        store = f"    store_sums({item_sums}, sums, e);\n"
+        return f"{position}    if ({outside}) return;\n{rows}{store}"
     # No work item may return before a barrier.
     return (
-        f"    __local int4 group[{together}];\n{place}    int4 own = (int4)(0);\n"
-        f"    if ({inside}) {{\n{rows}    own = {own};\n    }}\n"
+        f"    __local int4 group[{group_size}];\n{position}    int4 own = (int4)(0);\n"
+        f"    if ({inside}) {{\n{rows}    own = {item_sums};\n    }}\n"
         "    store_group_sums(own, group, sums);\n"
     )
 
 
-def _over_block(lines: Sequence[str], launch: Launch) -> list[str]:
+def _block_loop(lines: Sequence[str], launch: Launch) -> list[str]:
     """Return loops over the vectors of a stencil's block. It is in memory, so they stay rolled."""
     return [
         "#pragma unroll 1",
@@ -263,15 +274,15 @@ def _over_block(lines: Sequence[str], launch: Launch) -> list[str]:
     ]
 
 
-def _each_row(lines: Sequence[str], rows: int) -> list[str]:
+def _unrolled_rows(lines: Sequence[str], rows: int) -> list[str]:
     """Return the lines for each row of a work item, unrolled, with the row's number for ROW.
 
     Loops are not possible: Mesa's compiler mixes up an array that one loop fills and another reads.
     """
     if not lines:
         return []
-    place = "const site at = shifted(first, 0, ROW);"
-    scope = ["{", *(f"    {line}" for line in [place, *lines]), "}"]
+    site = "const site at = shifted(first, 0, ROW);"
+    scope = ["{", *(f"    {line}" for line in [site, *lines]), "}"]
     return [line.replace("ROW", str(row)) for row in range(rows) for line in scope]
 
 
@@ -280,17 +291,17 @@ def _store(writes: Sequence[str], kind: Kind, rows: int) -> list[str]:
     if not writes:
         return []
     inside = [line.replace("(", "_inside(", 1) for line in writes]
-    chosen = "".join(f"row == {row} ? values_{row} : " for row in range(rows - 1))
+    selection = "".join(f"row == {row} ? values_{row} : " for row in range(rows - 1))
     return [
         f"if (near_edge(first, {rows}, e)) {{",
         "#pragma unroll 1",
         f"    for (uint row = 0; row < {rows}; ++row) {{",
         "        const site at = shifted(first, 0, row);",
-        f"        const {kind.c_type} value = {chosen}values_{rows - 1};",
+        f"        const {kind.c_type} value = {selection}values_{rows - 1};",
         *(f"        {line.replace('values_ROW', 'value')}" for line in writes),
         "    }",
         "} else {",
-        *(f"    {line}" for line in _each_row(inside, rows)),
+        *(f"    {line}" for line in _unrolled_rows(inside, rows)),
         "}",
     ]
 
@@ -307,7 +318,7 @@ def _lines(builder: KernelBuilder, launch: Lines) -> str:
     return body
 
 
-def _count(builder: KernelBuilder, launch: Histogram) -> str:
+def _histogram(builder: KernelBuilder, launch: Histogram) -> str:
     op, bins = launch.op, launch.op.reduction.bins
     read = launch.reads[0]
     planes = builder.planes(read)[: len(read.image.kind.channels)]
@@ -318,9 +329,9 @@ def _count(builder: KernelBuilder, launch: Histogram) -> str:
     core = builder.core()
     if builder.lanes == 1:  # a work-group counts together, each work item in different columns
         row, first, step = "get_group_id(0)", "(uint)get_local_id(0)", "(uint)get_local_size(0)"
-        wait, count = "    barrier(CLK_GLOBAL_MEM_FENCE);\n", "atomic_inc(own + bin)"
+        barrier, count = "    barrier(CLK_GLOBAL_MEM_FENCE);\n", "atomic_inc(own + bin)"
     else:
-        row, first, step, wait, count = "get_global_id(0)", "0", "1", "", "own[bin] += 1"
+        row, first, step, barrier, count = "get_global_id(0)", "0", "1", "", "own[bin] += 1"
     starts = "".join(
         f"    __global const float *{origin} = image_origin({plane}, e);\n"
         for origin, plane in zip(origins, planes, strict=True)
@@ -328,7 +339,7 @@ def _count(builder: KernelBuilder, launch: Histogram) -> str:
     return (
         f"{starts}"
         f"    __global uint *own = {counts} + (size_t){row} * {bins};\n"
-        f"    for (uint k = {first}; k < {bins}; k += {step}) own[k] = 0;\n{wait}"
+        f"    for (uint k = {first}; k < {bins}; k += {step}) own[k] = 0;\n{barrier}"
         f"    for (uint y = {core}.top + {row}; y < {core}.bottom; y += {PARTIALS}) {{\n"
         f"        for (uint x = {core}.left + {first}; x < {core}.right; x += {step}) {{\n"
         f"            const int bin = {call(op, arguments)};\n"
@@ -337,7 +348,7 @@ def _count(builder: KernelBuilder, launch: Histogram) -> str:
     )
 
 
-def _add_up(builder: KernelBuilder, launch: Reduce) -> str:
+def _reduce(builder: KernelBuilder, launch: Reduce) -> str:
     tile, step = builder.tile_number(), launch.op.step
 
     def buffer(name: str, element: str, written: bool) -> None:
@@ -356,13 +367,13 @@ def _add_up(builder: KernelBuilder, launch: Reduce) -> str:
     return f"    add_up_blocks(sums, partials, {builder.number('blocks')}, {tile});\n"
 
 
-def _find(builder: KernelBuilder, launch: Finalize) -> str:
+def _finalize(builder: KernelBuilder, launch: Finalize) -> str:
     reduction, step = launch.op.reduction, launch.op.step
     content, element = ("histogram", "uint") if reduction.bins else ("partials", "long4")
-    whole = builder.buffer(content, element, step_buffer(content, step), restrict=False)
+    total = builder.buffer(content, element, step_buffer(content, step), restrict=False)
     if not reduction.bins:
-        whole = f"add_up_partials(partials, {PARTIALS})"
+        total = f"add_up_partials(partials, {PARTIALS})"
     estimates = builder.estimates(step, written=True)
     arguments = builder.arguments(launch.op, reduction.finish_arguments)
-    texts = [whole, *arguments, "e", estimates]
-    return f"    {reduction.finish}({', '.join(texts)});\n"
+    call_arguments = [total, *arguments, "e", estimates]
+    return f"    {reduction.finish}({', '.join(call_arguments)});\n"

@@ -25,10 +25,10 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 
 VARIABLE = "CLPIPE_CPU_TARGET"  # forces a target, for tests and support
-DRIVERS = "driver"  # the value that keeps the driver's choice
+DRIVER_CHOICE = "driver"  # the value that keeps the driver's choice
 
 _AVX2 = frozenset({"avx2", "fma", "f16c", "bmi1", "bmi2", "abm", "cx16", "popcnt"})
 _AVX512 = frozenset({"avx512f", "avx512bw", "avx512dq", "avx512cd", "avx512vl"})
@@ -44,7 +44,7 @@ TARGETS: dict[str, frozenset[str]] = {
     "x86-64": frozenset(),
 }
 # LLVM's names for CPUs with the same vector features as a target.
-SAME_AS = {
+EQUIVALENT_CPUS = {
     "skx": (
         "skylake-avx512",
         "cascadelake",
@@ -72,7 +72,7 @@ SAME_AS = {
     "penryn": ("nehalem", "westmere", "silvermont", "goldmont", "goldmont-plus", "tremont"),
     "core2": ("bonnell",),
 }
-RECORD = 1200  # bytes of the device record to search; in PoCL 3.0 the pointer is at 640
+RECORD_BYTES = 1200  # bytes of the device record to search; in PoCL 3.0 the pointer is at 640
 _texts: dict[int, ctypes.Array[ctypes.c_char]] = {}  # names set, by device; PoCL points to them
 
 
@@ -91,14 +91,14 @@ class Target:
     @property
     def is_wide(self) -> bool:
         """Whether the CPU has vector registers of 512 bits."""
-        return row_of(self.name) == "skx"
+        return equivalent_target(self.name) == "skx"
 
 
-def row_of(name: str) -> str | None:
+def equivalent_target(name: str) -> str | None:
     """Return the one of :data:`TARGETS` with a CPU's features; None for an unknown name."""
     if name in TARGETS:
         return name
-    return next((target for target, names in SAME_AS.items() if name in names), None)
+    return next((target for target, names in EQUIVALENT_CPUS.items() if name in names), None)
 
 
 def target_for(features: frozenset[str]) -> str:
@@ -111,7 +111,7 @@ def target_for(features: frozenset[str]) -> str:
 
 
 # The leaf, register and bit of each required feature, from glibc's <sys/platform/x86.h>.
-_ACTIVE = {
+_CPUID_BITS = {
     "ssse3": (0, 2, 9),
     "fma": (0, 2, 12),
     "cx16": (0, 2, 13),
@@ -175,37 +175,39 @@ def _usable() -> frozenset[str] | None:
     query.restype = ctypes.POINTER(ctypes.c_uint32 * 8)
     query.argtypes = [ctypes.c_uint32]
     active = {
-        leaf: list(query(leaf).contents)[4:] for leaf in {leaf for leaf, *_ in _ACTIVE.values()}
+        leaf: list(query(leaf).contents)[4:] for leaf in {leaf for leaf, *_ in _CPUID_BITS.values()}
     }
     return frozenset(
-        name for name, (leaf, register, bit) in _ACTIVE.items() if active[leaf][register] >> bit & 1
+        name
+        for name, (leaf, register, bit) in _CPUID_BITS.items()
+        if active[leaf][register] >> bit & 1
     )
 
 
 def forced_target() -> str | None:
-    """Return the target that :data:`VARIABLE` names, or :data:`DRIVERS`; None if it is not set.
+    """Return the target that :data:`VARIABLE` names, or :data:`DRIVER_CHOICE`; None if unset.
 
     Raises:
         DeviceError: the variable names an unknown target.
     """
     name = os.environ.get(VARIABLE) or None
-    if name and name not in (*TARGETS, DRIVERS):
-        raise DeviceError(f"{VARIABLE}: {one_of('target', name, (*TARGETS, DRIVERS))}")
+    if name and name not in (*TARGETS, DRIVER_CHOICE):
+        raise DeviceError(f"{VARIABLE}: {unknown_name('target', name, (*TARGETS, DRIVER_CHOICE))}")
     return name
 
 
-def own_target(version: str) -> tuple[str, str] | None:
+def driver_target(version: str) -> tuple[str, str] | None:
     """Return the target triple and the CPU that PoCL on Linux chooses, from its device's version.
 
     Returns:
         None if the version names no CPU. Debian's PoCL for arm64 has "(null)", because it compiles
         for all CPUs.
 
-    >>> own_target("OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-znver3")
+    >>> driver_target("OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-znver3")
     ('x86_64-unknown-linux-gnu', 'znver3')
     """
-    found = re.search(r"HSTR: \w+-((?:\w+-){1,2}linux-(?:gnu|musl))-(\w\S*)", version)
-    return (found[1], found[2]) if found else None
+    match = re.search(r"HSTR: \w+-((?:\w+-){1,2}linux-(?:gnu|musl))-(\w\S*)", version)
+    return (match[1], match[2]) if match else None
 
 
 def candidates(platform: Any, device: Any) -> list[Target]:
@@ -219,24 +221,28 @@ def candidates(platform: Any, device: Any) -> list[Target]:
         DeviceError: :data:`VARIABLE` names an unknown target.
     """
     forced = forced_target()
-    known = own_target(device.version) if "Portable Computing" in platform.name else None
-    if known is None:
+    triple_and_cpu = (
+        driver_target(device.version) if "Portable Computing" in platform.name else None
+    )
+    if triple_and_cpu is None:
         return [Target("", "the driver's choice")]
-    own = known[1]
+    driver_cpu = triple_and_cpu[1]
     features = cpu_features()
-    if features is None or not _chooses_by_name(platform.version) or _place(device) is None:
-        return [Target(own, f"PoCL's choice{f'; {VARIABLE} cannot change it' if forced else ''}")]
-    if forced == DRIVERS:
-        return [Target(own, f"PoCL's choice, set by {VARIABLE}")]
+    if features is None or not _uses_llvm_name(platform.version) or _name_pointer(device) is None:
+        return [
+            Target(driver_cpu, f"PoCL's choice{f'; {VARIABLE} cannot change it' if forced else ''}")
+        ]
+    if forced == DRIVER_CHOICE:
+        return [Target(driver_cpu, f"PoCL's choice, set by {VARIABLE}")]
     if forced:
         return [Target(forced, f"set by {VARIABLE}")]
     target = target_for(features)
-    if row_of(own) == target:
-        return [Target(own, "PoCL's choice, which matches the CPU's features")]
+    if equivalent_target(driver_cpu) == target:
+        return [Target(driver_cpu, "PoCL's choice, which matches the CPU's features")]
     failed = f"because {target}, which matches the CPU's features, does not work"
     return [
-        Target(target, f"from the CPU's features; PoCL's choice is {own}"),
-        *([] if own == "generic" else [Target(own, f"PoCL's choice, {failed}")]),
+        Target(target, f"from the CPU's features; PoCL's choice is {driver_cpu}"),
+        *([] if driver_cpu == "generic" else [Target(driver_cpu, f"PoCL's choice, {failed}")]),
         Target("x86-64", f"works on every such CPU, {failed}"),
     ]
 
@@ -246,49 +252,49 @@ def compile_for(device: Any, target: Target) -> None:
 
     This applies to everything compiled from now on, in all contexts of this process.
     """
-    known = own_target(device.version)
+    triple_and_cpu = driver_target(device.version)
     set_before = _texts.get(device.int_ptr)
-    now = set_before.value.decode() if set_before else known and known[1]
-    place = _place(device)
-    if place is None or target.name == now:
+    current = set_before.value.decode() if set_before else triple_and_cpu and triple_and_cpu[1]
+    pointer = _name_pointer(device)
+    if pointer is None or target.name == current:
         return
     text = ctypes.create_string_buffer(target.name.encode())
     with open("/proc/self/mem", "r+b", buffering=0) as memory:
-        os.pwrite(memory.fileno(), struct.pack("Q", ctypes.addressof(text)), place)
+        os.pwrite(memory.fileno(), struct.pack("Q", ctypes.addressof(text)), pointer)
     _texts[device.int_ptr] = text
 
 
-def _chooses_by_name(version: str) -> bool:
+def _uses_llvm_name(version: str) -> bool:
     """Return whether a PoCL with this platform version uses LLVM's name for the CPU."""
     found = re.search(r"PoCL (\d+)\.", version, re.IGNORECASE)
     return found is not None and int(found[1]) < 5
 
 
-def _place(device: Any) -> int | None:
+def _name_pointer(device: Any) -> int | None:
     """Return the address of the pointer to the CPU name; None if it cannot be found for certain."""
-    known = own_target(device.version)
-    if known is None:
+    triple_and_cpu = driver_target(device.version)
+    if triple_and_cpu is None:
         return None
-    changed = _texts.get(device.int_ptr)
-    triple = known[0].encode() + b"\0"
-    cpu = (changed.value if changed else known[1].encode()) + b"\0"
+    replaced = _texts.get(device.int_ptr)
+    triple = triple_and_cpu[0].encode() + b"\0"
+    cpu = (replaced.value if replaced else triple_and_cpu[1].encode()) + b"\0"
     try:
         with open("/proc/self/mem", "rb", buffering=0) as memory:
             descriptor = memory.fileno()
-            record = _read(descriptor, device.int_ptr, RECORD)
+            record = _read_memory(descriptor, device.int_ptr, RECORD_BYTES)
             words = struct.unpack_from(f"{len(record) // 8}Q", record)
-            found = [
+            pointers = [
                 device.int_ptr + 8 * (i + 1)
-                for i, (one, two) in enumerate(pairwise(words))
-                if _read(descriptor, two, len(cpu)) == cpu
-                and _read(descriptor, one, len(triple)) == triple
+                for i, (first, second) in enumerate(pairwise(words))
+                if _read_memory(descriptor, second, len(cpu)) == cpu
+                and _read_memory(descriptor, first, len(triple)) == triple
             ]
     except OSError:
         return None
-    return found[0] if len(found) == 1 else None
+    return pointers[0] if len(pointers) == 1 else None
 
 
-def _read(memory: int, address: int, size: int) -> bytes:
+def _read_memory(memory: int, address: int, size: int) -> bytes:
     """Return bytes of this process's memory; fewer if not all can be read."""
     if not 4096 <= address < 2**47:
         return b""

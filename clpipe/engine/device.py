@@ -12,17 +12,23 @@ from clpipe.engine.discovery import (
     DeviceInfo,
     choose,
     choose_all,
+    devices_of_process,
     find_devices,
-    shared_out,
     usable_memory,
 )
 from clpipe.engine.flow import Flight, Flow
 from clpipe.engine.ir import Plan
 from clpipe.engine.patches import with_patches
 from clpipe.engine.plan_kernels import PlanKernels
-from clpipe.engine.programs import announced, forget_programs, programs_of
+from clpipe.engine.programs import forget_programs, notice_if_slow, programs_of
 from clpipe.engine.recovery import Recovery
-from clpipe.engine.stack import BYTES_OF_PIXEL, FEWEST, STACK_BYTES, Stack, cut
+from clpipe.engine.stack import (
+    BYTES_PER_PIXEL,
+    MAX_STACK_BYTES,
+    MIN_MEMBERS,
+    Stack,
+    divide_into_stacks,
+)
 from clpipe.engine.tiles import Tiling, tiling_of
 from clpipe.engine.work import Member, R, Work
 
@@ -43,11 +49,11 @@ class Device:
         DeviceError: the device cannot be opened.
     """
 
-    def __init__(self, chosen: DeviceInfo, memory: int | None = None) -> None:
+    def __init__(self, info: DeviceInfo, memory: int | None = None) -> None:
         import pyopencl as cl
 
-        self.info = chosen
-        self.memory = memory or usable_memory(chosen)
+        self.info = info
+        self.memory = memory or usable_memory(info)
         self._cl = cl
         self._recovery = Recovery(self)
         self._open()
@@ -62,7 +68,7 @@ class Device:
         self._kernels = PlanKernels(self._programs, self.info.lanes)
         try:
             self.flow = Flow(
-                self._programs.context, self.info.alignment if self.info.in_place else None
+                self._programs.context, self.info.alignment if self.info.zero_copy else None
             )
         except self._cl.Error as error:
             raise DeviceError(
@@ -75,7 +81,7 @@ class Device:
         """The bytes of the buffers that are kept for the next image."""
         return self.flow.pool.bytes
 
-    def limit(self, memory: int) -> None:
+    def limit_memory(self, memory: int) -> None:
         """Limit the device's buffers to ``memory`` bytes. No image may be in flight."""
         self.memory = memory
         self._recovery.abandon()
@@ -116,9 +122,11 @@ class Device:
                 waits[work] = self._recovery.wait(work, flight)
         return [waits[work] for work in works]
 
-    def stacks(self, width: int, height: int) -> bool:
-        """Return whether images of this size share launches, at least :data:`FEWEST` in a stack."""
-        return width * height * BYTES_OF_PIXEL * FEWEST <= STACK_BYTES[self.info.in_place]
+    def can_stack(self, width: int, height: int) -> bool:
+        """Return whether images of this size share launches, :data:`MIN_MEMBERS` or more."""
+        return (
+            width * height * BYTES_PER_PIXEL * MIN_MEMBERS <= MAX_STACK_BYTES[self.info.zero_copy]
+        )
 
     def enqueue(self, works: Sequence[Work[Any]], memory: int) -> Flight | Exception:
         """Enqueue images whose plans have the same kernels, within ``memory`` bytes.
@@ -132,8 +140,8 @@ class Device:
         plan = works[0].plan
         is_new = plan not in self._kernels
         try:
-            with announced(self.info) if is_new else nullcontext():
-                flight = self._enqueued(works, memory)
+            with notice_if_slow(self.info) if is_new else nullcontext():
+                flight = self._enqueue_group(works, memory)
                 if is_new:
                     self.drain()  # PoCL finishes compiling a kernel at its first launch
                     self._programs.keep()
@@ -141,22 +149,28 @@ class Device:
         except (self._cl.Error, MemoryError) as error:
             return error
 
-    def _enqueued(self, works: Sequence[Work[Any]], memory: int) -> Flight:
+    def _enqueue_group(self, works: Sequence[Work[Any]], memory: int) -> Flight:
         flight, plan = Flight(), works[0].plan
         calls = self._kernels.of(plan)
         borders = partial(self._kernels.borders, plan)
         members: list[Member] = []
         for work in works:
             tiling = self.tiling(work, memory)
-            own = [Member(e, work, number) for number, e in enumerate(tiling.patches)]
-            if len(tiling.phases) > 1 or plan.incremental or not (own or len(tiling.tiles) == 1):
-                self.flow.start_alone(flight, work, tiling, calls, borders, self.memory)
+            patches = [Member(e, work, number) for number, e in enumerate(tiling.patches)]
+            if (
+                len(tiling.phases) > 1
+                or plan.incremental
+                or not (patches or len(tiling.tiles) == 1)
+            ):
+                self.flow.start_tiled(flight, work, tiling, calls, borders, self.memory)
             else:
-                members += own or [Member(tiling.tiles[0], work, is_whole=True)]
+                members += patches or [Member(tiling.tiles[0], work, is_whole=True)]
         if not members:
             return flight
-        in_place, largest = self.info.in_place, self.info.max_buffer
-        for part, strides, sizes in cut(members, in_place, memory, largest, self.depth):
+        zero_copy, largest = self.info.zero_copy, self.info.max_buffer
+        for part, strides, sizes in divide_into_stacks(
+            members, zero_copy, memory, largest, self.depth
+        ):
             fetches = part[0].work.options.download
             stack = Stack(part, calls, borders, strides, fetches=fetches)
             self.flow.start(flight, stack, sizes, self.memory)
@@ -191,14 +205,14 @@ class Device:
     def copy_speed(self, size: int = 96 * 2**20) -> float:
         """Return the speed of a buffer copy, read plus written, in bytes/s: the best of six."""
         cl = self._cl
-        one, two = (self.flow.new_buffer(size) for _ in range(2))
+        source, target = (self.flow.new_buffer(size) for _ in range(2))
         best = 0.0
         for _ in range(6):
             start = time.perf_counter()
-            cl.enqueue_copy(self.flow.queue, two, one, byte_count=size).wait()
+            cl.enqueue_copy(self.flow.queue, target, source, byte_count=size).wait()
             best = max(best, 2 * size / (time.perf_counter() - start))
-        one.release()
-        two.release()
+        source.release()
+        target.release()
         return best
 
 
@@ -230,7 +244,7 @@ def open_devices(
         memory: the most bytes that each device's buffers may use. None divides the free memory
             among CPUs, and a GPU's memory among processes.
         share: the number of this process, and how many processes of this machine share the
-            devices; see :func:`~clpipe.engine.discovery.shared_out`.
+            devices; see :func:`~clpipe.engine.discovery.devices_of_process`.
 
     Returns:
         The devices; an empty list for the selector "numpy".
@@ -240,18 +254,20 @@ def open_devices(
     """
     if any(selector.lower() == "numpy" for selector in selectors):
         if len(selectors) > 1:
-            named = ", ".join(selectors)
+            names = ", ".join(selectors)
             raise DeviceError(
-                f"devices {named}: numpy cannot be combined with other devices. Name it alone."
+                f"devices {names}: numpy cannot be combined with other devices. Name it alone."
             )
         return []
     chosen = choose_all(selectors, find_devices())
     processes = share[1]
-    on_each_gpu = -(-processes // len(chosen))
-    on_cpus = max(sum(info.type != "GPU" for info in chosen), processes)
+    processes_per_gpu = -(-processes // len(chosen))
+    cpu_users = max(sum(info.type != "GPU" for info in chosen), processes)
     return [
         Device(
-            info, memory or usable_memory(info) // (on_each_gpu if info.type == "GPU" else on_cpus)
+            info,
+            memory
+            or usable_memory(info) // (processes_per_gpu if info.type == "GPU" else cpu_users),
         )
-        for info in shared_out(chosen, *share)
+        for info in devices_of_process(chosen, *share)
     ]

@@ -7,29 +7,29 @@ from dataclasses import dataclass
 from typing import Any
 
 from clpipe.base.errors import DeviceError
-from clpipe.base.extras import installing
-from clpipe.base.memory import available_memory, check_addresses
+from clpipe.base.extras import install_command
+from clpipe.base.memory import available_memory, check_address_space
 from clpipe.base.system import processors
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.engine.cache_folder import pocl_problem
 from clpipe.engine.cpu_target import VARIABLE as TARGET_VARIABLE
 from clpipe.engine.cpu_target import Target, candidates, compile_for, forced_target
 from clpipe.engine.hardware import Hardware, hardware_of
 from clpipe.engine.runtimes import (
     attempt,
+    device_problem,
     is_pocl,
-    is_tried,
     lanes_for,
+    needs_test,
     platform_id,
-    problem_with,
     type_of,
 )
 from clpipe.engine.vendors import platforms
 from clpipe.engine.verdicts import Verdicts, verdicts
 
 # Bytes of address space: of PoCL while it compiles, and of one thread per processor.
-ADDRESSES = 256 << 20
-OF_THREAD = 8 << 20
+POCL_ADDRESS_SPACE = 256 << 20
+THREAD_ADDRESS_SPACE = 8 << 20
 
 _process: int | None = None  # the process id that first used OpenCL, here or before a fork
 
@@ -59,7 +59,7 @@ class DeviceInfo:
         return f"{self.name.strip()} ({self.platform})"
 
     @property
-    def in_place(self) -> bool:
+    def zero_copy(self) -> bool:
         """Whether kernels use the host's memory directly and at full speed."""
         return self.type == "CPU" and bool(self.handle.host_unified_memory)
 
@@ -73,11 +73,11 @@ class DeviceInfo:
         return 1 if is_pocl(self.platform) else self.handle.mem_base_addr_align // 8
 
 
-def find_devices(again: bool = False) -> list[DeviceInfo]:
+def find_devices(retest: bool = False) -> list[DeviceInfo]:
     """Return every device of every OpenCL platform, in the platforms' order. Each is tested once.
 
     Args:
-        again: whether to repeat failed tests.
+        retest: whether to repeat failed tests.
 
     Raises:
         DeviceError: pyopencl cannot be loaded, this process cannot use it, or the address space is
@@ -89,27 +89,29 @@ def find_devices(again: bool = False) -> list[DeviceInfo]:
             "this process was forked from one that had used OpenCL, so OpenCL would hang here. "
             'Use multiprocessing\'s "spawn" or "forkserver", or fork before OpenCL is used.'
         )
-    check_addresses(ADDRESSES + OF_THREAD * processors(), "an OpenCL runtime")
+    check_address_space(
+        POCL_ADDRESS_SPACE + THREAD_ADDRESS_SPACE * processors(), "an OpenCL runtime"
+    )
     _process = os.getpid()
     forced_target()
-    known = verdicts(again)
+    known = verdicts(retest)
     if known.listing:
-        raise DeviceError(f"OpenCL's drivers cannot be listed: {known.listing}. {remedies()}")
+        raise DeviceError(f"OpenCL's drivers cannot be listed: {known.listing}. {runtime_advice()}")
     found: list[DeviceInfo] = []
     for platform in platforms(known.hidden):
         devices, reason = devices_of(platform, known)
         for device in devices:
             is_new = known.of(platform, device) is None
-            if is_new and is_tried(type_of(platform, device), platform, device):
+            if is_new and needs_test(type_of(platform, device), platform, device):
                 known = verdicts(
                     missing=[attempt(platform, device, candidates(platform, device)[0])]
                 )
             found.append(describe(len(found), platform, device, known))
         if not devices:
             handle, version = platform.int_ptr, platform.version
-            found.append(without_device(len(found), platform.name, reason, version, handle))
+            found.append(empty_platform(len(found), platform.name, reason, version, handle))
     for name, reason in known.hidden.items():
-        found.append(without_device(len(found), name, reason))
+        found.append(empty_platform(len(found), name, reason))
     return found
 
 
@@ -129,7 +131,7 @@ def devices_of(platform: Any, known: Verdicts) -> tuple[list[Any], str]:
 def describe(index: int, platform: Any, device: Any, known: Verdicts) -> DeviceInfo:
     """Return the description of a ``pyopencl.Device``, and make it compile for its target."""
     type_ = type_of(platform, device)
-    problem = problem_with(type_, platform, device)
+    problem = device_problem(type_, platform, device)
     target = candidates(platform, device)[0]
     if not problem and (verdict := known.of(platform, device)):
         target, problem = verdict
@@ -152,7 +154,7 @@ def describe(index: int, platform: Any, device: Any, known: Verdicts) -> DeviceI
     )
 
 
-def without_device(
+def empty_platform(
     index: int, platform: str, reason: str, version: str = "", handle: int = 0
 ) -> DeviceInfo:
     """Return an entry for an installed platform without devices, which contains the reason."""
@@ -174,13 +176,13 @@ def without_device(
     )
 
 
-def remedies() -> str:
+def runtime_advice() -> str:
     """Return advice for a machine on which no OpenCL runtime works."""
     linux = this_system.system() == "Linux"
     x86 = this_system.machine() in ("x86_64", "AMD64")
     ways = [
         "your GPU's driver",
-        *([installing("intel-opencl-rt", "intel-cmplr-lib-rt")] if linux and x86 else []),
+        *([install_command("intel-opencl-rt", "intel-cmplr-lib-rt")] if linux and x86 else []),
         *(["apt-get install pocl-opencl-icd (Debian, Ubuntu)"] if linux else []),
     ]
     if name := forced_target():
@@ -203,9 +205,9 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
         DeviceError: there is no device, none matches, or the matching one cannot be used.
     """
     if not devices:
-        places = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES")  # they limit the loader's search
-        limits = "".join(f" ({n} is {os.environ[n]!r})" for n in places if n in os.environ)
-        raise DeviceError(f"no OpenCL platform was found{limits}. {remedies()}")
+        variables = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES")  # they limit the loader's search
+        limits = "".join(f" ({n} is {os.environ[n]!r})" for n in variables if n in os.environ)
+        raise DeviceError(f"no OpenCL platform was found{limits}. {runtime_advice()}")
     if selector is not None:
         matching = [
             d
@@ -214,7 +216,7 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
         ]
         if not matching:
             names = [f"{d.index}: {d.label}" for d in devices]
-            raise DeviceError(one_of("device", selector, [*names, "numpy"]))
+            raise DeviceError(unknown_name("device", selector, [*names, "numpy"]))
         usable = [d for d in matching if not d.problem]
         if not usable:
             raise DeviceError(
@@ -225,7 +227,7 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
     usable = [d for d in devices if d.type in ("GPU", "CPU") and not d.problem]
     if not usable:
         reasons = "; ".join(f"{d.label}: {d.problem or 'an emulator'}" for d in devices)
-        raise DeviceError(f"no usable OpenCL device ({reasons}). {remedies()}")
+        raise DeviceError(f"no usable OpenCL device ({reasons}). {runtime_advice()}")
     return min(usable, key=rank)
 
 
@@ -266,7 +268,7 @@ def choose_all(selectors: Sequence[str], devices: list[DeviceInfo]) -> list[Devi
     return distinct
 
 
-def shared_out(devices: list[DeviceInfo], number: int, of: int) -> list[DeviceInfo]:
+def devices_of_process(devices: list[DeviceInfo], index: int, count: int) -> list[DeviceInfo]:
     """Return the devices of one of several processes of a machine, distributed round-robin.
 
     If there are more processes than devices, several processes share a device. The distribution
@@ -274,13 +276,13 @@ def shared_out(devices: list[DeviceInfo], number: int, of: int) -> list[DeviceIn
 
     Args:
         devices: the devices of all processes together.
-        number: the number of the process, from 0.
-        of: the number of processes.
+        index: the number of the process, from 0.
+        count: the number of processes.
     """
-    if of == 1:
+    if count == 1:
         return devices
     ordered = sorted(devices, key=lambda d: (d.hardware.pci or (), d.index))
-    return ordered[number::of] or [ordered[number % len(ordered)]]
+    return ordered[index::count] or [ordered[index % len(ordered)]]
 
 
 def matches(selector: str, device: DeviceInfo) -> bool:
@@ -290,13 +292,13 @@ def matches(selector: str, device: DeviceInfo) -> bool:
     return bool(selector) and selector.lower() in names.lower()
 
 
-def usable_memory(chosen: DeviceInfo) -> int:
+def usable_memory(device: DeviceInfo) -> int:
     """Return the default limit for a device's buffers in bytes.
 
     It is nine tenths of a GPU's memory. A CPU shares its memory with all other programs, so there
     it is at most half of the memory that is available now.
     """
-    if chosen.type == "GPU":
-        return chosen.memory * 9 // 10
+    if device.type == "GPU":
+        return device.memory * 9 // 10
     available = available_memory()
-    return min(chosen.memory, available // 2) if available else chosen.memory
+    return min(device.memory, available // 2) if available else device.memory

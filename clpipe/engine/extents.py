@@ -33,7 +33,7 @@ class Box:
         return self.width <= 0 or self.height <= 0
 
 
-NOTHING = Box(0, 0, 0, 0)
+EMPTY = Box(0, 0, 0, 0)
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Extent:
 Extents = tuple[Extent, ...]
 
 
-def enclosing(places: Sequence[Extents]) -> Extents:
+def enclosing(parts: Sequence[Extents]) -> Extents:
     """Return, for each level, an extent with the largest image size and tile size of all places."""
     return tuple(
         Extent(
@@ -124,7 +124,7 @@ def enclosing(places: Sequence[Extents]) -> Extents:
             max(extent.height for extent in extents),
             extents[0].lanes,
             extents[0].border,
-            NOTHING,
+            EMPTY,
             Box(
                 0,
                 0,
@@ -132,7 +132,7 @@ def enclosing(places: Sequence[Extents]) -> Extents:
                 max(extent.stored.height for extent in extents),
             ),
         )
-        for extents in zip(*places, strict=True)
+        for extents in zip(*parts, strict=True)
     )
 
 

@@ -1,8 +1,9 @@
 """Stacks in flight on a device: commands that are enqueued, and results that are yet to be fetched.
 
-A stack is sent, launched and fetched. It has landed when its results are in the host's arrays. An
-image that is too large is processed in tiles, once in each phase. Each tile is a stack of one.
-Several stacks may be in flight together.
+The source pixels of a stack are uploaded, its kernels are launched, and its results are fetched.
+The stack is finished when its results are in the host's arrays. An image that is too large is
+processed in tiles, once in each phase. Each tile is a stack of one. Several stacks may be in flight
+together.
 """
 
 from collections import deque
@@ -24,16 +25,16 @@ from clpipe.engine.ir import Border, Launch
 from clpipe.engine.launch_cache import LaunchCache
 from clpipe.engine.stack import Call, Stack
 from clpipe.engine.tiles import Phase, Tiling, source_bytes
-from clpipe.engine.transfers import InPlace, Staged
+from clpipe.engine.transfers import Staged, ZeroCopy
 from clpipe.engine.work import Member, Work
 
-ONE = np.ones(1, np.uint32)  # before the first row, so that no offset is 0
-TABLES = 1 << 26  # bytes of arrays that are kept on the device, at most 64 arrays
+OFFSET_PADDING = np.ones(1, np.uint32)  # before the first row, so that no offset is 0
+MAX_TABLE_BYTES = 1 << 26  # bytes of arrays that are kept on the device, at most 64 arrays
 
 
-def room_of_table(buffer: Any) -> int:
-    """Return a buffer's share of :data:`TABLES`: its bytes, but at least 1/64 and at most all."""
-    return min(max(buffer.size, TABLES // 64), TABLES)
+def table_cost(buffer: Any) -> int:
+    """Return a buffer's part of :data:`MAX_TABLE_BYTES`: its bytes, within 1/64 and all."""
+    return min(max(buffer.size, MAX_TABLE_BYTES // 64), MAX_TABLE_BYTES)
 
 
 @dataclass
@@ -42,17 +43,17 @@ class Flight:
 
     Attributes:
         events: the names and events of launches and transfers.
-        stacks_left: the number of stacks that have not landed.
-        error: the first error of a stack that has landed.
+        pending: the number of stacks that are not finished.
+        error: the first error of a finished stack.
     """
 
     events: list[tuple[str, Any]] = field(default_factory=list)
-    stacks_left: int = 0
+    pending: int = 0
     error: Exception | None = None
 
 
 @dataclass(frozen=True)
-class Sent:
+class StackInFlight:
     """A stack in flight: the events to wait for, and the copies to make after them."""
 
     flight: Flight
@@ -74,17 +75,19 @@ class Flow:
 
         self._cl = cl
         self.context = context
-        self._in_place = alignment is not None
+        self._zero_copy = alignment is not None
         self.queue = self.new_queue()
         self.pool = Pool(self.new_buffer)
-        self.transfers: InPlace | Staged = (
-            InPlace(cl, self.queue, alignment)
+        self.transfers: ZeroCopy | Staged = (
+            ZeroCopy(cl, self.queue, alignment)
             if alignment
             else Staged(cl, self.queue, self.new_queue, self.pool)
         )
-        self._tables: BoundedCache[Any] = BoundedCache(TABLES, room_of_table)
-        self._sent: deque[Sent] = deque()
-        self._reads: list[Any] = []  # events of fetches from buffers that the next stack writes to
+        self._tables: BoundedCache[Any] = BoundedCache(MAX_TABLE_BYTES, table_cost)
+        self._in_flight: deque[StackInFlight] = deque()
+        self._fetch_events: list[
+            Any
+        ] = []  # events of fetches from buffers that the next stack writes to
         self._launch_cache = LaunchCache()
 
     def new_queue(self) -> Any:
@@ -98,17 +101,17 @@ class Flow:
         PoCL would allocate its own memory at the first launch, and crash if there is too little.
         """
         flags = self._cl.mem_flags
-        if not self._in_place:
+        if not self._zero_copy:
             return self._cl.Buffer(self.context, flags.READ_WRITE, size)
-        room = aligned_empty((size,), np.uint8)
-        return self._cl.Buffer(self.context, flags.READ_WRITE | flags.USE_HOST_PTR, hostbuf=room)
+        memory = aligned_empty((size,), np.uint8)
+        return self._cl.Buffer(self.context, flags.READ_WRITE | flags.USE_HOST_PTR, hostbuf=memory)
 
     @property
     def depth(self) -> int:
         """The number of stacks that may be in flight at a time."""
         return self.transfers.depth
 
-    def start_alone(
+    def start_tiled(
         self,
         flight: Flight,
         work: Work[Any],
@@ -121,12 +124,12 @@ class Flow:
 
         For an incremental plan, launches are skipped if their results are still on the device.
         """
-        known, after = self.forget(), LaunchCache()
+        previous, updated = self.reset_launch_cache(), LaunchCache()
         self.reserve(tiling.sizes, memory)
         is_whole = len(tiling.tiles) == 1 and not tiling.patches
         if work.plan.incremental and is_whole:
-            given = work.source, work.options.unchanged, tiling.tiles[0], work.bind
-            numbers, after = known.next(calls, self.pool, *given)
+            image = work.source, work.options.unchanged, tiling.tiles[0], work.bind
+            numbers, updated = previous.next(calls, self.pool, *image)
             tiling = replace(tiling, phases=(Phase((), numbers, ()),))
 
         def stack(place: int, extents: Extents, numbers: Sequence[int], phase: Phase) -> Stack:
@@ -146,20 +149,20 @@ class Flow:
             tiles = tiling.tiles_of(phase)
             self._launch(flight, stack(0, tiles[0], phase.first, phase), {}, [])
             for place, extents in enumerate(tiles):
-                self._send(flight, stack(place, extents, phase.each, phase))
+                self._submit(flight, stack(place, extents, phase.each, phase))
             self._launch(flight, stack(0, tiles[0], phase.last, phase), {}, [])
-        self._launch_cache = after
+        self._launch_cache = updated
 
     def start(self, flight: Flight, stack: Stack, sizes: Mapping[str, int], memory: int) -> None:
         """Enqueue a stack that needs buffers of these sizes; all take at most ``memory`` bytes."""
-        self.forget()
+        self.reset_launch_cache()
         self.reserve(sizes, memory)
-        self._send(flight, stack)
+        self._submit(flight, stack)
 
-    def forget(self) -> LaunchCache:
+    def reset_launch_cache(self) -> LaunchCache:
         """Return the launch cache, and start an empty one, because buffers will be overwritten."""
-        known, self._launch_cache = self._launch_cache, LaunchCache()
-        return known
+        previous, self._launch_cache = self._launch_cache, LaunchCache()
+        return previous
 
     def reserve(self, sizes: Mapping[str, int], memory: int) -> None:
         """Allocate buffers of these sizes (bytes by name), with at most ``memory`` bytes in all."""
@@ -168,40 +171,40 @@ class Flow:
             self.drain()  # releasing a buffer frees its host memory, even if a command uses it
         self.pool.reserve(needs, memory)
 
-    def _send(self, flight: Flight, stack: Stack) -> None:
-        """Send a stack's pixels if a kernel reads them, launch its kernels, and fetch the results.
+    def _submit(self, flight: Flight, stack: Stack) -> None:
+        """Upload a stack's pixels if a kernel reads them, launch its kernels, fetch its results.
 
         If more than :attr:`depth` stacks would be in flight, this first waits for the oldest.
         """
-        while len(self._sent) >= self.depth:
-            self._land()
+        while len(self._in_flight) >= self.depth:
+            self._finish_oldest()
         first, members = stack.members[0], stack.members
         work, is_whole = first.work, first.is_whole and len(members) == 1
         reads = any(call.reads_source for call in stack.calls)
         source, wait = self._upload(flight, stack, is_whole) if reads else (None, [])
-        whole = work.output.encoded if stack.fetches and is_whole else None
+        target = work.output.encoded if stack.fetches and is_whole else None
         last, size = members[-1].extents[-1].stored, 0
         if work.plan.encoded:
             size = stack.strides.get("dst", 0) * (len(members) - 1)
             size += last.width * last.height * len(work.plan.encoded.channels)
-        ends = {"src": source, "dst": self.transfers.target(size, whole)}
-        wait = [*wait, *self._reads]
-        self._reads = []
-        done = self._launch(flight, stack, ends, wait)
-        sent = Sent(flight, [*wait, *done], [])
+        io_buffers = {"src": source, "dst": self.transfers.target(size, target)}
+        wait = [*wait, *self._fetch_events]
+        self._fetch_events = []
+        events = self._launch(flight, stack, io_buffers, wait)
+        in_flight = StackInFlight(flight, [*wait, *events], [])
         if stack.fetches:
-            self._fetch_results(sent, stack, ends, done)
-        flight.stacks_left += 1
-        self._sent.append(sent)
+            self._fetch_results(in_flight, stack, io_buffers, events)
+        flight.pending += 1
+        self._in_flight.append(in_flight)
         self.transfers.flush()
 
     @CpuTimer("upload")
     def _upload(self, flight: Flight, stack: Stack, is_whole: bool) -> tuple[Any, list[Any]]:
-        """Send the source pixels of a stack's members, unless they are on the device already."""
+        """Upload the source pixels of a stack's members, unless they are on the device already."""
         first, members = stack.members[0], stack.members
         options, source = first.work.options, first.work.source
         is_same = is_whole and (options.unchanged or not options.download)
-        if is_same and (sent := self.transfers.again(source)):
+        if is_same and (sent := self.transfers.reuse_upload(source)):
             return sent
         if len(members) > 1:
             pixels = [member.pixels for member in members]
@@ -213,67 +216,80 @@ class Flow:
         return sent
 
     def _launch(
-        self, flight: Flight, stack: Stack, ends: Mapping[str, Any], wait: list[Any]
+        self, flight: Flight, stack: Stack, io_buffers: Mapping[str, Any], wait: list[Any]
     ) -> list[Any]:
         """Launch the kernels of a stack, the first one after the events ``wait``.
 
         Returns:
             The event of the last kernel; ``wait`` if there is none.
         """
-        buffers = {**self.pool.buffers, **ends}
+        buffers = {**self.pool.buffers, **io_buffers}
         launches = list(stack.launches())
         if not launches:
             return wait
-        asked = [value for call, *_ in launches for value in call.values]
-        values = [member.work.bind(asked) for member in stack.members]
-        given, first = [], 0
+        requested = [value for call, *_ in launches for value in call.values]
+        values = [member.work.bind(requested) for member in stack.members]
+        tables, first = [], 0
         for call, *_ in launches:
             end = first + len(call.values)
-            own = [each[first:end] for each in values]
-            given.append(call.table(stack, own, buffers, self.table, self.new_table))
+            call_values = [each[first:end] for each in values]
+            tables.append(call.table(stack, call_values, buffers, self.table, self.new_table))
             first = end
-        numbers = self.new_table(np.concatenate([ONE, *(rows.reshape(-1) for rows, _ in given)]))
-        offset, done = ONE.size, wait
-        for (call, across, local), (rows, pointers) in zip(launches, given, strict=True):
+        numbers = self.new_table(
+            np.concatenate([OFFSET_PADDING, *(rows.reshape(-1) for rows, _ in tables)])
+        )
+        offset, events = OFFSET_PADDING.size, wait
+        for (call, global_size, local_size), (rows, pointers) in zip(launches, tables, strict=True):
             call.compiled.set_args(numbers, *pointers)
             event = self._cl.enqueue_nd_range_kernel(
-                self.queue, call.compiled, across, local, (0, 0, offset), wait_for=wait or None
+                self.queue,
+                call.compiled,
+                global_size,
+                local_size,
+                (0, 0, offset),
+                wait_for=wait or None,
             )
             offset, wait = offset + rows.size, []
             if not isinstance(call.kernel.launch, Border):  # nothing waits for borders
                 flight.events.append((call.kernel.launch.name, event))
-                done = [event]
-        return done
+                events = [event]
+        return events
 
-    def _fetch(self, sent: Sent, name: str, buffer: Any, size: int, after: list[Any]) -> Array:
-        """Enqueue a fetch of a buffer after launches. Its bytes are valid when the stack lands."""
+    def _fetch(
+        self, stack: StackInFlight, name: str, buffer: Any, size: int, after: list[Any]
+    ) -> Array:
+        """Enqueue a fetch of a buffer. Its bytes are valid when the stack finishes."""
         array, event = self.transfers.fetch(name, buffer, size, after)
-        sent.flight.events.append(("download", event))
-        sent.events.append(event)
+        stack.flight.events.append(("download", event))
+        stack.events.append(event)
         if name != "dst":
-            self._reads.append(event)
+            self._fetch_events.append(event)
         return array
 
     def _fetch_results(
-        self, sent: Sent, stack: Stack, ends: Mapping[str, Any], after: list[Any]
+        self,
+        in_flight: StackInFlight,
+        stack: Stack,
+        io_buffers: Mapping[str, Any],
+        after: list[Any],
     ) -> None:
         """Enqueue the fetches of a stack's results after its launches.
 
         Args:
-            sent: receives the copies to make when the stack lands.
+            in_flight: receives the copies to make when the stack finishes.
             stack: the stack.
-            ends: the buffers "src" and "dst", which are not in the pool.
+            io_buffers: the buffers "src" and "dst", which are not in the pool.
             after: the events of the launches.
         """
         members = stack.members
         plan, output = members[0].work.plan, members[0].work.output
-        buffers = {**self.pool.buffers, **ends}
+        buffers = {**self.pool.buffers, **io_buffers}
 
         def parts(name: str, sizes: Sequence[int]) -> list[Array]:
             stride = stack.strides.get(name, 0)
             size = stride * (len(members) - 1) + sizes[-1]
-            whole = self._fetch(sent, name, buffers[name], size, after)
-            return [whole[n * stride : n * stride + own] for n, own in enumerate(sizes)]
+            data = self._fetch(in_flight, name, buffers[name], size, after)
+            return [data[n * stride : n * stride + length] for n, length in enumerate(sizes)]
 
         last = [member.extents[-1] for member in members]
         if plan.encoded and not last[0].core.is_empty:
@@ -282,45 +298,45 @@ class Flow:
             for member, extent, pixels in zip(members, last, parts("dst", sizes), strict=True):
                 encoded = member.work.output.encoded
                 assert encoded is not None
-                to = member.part_of(encoded, extent)
-                sent.copies.append(partial(copy_encoded, extent, pixels, to))
+                target = member.part_of(encoded, extent)
+                in_flight.copies.append(partial(copy_encoded, extent, pixels, target))
         for number in output.images:
-            own = [member.extents[plan.level_of(number)] for member in members]
-            if own[0].core.is_empty:
+            extents = [member.extents[plan.level_of(number)] for member in members]
+            if extents[0].core.is_empty:
                 continue
-            sizes = [extent.plane_bytes for extent in own]
+            sizes = [extent.plane_bytes for extent in extents]
             for channel, slot in enumerate(plan.slots[number]):
-                found = parts(slot_buffer(slot), sizes)
-                for member, extent, plane in zip(members, own, found, strict=True):
-                    to = member.part_of(member.work.output.images[number], extent)
-                    copy = partial(copy_plane, extent, plane.view(np.float32), to, channel)
-                    sent.copies.append(copy)
+                planes = parts(slot_buffer(slot), sizes)
+                for member, extent, plane in zip(members, extents, planes, strict=True):
+                    target = member.part_of(member.work.output.images[number], extent)
+                    copy = partial(copy_plane, extent, plane.view(np.float32), target, channel)
+                    in_flight.copies.append(copy)
         for step, values in output.estimates.items() if stack.is_last else ():
-            found = parts(step_buffer("estimates", step), [values.nbytes] * len(members))
-            for member, part in zip(members, found, strict=True):
-                to = member.work.output.estimates[step]
-                sent.copies.append(partial(np.copyto, to, part.view(to.dtype)))
+            planes = parts(step_buffer("estimates", step), [values.nbytes] * len(members))
+            for member, part in zip(members, planes, strict=True):
+                target = member.work.output.estimates[step]
+                in_flight.copies.append(partial(np.copyto, target, part.view(target.dtype)))
 
     def finish(self, flight: Flight) -> None:
-        """Wait until all stacks of a flight, and all stacks started before it, have landed.
+        """Wait until all stacks of a flight, and all stacks started before it, are finished.
 
         Raises:
             pyopencl.Error: a stack of the flight failed.
         """
-        while flight.stacks_left:
-            self._land()
+        while flight.pending:
+            self._finish_oldest()
         if flight.error:
             raise flight.error
 
     def drain(self) -> None:
         """Wait until no stack is in flight."""
-        while self._sent:
-            self._land()
+        while self._in_flight:
+            self._finish_oldest()
 
     def abandon(self) -> None:
         """After a failure, wait for all commands in flight, drop their results, release memory."""
-        self._sent.clear()
-        self._reads.clear()
+        self._in_flight.clear()
+        self._fetch_events.clear()
         for release in (
             self.queue.finish,
             self.transfers.release,
@@ -330,20 +346,20 @@ class Flow:
             with suppress(self._cl.Error):
                 release()
 
-    def _land(self) -> None:
+    def _finish_oldest(self) -> None:
         """Wait for the oldest stack in flight, and copy its results. Its flight stores an error."""
-        sent = self._sent.popleft()
-        sent.flight.stacks_left -= 1
+        stack = self._in_flight.popleft()
+        stack.flight.pending -= 1
         try:
-            if sent.events:
+            if stack.events:
                 with CpuTimer("kernels"):
-                    self._cl.wait_for_events(sent.events)
+                    self._cl.wait_for_events(stack.events)
             with CpuTimer("download"):
-                for copy in sent.copies:
+                for copy in stack.copies:
                     copy()
             self.transfers.done()
         except self._cl.Error as error:
-            sent.flight.error = sent.flight.error or error
+            stack.flight.error = stack.flight.error or error
 
     def table(self, table: Array) -> Any:
         """Return a buffer with a constant array, which is uploaded once per array object."""

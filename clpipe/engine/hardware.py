@@ -38,13 +38,13 @@ class Hardware:
 
 def hardware_of(device: Any) -> Hardware:
     """Return the hardware of a ``pyopencl.Device``."""
-    uuid = queried(device, UUID)
-    pci = queried(device, PCI_BUS_INFO)
-    address = struct.unpack("4I", pci) if pci else vendor_address(device)
+    uuid = query_device(device, UUID)
+    pci = query_device(device, PCI_BUS_INFO)
+    address = struct.unpack("4I", pci) if pci else pci_address(device)
     return Hardware(device.platform.int_ptr, address, uuid)
 
 
-def queried(device: Any, name: int, size: int = 16) -> bytes | None:
+def query_device(device: Any, name: int, size: int = 16) -> bytes | None:
     """Return a value of clGetDeviceInfo for which pyopencl has no name; None if it is missing."""
     import pyopencl as cl
 
@@ -60,7 +60,7 @@ def queried(device: Any, name: int, size: int = 16) -> bytes | None:
     return None if failed or not any(value.raw) else value.raw
 
 
-def vendor_address(device: Any) -> tuple[int, ...] | None:
+def pci_address(device: Any) -> tuple[int, ...] | None:
     """Return the PCI address of older NVIDIA and AMD drivers: domain, bus, device, function."""
     import pyopencl as cl
 
@@ -70,7 +70,7 @@ def vendor_address(device: Any) -> tuple[int, ...] | None:
     except (cl.Error, AttributeError):
         pass
     try:
-        place = device.topology_amd
-        return 0, place.bus, place.device, place.function
+        topology = device.topology_amd
+        return 0, topology.bus, topology.device, topology.function
     except (cl.Error, AttributeError):
         return None

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from clpipe.engine.bindings import (
     ArgumentValue,
-    Bound,
+    Binding,
     Buffer,
     EncodedCurves,
     ExtentNumber,
@@ -19,7 +19,7 @@ from clpipe.engine.ir import Plan, Read
 from clpipe.engine.ops import Op
 from clpipe.stage import NoiseScope
 
-LARGER = (
+INPUT_EXTENT = (
     "{from_width, from_height, from_pitch, from_left * LANES, from_top * 4, from_columns, "
     "from_rows, border}"
 )
@@ -49,10 +49,10 @@ class KernelBuilder:
             self._steps.append(step)
         return f"step{self._steps.index(step)}_{item}"
 
-    def parameter(self, name: str, type_: str, bound: Bound) -> str:
+    def parameter(self, name: str, type_: str, binding: Binding) -> str:
         """Add a kernel parameter and its binding, and return its name in the source."""
         space = "" if type_.endswith("*") else " "
-        self.parameters[name] = Parameter(f"{type_}{space}{name}", bound)
+        self.parameters[name] = Parameter(f"{type_}{space}{name}", binding)
         return name
 
     def buffer(
@@ -76,14 +76,14 @@ class KernelBuilder:
         self.setup.append(f"const core c = {{{', '.join(sides)}}};")
         return "c"
 
-    def larger(self) -> str:
+    def input_extent(self) -> str:
         """Return the variable with the extent of the image that a resampling reads."""
         for number in ("width", "height", "pitch", "left", "top", "columns", "rows"):
-            self.parameter(f"from_{number}", "uint", ExtentNumber(number, larger=True))
-        self.setup.append(f"const extent from = {LARGER};")
+            self.parameter(f"from_{number}", "uint", ExtentNumber(number, of_input=True))
+        self.setup.append(f"const extent from = {INPUT_EXTENT};")
         return "from"
 
-    def taps(self, level: int) -> list[str]:
+    def resampling_arguments(self, level: int) -> list[str]:
         """Return the parameters for the resampling from a level to the next."""
         return [
             self.parameter(f"tap_{item}", type_, ResamplingValue(level, item))
@@ -153,29 +153,29 @@ class KernelBuilder:
         return texts
 
 
-def in_order(parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
+def sort_parameters(parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
     """Return parameters in the order of the table's columns.
 
     The order is: extents, pointers, then the values of an image's chain by type.
     """
 
     def group(parameter: Parameter) -> int:
-        if isinstance(parameter.bound, ExtentNumber):
-            return int(parameter.bound.larger)
-        if element_of(parameter) or isinstance(parameter.bound, TileNumber):
+        if isinstance(parameter.binding, ExtentNumber):
+            return int(parameter.binding.of_input)
+        if element_type(parameter) or isinstance(parameter.binding, TileNumber):
             return 2
         return 3 + list(AS_TYPE).index(parameter.declaration.split()[0])
 
     return dict(sorted(parameters.items(), key=lambda item: group(item[1])))
 
 
-def element_of(parameter: Parameter) -> str | None:
+def element_type(parameter: Parameter) -> str | None:
     """Return the OpenCL type of a pointer parameter's elements; None for a number."""
     type_, star, _ = parameter.declaration.partition("*")
     return type_.split()[-1] if star else None
 
 
-def opening(parameters: Mapping[str, Parameter]) -> tuple[list[str], list[str]]:
+def kernel_opening(parameters: Mapping[str, Parameter]) -> tuple[list[str], list[str]]:
     """Return the declared parameters of a kernel, and its first lines, which read the table.
 
     Args:
@@ -186,9 +186,9 @@ def opening(parameters: Mapping[str, Parameter]) -> tuple[list[str], list[str]]:
         "const size_t member = get_global_id(2) - get_global_offset(2);",
         f"{TABLE} += get_global_offset(2) + member * {len(parameters)};",
     ]
-    for place, (name, parameter) in enumerate(parameters.items()):
-        number = f"{TABLE}[{place}]"
-        if element_of(parameter):
+    for column, (name, parameter) in enumerate(parameters.items()):
+        number = f"{TABLE}[{column}]"
+        if element_type(parameter):
             declared.append(parameter.declaration)
             lines.append(f"{name} += member * {number};")
         else:

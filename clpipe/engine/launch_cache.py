@@ -65,14 +65,14 @@ class LaunchCache:
             The numbers of the calls to launch, and the new cache. The last call is always launched,
             because its results need not stay on the device.
         """
-        same = unchanged and self.source is not None and self.source() is source
-        number = self.number + (not same)
-        after = LaunchCache(weakref.ref(source), number, dict(self.buffers))
+        is_same_source = unchanged and self.source is not None and self.source() is source
+        number = self.number + (not is_same_source)
+        updated = LaunchCache(weakref.ref(source), number, dict(self.buffers))
         planes = [repr(extent.numbers).encode() for extent in extents]
 
-        def holds(name: str, made: bytes) -> bool:
-            buffer, maker = after.buffers.get(name, (None, b""))
-            return buffer is pool.buffers[name] and maker == made
+        def is_current(name: str, output_digest: bytes) -> bool:
+            buffer, digest_held = updated.buffers.get(name, (None, b""))
+            return buffer is pool.buffers[name] and digest_held == output_digest
 
         def digest(value: Any) -> bytes:
             return (
@@ -84,15 +84,19 @@ class LaunchCache:
         numbers = []
         for i, call in enumerate(calls):
             level = call.kernel.launch.level
-            made = digest_of(
+            output_digest = digest_of(
                 call.kernel.name.encode(),
                 planes[level],
                 planes[max(level - 1, 0)],
                 number.to_bytes(8) if call.reads_source else b"",
-                *(after.buffers[name][1] for name in call.reads),
+                *(updated.buffers[name][1] for name in call.reads),
                 *map(digest, bind(call.values)),
             )
-            if call is calls[-1] or not all(holds(name, made) for name in call.writes):
+            if call is calls[-1] or not all(
+                is_current(name, output_digest) for name in call.writes
+            ):
                 numbers.append(i)
-            after.buffers.update((name, (pool.buffers[name], made)) for name in call.writes)
-        return tuple(numbers), after
+            updated.buffers.update(
+                (name, (pool.buffers[name], output_digest)) for name in call.writes
+            )
+        return tuple(numbers), updated

@@ -67,26 +67,29 @@ def chain_ops(
     steps: list[tuple[str, tuple[Op, ...]]] = []
     last: Op | None = None
     for step in chain.steps:
-        own = arguments[step.name]
-        ops = ops_of(step, own)
+        step_arguments = arguments[step.name]
+        ops = ops_of(step, step_arguments)
         if ops:
-            if last and undone(ops[0].pass_, own, last.pass_, arguments[last.step]):
+            if last and undoes(ops[0].pass_, step_arguments, last.pass_, arguments[last.step]):
                 ops = (replace(ops[0], undoes_previous=True), *ops[1:])
             last = ops[-1]
         steps.append((step.name, ops))
     return tuple(steps)
 
 
-def undone(
-    pass_: Pass, own: Mapping[str, Argument], before: Pass, others: Mapping[str, Argument]
+def undoes(
+    pass_: Pass,
+    arguments: Mapping[str, Argument],
+    previous: Pass,
+    previous_arguments: Mapping[str, Argument],
 ) -> bool:
     """Return whether a pass with its arguments undoes the previous pass with its arguments."""
     access = pass_.access
-    if not isinstance(access, Pointwise) or access.inverse_of != before.function:
+    if not isinstance(access, Pointwise) or access.inverse_of != previous.function:
         return False
     return all(
-        bytes_of(own[mine]) == bytes_of(others[theirs])
-        for mine, theirs in zip(pass_.arguments, before.arguments, strict=True)
+        bytes_of(arguments[mine]) == bytes_of(previous_arguments[theirs])
+        for mine, theirs in zip(pass_.arguments, previous.arguments, strict=True)
     )
 
 
@@ -106,6 +109,8 @@ def ops_of(step: Step, arguments: Mapping[str, Argument]) -> tuple[Op, ...]:
     kernel = f"{step.method.kernel}.cl"
     if step.stage.folder:
         kernel = str(step.stage.folder / kernel)
-    given = tuple(types), tuple(literals)
+    argument_types = tuple(types), tuple(literals)
     source, result = step.stage.reads, step.stage.writes
-    return tuple(Op(step.name, kernel, p, source, p.kind or result, *given) for p in passes)
+    return tuple(
+        Op(step.name, kernel, p, source, p.kind or result, *argument_types) for p in passes
+    )

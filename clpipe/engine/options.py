@@ -36,8 +36,8 @@ class RunOptions:
         unchanged: whether the image, if it is the previous image's array, has the same pixels.
         boxes: the parts of the results to compute, all of one size, in pixels. The results are
             then stacks of patches. () computes whole images.
-        later: the images of all exposures but the first; see :mod:`clpipe.chain.exposures`. () uses
-            the same image.
+        later_exposures: the images of all exposures but the first; see
+            :mod:`clpipe.chain.exposures`. () uses the same image.
     """
 
     timings: list[Timing] | None = None
@@ -45,7 +45,7 @@ class RunOptions:
     into: Array | None = None
     unchanged: bool = False
     boxes: Sequence[Box] = ()
-    later: Sequence[Array] = ()
+    later_exposures: Sequence[Array] = ()
 
 
 DEFAULTS = RunOptions()

@@ -8,14 +8,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from clpipe.base.errors import ImageError
-from clpipe.base.memory import in_words
+from clpipe.base.memory import format_bytes
 from clpipe.engine.extents import Box, enclosing
 from clpipe.engine.ir import Plan
 from clpipe.engine.tiles import Tiling, buffer_sizes, cutter_of, phases_of
 
 
 def with_patches(
-    plan: Plan, boxes: Sequence[Box], whole: Tiling, lanes: int, memory: int, ends: int = 1
+    plan: Plan, boxes: Sequence[Box], tiling: Tiling, lanes: int, memory: int, depth: int = 1
 ) -> Tiling:
     """Return the tiling that computes only patches of an image's result.
 
@@ -24,27 +24,27 @@ def with_patches(
     Args:
         plan: the plan.
         boxes: the patches, in pixels of the results, all of one size.
-        whole: the tiling of the whole image.
+        tiling: the tiling of the whole image.
         lanes: the lanes of the device.
         memory: the most bytes that all buffers together may use.
-        ends: as for :func:`~clpipe.engine.tiles.tiling_of`.
+        depth: as for :func:`~clpipe.engine.tiles.tiling_of`.
 
     Raises:
         ImageError: a patch does not fit into the memory. For patches that run in stacks, this is
             checked later, when the stacks are made.
     """
-    source = whole.tiles[0][0]
-    cut = cutter_of(plan, source.width, source.height, lanes)
-    levels = {image.level for _, image in plan.kept} | {len(cut.whole) - 1}
-    patches = tuple(cut.patch(box, levels) for box in boxes)
+    source = tiling.tiles[0][0]
+    cutter = cutter_of(plan, source.width, source.height, lanes)
+    levels = {image.level for _, image in plan.kept} | {len(cutter.whole) - 1}
+    patches = tuple(cutter.patch(box, levels) for box in boxes)
     phases = phases_of(plan)
     if len(phases) == 1:  # the patches run in stacks
-        return replace(whole, phases=phases, sizes={}, patches=patches)
-    sizes = dict(whole.sizes)
-    for name, size in buffer_sizes(plan, enclosing(patches), ends).items():
+        return replace(tiling, phases=phases, sizes={}, patches=patches)
+    sizes = dict(tiling.sizes)
+    for name, size in buffer_sizes(plan, enclosing(patches), depth).items():
         sizes[name] = max(size, sizes.get(name, 0))
     check_memory(sizes, memory)
-    return replace(whole, phases=phases, sizes=sizes, patches=patches)
+    return replace(tiling, phases=phases, sizes=sizes, patches=patches)
 
 
 def check_memory(sizes: Mapping[str, int], memory: int) -> None:
@@ -55,6 +55,6 @@ def check_memory(sizes: Mapping[str, int], memory: int) -> None:
     """
     if sum(sizes.values()) > memory:
         raise ImageError(
-            f"a patch needs {in_words(sum(sizes.values()))} of device memory, but the limit is "
-            f"{in_words(memory)}. Raise the memory limit, or use smaller patches."
+            f"a patch needs {format_bytes(sum(sizes.values()))} of device memory, but the limit is "
+            f"{format_bytes(memory)}. Raise the memory limit, or use smaller patches."
         )

@@ -203,7 +203,7 @@ def make_plan(
     for name in keep:
         chain.step_named(name)
     if not (encode or final):
-        chain = chain.through(keep)
+        chain = chain.up_to(keep)
     last = chain.steps[-1].name
     final = final or last in keep
     planner = _Planner(chain.source, fold)

@@ -6,10 +6,10 @@ from functools import partial
 from clpipe.base.cache import BoundedCache
 from clpipe.engine.codegen import write_kernel
 from clpipe.engine.ir import AnyLaunch, Border, Launch, Plan
-from clpipe.engine.programs import Programs, tell_watchers
+from clpipe.engine.programs import Programs, notify_watchers
 from clpipe.engine.stack import Call
 
-PLANS = 64  # the most plans whose kernels are cached
+MAX_PLANS = 64  # the most plans whose kernels are cached
 
 
 class PlanKernels:
@@ -23,8 +23,8 @@ class PlanKernels:
     def __init__(self, programs: Programs, lanes: int) -> None:
         self._programs = programs
         self._lanes = lanes
-        self._plans: BoundedCache[list[Call]] = BoundedCache(PLANS)
-        self._borders: BoundedCache[Call] = BoundedCache(PLANS)
+        self._plans: BoundedCache[list[Call]] = BoundedCache(MAX_PLANS)
+        self._borders: BoundedCache[Call] = BoundedCache(MAX_PLANS)
 
     def __contains__(self, plan: Plan) -> bool:
         """Return whether the kernels of a plan are compiled."""
@@ -36,16 +36,16 @@ class PlanKernels:
         Raises:
             DeviceError: a kernel does not compile. The message contains the compiler's.
         """
-        return self._plans.get(plan.unscaled, lambda: list(self._compiled(plan)))
+        return self._plans.get(plan.unscaled, lambda: list(self._compile_all(plan)))
 
-    def _compiled(self, plan: Plan) -> Iterator[Call]:
+    def _compile_all(self, plan: Plan) -> Iterator[Call]:
         count = len(plan.launches)
         for number, launch in enumerate(plan.launches):
-            tell_watchers(number, count)
-            yield self._made(plan, launch)
-        tell_watchers(count, count)
+            notify_watchers(number, count)
+            yield self._compile(plan, launch)
+        notify_watchers(count, count)
 
-    def _made(self, plan: Plan, launch: AnyLaunch | Border) -> Call:
+    def _compile(self, plan: Plan, launch: AnyLaunch | Border) -> Call:
         kernel = write_kernel(plan, launch, self._lanes)
         return Call(kernel, self._programs.kernel(kernel))
 
@@ -55,4 +55,4 @@ class PlanKernels:
             return
         for slot in plan.slots[image.number]:
             border = Border(slot, written.level, image.period)
-            yield self._borders.get(border, partial(self._made, plan, border))
+            yield self._borders.get(border, partial(self._compile, plan, border))

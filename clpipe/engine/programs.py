@@ -15,9 +15,9 @@ from typing import Any
 
 from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import DeviceError, RequestError
-from clpipe.base.system import kept_signals
+from clpipe.base.system import preserve_signal_handlers
 from clpipe.engine.builders import BinaryBuilder, PoclBuilder
-from clpipe.engine.cache_folder import cache_folder, later_runs, pocl_folder
+from clpipe.engine.cache_folder import cache_folder, cache_notice, pocl_folder
 from clpipe.engine.discovery import DeviceInfo
 from clpipe.engine.ir import Kernel
 from clpipe.engine.runtimes import is_pocl
@@ -25,13 +25,13 @@ from clpipe.engine.store import Store
 
 # PoCL includes the declarations of all OpenCL functions before each program. The first option makes
 # PoCL skip this. The second makes kernels/lib/builtins.h declare the functions that kernels call.
-DECLARED_HERE = ("-D_OPENCL_H_", "-DDECLARED_HERE")
-PROGRAMS = 1024  # the most programs that a process keeps for each device
-LONG = 2.0  # s of compiling after which this is logged
+BUILTIN_OPTIONS = ("-D_OPENCL_H_", "-DDECLARED_HERE")
+MAX_PROGRAMS = 1024  # the most programs that a process keeps for each device
+NOTICE_DELAY = 2.0  # s of compiling after which this is logged
 log = logging.getLogger(__name__)
 _by_device: dict[int, "Programs"] = {}
 _lock = threading.Lock()  # guards _by_device
-_announced = threading.Event()
+_notice_logged = threading.Event()
 _watchers: list[Callable[[int, int], None]] = []
 
 
@@ -39,7 +39,7 @@ class Programs:
     """The OpenCL context of a device, and the programs that this process compiled in it.
 
     Attributes:
-        declares: whether clpipe declares OpenCL's functions; see :data:`DECLARED_HERE`.
+        declares: whether clpipe declares OpenCL's functions; see :data:`BUILTIN_OPTIONS`.
 
     Raises:
         DeviceError: the device cannot be opened.
@@ -50,14 +50,14 @@ class Programs:
 
         self._cl = cl
         try:
-            with kept_signals():
+            with preserve_signal_handlers():
                 self.context = cl.Context([info.handle])
         except cl.Error as error:
             raise DeviceError(
                 f"{info.label} cannot be opened: {error}. Close other programs that use it, or "
                 "choose another device."
             ) from None
-        self._programs: BoundedCache[Any] = BoundedCache(PROGRAMS)
+        self._programs: BoundedCache[Any] = BoundedCache(MAX_PROGRAMS)
         self._lock = threading.Lock()  # lets one thread compile at a time
         self._options = ["-cl-std=CL1.2", "-w"]
         if info.handle.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
@@ -87,7 +87,7 @@ class Programs:
         stage_files = [file for file in kernel.files if Path(file).is_absolute()]
         if self.declares and not stage_files:  # stage files may call any function
             with suppress(cl.Error):
-                return self._build(kernel, [*self._options, *DECLARED_HERE])
+                return self._build(kernel, [*self._options, *BUILTIN_OPTIONS])
         try:
             program = self._build(kernel, self._options)
         except cl.MemoryError:
@@ -118,12 +118,12 @@ def builder_for(info: DeviceInfo, context: Any) -> BinaryBuilder | PoclBuilder |
     """Return the builder of a device's programs; None if the driver has its own cache."""
     from pyopencl.characterize import has_src_build_cache
 
-    folder, of_pocl = cache_folder(), pocl_folder()
+    folder, pocl = cache_folder(), pocl_folder()
     platform = info.handle.platform.version
-    made_by = (info.platform, platform, info.name, info.version, info.driver, info.target.name)
-    store = Store(folder / "programs" if folder else None, *made_by)
+    versions = (info.platform, platform, info.name, info.version, info.driver, info.target.name)
+    store = Store(folder / "programs" if folder else None, *versions)
     if is_pocl(info.platform):
-        return PoclBuilder(context, store, of_pocl) if of_pocl else None
+        return PoclBuilder(context, store, pocl) if pocl else None
     return None if has_src_build_cache(info.handle) else BinaryBuilder(context, store)
 
 
@@ -140,26 +140,26 @@ def programs_of(info: DeviceInfo) -> Programs:
         return _by_device[key]
 
 
-def forget_programs(info: DeviceInfo, dead: Programs) -> None:
+def forget_programs(info: DeviceInfo, broken: Programs) -> None:
     """Remove a broken context, so that the next call of :func:`programs_of` creates a new one."""
     with _lock:
-        if _by_device.get(info.handle.int_ptr) is dead:
+        if _by_device.get(info.handle.int_ptr) is broken:
             del _by_device[info.handle.int_ptr]
 
 
 @contextmanager
-def announced(info: DeviceInfo) -> Iterator[None]:
-    """Log that kernels are being compiled, once per process, if it takes longer than :data:`LONG`.
+def notice_if_slow(info: DeviceInfo) -> Iterator[None]:
+    """Log once per process that kernels are compiled, if it takes over :data:`NOTICE_DELAY`.
 
     The logger is ``clpipe.engine.programs``. The level is INFO.
     """
 
     def announce() -> None:
-        if not _announced.is_set():
-            _announced.set()
-            log.info("compiling kernels for %s; %s", info.label, later_runs())
+        if not _notice_logged.is_set():
+            _notice_logged.set()
+            log.info("compiling kernels for %s; %s", info.label, cache_notice())
 
-    timer = threading.Timer(LONG, announce)
+    timer = threading.Timer(NOTICE_DELAY, announce)
     timer.daemon = True
     timer.start()
     try:
@@ -169,7 +169,7 @@ def announced(info: DeviceInfo) -> Iterator[None]:
 
 
 @contextmanager
-def watched(watcher: Callable[[int, int], None]) -> Iterator[None]:
+def watching_compilation(watcher: Callable[[int, int], None]) -> Iterator[None]:
     """Call a function with the number of compiled kernels and of all kernels, from any thread."""
     _watchers.append(watcher)
     try:
@@ -178,10 +178,10 @@ def watched(watcher: Callable[[int, int], None]) -> Iterator[None]:
         _watchers.remove(watcher)
 
 
-def tell_watchers(compiled: int, of: int) -> None:
+def notify_watchers(compiled: int, total: int) -> None:
     """Report to all watchers how many kernels of a plan are compiled."""
     for watcher in tuple(_watchers):
-        watcher(compiled, of)
+        watcher(compiled, total)
 
 
 def build_log(text: str) -> str:

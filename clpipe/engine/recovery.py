@@ -15,7 +15,7 @@ from clpipe.engine.work import R, Work
 if TYPE_CHECKING:
     from clpipe.engine.device import Device
 
-FAILURES = 3  # images in a row for which a device may fail before it is no longer used
+MAX_FAILURES = 3  # images in a row for which a device may fail before it is no longer used
 
 
 class Recovery:
@@ -52,11 +52,11 @@ class Recovery:
         Raises:
             ImageError: the memory is too small even for the smallest tiles.
             DeviceFailedError: the device failed twice.
-            DeviceError: the device failed for :data:`FAILURES` images in a row.
+            DeviceError: the device failed for :data:`MAX_FAILURES` images in a row.
         """
         cl, device = self._cl, self._device
         memory = device.memory
-        full: Exception | None = None  # the device's error when its memory ran out
+        full: Exception | None = None  # the error when the device's memory was full
         failed = False
         while True:
             if generation != self.generation:  # the enqueued commands are lost
@@ -87,7 +87,7 @@ class Recovery:
                 raise DeviceFailedError(f"{device.info.label} failed: {error}") from None
             self._failures = 0
             if work.options.timings is not None:
-                work.options.timings.extend(timed(flight.events))
+                work.options.timings.extend(timings_of(flight.events))
             return work.output if work.options.download else HostImages({}, None, {})
 
     def abandon(self) -> None:
@@ -105,28 +105,28 @@ class Recovery:
             DeviceError: the device cannot be opened again.
         """
         self.abandon()
-        if self._works():
+        if self._copy_works():
             return True
         self._device.reopen()
         return False
 
-    def _works(self) -> bool:
+    def _copy_works(self) -> bool:
         """Return whether the context still works after an error. This copies a few bytes.
 
         Error codes are not enough. NVIDIA reports an invalid read in a kernel as
         CL_OUT_OF_RESOURCES, which also means too little memory. But after an invalid read, every
         command in that context fails.
         """
-        cl, sent, back = self._cl, np.arange(4, dtype=np.uint8), np.zeros(4, np.uint8)
+        cl, sent, received = self._cl, np.arange(4, dtype=np.uint8), np.zeros(4, np.uint8)
         flow = self._device.flow
         try:
             queue = flow.new_queue()
             flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
-            cl.enqueue_copy(queue, back, cl.Buffer(flow.context, flags, hostbuf=sent))
+            cl.enqueue_copy(queue, received, cl.Buffer(flow.context, flags, hostbuf=sent))
             queue.finish()
         except cl.Error:
             return False
-        return np.array_equal(sent, back)
+        return np.array_equal(sent, received)
 
     def _count_failure(self, error: Exception) -> None:
         """Count an image for which the device failed twice.
@@ -135,14 +135,14 @@ class Recovery:
             DeviceError: the device failed for too many images in a row.
         """
         self._failures += 1
-        if self._failures >= FAILURES:
+        if self._failures >= MAX_FAILURES:
             raise DeviceError(
                 f"{self._device.info.label} failed for {self._failures} images in a row, so it is "
                 f"no longer used: {error}. To choose another one, run clpipe devices."
             ) from None
 
 
-def timed(events: Sequence[tuple[str, Any]]) -> list[Timing]:
+def timings_of(events: Sequence[tuple[str, Any]]) -> list[Timing]:
     """Return the timings of events. The last event must have just ended."""
     if not events:
         return []

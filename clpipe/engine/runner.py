@@ -9,10 +9,10 @@ import numpy as np
 from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array, Floats
-from clpipe.chain.chain import Chain, of_structure
+from clpipe.chain.chain import Chain, cached_by_structure
 from clpipe.chain.exposures import exposures_of
 from clpipe.chain.registry import user_code_errors
-from clpipe.engine.buffers import HostImages, room_for
+from clpipe.engine.buffers import HostImages, allocate_results
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.ir import Plan
@@ -83,13 +83,13 @@ def is_planar(image: Array) -> bool:
     return image.transpose(2, 0, 1).flags.c_contiguous
 
 
-def cut_out(image: Array, boxes: Sequence[Box]) -> Array:
+def crop_patches(image: Array, boxes: Sequence[Box]) -> Array:
     """Return parts of an image, all of one size, as (patch, height, width[, channel])."""
     return np.stack([image[box.top : box.bottom, box.left : box.right] for box in boxes])
 
 
-@of_structure
-def may_estimate(chain: Chain) -> bool:
+@cached_by_structure
+def has_size_estimates(chain: Chain) -> bool:
     """Return whether a stage derives numbers from the size of the image."""
     return any(type(s.method).estimates_for is not Method.estimates_for for s in chain.steps)
 
@@ -102,10 +102,10 @@ def check_sizes(plan: Plan, width: int, height: int) -> None:
     """
     *_, last = sizes = plan.sizes(width, height)
     for name, kept in plan.kept:
-        own = sizes[kept.level]
-        if own != last:
+        size = sizes[kept.level]
+        if size != last:
             raise ImageError(
-                f"the image after {name} has {own[0]}x{own[1]} pixels, but the last image has "
+                f"the image after {name} has {size[0]}x{size[1]} pixels, but the last image has "
                 f"{last[0]}x{last[1]}. Patches need images of one size. Do not keep {name}."
             )
 
@@ -155,7 +155,7 @@ class Runner:
         return other
 
     @cached_property
-    def _later(self) -> list["Runner"]:
+    def _exposure_runners(self) -> list["Runner"]:
         """The runners of all exposures but the first, up to the step that merges them."""
         chains = self._exposures.later if self._exposures else ()
         runners = [Runner(chain, self.device, encode=False, final=True) for chain in chains]
@@ -192,7 +192,7 @@ class Runner:
         """
         if self.device:
             try:
-                for runner in (*self._later, self):
+                for runner in (*self._exposure_runners, self):
                     runner._compile_plan(runner.plan(half))
             except DeviceFailedError as error:
                 raise DeviceError(str(error)) from None
@@ -204,7 +204,7 @@ class Runner:
         """
         assert self.device
         if not self.device.is_compiled(plan):
-            width, height = self.chain.margins.around(8, 8)
+            width, height = self.chain.margins.image_size(8, 8)
             shape = (height, width, 3)[: 2 if len(self.chain.source.channels) == 1 else 3]
             tiny = np.zeros(shape, np.float16 if plan.half else np.float32)
             try:
@@ -237,7 +237,7 @@ class Runner:
             DeviceFailedError: the device failed for this image.
             DeviceError: a kernel does not compile, or the device failed for too many images.
         """
-        return submit_together([(self, image, noise_key, options)])[0]
+        return submit_batch([(self, image, noise_key, options)])[0]
 
     def work(
         self, image: Array, noise_key: str, options: RunOptions = DEFAULTS
@@ -251,7 +251,7 @@ class Runner:
             The work; if no device is needed, a callable that returns the result.
         """
         self.check(image)
-        runner = self._merging(image, noise_key, options.later)
+        runner = self._with_exposures(image, noise_key, options.later_exposures)
         if not (self.encode or self.final or self.keep):
             return lambda: Result(None, None, {}, {})
         if not self.device:
@@ -268,23 +268,25 @@ class Runner:
     def _work(self, plan: Plan, image: Array, noise_key: str, options: RunOptions) -> Work[Result]:
         """Return the work of one image whose other exposures are done. See :meth:`work`."""
         width, height = image.shape[1::-1]
-        estimates = self._estimates_for(width, height) if may_estimate(self.chain) else {}
+        estimates = self._estimates_for(width, height) if has_size_estimates(self.chain) else {}
         return Work(
             plan,
             image,
             binding(self.chain, plan, (width, height), noise_key, self._tables),
-            room_for(plan, width, height, options.into, options.boxes),
+            allocate_results(plan, width, height, options.into, options.boxes),
             options,
             partial(self._result, plan, estimates),
         )
 
-    def _merging(self, image: Array, noise_key: str, later: Sequence[Array]) -> "Runner":
+    def _with_exposures(
+        self, image: Array, noise_key: str, later_images: Sequence[Array]
+    ) -> "Runner":
         """Run all exposures but the first, and return a runner that merges them with the first.
 
         Args:
             image: the image of the first exposure.
             noise_key: the text from which the noise is seeded.
-            later: the images of the other exposures; () uses ``image``.
+            later_images: the images of the other exposures; () uses ``image``.
 
         Returns:
             The runner; this one if the chain has only one exposure.
@@ -294,9 +296,13 @@ class Runner:
         """
         if not self._exposures or not (self.encode or self.final or self.keep):
             return self
-        pairs = zip(self._later, later or [image] * len(self._later), strict=True)
-        seen = [runner.run(own, noise_key).image for runner, own in pairs]
-        return self.for_chain(self._exposures.merging(seen))
+        pairs = zip(
+            self._exposure_runners,
+            later_images or [image] * len(self._exposure_runners),
+            strict=True,
+        )
+        exposure_images = [runner.run(exposure, noise_key).image for runner, exposure in pairs]
+        return self.for_chain(self._exposures.merge_chain(exposure_images))
 
     def check(self, image: Array) -> None:
         """Check that an image has the shape that the chain starts on.
@@ -343,19 +349,19 @@ class Runner:
         kept: dict[str, Floats] = {}
         estimates: dict[str, dict[str, float]] = {}
         whole = self.encode or self.final
-        steps = (self.chain if whole else self.chain.through(self.keep)).steps
+        steps = (self.chain if whole else self.chain.up_to(self.keep)).steps
         for step in steps:
             from_size = dict(step.method.estimates_for(*image.shape[1::-1]))
             streams = {s: self.chain.stream(step.name, s, noise_key) for s in NoiseScope}
-            given = ReferenceContext(step.context, streams, from_size)
+            context = ReferenceContext(step.context, streams, from_size)
             with user_code_errors(f"stage {step.name}", step.stage.folder):
-                image = step.method.reference(image, given)
+                image = step.method.reference(image, context)
             if step.name in self.keep:
                 kept[step.name] = image
-            if given.estimates:
-                estimates[step.name] = given.estimates
+            if context.estimates:
+                estimates[step.name] = context.estimates
         if boxes:
-            image, *parts = (cut_out(each, boxes) for each in (image, *kept.values()))
+            image, *parts = (crop_patches(each, boxes) for each in (image, *kept.values()))
             kept = dict(zip(kept, parts, strict=True))
         return Result(
             final=image if self.final or steps[-1].name in self.keep else None,
@@ -365,7 +371,7 @@ class Runner:
         )
 
 
-def submit_together(
+def submit_batch(
     images: Sequence[tuple[Runner, Array, str, RunOptions]],
 ) -> list[Callable[[], Result]]:
     """Enqueue images. Small images of similar chains share launches.
@@ -383,5 +389,5 @@ def submit_together(
     """
     works = [runner.work(image, key, options) for runner, image, key, options in images]
     device = images[0][0].device
-    begun = iter(device.submit([w for w in works if isinstance(w, Work)]) if device else ())
-    return [next(begun) if isinstance(work, Work) else work for work in works]
+    submitted = iter(device.submit([w for w in works if isinstance(w, Work)]) if device else ())
+    return [next(submitted) if isinstance(work, Work) else work for work in works]

@@ -37,7 +37,7 @@ def lanes_for(type_: str, platform: Any, device: Any, target: Target) -> int:
     return 1 if width == 1 else 8 if width < 16 else 16
 
 
-def problem_with(type_: str, platform: Any, device: Any) -> str:
+def device_problem(type_: str, platform: Any, device: Any) -> str:
     """Return why a device is unusable, as far as this is known without a test; else ""."""
     if type_ == "accelerator":
         return "it is neither a GPU nor a CPU, but an emulator or an FPGA"
@@ -51,9 +51,9 @@ def problem_with(type_: str, platform: Any, device: Any) -> str:
     return pocl_problem() if is_pocl(platform.name) else ""
 
 
-def is_tried(type_: str, platform: Any, device: Any) -> bool:
+def needs_test(type_: str, platform: Any, device: Any) -> bool:
     """Return whether a device is tested before it is used. Emulators would take too long."""
-    return type_ in ("GPU", "CPU") and not problem_with(type_, platform, device)
+    return type_ in ("GPU", "CPU") and not device_problem(type_, platform, device)
 
 
 def platform_id(platform: Any) -> str:

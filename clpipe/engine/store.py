@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from clpipe.base.errors import ImageError
-from clpipe.base.files import discard, passing_files, write_new
+from clpipe.base.files import discard, unsynced_files, write_new
 
 DIGEST = hashlib.sha256().digest_size  # bytes at the beginning of a file
 
@@ -23,13 +23,15 @@ class Store:
         of: texts that are part of every key.
     """
 
-    def __init__(self, folder: Path | None, *of: str) -> None:
+    def __init__(self, folder: Path | None, *namespace: str) -> None:
         self.folder = folder
-        self._of = of
+        self._namespace = namespace
 
     def path(self, *key: str) -> Path | None:
         """Return the file of a key; None without a folder."""
-        parts = b"\0".join(hashlib.sha256(part.encode()).digest() for part in (*self._of, *key))
+        parts = b"\0".join(
+            hashlib.sha256(part.encode()).digest() for part in (*self._namespace, *key)
+        )
         return self.folder / hashlib.sha256(parts).hexdigest()[:40] if self.folder else None
 
     def load(self, *key: str) -> bytes | None:
@@ -52,5 +54,5 @@ class Store:
         """Store bytes under a key, in place of earlier ones. Errors are ignored."""
         path = self.path(*key)
         if path is not None:
-            with suppress(ImageError), passing_files():
+            with suppress(ImageError), unsynced_files():
                 write_new(path, hashlib.sha256(data).digest() + data)

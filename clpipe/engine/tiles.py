@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from clpipe.base.errors import ImageError
-from clpipe.base.memory import in_words
+from clpipe.base.memory import format_bytes
 from clpipe.engine.bindings import slot_buffer, step_buffer
 from clpipe.engine.extents import Box, Extent, Extents, whole_image
 from clpipe.engine.ir import AnyLaunch, Finalize, Histogram, Launch, Lines, Plan, Reduce, reads_of
@@ -37,18 +37,18 @@ def source_bytes(plan: Plan, extent: Extent) -> int:
     return pixels * len(plan.source.channels) * (2 if plan.half else 4)
 
 
-def buffer_sizes(plan: Plan, extents: Extents, ends: int = 1) -> dict[str, int]:
+def buffer_sizes(plan: Plan, extents: Extents, depth: int = 1) -> dict[str, int]:
     """Return the device buffers that a plan needs for an image or a tile, as bytes by name.
 
-    ``ends`` is the number of sources and eight-bit results that exist at a time.
+    ``depth`` is the number of sources and eight-bit results that exist at a time.
     """
     first, last = extents[0], extents[-1]
-    sizes = {f"src{i}": source_bytes(plan, first) for i in range(ends)}
+    sizes = {f"src{i}": source_bytes(plan, first) for i in range(depth)}
     for number, levels in enumerate(plan.levels_of_slots):
         sizes[slot_buffer(number)] = max(extents[level].plane_bytes for level in levels)
     if plan.encoded:
         encoded = last.stored.width * last.stored.height * len(plan.encoded.channels)
-        sizes |= {f"dst{i}": encoded for i in range(ends)}
+        sizes |= {f"dst{i}": encoded for i in range(depth)}
     for launch in plan.launches:
         match launch:
             case Lines(ops=ops, level=level):
@@ -113,10 +113,10 @@ def phases_of(plan: Plan) -> tuple[Phase, ...]:
     numbered = tuple(enumerate(plan.launches))
     lines = tuple(i for i, launch in numbered if isinstance(launch, Lines))
     phases = []
-    for end, find in numbered:
-        if isinstance(find, Finalize):
-            reduces = {i for i, launch in numbered if reduction_of(launch) is find.op}
-            phases.append(Phase((), leading_to(plan, reduces), (end,)))
+    for end, finalize in numbered:
+        if isinstance(finalize, Finalize):
+            reduces = {i for i, launch in numbered if reduction_of(launch) is finalize.op}
+            phases.append(Phase((), with_dependencies(plan, reduces), (end,)))
     results = {image.number for _, image in plan.kept}
     results |= {plan.final.number} if plan.final else set()
     ends = {
@@ -125,7 +125,7 @@ def phases_of(plan: Plan) -> tuple[Phase, ...]:
         if isinstance(launch, Launch)
         and (launch.encodes or (launch.writes and launch.writes.number in results))
     }
-    phases.append(Phase((), leading_to(plan, ends), ()))
+    phases.append(Phase((), with_dependencies(plan, ends), ()))
     return (replace(phases[0], first=lines), *phases[1:])
 
 
@@ -136,7 +136,7 @@ def reduction_of(launch: AnyLaunch) -> Op | None:
     return launch.op if isinstance(launch, Histogram | Reduce) else None
 
 
-def leading_to(plan: Plan, ends: set[int]) -> tuple[int, ...]:
+def with_dependencies(plan: Plan, ends: set[int]) -> tuple[int, ...]:
     """Return the numbers of these launches and of all launches that they depend on."""
     images: set[int] = set()
     chosen = []
@@ -153,25 +153,25 @@ def halos_of(plan: Plan) -> tuple[int, ...]:
     reach: dict[int, int] = {}  # of each stored image
     halos = [0] * (len(plan.resamplings) + 1)
     for launch in reversed(plan.launches):
-        own = 0
+        halo = 0
         if isinstance(launch, Launch):
-            own = reach.get(launch.writes.number, 0) if launch.writes else 0
-            own += launch.stencil.radius if launch.stencil else 0
+            halo = reach.get(launch.writes.number, 0) if launch.writes else 0
+            halo += launch.stencil.radius if launch.stencil else 0
             if not launch.reads or launch.reads[0].image.level < launch.level:
-                halos[launch.level] = max(halos[launch.level], own)
-                own = 0
+                halos[launch.level] = max(halos[launch.level], halo)
+                halo = 0
         for read in reads_of(launch):
-            reach[read.image.number] = max(reach.get(read.image.number, 0), own)
+            reach[read.image.number] = max(reach.get(read.image.number, 0), halo)
     return tuple(halos)
 
 
 class Cutter:
-    """Cuts an image into tiles whose columns begin at multiples of ``across``, and rows of 4."""
+    """Cuts an image into tiles whose columns begin at multiples of ``column_step``, rows of 4."""
 
     def __init__(self, plan: Plan, width: int, height: int, lanes: int) -> None:
         self.whole = whole_image(plan, width, height, lanes)
         columns = (columns_of(x, lanes) for x in plan.launches)
-        self.across = lanes * math.lcm(2, *columns)
+        self.column_step = lanes * math.lcm(2, *columns)
         self._halos = halos_of(plan)
         self._resamplings = plan.resamplings
         self._sizes = plan.sizes(width, height)
@@ -187,7 +187,7 @@ class Cutter:
         Returns:
             For each level, begin and end of the core, then begin and end of the stored part.
         """
-        step = self.across if axis == "columns" else 4
+        step = self.column_step if axis == "columns" else 4
         sizes = [e.width if axis == "columns" else e.height for e in self.whole]
         # Rounded up, so that the first tile's core is not empty on any level.
         cores = [
@@ -201,7 +201,7 @@ class Cutter:
 
     def spans_of(self, axis: Axis, cores: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
         """Return the :meth:`spans` of a tile with any core on each level."""
-        step = self.across if axis == "columns" else 4
+        step = self.column_step if axis == "columns" else 4
         sizes = [e.width if axis == "columns" else e.height for e in self.whole]
         spans: list[tuple[int, ...]] = []
         low = high = 0  # the part of this level that the next one needs
@@ -220,19 +220,19 @@ class Cutter:
     def tile(self, left: int, top: int, columns: int, rows: int) -> Extents:
         """Return the tile with a core of this position and size on level 0, cut at the image."""
         width, height = self.whole[0].width, self.whole[0].height
-        across = self.spans("columns", left, min(left + columns, width))
-        down = self.spans("rows", top, min(top + rows, height))
-        return self._extents(across, down)
+        x_spans = self.spans("columns", left, min(left + columns, width))
+        y_spans = self.spans("rows", top, min(top + rows, height))
+        return self._extents(x_spans, y_spans)
 
     def patch(self, box: Box, levels: Set[int]) -> Extents:
         """Return the tile that computes only a part of the images of these levels."""
-        every = range(len(self.whole))
-        across = [(box.left, box.right) if level in levels else (0, 0) for level in every]
-        down = [(box.top, box.bottom) if level in levels else (0, 0) for level in every]
-        return self._extents(self.spans_of("columns", across), self.spans_of("rows", down))
+        all_levels = range(len(self.whole))
+        x_spans = [(box.left, box.right) if level in levels else (0, 0) for level in all_levels]
+        y_spans = [(box.top, box.bottom) if level in levels else (0, 0) for level in all_levels]
+        return self._extents(self.spans_of("columns", x_spans), self.spans_of("rows", y_spans))
 
     def _extents(
-        self, across: Sequence[tuple[int, ...]], down: Sequence[tuple[int, ...]]
+        self, x_spans: Sequence[tuple[int, ...]], y_spans: Sequence[tuple[int, ...]]
     ) -> Extents:
         return tuple(
             Extent(
@@ -243,10 +243,10 @@ class Cutter:
                 core=Box(x[0], y[0], x[1], y[1]),
                 stored=Box(x[2], y[2], x[3], y[3]),
             )
-            for extent, x, y in zip(self.whole, across, down, strict=True)
+            for extent, x, y in zip(self.whole, x_spans, y_spans, strict=True)
         )
 
-    def amid(self, columns: int, rows: int) -> Extents:
+    def largest_tile(self, columns: int, rows: int) -> Extents:
         """Return the largest extents that a tile of this size can have on each level."""
         wide, high = self._longest("columns", columns), self._longest("rows", rows)
         boxes = [Box(0, 0, x, y) for x, y in zip(wide, high, strict=True)]
@@ -255,7 +255,7 @@ class Cutter:
 
     def _longest(self, axis: Axis, core: int) -> list[int]:
         """Return the most rows or columns that a tile can store on each level."""
-        step = self.across if axis == "columns" else 4
+        step = self.column_step if axis == "columns" else 4
         sizes = [e.width if axis == "columns" else e.height for e in self.whole]
         found = []
         low = high = 0  # what is needed before and after the position of the core of level 0
@@ -279,7 +279,7 @@ def cutter_of(plan: Plan, width: int, height: int, lanes: int) -> Cutter:
 
 @lru_cache(maxsize=64)
 def tiling_of(
-    plan: Plan, width: int, height: int, lanes: int, memory: int, largest: int, ends: int = 1
+    plan: Plan, width: int, height: int, lanes: int, memory: int, largest: int, depth: int = 1
 ) -> Tiling:
     """Return the tiling of an image for limited memory: whole if it fits, else in tiles.
 
@@ -293,54 +293,57 @@ def tiling_of(
         lanes: the lanes of the device.
         memory: the most bytes that all buffers together may use.
         largest: the most bytes of a single buffer.
-        ends: the number of sources and eight-bit results that exist at a time.
+        depth: the number of sources and eight-bit results that exist at a time.
 
     Raises:
         ImageError: even the smallest tile does not fit. The message contains the required memory.
     """
-    cut = cutter_of(plan, width, height, lanes)
-    whole, across = cut.whole, cut.across
+    cutter = cutter_of(plan, width, height, lanes)
+    whole, column_step = cutter.whole, cutter.column_step
 
     def fits(extents: Extents, memory: int) -> bool:
-        sizes = buffer_sizes(plan, extents, ends).values()
+        sizes = buffer_sizes(plan, extents, depth).values()
         return sum(sizes) <= memory and max(sizes) <= largest
 
     if fits(whole, memory):
-        every = tuple(range(len(plan.launches)))
-        return Tiling((whole,), (Phase((), every, ()),), buffer_sizes(plan, whole, ends))
-    of_tile = min(memory, LARGEST_TILE)
+        all_launches = tuple(range(len(plan.launches)))
+        return Tiling((whole,), (Phase((), all_launches, ()),), buffer_sizes(plan, whole, depth))
+    tile_memory = min(memory, LARGEST_TILE)
     best: tuple[float, int, int] | None = None
     for columns in dict.fromkeys(
-        round_up(-(-width // parts), across) for parts in divisions(-(-width // across))
+        round_up(-(-width // parts), column_step) for parts in divisions(-(-width // column_step))
     ):
         blocks = bisect_left(
             range(1, -(-height // 4) + 1),
             True,
-            key=lambda n: not fits(cut.amid(columns, 4 * n), of_tile),
+            key=lambda n: not fits(cutter.largest_tile(columns, 4 * n), tile_memory),
         )
         if blocks:
             parts = -(-height // (4 * blocks))
             rows = round_up(-(-height // parts), 4)
-            extent = cut.amid(columns, rows)[0].stored
+            extent = cutter.largest_tile(columns, rows)[0].stored
             cost = extent.width * extent.height / (columns * rows)
             if best is None or cost < best[0] / 1.02:
                 best = cost, columns, rows
     if best is None:
-        least = cut.amid(across, 4)
-        needs, wants = (buffer_sizes(plan, extents, ends) for extents in (least, whole))
+        smallest = cutter.largest_tile(column_step, 4)
+        least, full = (buffer_sizes(plan, extents, depth) for extents in (smallest, whole))
         raise ImageError(
-            f"{width}x{height} pixels need {in_words(sum(wants.values()))} of device memory, or "
-            f"{in_words(sum(needs.values()))} in the smallest tiles, with a buffer of "
-            f"{in_words(max(needs.values()))}. The limit is {in_words(memory)}, with buffers of at "
-            f"most {in_words(largest)}. Raise the memory limit, or use another device."
+            f"{width}x{height} pixels need {format_bytes(sum(full.values()))} of device memory, or "
+            f"{format_bytes(sum(least.values()))} in the smallest tiles, with a buffer of "
+            f"{format_bytes(max(least.values()))}. The limit is {format_bytes(memory)}, with "
+            f"buffers of at most {format_bytes(largest)}. Raise the memory limit, or use another "
+            "device."
         )
     _, columns, rows = best
     tiles = tuple(
-        cut.tile(left, top, columns, rows)
+        cutter.tile(left, top, columns, rows)
         for top in range(0, height, rows)
         for left in range(0, width, columns)
     )
-    return Tiling(tiles, phases_of(plan), buffer_sizes(plan, cut.amid(columns, rows), ends))
+    return Tiling(
+        tiles, phases_of(plan), buffer_sizes(plan, cutter.largest_tile(columns, rows), depth)
+    )
 
 
 def divisions(most: int) -> Iterator[int]:

@@ -6,7 +6,7 @@ from clpipe.engine.ir import AnyLaunch, Launch, Plan, Reduce, reads_of
 from clpipe.engine.work_items import summed_together
 
 
-def share(plan: Plan, level: int) -> float:
+def relative_pixels(plan: Plan, level: int) -> float:
     """Return the approximate number of pixels on a level per pixel of the source."""
     return math.prod(each.scale for each in plan.resamplings[:level])
 
@@ -19,20 +19,20 @@ def sum_bytes(lanes: int) -> float:
 def bytes_per_pixel(plan: Plan, lanes: int) -> float:
     """Return the device memory in bytes per pixel: source, slots, block sums, eight-bit result."""
     total = float(len(plan.source.channels) * (2 if plan.half else 4))
-    total += sum(4 * share(plan, min(levels)) for levels in plan.levels_of_slots)
+    total += sum(4 * relative_pixels(plan, min(levels)) for levels in plan.levels_of_slots)
     for launch in plan.launches:
         if isinstance(launch, Launch) and launch.sums:
-            total += sum_bytes(lanes) * share(plan, launch.level)
+            total += sum_bytes(lanes) * relative_pixels(plan, launch.level)
     encoded = len(plan.encoded.channels) if plan.encoded else 0
-    return total + encoded * share(plan, len(plan.resamplings))
+    return total + encoded * relative_pixels(plan, len(plan.resamplings))
 
 
 def launch_bytes(plan: Plan, launch: AnyLaunch, lanes: int) -> float:
     """Return the bytes per pixel that a launch reads and writes, counting each sample once."""
     if isinstance(launch, Reduce) and not launch.op.reduction.bins:
-        return sum_bytes(lanes) * share(plan, launch.level)
+        return sum_bytes(lanes) * relative_pixels(plan, launch.level)
     images = [read.image for read in reads_of(launch)]
-    total = sum(4 * len(i.kind.channels) * share(plan, i.level) for i in images)
+    total = sum(4 * len(i.kind.channels) * relative_pixels(plan, i.level) for i in images)
     if not isinstance(launch, Launch):
         return total
     if not launch.reads:
@@ -44,4 +44,4 @@ def launch_bytes(plan: Plan, launch: AnyLaunch, lanes: int) -> float:
         written += len(plan.encoded.channels)
     if launch.sums:
         written += sum_bytes(lanes)
-    return total + written * share(plan, launch.level)
+    return total + written * relative_pixels(plan, launch.level)

@@ -1,4 +1,4 @@
-"""Transfers of pixels to a device and back: in place, or through staging buffers.
+"""Transfers of pixels to a device and back: without copies, or through staging buffers.
 
 An image or a tile needs three steps: ``upload``, ``target`` for the eight-bit pixels, and ``fetch``
 for each result. The array of a fetch is valid from the completion of its event until ``done``. At
@@ -14,8 +14,8 @@ import numpy as np
 from clpipe.base.types import Array
 from clpipe.engine.buffers import Pool, aligned_empty
 
-Sent = tuple[Any, list[Any]]  # a buffer, and the events after which kernels can read it
-Fetched = tuple[Array, Any]  # bytes, and the event after which they are valid
+Upload = tuple[Any, list[Any]]  # a buffer, and the events after which kernels can read it
+Fetch = tuple[Array, Any]  # bytes, and the event after which they are valid
 
 
 def bytes_from(array: Array, size: int) -> Array | None:
@@ -42,8 +42,8 @@ def fill(data: Array, parts: Sequence[Array], dtype: Any, stride: int) -> None:
     """Convert arrays to a type, and copy them to offsets in bytes that are ``stride`` apart."""
     for number, part in enumerate(parts):
         start, count = number * stride, part.size * np.dtype(dtype).itemsize
-        to = data[start : start + count].view(dtype).reshape(part.shape)
-        np.copyto(to, part, casting="unsafe")
+        target = data[start : start + count].view(dtype).reshape(part.shape)
+        np.copyto(target, part, casting="unsafe")
 
 
 def _unmap(array: Array, queue: Any) -> None:
@@ -52,8 +52,8 @@ def _unmap(array: Array, queue: Any) -> None:
     base.release(queue)
 
 
-class InPlace:
-    """Transfers for a device that uses host memory directly: kernels work on NumPy's arrays.
+class ZeroCopy:
+    """Transfers for a device that uses host memory directly: kernels use NumPy's arrays.
 
     An array is copied first if its type, order or alignment is wrong, or if too little memory
     follows it.
@@ -68,13 +68,13 @@ class InPlace:
         self._flags = cl.mem_flags.USE_HOST_PTR
         self._scratch: dict[str, Array] = {}
         self._maps: list[Array] = []
-        self._ends: list[Any] = []
+        self._io_buffers: list[Any] = []
 
     def needs(self, sizes: Mapping[str, int]) -> dict[str, int]:
         """Return the buffers of a tiling that must be allocated, as bytes by name."""
         return {name: size for name, size in sizes.items() if name[:3] not in ("src", "dst")}
 
-    def upload(self, source: Array, pixels: Array, dtype: Any, size: int) -> Sent:
+    def upload(self, source: Array, pixels: Array, dtype: Any, size: int) -> Upload:
         """Return a buffer of ``size`` bytes that begins with an image, as samples of ``dtype``.
 
         ``pixels`` is a view of the array ``source``.
@@ -83,17 +83,17 @@ class InPlace:
         if pixels.dtype == dtype and pixels.flags.c_contiguous:
             data = bytes_from(pixels, size)
         if data is None or data.ctypes.data % self._alignment:
-            data = self._room("src", size)
+            data = self._scratch_memory("src", size)
             fill(data, [pixels], dtype, size)
-        return self._end(self._cl.mem_flags.READ_ONLY, data), []
+        return self._io_buffer(self._cl.mem_flags.READ_ONLY, data), []
 
-    def upload_all(self, parts: Sequence[Array], dtype: Any, stride: int) -> Sent:
+    def upload_all(self, parts: Sequence[Array], dtype: Any, stride: int) -> Upload:
         """Return a buffer of images, ``stride`` bytes apart, as samples of ``dtype``."""
-        data = self._room("src", stride * len(parts))
+        data = self._scratch_memory("src", stride * len(parts))
         fill(data, parts, dtype, stride)
-        return self._end(self._cl.mem_flags.READ_ONLY, data), []
+        return self._io_buffer(self._cl.mem_flags.READ_ONLY, data), []
 
-    def again(self, source: Array) -> Sent | None:
+    def reuse_upload(self, source: Array) -> Upload | None:
         """Return the last upload if it was of this array, else None.
 
         This class always returns None, because its uploads cost nothing.
@@ -107,10 +107,10 @@ class InPlace:
         """
         if not size:
             return None
-        data = self._room("dst", size) if whole is None else whole
-        return self._end(self._cl.mem_flags.READ_WRITE, data)
+        data = self._scratch_memory("dst", size) if whole is None else whole
+        return self._io_buffer(self._cl.mem_flags.READ_WRITE, data)
 
-    def fetch(self, name: str, buffer: Any, size: int, after: Sequence[Any]) -> Fetched:
+    def fetch(self, name: str, buffer: Any, size: int, after: Sequence[Any]) -> Fetch:
         """Enqueue a fetch of a buffer's first ``size`` bytes, after the events ``after``."""
         array, event = self._cl.enqueue_map_buffer(
             self._queue,
@@ -132,10 +132,10 @@ class InPlace:
     def done(self) -> None:
         """Release the fetched arrays. They must not be used any more."""
         maps, self._maps = self._maps, []
-        ends, self._ends = self._ends, []
+        buffers, self._io_buffers = self._io_buffers, []
         for array in maps:
             _unmap(array, self._queue)
-        for buffer in ends:
+        for buffer in buffers:
             buffer.release()
 
     def release(self) -> None:
@@ -143,16 +143,16 @@ class InPlace:
         self._scratch.clear()
         self.done()
 
-    def _room(self, name: str, size: int) -> Array:
+    def _scratch_memory(self, name: str, size: int) -> Array:
         """Return scratch memory, which is reused if it is large enough."""
         if name not in self._scratch or self._scratch[name].size < size:
             self._scratch[name] = aligned_empty((size,), np.uint8)
         return self._scratch[name][:size]
 
-    def _end(self, access: int, data: Array) -> Any:
+    def _io_buffer(self, access: int, data: Array) -> Any:
         context = self._queue.context
-        self._ends.append(self._cl.Buffer(context, access | self._flags, hostbuf=data))
-        return self._ends[-1]
+        self._io_buffers.append(self._cl.Buffer(context, access | self._flags, hostbuf=data))
+        return self._io_buffers[-1]
 
 
 class Staged:
@@ -171,21 +171,21 @@ class Staged:
         self._up, self._down = new_queue(), new_queue()
         self._pinned: dict[str, tuple[Any, Array]] = {}
         self._source = self._target = 0  # which of the two buffers is in use
-        self._sent: tuple[weakref.ref[Array], Sent] | None = None
+        self._last_upload: tuple[weakref.ref[Array], Upload] | None = None
 
     def needs(self, sizes: Mapping[str, int]) -> dict[str, int]:
-        """See :meth:`InPlace.needs`."""
+        """See :meth:`ZeroCopy.needs`."""
         return dict(sizes)
 
-    def upload(self, source: Array, pixels: Array, dtype: Any, size: int) -> Sent:
-        """See :meth:`InPlace.upload`."""
+    def upload(self, source: Array, pixels: Array, dtype: Any, size: int) -> Upload:
+        """See :meth:`ZeroCopy.upload`."""
         sent = self.upload_all([pixels], dtype, pixels.size * np.dtype(dtype).itemsize)
-        self._sent = (weakref.ref(source), sent) if pixels.size == source.size else None
+        self._last_upload = (weakref.ref(source), sent) if pixels.size == source.size else None
         return sent
 
-    def upload_all(self, parts: Sequence[Array], dtype: Any, stride: int) -> Sent:
-        """See :meth:`InPlace.upload_all`."""
-        self._source, self._sent = 1 - self._source, None
+    def upload_all(self, parts: Sequence[Array], dtype: Any, stride: int) -> Upload:
+        """See :meth:`ZeroCopy.upload_all`."""
+        self._source, self._last_upload = 1 - self._source, None
         size = stride * len(parts)
         data = self._page_locked(f"src{self._source}", size)[:size]
         fill(data, parts, dtype, stride)
@@ -194,20 +194,20 @@ class Staged:
         self._up.flush()
         return sent
 
-    def again(self, source: Array) -> Sent | None:
-        """See :meth:`InPlace.again`."""
-        if not self._sent or self._sent[0]() is not source:
+    def reuse_upload(self, source: Array) -> Upload | None:
+        """See :meth:`ZeroCopy.reuse_upload`."""
+        if not self._last_upload or self._last_upload[0]() is not source:
             return None
-        sent = self._sent[1]
+        sent = self._last_upload[1]
         return sent if self._pool.buffers.get(f"src{self._source}") is sent[0] else None
 
     def target(self, size: int, whole: Array | None) -> Any:
-        """See :meth:`InPlace.target`."""
+        """See :meth:`ZeroCopy.target`."""
         self._target = 1 - self._target
         return self._pool.buffers.get(f"dst{self._target}")
 
-    def fetch(self, name: str, buffer: Any, size: int, after: Sequence[Any]) -> Fetched:
-        """See :meth:`InPlace.fetch`."""
+    def fetch(self, name: str, buffer: Any, size: int, after: Sequence[Any]) -> Fetch:
+        """See :meth:`ZeroCopy.fetch`."""
         self._queue.flush()
         array = self._page_locked(f"{name}.{self._target}", size)[:size]
         event = self._cl.enqueue_copy(
@@ -216,16 +216,16 @@ class Staged:
         return array, event
 
     def flush(self) -> None:
-        """See :meth:`InPlace.flush`."""
+        """See :meth:`ZeroCopy.flush`."""
         self._queue.flush()
         self._down.flush()
 
     def done(self) -> None:
-        """See :meth:`InPlace.done`."""
+        """See :meth:`ZeroCopy.done`."""
 
     def release(self) -> None:
-        """See :meth:`InPlace.release`."""
-        self._sent = None
+        """See :meth:`ZeroCopy.release`."""
+        self._last_upload = None
         pinned, self._pinned = self._pinned, {}
         for queue in (self._up, self._down):
             queue.finish()
@@ -236,17 +236,17 @@ class Staged:
     def _page_locked(self, name: str, size: int) -> Array:
         """Return page-locked memory of at least this size, which is reused for later images."""
         cl = self._cl
-        held = self._pinned.get(name)
-        if held and held[1].size >= size:
-            return held[1]
+        existing = self._pinned.get(name)
+        if existing and existing[1].size >= size:
+            return existing[1]
         flags = cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR
         buffer = cl.Buffer(self._queue.context, flags, size)
         both = cl.map_flags.READ | cl.map_flags.WRITE
         array, _ = cl.enqueue_map_buffer(
             self._down, buffer, both, 0, (size,), np.uint8, is_blocking=True
         )
-        if held:
-            _unmap(held[1], self._down)
-            held[0].release()
+        if existing:
+            _unmap(existing[1], self._down)
+            existing[0].release()
         self._pinned[name] = buffer, array
         return array

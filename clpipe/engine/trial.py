@@ -16,15 +16,15 @@ import numpy as np
 from clpipe.base.errors import DeviceError
 from clpipe.base.types import Floats
 from clpipe.engine.cpu_target import candidates, compile_for
-from clpipe.engine.runtimes import attempt, is_tried, lanes_for, platform_id, type_of
+from clpipe.engine.runtimes import attempt, lanes_for, needs_test, platform_id, type_of
 from clpipe.engine.sources import files_text
-from clpipe.engine.vendors import loaded, platforms
+from clpipe.engine.vendors import load_pyopencl, platforms
 from clpipe.reference.math import square_root
 from clpipe.reference.random import Stream, normal_of, philox
 
 # The operations that a raw needs: half floats, 64-bit products, square roots and a division. The
 # kernel uses lanes and a local size.
-TEXT = """
+SOURCE = """
 __kernel void trial(__global const half *src, __global float *dst, float divisor) {
     const uint i = (uint)get_global_id(0) * LANES, count = (uint)get_global_size(0) * LANES;
     const stream s = {1, 2, 3};
@@ -50,7 +50,7 @@ def expected(source: np.ndarray) -> tuple[Floats, Floats]:
     return a + square_root(np.abs(a)) * normal_of(word), a / DIVISOR
 
 
-def problem_of(device: Any, lanes: int) -> str:
+def find_problem(device: Any, lanes: int) -> str:
     """Return why a ``pyopencl.Device`` is unusable; "" if it computes correctly.
 
     Raises:
@@ -63,7 +63,7 @@ def problem_of(device: Any, lanes: int) -> str:
         [f"lib/{name}.h" for name in ("builtins", "lanes", "math", "image", "random")], set()
     )
     try:
-        program = cl.Program(context, text + TEXT).build(["-cl-std=CL1.2", "-w"], cache_dir=False)
+        program = cl.Program(context, text + SOURCE).build(["-cl-std=CL1.2", "-w"], cache_dir=False)
     except cl.MemoryError:
         raise
     except cl.Error as error:
@@ -92,26 +92,26 @@ def first_error(text: str) -> str:
     return [*errors, *lines, "the compiler gives no reason"][0]
 
 
-def try_all(known: dict[str, Any]) -> None:
+def test_all(known: dict[str, Any]) -> None:
     """Test all runtimes without known results, and write the results to the standard output."""
     report = os.dup(sys.stdout.fileno())  # because runtimes write to the standard output
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
 
-    def say(**values: Any) -> None:
+    def write_line(**values: Any) -> None:
         os.write(report, json.dumps(values).encode() + b"\n")
 
-    cl = loaded()
-    say(at="list")
+    cl = load_pyopencl()
+    write_line(at="list")
     for platform in platforms(known["hidden"]):
         if platform_id(platform) in known["platforms"]:
             continue
-        say(at="platform", name=platform_id(platform))
+        write_line(at="platform", name=platform_id(platform))
         try:
             devices = platform.get_devices()
         except cl.Error:
             continue
         for device in [] if known["only_listing"] else devices:
-            if not is_tried(type_of(platform, device), platform, device):
+            if not needs_test(type_of(platform, device), platform, device):
                 continue
             for target in candidates(platform, device):
                 name = attempt(platform, device, target)
@@ -119,16 +119,16 @@ def try_all(known: dict[str, Any]) -> None:
                     if known["attempts"][name]:
                         continue
                     break
-                say(at="attempt", name=name)
+                write_line(at="attempt", name=name)
                 compile_for(device, target)
                 lanes = lanes_for(type_of(platform, device), platform, device, target)
-                passing = False
+                is_temporary = False
                 try:
-                    problem = problem_of(device, lanes)
+                    problem = find_problem(device, lanes)
                 except cl.Error as error:  # perhaps temporary: other programs may use the device
-                    problem, passing = "", True
+                    problem, is_temporary = "", True
                     sys.stderr.write(f"{error}\n")
-                say(attempt=name, problem=problem, passing=passing)
+                write_line(attempt=name, problem=problem, passing=is_temporary)
                 known["attempts"][name] = problem
                 if not problem:
                     break
@@ -138,7 +138,7 @@ def main() -> None:
     """Read the known results from the standard input, and test the rest."""
     known = json.load(sys.stdin)
     try:
-        try_all(known)
+        test_all(known)
     except DeviceError as error:
         sys.exit(str(error))
 

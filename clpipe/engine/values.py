@@ -42,7 +42,7 @@ def binding(
     streams: dict[tuple[str, NoiseScope], Stream] = {}
     sizes = plan.sizes(*size)
 
-    def other(value: Value) -> Any:
+    def non_argument(value: Value) -> Any:
         match value:
             case ResamplingValue(level, name):
                 return plan.resamplings[level].values(*sizes[level])[name]
@@ -55,7 +55,7 @@ def binding(
 
     def bind(values: Sequence[Value]) -> list[Any]:
         return [
-            arguments[each.step][each.name] if type(each) is ArgumentValue else other(each)
+            arguments[each.step][each.name] if type(each) is ArgumentValue else non_argument(each)
             for each in values
         ]
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError
-from clpipe.base.extras import installing
+from clpipe.base.extras import install_command
 from clpipe.base.process_folder import process_folder
 from clpipe.engine.cache_folder import prepare_environment
 
@@ -48,7 +48,7 @@ def icd_files() -> list[tuple[Path, str]]:
     return found
 
 
-def loaded() -> Any:
+def load_pyopencl() -> Any:
     """Return pyopencl, after preparing the environment. Every use of OpenCL starts here.
 
     Raises:
@@ -58,7 +58,7 @@ def loaded() -> Any:
     try:
         import pyopencl as cl
     except (ImportError, OSError) as error:
-        way = f"Use --device numpy, or run: {installing('--force-reinstall', 'pyopencl')}"
+        way = f"Use --device numpy, or run: {install_command('--force-reinstall', 'pyopencl')}"
         raise DeviceError(f"pyopencl cannot be loaded: {error}. {way}") from None
     return cl
 
@@ -68,7 +68,7 @@ def installed_drivers() -> list[str]:
 
     If the user has set one of :data:`VARIABLES`, the .icd files cannot be hidden.
     """
-    bundled = [BUNDLED] if any(Path(loaded().__file__).parent.glob(".libs/*.icd")) else []
+    bundled = [BUNDLED] if any(Path(load_pyopencl().__file__).parent.glob(".libs/*.icd")) else []
     named = any(name in os.environ for name in VARIABLES)
     return bundled if named else [*bundled, *(str(path) for path, _ in icd_files())]
 
@@ -84,7 +84,7 @@ def platforms(hidden: Collection[str] = ()) -> list[Any]:
     Raises:
         DeviceError: pyopencl cannot be loaded, or the platforms cannot be listed.
     """
-    cl = loaded()
+    cl = load_pyopencl()
     try:
         with drivers_visible(hidden):
             return list(cl.get_platforms())

@@ -80,7 +80,7 @@ def verdicts(again: bool = False, missing: Sequence[str] = ()) -> Verdicts:
         known = None
     if known and not missing:
         return known
-    found = tried(known or Verdicts())
+    found = run_tests(known or Verdicts())
     for name in missing:
         found.attempts.setdefault(name, "")
     if found.lasting:
@@ -88,7 +88,7 @@ def verdicts(again: bool = False, missing: Sequence[str] = ()) -> Verdicts:
     return found
 
 
-def tried(known: Verdicts) -> Verdicts:
+def run_tests(known: Verdicts) -> Verdicts:
     """Complete the verdicts. After a crash, the next process skips the runtime that caused it."""
     while True:
         lines, ending = _run(known)
@@ -107,7 +107,7 @@ def tried(known: Verdicts) -> Verdicts:
         if ending == "" or not at:  # the test could not run, so no runtime is to blame
             return replace(known, lasting=False)
         if at["at"] == "list":
-            found = _that_end_the_listing(known)
+            found = _crashing_drivers(known)
             if not found:
                 return replace(known, listing=ending)
             known.hidden.update(found)
@@ -118,7 +118,7 @@ def tried(known: Verdicts) -> Verdicts:
         of[at["name"]] = ending
 
 
-def _that_end_the_listing(known: Verdicts) -> dict[str, str]:
+def _crashing_drivers(known: Verdicts) -> dict[str, str]:
     """Return the drivers that crash a process that lists only them, and how.
 
     The drivers' devices are also listed: if a loader has several drivers, it asks each for devices,

@@ -8,7 +8,7 @@ import numpy as np
 
 from clpipe.base.types import Array
 from clpipe.engine.bindings import Bind
-from clpipe.engine.buffers import HostImages, core_of
+from clpipe.engine.buffers import HostImages, core_view
 from clpipe.engine.extents import Extent, Extents
 from clpipe.engine.ir import Plan
 from clpipe.engine.options import RunOptions
@@ -80,4 +80,4 @@ class Member:
 
     def part_of(self, result: Array, extent: Extent) -> Array:
         """Return the part of a result of the image that this member computes."""
-        return core_of(extent, result) if self.patch is None else result[self.patch]
+        return core_view(extent, result) if self.patch is None else result[self.patch]

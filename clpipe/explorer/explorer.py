@@ -277,7 +277,7 @@ class Explorer:
                 raise RequestError(f"found truth {view.truth!r}; it is {' or '.join(PICTURES)}")
             chain = picture_without_noise(view.truth, chain)
         if view.step:
-            chain = chain.through([chain.step_named(view.step).name])
+            chain = chain.up_to([chain.step_named(view.step).name])
         pixels = loaded.source.pixels
         key = noise_key(chain.settings, loaded.key)
         with self._lock:

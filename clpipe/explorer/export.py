@@ -10,7 +10,7 @@ from clpipe.chain.keys import KEYS, TABLES
 from clpipe.chain.request import Request
 from clpipe.chain.toml import value_text
 from clpipe.explorer.explorer import Explorer
-from clpipe.images.pixels import USUAL_MAX_PIXELS
+from clpipe.images.pixels import DEFAULT_MAX_PIXELS
 from clpipe.inputs.find import Job
 
 OUT = "out"  # the output directory in the commands
@@ -101,6 +101,6 @@ def _reading_options(request: Request) -> list[str]:
         "--until": request.until,
         "--layer": request.layer,
         "--transfer": request.transfer,
-        "--max-pixels": None if request.max_pixels == USUAL_MAX_PIXELS else request.max_pixels,
+        "--max-pixels": None if request.max_pixels == DEFAULT_MAX_PIXELS else request.max_pixels,
     }
     return [str(part) for option, value in own.items() if value for part in (option, value)]

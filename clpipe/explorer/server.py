@@ -35,7 +35,7 @@ from clpipe.explorer.explorer import Explorer
 from clpipe.explorer.export import SAVED, exported
 from clpipe.explorer.timeout import TimeoutProtocol
 from clpipe.explorer.view import View
-from clpipe.images.preview import reduced
+from clpipe.images.preview import reduce
 
 HOST = "127.0.0.1"
 MAX_REQUEST_BYTES = 1 << 20  # bytes of a request
@@ -146,7 +146,7 @@ class Server:
         )
         left, top = min(max(left, 0), MAX_COORDINATE), min(max(top, 0), MAX_COORDINATE)
         part = sample.shown[top : top + max(height, 0), left : left + max(width, 0)]
-        small = reduced(np.ascontiguousarray(part), min(max(by, 1), 64)) if part.size else part
+        small = reduce(np.ascontiguousarray(part), min(max(by, 1), 64)) if part.size else part
         place = {"left": left, "top": top, "width": part.shape[1], "height": part.shape[0]}
         return pixel_response(sample.facts, small, place)
 

@@ -12,7 +12,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain
 from clpipe.engine.runner import Result
-from clpipe.images.preview import encoded_light
+from clpipe.images.preview import light_to_srgb
 from clpipe.stage import Kind
 
 
@@ -53,7 +53,7 @@ def display_pixels(chain: Chain, result: Result) -> Array:
     """Return a result for display, (height, width, 3) uint8."""
     image = result.image
     if result.encoded is None:
-        image = encoded_light(to_signal(image, chain))
+        image = light_to_srgb(to_signal(image, chain))
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
 
@@ -100,4 +100,6 @@ def measurable_part(name: str, part: Array, chain: Chain) -> Picture:
         return Picture(path, "rgb", part, white=1.0)
     black, white = context.black_level, context.white_level
     lowest = None if black is None or white is None else -black / (white - black)
-    return Picture(path, "mosaic", to_signal(part, chain), context.filters.pattern, lowest, 1.0)
+    return Picture(
+        path, "mosaic", to_signal(part, chain), context.filter_array.pattern, lowest, 1.0
+    )

@@ -53,7 +53,7 @@ def as_image(value: Any, kind: Kind) -> Array:
     if kind is Kind.DISPLAY and image.dtype in (np.uint8, np.uint16):
         return image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
     if image.dtype.kind != "f" and not (is_mosaic and image.dtype in (np.uint16, np.uint32)):
-        way = (
+        advice = (
             "For DN, pass image.astype(np.uint16)"
             if is_mosaic
             else "For linear values, pass image / np.float32(WHITE), with the value of white. "
@@ -61,7 +61,7 @@ def as_image(value: Any, kind: Kind) -> Array:
         )
         raise ImageError(
             f"the image has samples of type {image.dtype}, but the chain starts on {kind.label} in "
-            f"floats. {way}"
+            f"floats. {advice}"
         )
     if image.dtype not in (np.float16, np.float32):
         image = image.astype(np.float32)
@@ -86,19 +86,19 @@ def check_shape(shape: tuple[int, ...], kind: Kind) -> None:
     expected = "(height, width, 3)" if channels > 1 else "(height, width)"
     if 0 not in shape and len(shape) == (3 if channels > 1 else 2) and shape[2:] in ((), (3,)):
         return
-    way = ""
+    advice = ""
     if channels == 1 and len(shape) == 3 and 1 in (shape[0], shape[2]):
-        way = f"Pass {'image[0]' if shape[0] == 1 else 'image[..., 0]'}"
+        advice = f"Pass {'image[0]' if shape[0] == 1 else 'image[..., 0]'}"
     elif channels == 1 and len(shape) == 3 and shape[2] == 3:
-        way = "To process colours, start the chain at mosaic or before it"
+        advice = "To process colours, start the chain at mosaic or before it"
     elif channels > 1 and len(shape) == 3 and shape[2] == 4:
-        way = "To leave out alpha, pass image[..., :3]"
+        advice = "To leave out alpha, pass image[..., :3]"
     elif channels > 1 and len(shape) == 3 and shape[0] in (3, 4):
-        way = "Channels are last: pass np.moveaxis(image[:3], 0, -1)"
+        advice = "Channels are last: pass np.moveaxis(image[:3], 0, -1)"
     elif channels > 1 and (len(shape) == 2 or shape[2:] == (1,)):
-        way = "For a grey image, pass np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)"
+        advice = "For a grey image, pass np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)"
     elif len(shape) == (4 if channels > 1 else 3):
-        way = "For a batch, use process_many(zip(images, keys))"
+        advice = "For a batch, use process_many(zip(images, keys))"
     raise ImageError(
-        f"the image has shape {shape}, but {expected} is expected{'. ' * bool(way)}{way}"
+        f"the image has shape {shape}, but {expected} is expected{'. ' * bool(advice)}{advice}"
     )

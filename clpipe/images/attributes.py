@@ -13,7 +13,7 @@ SHOT_OF_TAGS = {"exposure_time": "exposure", "focal_length": "focal_length"}
 PREFIX = "clpipe:"  # of the names of clpipe's own attributes
 
 
-def own_attributes(spec: Any) -> dict[str, str]:
+def clpipe_attributes(spec: Any) -> dict[str, str]:
     """Return clpipe's own attributes in an OpenImageIO spec, by their names without the prefix."""
     return {
         attribute.name.removeprefix(PREFIX): str(attribute.value)
@@ -25,7 +25,7 @@ def own_attributes(spec: Any) -> dict[str, str]:
 def read_attributes(path: Path) -> dict[str, str]:
     """Return clpipe's own attributes of a file; {} if it is missing, unreadable or has none."""
     with contextlib.suppress(ImageError), open_image(path) as file:
-        return own_attributes(file.spec())
+        return clpipe_attributes(file.spec())
     return {}
 
 
@@ -55,24 +55,24 @@ def photograph_attributes(spec: Any) -> tuple[dict[str, str], dict[str, float]]:
         :func:`shot_attributes`. The sensor's width is known if EXIF has the equivalent focal
         length on 35 mm film.
     """
-    named = {
+    stated = {
         "exposure": spec.getattribute("ExposureTime"),
         "aperture": spec.getattribute("FNumber"),
         "focal_length": spec.getattribute("Exif:FocalLength"),
     }
-    values = _plausible(named)
+    values = _plausible(stated)
     shot = {name: values[key] for name, key in SHOT_OF_TAGS.items() if key in values}
     equivalent = spec.getattribute("Exif:FocalLengthIn35mmFilm")
     if isinstance(equivalent, int) and 0 < equivalent <= 10_000 and "focal_length" in values:
         length = values["focal_length"]
         shot["sensor_width"] = sensor_width(length, equivalent, spec.height, spec.width)
     taken = str(spec.getattribute("Exif:DateTimeOriginal") or "")
-    said: dict[str, float | str] = {**values}
+    tags: dict[str, float | str] = {**values}
     if DATE.fullmatch(taken):
-        said["taken"] = taken
+        tags["taken"] = taken
     orientation = spec.getattribute("Orientation")
-    turned = orientation if orientation in FLIPS else 1
-    return shot_to_attributes(said, turned), shot
+    orientation_ = orientation if orientation in FLIPS else 1
+    return shot_to_attributes(tags, orientation_), shot
 
 
 def _plausible(values: Mapping[str, Any]) -> dict[str, float]:

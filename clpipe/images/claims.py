@@ -7,7 +7,7 @@ from typing import Any
 from clpipe.base.errors import ImageError
 from clpipe.images.colour import CIE_XYZ, SRGB, to_linear_srgb
 from clpipe.images.layers import picture_channels
-from clpipe.images.openexr import WASTE
+from clpipe.images.openexr import MAX_EXTRA
 from clpipe.images.openimageio import open_image
 from clpipe.images.raw import RAW_SUFFIXES, raw_size
 
@@ -15,7 +15,7 @@ FLOAT = 4  # bytes
 
 
 @dataclass(frozen=True)
-class Claim:
+class MemoryClaim:
     """The size that a file claims in px, and the bytes of memory for its image and to read it.
 
     The model follows :mod:`clpipe.images.read`. This table compares it with measurements at 24 MP,
@@ -49,9 +49,9 @@ class Claim:
         return self.width * self.height / 1e6
 
 
-def plain_claim(width: int, height: int) -> Claim:
+def mosaic_claim(width: int, height: int) -> MemoryClaim:
     """Return the claim of a mosaic that is read in whole numbers and converted to floats."""
-    return Claim(width, height, width * height * FLOAT, width * height * 3 * FLOAT)
+    return MemoryClaim(width, height, width * height * FLOAT, width * height * 3 * FLOAT)
 
 
 def display_size(path: Path) -> tuple[int, int]:
@@ -65,7 +65,7 @@ def display_size(path: Path) -> tuple[int, int]:
         return spec.full_width, spec.full_height
 
 
-def claim_of(path: Path, mosaic: bool = False) -> Claim | None:
+def claim_of(path: Path, mosaic: bool = False) -> MemoryClaim | None:
     """Return the claim of a file; None if it cannot be opened.
 
     Args:
@@ -74,31 +74,31 @@ def claim_of(path: Path, mosaic: bool = False) -> Claim | None:
     """
     try:
         if path.suffix.lower() in RAW_SUFFIXES:
-            return plain_claim(*raw_size(path))
+            return mosaic_claim(*raw_size(path))
         with open_image(path) as file:
             return _claim(file.spec(), file.format_name() == "openexr", mosaic)
     except ImageError:
         return None
 
 
-def _claim(spec: Any, is_exr: bool, mosaic: bool) -> Claim:
+def _claim(spec: Any, is_exr: bool, mosaic: bool) -> MemoryClaim:
     width, height = max(spec.width, spec.full_width), max(spec.height, spec.full_height)
     formats = spec.channelformats or [spec.format] * spec.nchannels
     picture = None if mosaic else picture_channels(list(spec.channelnames))
-    own = [formats[i] for i in picture[1]] if picture else formats
-    sample = 2 if is_exr and all(each.size() == 2 for each in own) else FLOAT
+    picture_formats = [formats[i] for i in picture[1]] if picture else formats
+    sample = 2 if is_exr and all(each.size() == 2 for each in picture_formats) else FLOAT
     image = sample * (1 if mosaic else 3)
     stored = sum(each.size() for each in formats)
     # The package OpenEXR decodes all channels, from which the requested ones are copied.
-    more = 0 if stored == image else min(stored, WASTE * image)
-    reading = image + (more if is_exr else image)
+    extra = 0 if stored == image else min(stored, MAX_EXTRA * image)
+    reading = image + (extra if is_exr else image)
     window = spec.x, spec.y, spec.width, spec.height
     if window != (spec.full_x, spec.full_y, spec.full_width, spec.full_height):
         reading = max(reading, 2 * image)
     if not mosaic and _is_converted(spec, bool(picture)):
         reading, image = max(reading, image + 3 * FLOAT), 3 * FLOAT
     pixels = width * height
-    return Claim(width, height, pixels * image, pixels * reading)
+    return MemoryClaim(width, height, pixels * image, pixels * reading)
 
 
 def _is_converted(spec: Any, has_picture: bool) -> bool:

@@ -9,7 +9,9 @@ from clpipe.base.types import Array, Floats
 
 # x and y of red, green, blue and white: ITU-R BT.709-6 (2015), which sRGB shares.
 SRGB = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-FARTHEST = 100.0  # the largest absolute x or y; those of wide colour spaces are within -1 to 2
+MAX_CHROMATICITY = (
+    100.0  # the largest absolute x or y; those of wide colour spaces are within -1 to 2
+)
 CIE_XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
 
 # Cone response of the Bradford transform (Lam 1985), after B. Lindbloom, "Chromatic Adaptation".
@@ -36,7 +38,7 @@ def rgb_to_xyz(chromaticities: Sequence[float]) -> Array:
     colours = np.stack([x, y, 1 - x - y])
     primaries, white = colours[:, :3], colours[:, 3]
     with np.errstate(all="ignore"):
-        is_near = bool((np.abs(colours) < FARTHEST).all())  # False for NaN
+        is_near = bool((np.abs(colours) < MAX_CHROMATICITY).all())  # False for NaN
         if is_near and abs(np.linalg.det(primaries)) > 1e-6 < white[1]:
             matrix: Array = primaries * np.linalg.solve(primaries, white / white[1])
             if np.isfinite(matrix).all() and abs(np.linalg.det(matrix)) > 1e-6:

@@ -13,7 +13,7 @@ import numpy as np
 
 from clpipe.base.about import __version__
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.files import Stored, write_whole
+from clpipe.base.files import Stored, write_atomic
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.profile import SRGB_TO_XYZ
@@ -60,22 +60,24 @@ class Negative:
 
 
 # The numbers of channels in a DNG (CFAPattern).
-CODES = {"R": 0, "G": 1, "B": 2, "C": 3, "M": 4, "Y": 5, "W": 6}
+CFA_COLORS = {"R": 0, "G": 1, "B": 2, "C": 3, "M": 4, "Y": 5, "W": 6}
 
 
-def planes_of(array: FilterArray) -> list[str]:
+def plane_order(array: FilterArray) -> list[str]:
     """Return the channels of an array in the order of a DNG's planes.
 
     The channel that replaces green is in the middle, where converters that know only red, green and
     blue expect it.
     """
-    own = list(array.channels)
-    if "G" in own or not {*"RB"} <= {*own}:
-        return own
-    return ["R", *(letter for letter in own if letter not in "RB"), "B"]
+    channels = list(array.channels)
+    if "G" in channels or not {*"RB"} <= {*channels}:
+        return channels
+    return ["R", *(letter for letter in channels if letter not in "RB"), "B"]
 
 
-BEHIND = ", filter array "  # follows a model's name if the array differs from the real camera's
+ARRAY_SEPARATOR = (
+    ", filter array "  # follows a model's name if the array differs from the real camera's
+)
 
 
 def array_suffix(array: FilterArray) -> str:
@@ -84,7 +86,7 @@ def array_suffix(array: FilterArray) -> str:
     The suffix keeps converters from using their colours of the real model. clpipe reads the array
     from it if LibRaw does not know the pattern.
     """
-    return "" if array.pattern in PATTERNS else f"{BEHIND}{array.pattern}"
+    return "" if array.pattern in PATTERNS else f"{ARRAY_SEPARATOR}{array.pattern}"
 
 
 def check_array(array: FilterArray) -> None:
@@ -93,11 +95,11 @@ def check_array(array: FilterArray) -> None:
     Raises:
         RequestError: the array has a channel that DNG does not define.
     """
-    unknown = [letter for letter in array.channels if letter not in CODES]
+    unknown = [letter for letter in array.channels if letter not in CFA_COLORS]
     if unknown and not array.is_gray:
         raise RequestError(
             f"--format dng: {array.name} has the channel {unknown[0]}, but DNG only allows "
-            f"{', '.join(CODES)}, and sensors of one channel; use --format npy"
+            f"{', '.join(CFA_COLORS)}, and sensors of one channel; use --format npy"
         )
 
 
@@ -131,9 +133,9 @@ def xyz_to_camera(colours: Doubles, array: FilterArray) -> Doubles:
     >>> xyz_to_camera(camera.srgb_to_camera(), array).round(3).tolist()[0]
     [0.663, -0.19, -0.048]
     """
-    seen = np.stack([array.responses[letter] for letter in planes_of(array)])
-    levels = [array.levels[letter] for letter in planes_of(array)]
-    matrix = np.diag(levels) @ seen @ colours @ np.linalg.inv(SRGB_TO_XYZ)
+    responses = np.stack([array.responses[letter] for letter in plane_order(array)])
+    levels = [array.levels[letter] for letter in plane_order(array)]
+    matrix = np.diag(levels) @ responses @ colours @ np.linalg.inv(SRGB_TO_XYZ)
     return np.asarray(matrix / (matrix @ D50_XYZ).max())
 
 
@@ -152,16 +154,16 @@ def preview(dn: Array, negative: Negative) -> Array:
 
     def site(x: int, y: int) -> Floats:
         top, left = min(middle_y + y, dn.shape[0] - 1), min(middle_x + x, dn.shape[1] - 1)
-        found = dn[top :: down * block, left :: across * block]
-        return found[:high, :wide].astype(np.float32)
+        samples = dn[top :: down * block, left :: across * block]
+        return samples[:high, :wide].astype(np.float32)
 
     def mean(letter: str) -> Floats:
-        found = [site(x, y) for y, x in np.argwhere(array.letters == letter).tolist()]
-        return np.asarray(sum(found[1:], found[0]) / len(found), np.float32)
+        samples = [site(x, y) for y, x in np.argwhere(array.letters == letter).tolist()]
+        return np.asarray(sum(samples[1:], samples[0]) / len(samples), np.float32)
 
-    planes = np.stack([mean(letter) for letter in planes_of(array)], axis=-1)
+    planes = np.stack([mean(letter) for letter in plane_order(array)], axis=-1)
     signal = (planes - negative.black_level) / (negative.white_level - negative.black_level)
-    neutral = np.array([array.levels[letter] for letter in planes_of(array)])
+    neutral = np.array([array.levels[letter] for letter in plane_order(array)])
     clipped = np.clip(signal / neutral, 0, 1) * neutral
     if array.is_gray:
         linear = np.repeat(clipped, 3, axis=-1)
@@ -170,8 +172,8 @@ def preview(dn: Array, negative: Negative) -> Array:
         strongest = neutral.argmax()
         linear = clipped @ np.linalg.pinv(to_camera).T * to_camera.sum(1)[strongest]
     picture = negative.tone(np.clip(linear, 0, 1).astype(np.float32))
-    shown = np.clip(picture.astype(np.float64), 0, 1)  # which rounding may leave
-    return to_8_bit(srgb_curve(shown).astype(np.float32))
+    encoded = np.clip(picture.astype(np.float64), 0, 1)  # which rounding may leave
+    return to_8_bit(srgb_curve(encoded).astype(np.float32))
 
 
 def tone_fields(negative: Negative) -> tiff.Directory:
@@ -189,15 +191,15 @@ def tone_fields(negative: Negative) -> tiff.Directory:
 
 
 def main_directory(
-    small: Array, negative: Negative, tags: Tags, orientation: int
+    thumbnail: Array, negative: Negative, tags: Tags, orientation: int
 ) -> tiff.Directory:
     """Return the first directory: the preview, the camera, and fields for colour.
 
     Its offsets are 0 until they are known. The arguments are those of :func:`write_dng`, and the
-    preview ``small``.
+    preview ``thumbnail``.
     """
     whole_name = tags.model if tags.model.startswith(tags.make) else f"{tags.make} {tags.model}"
-    neutral = [negative.array.levels[letter] for letter in planes_of(negative.array)]
+    neutral = [negative.array.levels[letter] for letter in plane_order(negative.array)]
     colour: tiff.Directory = {}
     if not negative.array.is_gray:
         colour = {
@@ -206,7 +208,7 @@ def main_directory(
             50778: tiff.short(D65),  # CalibrationIlluminant1
         }
     return {
-        **tiff.image_fields(small, subfile_type=1, photometric=2),  # RGB
+        **tiff.image_fields(thumbnail, subfile_type=1, photometric=2),  # RGB
         **noise_fields(negative),
         **tone_fields(negative),
         **({306: tiff.text(tags.taken)} if tags.taken else {}),  # DateTime
@@ -236,9 +238,11 @@ def raw_directory(dn: Array, negative: Negative) -> tiff.Directory:
         filters = {
             33421: tiff.short(*array.period),  # CFARepeatPatternDim
             33422: tiff.byte(
-                *(CODES[letter] for row in array.rows for letter in row)
+                *(CFA_COLORS[letter] for row in array.rows for letter in row)
             ),  # CFAPattern
-            50710: tiff.byte(*(CODES[letter] for letter in planes_of(array))),  # CFAPlaneColor
+            50710: tiff.byte(
+                *(CFA_COLORS[letter] for letter in plane_order(array))
+            ),  # CFAPlaneColor
             50711: tiff.short(1),  # CFALayout: rectangular
         }
     return {
@@ -287,22 +291,22 @@ def write_dng(
             f"{path}: this raw has samples that are not whole DN from 0 to 65535, which a DNG "
             "requires; use --format npy"
         )
-    small = preview(dn, negative)
-    main, raw = main_directory(small, negative, tags, orientation), raw_directory(dn, negative)
+    thumbnail = preview(dn, negative)
+    main, raw = main_directory(thumbnail, negative, tags, orientation), raw_directory(dn, negative)
     shot = tiff.exif_fields(exif(tags, *dn.shape))
 
     # The file: header, the three directories, the preview, the mosaic.
     raw_offset = 8 + tiff.directory_size(main)
     shot_offset = raw_offset + tiff.directory_size(raw)
-    small_offset = shot_offset + tiff.directory_size(shot)
-    dn_offset = small_offset + small.nbytes + small.nbytes % 2
-    main[STRIP_OFFSETS] = tiff.long(small_offset)
+    thumbnail_offset = shot_offset + tiff.directory_size(shot)
+    dn_offset = thumbnail_offset + thumbnail.nbytes + thumbnail.nbytes % 2
+    main[STRIP_OFFSETS] = tiff.long(thumbnail_offset)
     main[SUB_IFDS] = tiff.long(raw_offset)
     main[EXIF_IFD] = tiff.long(shot_offset)
     raw[STRIP_OFFSETS] = tiff.long(dn_offset)
     head = b"II*\0" + struct.pack("<I", 8)
     for directory, offset in ((main, 8), (raw, raw_offset), (shot, shot_offset)):
         head += tiff.directory_bytes(directory, offset)
-    head += small.tobytes().ljust(dn_offset - small_offset, b"\0")
+    head += thumbnail.tobytes().ljust(dn_offset - thumbnail_offset, b"\0")
 
-    return write_whole(path, head, np.ascontiguousarray(dn).data.cast("B"))
+    return write_atomic(path, head, np.ascontiguousarray(dn).data.cast("B"))

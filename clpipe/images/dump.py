@@ -10,9 +10,9 @@ import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_regular
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.base.types import Array, Floats
-from clpipe.images.pixels import USUAL_MAX_PIXELS, check_size
+from clpipe.images.pixels import DEFAULT_MAX_PIXELS, check_size
 
 # Bytes of a sample. RAW10 and RAW12 are packed as in MIPI CSI-2, without padding after rows.
 TYPES = {
@@ -90,7 +90,7 @@ def parse_dump(text: str) -> Dump:
         )
     width, height, type_ = int(match[1]), int(match[2]), match[3]
     if type_ not in TYPES:
-        raise RequestError(f"dump: {one_of('type', type_, list(TYPES))}")
+        raise RequestError(f"dump: {unknown_name('type', type_, list(TYPES))}")
     if not (2 <= width <= MAX_SIDE and 2 <= height <= MAX_SIDE):
         raise RequestError(
             f"dump: found {text!r}; width and height must be from 2 to {MAX_SIDE} pixels"
@@ -103,7 +103,7 @@ def parse_dump(text: str) -> Dump:
     return Dump(width, height, type_)
 
 
-def read_dump(path: Path, dump: Dump, max_pixels: int = USUAL_MAX_PIXELS) -> Floats:
+def read_dump(path: Path, dump: Dump, max_pixels: int = DEFAULT_MAX_PIXELS) -> Floats:
     """Return the mosaic of a dump in DN, (height, width) float32.
 
     Raises:

@@ -53,16 +53,16 @@ def jpeg_encoding(path: Path) -> JpegEncoding | None:
             if not isinstance(image, JpegImagePlugin.JpegImageFile) or image.mode != "RGB":
                 return None
             sampling = JpegImagePlugin.get_sampling(image)
-            own = np.sort(np.array(image.quantization[0]))
+            table = np.sort(np.array(image.quantization[0]))
     except (OSError, UnidentifiedImageError) as error:
         raise ImageError(f"{path}: cannot be read: {error}") from None
     if sampling < 0:
         return None
-    distances = [np.abs(luma_table(q) - own).sum() for q in range(1, 101)]
+    distances = [np.abs(luma_table(q) - table).sum() for q in range(1, 101)]
     return JpegEncoding(int(np.argmin(distances)) + 1, SUBSAMPLINGS[sampling])
 
 
-def through_jpeg(pixels: Array, encoding: JpegEncoding) -> Array:
+def jpeg_round_trip(pixels: Array, encoding: JpegEncoding) -> Array:
     """Return a picture, (height, width, 3) uint8, after encoding it as JPEG and decoding it."""
     file = BytesIO()
     Image.fromarray(pixels).save(

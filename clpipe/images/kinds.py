@@ -5,7 +5,7 @@ import re
 from clpipe.reference.carried import LayerKind, Vector
 
 # Kinds of layers by their names in Blender, Mitsuba and others, in lower-case letters.
-NAMES: dict[LayerKind, tuple[str, ...]] = {
+KIND_NAMES: dict[LayerKind, tuple[str, ...]] = {
     "depth": ("depth", "z", "zdepth", "mist", "distance"),
     "label": (
         *("indexob", "indexma", "objectindex", "materialindex", "objectid", "materialid", "id"),
@@ -26,12 +26,12 @@ NAMES: dict[LayerKind, tuple[str, ...]] = {
     "colour": ("albedo", "basecolor", "basecolour"),
 }
 
-CHANNELS: dict[LayerKind, int] = {"flow": 2, "normal": 3}  # the smallest number
+MIN_CHANNELS: dict[LayerKind, int] = {"flow": 2, "normal": 3}  # the smallest number
 
 # Layers that renderers write next to the picture: data, and single components of the light. The
 # names are from the manuals of Blender, LuxCore, RenderMan, Arnold, V-Ray, Houdini and Unreal, in
 # lower case, with _ between and around words.
-AOV = re.compile(
+AOV_PATTERN = re.compile(
     "|".join(
         (
             *(
@@ -64,14 +64,15 @@ AOV = re.compile(
 )
 
 
-def kind_named(name: str) -> LayerKind | None:
+def kind_from_name(name: str) -> LayerKind | None:
     """Return the kind of a layer with this name; None if the name does not tell.
 
-    >>> kind_named("ViewLayer.CryptoObject00"), kind_named("sh_normal"), kind_named("DiffCol")
-    ('label', 'normal', None)
+    >>> kind_from_name("ViewLayer.CryptoObject00"), kind_from_name("sh_normal")
+    ('label', 'normal')
+    >>> kind_from_name("DiffCol")
     """
     plain = re.sub(r"[^a-z]", "", name.rpartition(".")[2].lower())
-    return next((kind for kind, names in NAMES.items() if plain in names), None)
+    return next((kind for kind, names in KIND_NAMES.items() if plain in names), None)
 
 
 def is_aov(name: str) -> bool:
@@ -86,10 +87,10 @@ def is_aov(name: str) -> bool:
     [False, False, False, False, False]
     """
     words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)
-    return bool(kind_named(name) or AOV.search(f"_{'_'.join(words)}_".lower()))
+    return bool(kind_from_name(name) or AOV_PATTERN.search(f"_{'_'.join(words)}_".lower()))
 
 
-def vectors_of(name: str, channels: tuple[str, ...]) -> tuple[Vector, ...]:
+def flow_vectors(name: str, channels: tuple[str, ...]) -> tuple[Vector, ...]:
     """Return the vectors of a flow layer: for each, the channels of x and y, and their signs.
 
     Vectors point right and down, to the place of the surface in the other frame. Blender's Vector
@@ -99,9 +100,9 @@ def vectors_of(name: str, channels: tuple[str, ...]) -> tuple[Vector, ...]:
         name: the name of the layer.
         channels: the names of its channels.
 
-    >>> vectors_of("Vector", ("X", "Y", "Z", "W"))
+    >>> flow_vectors("Vector", ("X", "Y", "Z", "W"))
     (((0, 1), (1, -1)), ((2, -1), (3, 1)))
-    >>> vectors_of("flow", ("R", "G", "B"))
+    >>> flow_vectors("flow", ("R", "G", "B"))
     (((0, 1), (1, 1)),)
     """
     if name.rpartition(".")[2].lower() == "vector" and len(channels) == 4:

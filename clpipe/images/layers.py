@@ -8,7 +8,7 @@ from typing import Any
 
 from clpipe.base.errors import ImageError, KindError, NoPictureError
 from clpipe.base.text import printable
-from clpipe.images.attributes import own_attributes
+from clpipe.images.attributes import clpipe_attributes
 from clpipe.images.kinds import is_aov
 
 # Names of layers that hold the finished picture, in order of preference, in lower-case letters. The
@@ -26,9 +26,17 @@ PICTURE_LAYERS = (
     *("effectsresult", "rgbcolor"),  # V-Ray
     *("main", "image", "color", "colour", "default"),
 )
-CONTAINED = ("rgba", "rgb", "color", "colour", "default", "main", "image")  # in layers of any kind
+GENERIC_NAMES = (
+    "rgba",
+    "rgb",
+    "color",
+    "colour",
+    "default",
+    "main",
+    "image",
+)  # in layers of any kind
 
-MOST_PARTS = 1000  # the time to reach a part grows with the number of parts before it
+MAX_PARTS = 1000  # the time to reach a part grows with the number of parts before it
 
 
 @dataclass(frozen=True)
@@ -65,7 +73,7 @@ class PictureLocation:
         if not self.name:
             return False
         *above, last = self.name.split(".")
-        return is_aov(last) or (last.lower() in CONTAINED and any(map(is_aov, above)))
+        return is_aov(last) or (last.lower() in GENERIC_NAMES and any(map(is_aov, above)))
 
 
 def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> PictureLocation:
@@ -83,45 +91,45 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
     """
     pictures: list[PictureLocation] = []
     channel_names: list[str] = []
-    refusals: list[str] = []
+    rejections: list[str] = []
     views: list[str] = []
     several_parts = file.seek_subimage(1, 0)
     part = 0
     while file.seek_subimage(part, 0):
         spec = file.spec()
         part += 1
-        if part > MOST_PARTS:
+        if part > MAX_PARTS:
             raise ImageError(
-                f"{path}: this file has more than {MOST_PARTS} parts; split it into several files"
+                f"{path}: this file has more than {MAX_PARTS} parts; split it into several files"
             )
-        if refusal := _refusal(spec, has_levels=file.seek_subimage(part - 1, 1)):
-            refusals.append(refusal)
+        if rejection := _rejection(spec, has_levels=file.seek_subimage(part - 1, 1)):
+            rejections.append(rejection)
             continue
         names = list(spec.channelnames)
         channel_names += [name for name in names if name not in channel_names]
-        kept = "kind" in own_attributes(spec)
+        is_kept = "kind" in clpipe_attributes(spec)
         part_name = str(spec.getattribute("oiio:subimagename") or "") if several_parts else ""
         stated = spec.getattribute("view") or spec.getattribute("multiView") or ()
         views += [stated] if isinstance(stated, str) else [str(each) for each in stated]
         channel = mosaic_channel(names) if mosaic else None
-        found = [] if mosaic else list(_layers(names, kept))
-        if kept and not (found or channel):
-            raise KindError(path, own_attributes(spec))
+        found = [] if mosaic else list(_layers(names, is_kept))
+        if is_kept and not (found or channel):
+            raise KindError(path, clpipe_attributes(spec))
         pictures += [PictureLocation(part - 1, *channel)] if channel else []
-        for own_name, channels, xyz in found:
-            full = full_name(part_name, own_name)
-            refusals += (problem := _whole_numbers(spec, full, channels))
+        for layer_name, channels, xyz in found:
+            full = full_name(part_name, layer_name)
+            rejections += (problem := _integer_problem(spec, full, channels))
             if not problem:
                 view, name = _view_of(full, views)
                 pictures.append(PictureLocation(part - 1, full, channels, xyz, view, name))
-    if not pictures and refusals:
-        raise ImageError(f"{path}: {refusals[0]}")
+    if not pictures and rejections:
+        raise ImageError(f"{path}: {rejections[0]}")
     if not pictures:
         listed = ", ".join(name for name in channel_names[:20] if name) or "none"
         missing = "several channels, but a mosaic has one" if mosaic else "no R, G and B channels"
-        way = "" if mosaic else "To use its layers as ground truth of a picture, see --carry"
-        raise NoPictureError(f"{path}: there are {missing}; found {printable(listed)}", way)
-    best = _chosen(path, pictures) if layer is None else _of_layer(path, pictures, layer)
+        advice = "" if mosaic else "To use its layers as ground truth of a picture, see --carry"
+        raise NoPictureError(f"{path}: there are {missing}; found {printable(listed)}", advice)
+    best = _preferred(path, pictures) if layer is None else _picture_in_layer(path, pictures, layer)
     file.seek_subimage(best.part, 0)
     file.geterror()  # clears it: the loop asked for parts and levels that do not exist
     return best
@@ -139,7 +147,7 @@ def _view_of(name: str, views: Sequence[str]) -> tuple[int, str]:
     return 0, name
 
 
-def _whole_numbers(spec: Any, layer: str, channels: Sequence[int]) -> list[str]:
+def _integer_problem(spec: Any, layer: str, channels: Sequence[int]) -> list[str]:
     """Return why channels of an OpenEXR file are IDs instead of light; [] if they may be light."""
     formats = spec.channelformats or [spec.format] * spec.nchannels
     types = dict.fromkeys(str(formats[i]) for i in channels)
@@ -152,7 +160,7 @@ def _whole_numbers(spec: Any, layer: str, channels: Sequence[int]) -> list[str]:
     ]
 
 
-def _chosen(path: Path, pictures: Sequence[PictureLocation]) -> PictureLocation:
+def _preferred(path: Path, pictures: Sequence[PictureLocation]) -> PictureLocation:
     """Return the preferred picture among the layers that may be one.
 
     Raises:
@@ -182,7 +190,7 @@ def _chosen(path: Path, pictures: Sequence[PictureLocation]) -> PictureLocation:
     return best
 
 
-def _of_layer(path: Path, pictures: list[PictureLocation], layer: str) -> PictureLocation:
+def _picture_in_layer(path: Path, pictures: list[PictureLocation], layer: str) -> PictureLocation:
     """Return the picture in the first layer of this name, in any case.
 
     Raises:
@@ -198,7 +206,7 @@ def _of_layer(path: Path, pictures: list[PictureLocation], layer: str) -> Pictur
     return named
 
 
-def _refusal(spec: Any, has_levels: bool) -> str:
+def _rejection(spec: Any, has_levels: bool) -> str:
     """Return why a part cannot be a picture; "" if it may be one."""
     if spec.deep:
         return "this is a deep image (many samples per pixel). Render or flatten it to a flat image"
@@ -221,33 +229,33 @@ def full_name(part: str, layer: str) -> str:
     return f"{part}.{layer}" if part and layer else part or layer
 
 
-def _layers(names: Sequence[str], kept: bool) -> Iterator[tuple[str, tuple[int, ...], bool]]:
+def _layers(names: Sequence[str], is_kept: bool) -> Iterator[tuple[str, tuple[int, ...], bool]]:
     """Yield the layers that can be a picture: name, channels, and whether these are X, Y and Z.
 
     Channels are called R, G and B, or red, green and blue in Nuke's layers. X, Y and Z are a
     picture only in a layer without a name; in others they are positions or normals. Y is luminance
-    if the layer has no other channels except alpha and depth. ``kept`` images, which clpipe wrote,
-    have neither.
+    if the layer has no other channels except alpha and depth. ``is_kept`` images, which clpipe
+    wrote, have neither.
 
-    >>> list(_layers(["comp.red", "comp.green", "comp.blue"], kept=False))
+    >>> list(_layers(["comp.red", "comp.green", "comp.blue"], is_kept=False))
     [('comp', (0, 1, 2), False)]
     """
     for layer in dict.fromkeys(name.rpartition(".")[0] for name in names):
-        place = {
+        index = {
             _channel(name.rpartition(".")[2]): i
             for i, name in enumerate(names)
             if name.rpartition(".")[0].lower() == layer.lower()
         }
-        channels = set(place)
+        channels = set(index)
         if channels >= set("rgb"):
             colours = "rgb"
-        elif not kept and not layer and channels - {"a"} == set("xyz"):
+        elif not is_kept and not layer and channels - {"a"} == set("xyz"):
             colours = "xyz"
-        elif not kept and channels - {"a", "z"} == {"y"}:
+        elif not is_kept and channels - {"a", "z"} == {"y"}:
             colours = "y"
         else:
             continue
-        yield layer, tuple(place[c] for c in colours), colours == "xyz"
+        yield layer, tuple(index[c] for c in colours), colours == "xyz"
 
 
 def _channel(name: str) -> str:
@@ -262,8 +270,8 @@ def mosaic_channel(names: Sequence[str]) -> tuple[str, tuple[int]] | None:
     >>> mosaic_channel(["Raw"]), mosaic_channel(["A", "Y"]), mosaic_channel(["X", "Y"])
     (('', (0,)), ('', (1,)), None)
     """
-    places = [i for i, name in enumerate(names) if len(names) == 1 or name not in ("A", "Z")]
-    return ("", (places[0],)) if len(places) == 1 else None
+    indices = [i for i, name in enumerate(names) if len(names) == 1 or name not in ("A", "Z")]
+    return ("", (indices[0],)) if len(indices) == 1 else None
 
 
 def picture_channels(names: Sequence[str]) -> tuple[str, tuple[int, ...]] | None:
@@ -274,7 +282,7 @@ def picture_channels(names: Sequence[str]) -> tuple[str, tuple[int, ...]] | None
     """
     pictures = [
         PictureLocation(0, name, channels, xyz, 0, name)
-        for name, channels, xyz in _layers(names, kept=True)
+        for name, channels, xyz in _layers(names, is_kept=True)
     ]
     if len(pictures) > 1:
         pictures.sort(key=lambda picture: (picture.is_aov, picture.rank))

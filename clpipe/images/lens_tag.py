@@ -9,14 +9,14 @@ HEADER = b"Exif\0\0"
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
-def with_lens(file: bytes, lens: str) -> bytes:
+def with_lens_model(file: bytes, lens: str) -> bytes:
     """Return the bytes of a picture with the model of a lens added to its EXIF.
 
     Args:
         file: the bytes of a JPEG or PNG that has EXIF.
         lens: the model.
     """
-    start, end = _place(file)
+    start, end = _exif_range(file)
     exif = Image.Exif()
     exif.load(file[start:end])
     exif.get_ifd(EXIF_IFD)[LENS_MODEL] = lens
@@ -30,18 +30,21 @@ def with_lens(file: bytes, lens: str) -> bytes:
     return file[: start - 8] + chunk + file[end + 4 :]
 
 
-def _place(file: bytes) -> tuple[int, int]:
+def _exif_range(file: bytes) -> tuple[int, int]:
     """Return the offsets at which the EXIF of a file begins and ends."""
     if file.startswith(PNG):
-        at = len(PNG)
+        offset = len(PNG)
         while True:
-            size, kind = int.from_bytes(file[at : at + 4], "big"), file[at + 4 : at + 8]
+            size, kind = (
+                int.from_bytes(file[offset : offset + 4], "big"),
+                file[offset + 4 : offset + 8],
+            )
             if kind == b"eXIf":
-                return at + 8, at + 8 + size
-            at += 12 + size
-    at = 2
+                return offset + 8, offset + 8 + size
+            offset += 12 + size
+    offset = 2
     while True:
-        size = int.from_bytes(file[at + 2 : at + 4], "big")
-        if file[at + 1] == 0xE1 and file[at + 4 : at + 10] == HEADER:
-            return at + 4, at + 2 + size
-        at += 2 + size
+        size = int.from_bytes(file[offset + 2 : offset + 4], "big")
+        if file[offset + 1] == 0xE1 and file[offset + 4 : offset + 10] == HEADER:
+            return offset + 4, offset + 2 + size
+        offset += 2 + size

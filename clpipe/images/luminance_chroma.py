@@ -16,7 +16,7 @@ from clpipe.images.openimageio import error_text
 from clpipe.images.pixels import check_size
 
 CHANNELS = ("Y", "RY", "BY")
-CHANNELS_AT_MOST = 8  # in all parts: luminance, chroma, alpha, depth and a few more
+MAX_CHANNELS = 8  # in all parts: luminance, chroma, alpha, depth and a few more
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,9 @@ def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
     for width, height in (size, picture):
         check_size(path, width, height, max_pixels)
     # OpenEXR reads all parts and channels.
-    if sum(_samples(part.header) for part in parts) > CHANNELS_AT_MOST * max_pixels:
+    if sum(_samples(part.header) for part in parts) > MAX_CHANNELS * max_pixels:
         raise ImageError(
-            f"{path}: its parts and channels have more samples than {CHANNELS_AT_MOST} channels of "
+            f"{path}: its parts and channels have more samples than {MAX_CHANNELS} channels of "
             f"{max_pixels} pixels. To read more, set --max-pixels"
         )
     channels = read(header_only=False)[0].channels
@@ -109,14 +109,14 @@ def to_rgb(luminance: Array, red: Array, blue: Array, weights: Array) -> Floats:
     y = luminance.astype(np.float32)
     wr, wg, wb = (np.float32(weight) for weight in weights)
     with np.errstate(all="ignore"):  # the file may hold infinity
-        r, b = ((upsampled(plane, y.shape) + 1) * y for plane in (red, blue))
+        r, b = ((upsample(plane, y.shape) + 1) * y for plane in (red, blue))
         return np.stack([r, (y - wr * r - wb * b) / wg, b], axis=-1)
 
 
-def upsampled(plane: Array, shape: tuple[int, ...]) -> Floats:
+def upsample(plane: Array, shape: tuple[int, ...]) -> Floats:
     """Return a plane upsampled by 2 with linear interpolation, cropped to ``shape``.
 
-    >>> upsampled(np.array([[0, 1]]), (1, 4)).tolist()
+    >>> upsample(np.array([[0, 1]]), (1, 4)).tolist()
     [[0.0, 0.5, 1.0, 1.0]]
     """
     for axis, size in enumerate(shape):

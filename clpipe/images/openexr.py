@@ -17,7 +17,7 @@ from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.types import Array
 from clpipe.images.exr_header import read_header
 
-WASTE = 2  # all channels take at most this many times the memory of the requested ones
+MAX_EXTRA = 2  # all channels take at most this many times the memory of the requested ones
 
 
 def open_exr(path: Path, header_only: bool = False, separate: bool = True) -> Any:
@@ -33,7 +33,7 @@ def open_exr(path: Path, header_only: bool = False, separate: bool = True) -> An
     """
     import OpenEXR
 
-    with _silence():
+    with _discard_stdout():
         return OpenEXR.File(
             str(path), separate_channels=separate, header_only=header_only, num_threads=1
         )
@@ -62,7 +62,7 @@ def read_channels(path: Path, names: Sequence[str], shape: tuple[int, int]) -> A
     size = sum(each.itemsize for each in types.values())
     if {types[name] for name in names} != {dtype} or dtype.kind != "f":
         return None
-    if size > WASTE * len(names) * dtype.itemsize:
+    if size > MAX_EXTRA * len(names) * dtype.itemsize:
         return None
     layer = names[0].removesuffix("R")
     is_rgb = list(names) == [layer + colour for colour in "RGB"] and layer + "A" not in types
@@ -71,13 +71,13 @@ def read_channels(path: Path, names: Sequence[str], shape: tuple[int, int]) -> A
         if is_rgb:
             pixels = channels[layer.removesuffix(".") or "RGB"].pixels
         else:
-            pixels = _joined(channels, names, dtype)
+            pixels = _join_planes(channels, names, dtype)
     except Exception:  # OpenImageIO reports the error
         return None
     return pixels if (pixels.shape, pixels.dtype) == ((*shape, len(names)), dtype) else None
 
 
-def _joined(channels: dict[str, Any], names: Sequence[str], dtype: np.dtype[Any]) -> Array:
+def _join_planes(channels: dict[str, Any], names: Sequence[str], dtype: np.dtype[Any]) -> Array:
     """Return planes as one array, (rows, columns, channel). Each is freed after it is copied."""
     for name in channels.keys() - set(names):
         del channels[name]
@@ -91,11 +91,11 @@ def _joined(channels: dict[str, Any], names: Sequence[str], dtype: np.dtype[Any]
 
 
 @CpuTimer("encode")
-def write_channels(to: str, planes: Mapping[str, Array], attributes: Mapping[str, str]) -> None:
+def write_channels(path: str, planes: Mapping[str, Array], attributes: Mapping[str, str]) -> None:
     """Write an OpenEXR file with ZIP compression.
 
     Args:
-        to: the path to write to.
+        path: the path to write to.
         planes: (rows, columns) float16, float32 or uint32, by the names of the channels.
         attributes: text attributes of the header.
 
@@ -107,16 +107,16 @@ def write_channels(to: str, planes: Mapping[str, Array], attributes: Mapping[str
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **attributes}
     channels = {name: np.ascontiguousarray(plane) for name, plane in planes.items()}
     try:
-        with _silence():
-            OpenEXR.File(header, channels, num_threads=1).write(to)
+        with _discard_stdout():
+            OpenEXR.File(header, channels, num_threads=1).write(path)
     except OSError:
         raise
     except Exception as error:  # the C++ library raises many types of exceptions
         raise OSError(0, str(error)) from None
 
 
-class _Stdout:
-    """Standard output, except for the output of threads in :func:`_silence`."""
+class _FilteredStdout:
+    """Standard output, except for the output of threads in :func:`_discard_stdout`."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
@@ -134,11 +134,11 @@ _silent: list[threading.Thread] = []
 
 
 @contextlib.contextmanager
-def _silence() -> Iterator[None]:
+def _discard_stdout() -> Iterator[None]:
     """Discard what this thread writes to standard output. Other threads are not affected."""
     with _lock:
         if not _silent:
-            sys.stdout = _Stdout(sys.stdout)
+            sys.stdout = _FilteredStdout(sys.stdout)
         _silent.append(threading.current_thread())
     _thread.is_silent = True
     try:
@@ -147,5 +147,5 @@ def _silence() -> Iterator[None]:
         del _thread.is_silent
         with _lock:
             _silent.pop()
-            if not _silent and isinstance(sys.stdout, _Stdout):
+            if not _silent and isinstance(sys.stdout, _FilteredStdout):
                 sys.stdout = sys.stdout.stream

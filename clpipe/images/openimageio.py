@@ -23,7 +23,7 @@ ERROR_LENGTH = 400  # characters; some repeat what they found, of any length
 
 # The first bytes of each format. OpenImageIO would try the readers of twenty more formats, which
 # are less tested with damaged files. A Targa file has no such bytes.
-BEGINNINGS = (
+SIGNATURES = (
     b"v/1\x01",  # OpenEXR
     radiance.MAGIC,
     *pfm.MAGICS,
@@ -33,12 +33,12 @@ BEGINNINGS = (
     b"BM",  # BMP
     b"RIFF",  # WebP
 )
-TEXTS = (radiance.MAGIC, *pfm.MAGICS)
+TEXT_HEADERS = (radiance.MAGIC, *pfm.MAGICS)
 TARGA = ".tga"
-READ = "OpenEXR, Radiance HDR, PFM, TIFF, PNG, JPEG, BMP, Targa and WebP"
+FORMATS_READ = "OpenEXR, Radiance HDR, PFM, TIFF, PNG, JPEG, BMP, Targa and WebP"
 
 # Formats that are not read, by the offset and value of identifying bytes.
-OTHERS = {
+UNSUPPORTED = {
     (0, b"GIF8"): "GIF",
     (0, b"\0\0\0\x0cjP"): "JPEG 2000",
     (0, b"\xffO\xffQ"): "JPEG 2000",
@@ -82,21 +82,23 @@ def open_image(path: Path) -> Iterator[Any]:
     try:
         size = check_regular(path).st_size
         with path.open("rb") as start:
-            beginning = start.read(16)
+            signature = start.read(16)
     except FileNotFoundError:
         raise ImageError(f"{path}: no such file") from None
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
     if not size:
         raise ImageError(f"{path}: the file is empty")
-    if not beginning.startswith(BEGINNINGS) and path.suffix.lower() != TARGA:
-        raise ImageError(f"{path}: cannot be read as an image: {_unread(beginning)}")
+    if not signature.startswith(SIGNATURES) and path.suffix.lower() != TARGA:
+        raise ImageError(f"{path}: cannot be read as an image: {_format_problem(signature)}")
     try:
         hints = oiio.ImageSpec()
         hints.attribute("pnm:pfmflip", 1)  # without it, OpenImageIO 3.2 reads PFM upside down
         hints.attribute("oiio:UnassociatedAlpha", 1)  # do not multiply encoded values by alpha
-        has_text = beginning.startswith(TEXTS)  # a text header, which OpenImageIO may misread
-        with _readable(path, beginning, size) if has_text else nullcontext(path) as readable:
+        has_text = signature.startswith(
+            TEXT_HEADERS
+        )  # a text header, which OpenImageIO may misread
+        with _readable_copy(path, signature, size) if has_text else nullcontext(path) as readable:
             file = oiio.ImageInput.open(str(readable), hints)
             if file is None:
                 reason = error_text(oiio.geterror())
@@ -109,26 +111,26 @@ def open_image(path: Path) -> Iterator[Any]:
         raise ImageError(f"{path}: damaged: a name or attribute in it is not UTF-8") from None
 
 
-def _unread(beginning: bytes) -> str:
+def _format_problem(signature: bytes) -> str:
     """Return why a file with these first bytes is not read."""
-    if beginning.startswith(b"\x93NUMPY"):
+    if signature.startswith(b"\x93NUMPY"):
         return "it is a NumPy array, not an image file; write its pixels as an OpenEXR file"
-    for (place, mark), name in OTHERS.items():
-        if beginning[place:].startswith(mark):
+    for (offset, mark), name in UNSUPPORTED.items():
+        if signature[offset:].startswith(mark):
             return (
-                f"it is a {name} file; clpipe reads {READ}. Convert it with ImageMagick or "
+                f"it is a {name} file; clpipe reads {FORMATS_READ}. Convert it with ImageMagick or "
                 "OpenImageIO's oiiotool, for example to PNG or TIFF"
             )
     return error_text("")
 
 
 @contextlib.contextmanager
-def _readable(path: Path, beginning: bytes, size: int) -> Iterator[Path]:
+def _readable_copy(path: Path, signature: bytes, size: int) -> Iterator[Path]:
     """Yield the file, or a temporary copy with another header if OpenImageIO misreads its own."""
     header: radiance.RadianceHeader | pfm.PfmHeader | None = None
-    if beginning.startswith(radiance.MAGIC):
-        known = radiance_header(path)
-        header = None if known.is_usual else known
+    if signature.startswith(radiance.MAGIC):
+        radiance_ = radiance_header(path)
+        header = None if radiance_.is_standard else radiance_
     else:
         with path.open("rb") as file:
             header = pfm.pfm_header(file.read(radiance.HEADER_BYTES), size)
@@ -138,7 +140,7 @@ def _readable(path: Path, beginning: bytes, size: int) -> Iterator[Path]:
     with tempfile.NamedTemporaryFile(suffix=path.suffix) as copy:
         with path.open("rb") as file:
             file.seek(header.end)
-            copy.write(header.usual)
+            copy.write(header.standard)
             shutil.copyfileobj(file, copy)
         copy.flush()
         yield Path(copy.name)
@@ -162,7 +164,7 @@ def radiance_header(path: Path) -> radiance.RadianceHeader:
 def error_text(text: str) -> str:
     """Return a library's error in one short line. For some damaged files, the error is empty."""
     if not text or "could not find a format reader" in text:
-        return f"it is damaged, or in an unknown format; clpipe reads {READ}"
+        return f"it is damaged, or in an unknown format; clpipe reads {FORMATS_READ}"
     line = printable(text)
     return line if len(line) <= ERROR_LENGTH else f"{line[:ERROR_LENGTH]}..."
 

@@ -10,19 +10,19 @@ import OpenImageIO as oiio
 
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.types import Array
-from clpipe.images.kinds import kind_named
-from clpipe.images.layers import MOST_PARTS, full_name
+from clpipe.images.kinds import kind_from_name
+from clpipe.images.layers import MAX_PARTS, full_name
 from clpipe.images.openimageio import open_image
 from clpipe.images.pixels import check_size
 from clpipe.images.samples import read_samples
-from clpipe.images.statements import statements
+from clpipe.images.statements import read_statements
 from clpipe.reference.carried import LayerKind
 
 CRYPTOMATTE = "cryptomatte/"  # prefix of attributes that map Cryptomatte's numbers to names
 
-ORDER = "RGBAXYZWUV"  # of channels within a layer
+CHANNEL_ORDER = "RGBAXYZWUV"  # of channels within a layer
 
-FLOATS = {oiio.HALF: oiio.HALF, oiio.FLOAT: oiio.FLOAT, oiio.DOUBLE: oiio.FLOAT}
+FLOAT_TYPES = {oiio.HALF: oiio.HALF, oiio.FLOAT: oiio.FLOAT, oiio.DOUBLE: oiio.FLOAT}
 
 
 @dataclass(frozen=True)
@@ -33,18 +33,18 @@ class LayerLocation:
         name: the name of the layer; "" for channels whose names have no layer.
         part: the number of its part.
         channels: the names of its channels, without the layer's.
-        places: their numbers in the part.
+        indices: their numbers in the part.
         type: the ``oiio.BASETYPE`` of its samples.
     """
 
     name: str
     part: int
     channels: tuple[str, ...]
-    places: tuple[int, ...]
+    indices: tuple[int, ...]
     type: Any
 
     @property
-    def is_alone(self) -> bool:
+    def is_bare_channel(self) -> bool:
         """Whether it is a single channel without a layer."""
         return self.channels == (self.name,)
 
@@ -53,7 +53,7 @@ class LayerLocation:
         """Whether its channels are red, green and blue."""
         return {channel.upper() for channel in self.channels} >= set("RGB")
 
-    def answers_to(self, name: str) -> bool:
+    def matches(self, name: str) -> bool:
         """Return whether a name is that of this layer, or the end of it, in any case.
 
         All ranks of a Cryptomatte match its name without a number. A single Z matches depth.
@@ -68,11 +68,11 @@ class LayerLocation:
         return self.name[:-2] if is_rank else self.name
 
 
-def kind_of(name: str, location: LayerLocation) -> LayerKind | None:
+def layer_kind(name: str, location: LayerLocation) -> LayerKind | None:
     """Return the kind of a layer, from its names and channels; None if it is not known."""
-    if kind := kind_named(name) or kind_named(location.name):
+    if kind := kind_from_name(name) or kind_from_name(location.name):
         return kind
-    if location.type not in FLOATS:
+    if location.type not in FLOAT_TYPES:
         return "label"
     return "colour" if location.is_colour else None
 
@@ -87,7 +87,7 @@ def find_layers(path: Path) -> list[LayerLocation]:
     with open_image(path) as file:
         several = file.seek_subimage(1, 0)
         part = 0
-        while part < MOST_PARTS and file.seek_subimage(part, 0):
+        while part < MAX_PARTS and file.seek_subimage(part, 0):
             spec = file.spec()
             if not spec.deep:
                 part_name = str(spec.getattribute("oiio:subimagename") or "") if several else ""
@@ -100,35 +100,37 @@ def find_layers(path: Path) -> list[LayerLocation]:
 def _layers_in(part: int, part_name: str, spec: Any) -> Iterator[LayerLocation]:
     """Yield the layers of one part."""
     types = spec.channelformats or [spec.format] * spec.nchannels
-    for name, places in _grouped(spec.channelnames, bool(part_name)).items():
-        own = {i: spec.channelnames[i].rpartition(".")[2] for i in places}
-        order = sorted(places, key=lambda i: (ORDER.find(own[i].upper()), own[i]))
-        basetypes = {types[i].basetype for i in places}
+    for name, indices in _group_channels(spec.channelnames, bool(part_name)).items():
+        names = {i: spec.channelnames[i].rpartition(".")[2] for i in indices}
+        order = sorted(indices, key=lambda i: (CHANNEL_ORDER.find(names[i].upper()), names[i]))
+        basetypes = {types[i].basetype for i in indices}
         type_ = basetypes.pop() if len(basetypes) == 1 else oiio.FLOAT
-        channels = tuple(own[i] for i in order)
+        channels = tuple(names[i] for i in order)
         yield LayerLocation(full_name(part_name, name), part, channels, tuple(order), type_)
 
 
-def _grouped(names: Sequence[str], in_part: bool = False) -> Mapping[str, list[int]]:
+def _group_channels(names: Sequence[str], in_part: bool = False) -> Mapping[str, list[int]]:
     """Return the numbers of channels by layer.
 
-    Colours and coordinates of a vector without a layer form the layer "". Any other channel without
-    a layer is a layer of its own. In a file of several parts, this requires that the part has R, G
-    and B as well.
+    Colour channels and vector components without a layer form the layer "". Any other channel
+    without a layer is a layer of its own. In a file of several parts, this requires that the part
+    has R, G and B as well.
 
-    >>> _grouped(["R", "G", "B", "A", "Z", "id", "Normal.X"])
+    >>> _group_channels(["R", "G", "B", "A", "Z", "id", "Normal.X"])
     {'': [0, 1, 2, 3], 'Z': [4], 'id': [5], 'Normal': [6]}
-    >>> _grouped(["X", "Y", "Z"]), _grouped(["Z"]), _grouped(["Z"], in_part=True)
-    ({'': [0, 1, 2]}, {'Z': [0]}, {'': [0]})
+    >>> _group_channels(["X", "Y", "Z"]), _group_channels(["Z"])
+    ({'': [0, 1, 2]}, {'Z': [0]})
+    >>> _group_channels(["Z"], in_part=True)
+    {'': [0]}
     """
     bare = {name.upper() for name in names if "." not in name}
-    wholes = ("RGBA", "XYZW", "XY", "UV", *([bare] if in_part else []))
-    whole = next((each for each in wholes if set(list(each)[:3]) <= bare), ())
+    vectors = ("RGBA", "XYZW", "XY", "UV", *([bare] if in_part else []))
+    vector = next((each for each in vectors if set(list(each)[:3]) <= bare), ())
     groups: dict[str, list[int]] = {}
     for i, name in enumerate(names):
         layer, dot, channel = name.rpartition(".")
-        own = layer if dot or channel.upper() in whole else channel
-        groups.setdefault(own, []).append(i)
+        group = layer if dot or channel.upper() in vector else channel
+        groups.setdefault(group, []).append(i)
     return groups
 
 
@@ -156,14 +158,14 @@ def read_layer(
         width, height = spec.full_width, spec.full_height
         check_size(path, width, height, max_pixels)
         check_size(path, spec.width, spec.height, max_pixels)
-        type_ = FLOATS.get(location.type, location.type)  # whole numbers would be scaled
-        pixels = read_samples(path, file, location.part, location.places, type_)
+        type_ = FLOAT_TYPES.get(location.type, location.type)  # whole numbers would be scaled
+        pixels = read_samples(path, file, location.part, location.indices, type_)
         if pixels.dtype.kind != "f":
             pixels = pixels.astype(np.uint32)
-        stated = statements(path, file)
+        stated = read_statements(path, file)
         if stated.orientation != 1:  # such files have no data window
-            turned = stated.upright(pixels)
-            return turned, (0, 0), (turned.shape[1], turned.shape[0])
+            upright = stated.upright(pixels)
+            return upright, (0, 0), (upright.shape[1], upright.shape[0])
         return (
             np.ascontiguousarray(pixels),
             (spec.x - spec.full_x, spec.y - spec.full_y),

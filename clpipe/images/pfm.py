@@ -12,7 +12,7 @@ HEADER = re.compile(rb"(P[Ff])" + SPACE + rb"(\d+)" + SPACE + rb"(\d+)" + SPACE 
 class PfmHeader:
     """A header that OpenImageIO reads correctly, and the offset ``end`` at which samples begin."""
 
-    usual: bytes
+    standard: bytes
     end: int
 
 
@@ -22,7 +22,7 @@ def pfm_header(start: bytes, size: int) -> PfmHeader | None:
     The scale is followed by one character, or by CR and LF. The file's length distinguishes them.
 
     >>> pfm_header(b"Pf\r\n1 1\r\n-1.0\r\n\0\0\x80\x3f", 19)
-    PfmHeader(usual=b'Pf\n1 1\n-1.0\n', end=15)
+    PfmHeader(standard=b'Pf\n1 1\n-1.0\n', end=15)
 
     Args:
         start: the first bytes of the file.

@@ -12,7 +12,7 @@ from clpipe.base.types import Array, Floats
 from clpipe.reference.geometry import NO_MARGINS, Margins
 
 MAX_PIXELS = 1_000_000_000  # the largest --max-pixels
-USUAL_MAX_PIXELS = 200_000_000  # the default of --max-pixels
+DEFAULT_MAX_PIXELS = 200_000_000  # the default of --max-pixels
 HALF_MAX = np.float32(65504)  # the largest half
 BLOCK = 1 << 18  # samples that fit into a cache
 
@@ -32,7 +32,7 @@ def check_size(path: Path, width: int, height: int, max_pixels: int) -> None:
         )
 
 
-def margins_of(x: int, y: int, data: Sequence[int], display: Sequence[int]) -> Margins:
+def overscan_margins(x: int, y: int, data: Sequence[int], display: Sequence[int]) -> Margins:
     """Return the overscan: how far the data window exceeds the display window on each side.
 
     It is 0 if the windows do not overlap.
@@ -41,8 +41,10 @@ def margins_of(x: int, y: int, data: Sequence[int], display: Sequence[int]) -> M
         x, y: column and row of the data window's upper left pixel in the display window.
         data, display: the width and height of each in px.
 
-    >>> tuple(margins_of(-2, 1, (10, 6), (7, 7))), tuple(margins_of(7, 0, (3, 3), (7, 7)))
-    ((2, 0, 1, 0), (0, 0, 0, 0))
+    >>> tuple(overscan_margins(-2, 1, (10, 6), (7, 7)))
+    (2, 0, 1, 0)
+    >>> tuple(overscan_margins(7, 0, (3, 3), (7, 7)))
+    (0, 0, 0, 0)
     """
     (width, height), (right, bottom) = display, (x + data[0], y + data[1])
     if min(right, bottom) <= 0 or x >= width or y >= height:
@@ -71,16 +73,16 @@ def display_window(
 
 
 @CpuTimer("convert")
-def by_rows(convert: Callable[[Array], Array], pixels: Array) -> Floats:
+def convert_by_rows(convert: Callable[[Array], Array], pixels: Array) -> Floats:
     """Return a new float32 image, converted a few rows at a time.
 
     Intermediate results therefore never need the memory of whole images.
     """
-    made = np.empty(pixels.shape, np.float32)
+    result = np.empty(pixels.shape, np.float32)
     rows = max(BLOCK // max(pixels[0].size, 1), 1)
     for top in range(0, len(pixels), rows):
-        made[top : top + rows] = convert(pixels[top : top + rows])
-    return made
+        result[top : top + rows] = convert(pixels[top : top + rows])
+    return result
 
 
 @CpuTimer("convert")
@@ -88,7 +90,7 @@ def make_finite(pixels: Array) -> int:
     """Set each NaN and infinity of an image to 0, in place, and return their number."""
     infinity = np.array(np.inf, pixels.dtype)
     count = 0
-    for block in _blocks_beyond(pixels, np.nextafter(infinity, pixels.dtype.type(0))):
+    for block in _blocks_outside(pixels, np.nextafter(infinity, pixels.dtype.type(0))):
         bad = ~np.isfinite(block)
         count += int(np.count_nonzero(bad))
         block[bad] = 0
@@ -99,13 +101,13 @@ def make_finite(pixels: Array) -> int:
 def clip_to_half(pixels: Array) -> int:
     """Clip float32 samples to the range of half, in place, and return the number clipped."""
     count = 0
-    for block in _blocks_beyond(pixels, HALF_MAX):
+    for block in _blocks_outside(pixels, HALF_MAX):
         count += int(np.count_nonzero(np.abs(block) > HALF_MAX))
         np.clip(block, -HALF_MAX, HALF_MAX, out=block)
     return count
 
 
-def _blocks_beyond(pixels: Array, limit: Any) -> Iterator[Array]:
+def _blocks_outside(pixels: Array, limit: Any) -> Iterator[Array]:
     """Yield views of the blocks of an image that have samples outside -limit..limit.
 
     The image may be planar in memory. Bits compare faster than floats. The bits of non-negative

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 MAGIC = b"\x89PNG\r\n\x1a\n"
-MOST_CHUNKS = 1000  # before the first chunk of samples
+MAX_CHUNKS = 1000  # before the first chunk of samples
 
 # ITU-T H.273 (2024), tables 2 and 3: x and y of red, green, blue and white; names of curves.
 PRIMARIES = {
@@ -55,9 +55,9 @@ def png_colours(path: Path) -> PngColours:
     curve, chromaticities = "", None
     if len(chunks.get(b"gAMA", b"")) == 4:
         gamma = struct.unpack(">I", chunks[b"gAMA"])[0] / 100_000
-        usual = {"linear": 1.0, "srgb": SRGB_GAMMA}
-        near = [name for name, value in usual.items() if abs(gamma - value) < 0.01]
-        curve = near[0] if near else f"gamma {1 / max(gamma, 1e-5):.3g}"
+        known_gammas = {"linear": 1.0, "srgb": SRGB_GAMMA}
+        matches = [name for name, value in known_gammas.items() if abs(gamma - value) < 0.01]
+        curve = matches[0] if matches else f"gamma {1 / max(gamma, 1e-5):.3g}"
     if len(chunks.get(b"cHRM", b"")) == 32:
         white, colours = (values := struct.unpack(">8I", chunks[b"cHRM"]))[:2], values[2:]
         chromaticities = tuple(value / 100_000 for value in (*colours, *white))
@@ -68,7 +68,7 @@ def _chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
     """Yield name and content of each chunk before the samples; b"" for a long content."""
     with path.open("rb") as file:
         file.seek(len(MAGIC))
-        for _ in range(MOST_CHUNKS):
+        for _ in range(MAX_CHUNKS):
             head = file.read(8)
             if len(head) < 8 or head[4:] == b"IDAT":
                 return

@@ -17,7 +17,7 @@ from clpipe.reference.transfer import srgb_curve
 from clpipe.stage import Kind
 
 # The exceptions that Pillow raises for a file that is damaged, or claims to be very large.
-DAMAGED = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
+PILLOW_ERRORS = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
 
 
 def png_bytes(pixels: Array) -> bytes:
@@ -56,7 +56,7 @@ def thumbnail(file: Path | io.BytesIO, name: str, side: int) -> Image.Image:
             small = picture.convert("RGB")
             small.thumbnail((side, side), Image.Resampling.LANCZOS)
             return small
-    except DAMAGED as error:
+    except PILLOW_ERRORS as error:
         raise ImageError(f"{name}: cannot be shown: {error}") from None
 
 
@@ -64,7 +64,7 @@ def thumbnail_bytes(data: bytes, name: str, side: int) -> bytes:
     """Return a small WebP of a picture, at most ``side`` pixels wide and high.
 
     Args:
-        data: the bytes of its file; see :func:`decoded`.
+        data: the bytes of its file; see :func:`decode_8_bit`.
         name: the name of the file.
         side: the largest width and height in px.
 
@@ -74,14 +74,14 @@ def thumbnail_bytes(data: bytes, name: str, side: int) -> bytes:
     if name.endswith(".jpg"):
         small = thumbnail(io.BytesIO(data), name, side)
     else:
-        small = Image.fromarray(decoded(data, name))
+        small = Image.fromarray(decode_8_bit(data, name))
         small.thumbnail((side, side), Image.Resampling.LANCZOS)
     file = io.BytesIO()
     small.save(file, "WEBP", quality=75)
     return file.getvalue()
 
 
-def decoded(data: bytes, name: str) -> Array:
+def decode_8_bit(data: bytes, name: str) -> Array:
     """Return a picture with 8 bits per channel, (height, width, 3).
 
     Linear light is encoded with sRGB's curve. So are mosaics, whose brightest sample becomes white.
@@ -95,22 +95,22 @@ def decoded(data: bytes, name: str) -> Array:
     """
     try:
         if name.endswith(".exr"):
-            return _decoded_exr(data)
+            return _decode_exr(data)
         if name.endswith(".npy"):
             array = np.load(io.BytesIO(data), allow_pickle=False)
-            return _shown(array, np.issubdtype(array.dtype, np.float16))
+            return _to_8_bit_rgb(array, np.issubdtype(array.dtype, np.float16))
         with Image.open(io.BytesIO(data)) as picture:
             return np.asarray(picture.convert("RGB"))
     except ImageError as error:
         raise ImageError(f"{name}: {str(error).partition(': ')[2]}") from None
-    except DAMAGED as error:
+    except PILLOW_ERRORS as error:
         raise ImageError(f"{name}: cannot be shown: {error}") from None
 
 
-def reduced(pixels: Array, by: int) -> Array:
+def reduce(pixels: Array, by: int) -> Array:
     """Return (height, width, 3) uint8 in which each pixel is the mean of ``by`` x ``by`` pixels.
 
-    >>> reduced(np.uint8([[[0, 0, 9], [2, 0, 9], [4, 4, 4]]]), 2).tolist()
+    >>> reduce(np.uint8([[[0, 0, 9], [2, 0, 9], [4, 4, 4]]]), 2).tolist()
     [[[1, 0, 9], [4, 4, 4]]]
     """
     return np.asarray(Image.fromarray(pixels).reduce(by)) if by > 1 else pixels
@@ -124,27 +124,27 @@ def _light_table() -> Array:
     return to_8_bit(srgb_curve(light).astype(np.float32))
 
 
-def encoded_light(image: Array) -> Array:
+def light_to_srgb(image: Array) -> Array:
     """Return linear light from 0 (black) to 1 (white) as 8 bits on sRGB's curve, via half floats.
 
-    >>> encoded_light(np.float32([[-1, 0, 0.5, 1, 9]])).tolist()
+    >>> light_to_srgb(np.float32([[-1, 0, 0.5, 1, 9]])).tolist()
     [[0, 0, 188, 255, 255]]
     """
     with np.errstate(over="ignore"):
         return _light_table()[image.astype(np.float16).view(np.uint16)]
 
 
-def _decoded_exr(data: bytes) -> Array:
+def _decode_exr(data: bytes) -> Array:
     with tempfile.NamedTemporaryFile(suffix=".exr") as file:
         file.write(data)
         file.flush()
         path = Path(file.name)
         image = read_image(path, holds_mosaic(path))
-    return _shown(image.pixels, image.attributes.get("kind") == Kind.DISPLAY.label)
+    return _to_8_bit_rgb(image.pixels, image.attributes.get("kind") == Kind.DISPLAY.label)
 
 
-def _shown(array: Array, is_display: bool) -> Array:
-    """Return an image with 8 bits per channel; see :func:`decoded`."""
+def _to_8_bit_rgb(array: Array, is_display: bool) -> Array:
+    """Return an image with 8 bits per channel; see :func:`decode_8_bit`."""
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3):
         raise ValueError(f"its shape is {array.shape}, but a picture has 3 channels, a mosaic none")
     values = np.nan_to_num(array.astype(np.float64))

@@ -33,7 +33,7 @@ class RadianceHeader:
             lines.
         chromaticities: x and y of red, green, blue and white; None if they are not stated.
         pixel_aspect: height of a pixel over its width.
-        is_usual: whether OpenImageIO reads the file correctly.
+        is_standard: whether OpenImageIO reads the file correctly.
         orientation: EXIF's orientation of the stored samples.
         size: the line with the picture's size.
         end: the offset in the file at which the samples begin.
@@ -42,13 +42,13 @@ class RadianceHeader:
     factors: tuple[float, float, float]
     chromaticities: tuple[float, ...] | None
     pixel_aspect: float
-    is_usual: bool
+    is_standard: bool
     orientation: int
     size: bytes
     end: int
 
     @property
-    def usual(self) -> bytes:
+    def standard(self) -> bytes:
         """A header for the same samples that OpenImageIO reads correctly."""
         return b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n" + self.size + b"\n"
 
@@ -65,10 +65,10 @@ def radiance_header(start: bytes) -> RadianceHeader:
     """
     factors, aspect = np.ones(3), 1.0
     chromaticities: tuple[float, ...] | None = None
-    format_, at = b"", 0
+    format_, offset = b"", 0
     while True:
-        line, newline, _ = start[at:].partition(b"\n")
-        at += len(line) + 1
+        line, newline, _ = start[offset:].partition(b"\n")
+        offset += len(line) + 1
         if not newline:
             raise ImageError("it is damaged: its header has no end")
         if not line.strip():
@@ -90,22 +90,22 @@ def radiance_header(start: bytes) -> RadianceHeader:
             f"its FORMAT is {format_.decode(errors='replace')!r}, but must be 32-bit_rle_rgbe or "
             "32-bit_rle_xyze"
         )
-    size, newline, _ = start[at:].partition(b"\n")
+    size, newline, _ = start[offset:].partition(b"\n")
     found = SIZE.match(size)
     orientation = ORIENTATIONS.get(found[1] + found[2]) if found else None
     if not newline or orientation is None:
         raise ImageError("it is damaged: its header states no size, such as -Y 480 +X 640")
     red, green, blue = factors.tolist()
     is_xyz = format_ == b"32-bit_rle_xyze"
-    is_usual = format_ == b"32-bit_rle_rgbe" and b"\r" not in start[: at + len(size)]
+    is_standard = format_ == b"32-bit_rle_rgbe" and b"\r" not in start[: offset + len(size)]
     return RadianceHeader(
         (red, green, blue),
         CIE_XYZ if is_xyz else chromaticities,
         aspect,
-        is_usual,
+        is_standard,
         orientation,
         size.strip(),
-        at + len(size) + 1,
+        offset + len(size) + 1,
     )
 
 

@@ -19,9 +19,9 @@ from clpipe.base.errors import ImageError
 from clpipe.base.reading import check_regular
 from clpipe.base.types import Array, Floats
 from clpipe.camera.profile import SRGB_TO_XYZ, Matrix
-from clpipe.images.dng import BEHIND, D65
+from clpipe.images.dng import ARRAY_SEPARATOR, D65
 from clpipe.images.encoding import SIMULATED
-from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS, check_size
+from clpipe.images.pixels import DEFAULT_MAX_PIXELS, MAX_PIXELS, check_size
 from clpipe.images.tags import DATE
 from clpipe.reference.cfa import PATTERNS
 from clpipe.reference.filter_array import MONO
@@ -32,8 +32,8 @@ RAW_SUFFIXES = (
     *(".srf", ".srw", ".x3f"),
 )
 
-LEAST_BITS = 0.25  # of a pixel; assumed to be less than any compressed raw has
-MOST_GAIN = 8.0  # of white balance; the smallest is its inverse. No light source needs more.
+MIN_BITS = 0.25  # of a pixel; assumed to be less than any compressed raw has
+MAX_GAIN = 8.0  # of white balance; the smallest is its inverse. No light source needs more.
 
 # EXIF's orientation by LibRaw's flip (1: left to right, 2: upside down, 4: then transposed).
 ORIENTATIONS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
@@ -41,17 +41,17 @@ ORIENTATIONS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
 # The bytes before the EXIF in files that are not TIFF: in a CR3's boxes, in a RAF's JPEG.
 EXIF_MARKS = (b"CMT1", b"CMT2", b"Exif\0\0")
 MODEL = "Tag 0xC614"  # UniqueCameraModel of a DNG
-PARTS = ("EXIF", "Image")  # exifread's prefixes of tags, in order of preference
+TAG_PREFIXES = ("EXIF", "Image")  # exifread's prefixes of tags, in order of preference
 EXIF_BYTES = 1 << 20  # largest size of a tag, and of the part of a file searched for EXIF_MARKS
-MOST_READS = 200_000  # by exifread, which reads each value separately; 1,000 are usual
+MAX_READS = 200_000  # by exifread, which reads each value separately; 1,000 are usual
 DATE_TAGS = ("DateTimeOriginal", "DateTime")
 COLOR_MATRICES = {"0xC622": "0xC65B", "0xC621": "0xC65A"}  # a DNG's, and their illuminants
 DUMP_HINT = "if it is a headerless dump of samples, add --dump WxH:TYPE"
-OTHERS = {b"\xff\xd8\xff": "a JPEG", b"\x89PNG": "a PNG", b"v/1\x01": "an OpenEXR image"}
+OTHER_FORMATS = {b"\xff\xd8\xff": "a JPEG", b"\x89PNG": "a PNG", b"v/1\x01": "an OpenEXR image"}
 
 
 @dataclass(frozen=True)
-class RawFacts:
+class RawInfo:
     """The metadata of a raw file. Levels are in DN, gains relative to green = 1; None is unknown.
 
     Implausible gains (outside 1/8 to 8) are None; ``as_shot`` contains the file's own values.
@@ -80,7 +80,7 @@ class RawFacts:
         return round(sum(self.black_levels) / 4)
 
 
-def read_facts(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> RawFacts:
+def read_raw_info(path: Path, max_pixels: int = DEFAULT_MAX_PIXELS) -> RawInfo:
     """Read the metadata of a raw file.
 
     Args:
@@ -91,9 +91,9 @@ def read_facts(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> RawFacts:
         ImageError: the file is missing, damaged, not a raw, too large, or not a mosaic.
     """
     exif = read_exif(path)
-    with _opened(path, max_pixels) as raw:
+    with _open_raw(path, max_pixels) as raw:
         pattern = _pattern(path, raw, exif)
-        speed, shutter, aperture, focal_length = _shot(raw)
+        speed, shutter, aperture, focal_length = _exposure_values(raw)
         iso = speed or exif.number("ISOSpeedRatings", 0)
         exposure = exif.number("ExposureTime", shutter)
         if not (exif.tags or iso or exposure):
@@ -109,7 +109,7 @@ def read_facts(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> RawFacts:
         if to_srgb is None and matrix is not None:
             to_camera = np.array(matrix) @ SRGB_TO_XYZ
             to_srgb = _matrix(np.linalg.inv(to_camera / to_camera.sum(1, keepdims=True)))
-        return RawFacts(
+        return RawInfo(
             make=exif.text("Make") or "unknown",
             model=exif.text("Model").removeprefix(SIMULATED) or "unknown",
             iso=iso or None,
@@ -135,7 +135,7 @@ def _gains(red: float, green: float, blue: float) -> tuple[float, float] | None:
     >>> _gains(1024.0, 512.0, 768.0), _gains(-2.0, 1.0, 1.5), _gains(2.0, 1.0, 100.0)
     ((2.0, 1.5), None, None)
     """
-    if not (green > 0 and all(1 / MOST_GAIN <= c / green <= MOST_GAIN for c in (red, blue))):
+    if not (green > 0 and all(1 / MAX_GAIN <= c / green <= MAX_GAIN for c in (red, blue))):
         return None
     return red / green, blue / green
 
@@ -149,23 +149,23 @@ def _matrix(rows: Any) -> Matrix | None:
     return one, two, three
 
 
-def read_raw(path: Path, facts: RawFacts, max_pixels: int = USUAL_MAX_PIXELS) -> Floats:
+def read_raw(path: Path, info: RawInfo, max_pixels: int = DEFAULT_MAX_PIXELS) -> Floats:
     """Read the mosaic of the visible area in DN, (height, width).
 
     The sites of each colour are shifted to the common ``facts.black_level``.
 
     Raises:
-        ImageError: as for :func:`read_facts`, or the file has no pixels.
+        ImageError: as for :func:`read_raw_info`, or the file has no pixels.
     """
-    with _opened(path, max_pixels) as raw:
+    with _open_raw(path, max_pixels) as raw:
         mosaic = np.array(raw.raw_image_visible, np.float32)
         blacks = np.array(raw.black_level_per_channel, np.float32)[_colours(raw)]
     # For a file whose pixels were removed, LibRaw returns whatever was in memory.
-    if path.stat().st_size * 8 < LEAST_BITS * mosaic.size or mosaic.min() == mosaic.max():
+    if path.stat().st_size * 8 < MIN_BITS * mosaic.size or mosaic.min() == mosaic.max():
         raise ImageError(
             f"{path}: this raw has only metadata and no pixels; use the original file of the camera"
         )
-    return mosaic + np.float32(facts.black_level) - blacks
+    return mosaic + np.float32(info.black_level) - blacks
 
 
 def check_raw(path: Path) -> None:
@@ -174,7 +174,7 @@ def check_raw(path: Path) -> None:
     Raises:
         ImageError: it cannot.
     """
-    with _opened(path, sys.maxsize) as raw:
+    with _open_raw(path, sys.maxsize) as raw:
         raw.unpack()
 
 
@@ -184,12 +184,12 @@ def raw_size(path: Path) -> tuple[int, int]:
     Raises:
         ImageError: the file is missing, damaged or not a raw.
     """
-    with _opened(path, MAX_PIXELS) as raw:
+    with _open_raw(path, MAX_PIXELS) as raw:
         return raw.sizes.raw_width, raw.sizes.raw_height
 
 
 @contextmanager
-def _opened(path: Path, max_pixels: int) -> Iterator[Any]:
+def _open_raw(path: Path, max_pixels: int) -> Iterator[Any]:
     """Open a file with rawpy.
 
     Raises:
@@ -203,7 +203,7 @@ def _opened(path: Path, max_pixels: int) -> Iterator[Any]:
             start = file.read(8)
         if not start:
             raise ImageError(f"{path}: the file is empty")
-        for mark, what in OTHERS.items():
+        for mark, what in OTHER_FORMATS.items():
             if start.startswith(mark):
                 raise ImageError(
                     f"{path}: this is {what}, not a camera raw. Give it the extension of its format"
@@ -221,7 +221,7 @@ def _opened(path: Path, max_pixels: int) -> Iterator[Any]:
         raise ImageError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
-def _shot(raw: Any) -> tuple[float, float, float, float]:
+def _exposure_values(raw: Any) -> tuple[float, float, float, float]:
     """Return ISO, exposure time (s), f-number and focal length (mm) from LibRaw; 0 is unknown."""
     try:
         other = raw.other
@@ -249,14 +249,14 @@ def _pattern(path: Path, raw: Any, exif: "Exif") -> str:
         )
     if raw.num_colors == 1:
         return MONO
-    own = exif.text(MODEL).partition(BEHIND)[2]  # LibRaw may misread this array
-    if {*own} - {*"RGB/"}:
+    array = exif.text(MODEL).partition(ARRAY_SEPARATOR)[2]  # LibRaw may misread this array
+    if {*array} - {*"RGB/"}:
         raise ImageError(
-            f"{path}: its filter array is {own}. clpipe only reads DNG files whose array has red, "
-            "green and blue. Keep the mosaic as EXR (--keep mosaic) to read it again"
+            f"{path}: its filter array is {array}. clpipe only reads DNG files whose array has "
+            "red, green and blue. Keep the mosaic as EXR (--keep mosaic) to read it again"
         )
-    if own:
-        return own
+    if array:
+        return array
     height, width = raw.raw_pattern.shape
     letters = raw.color_desc.decode()
     rows = ["".join(letters[c] for c in row[:width]) for row in _colours(raw)[:height]]
@@ -278,13 +278,13 @@ class Exif:
 
     def text(self, name: str) -> str:
         """Return the text of a tag in the first part that has it; "" if none has."""
-        both = (str(self.tags.get(f"{part} {name}", "")).strip("\0 ") for part in PARTS)
-        return next((text for text in both if text), "")
+        texts = (str(self.tags.get(f"{part} {name}", "")).strip("\0 ") for part in TAG_PREFIXES)
+        return next((text for text in texts if text), "")
 
     def number(self, name: str, default: float) -> float | None:
         """Return a tag's first number, or ``default``; None unless it is finite and above 0."""
         value = default
-        for part in PARTS:
+        for part in TAG_PREFIXES:
             if tag := self.tags.get(f"{part} {name}"):
                 try:
                     value = float(tag.values[0])
@@ -325,7 +325,7 @@ def read_exif(path: Path) -> Exif:
     return Exif(tags)
 
 
-class _Metered:
+class _LimitedReader:
     """Wraps a file, and stops reading if its tags claim more values than are plausible."""
 
     def __init__(self, file: Any) -> None:
@@ -334,7 +334,7 @@ class _Metered:
 
     def read(self, size: int = EXIF_BYTES) -> bytes:
         self._count += 1
-        if self._count > MOST_READS:
+        if self._count > MAX_READS:
             raise ValueError
         return self._file.read(min(size, EXIF_BYTES))
 
@@ -348,6 +348,6 @@ def _tags(file: Any) -> dict[str, Any]:
 
     logging.getLogger("exifread").setLevel(logging.CRITICAL)
     try:
-        return dict(exifread.process_file(_Metered(file), details=False))
+        return dict(exifread.process_file(_LimitedReader(file), details=False))
     except Exception:  # on damaged files exifread raises exceptions of any type
         return {}

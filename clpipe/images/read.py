@@ -10,23 +10,23 @@ import OpenImageIO as oiio
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Doubles, Floats
-from clpipe.images.attributes import own_attributes, photograph_attributes, shot_attributes
+from clpipe.images.attributes import clpipe_attributes, photograph_attributes, shot_attributes
 from clpipe.images.colour import SRGB, to_linear_srgb
 from clpipe.images.layers import find_picture, picture_channels
 from clpipe.images.luminance_chroma import read_luminance_chroma
 from clpipe.images.openimageio import SubsampledError, open_image
 from clpipe.images.pixels import (
+    DEFAULT_MAX_PIXELS,
     HALF_MAX,
-    USUAL_MAX_PIXELS,
-    by_rows,
     check_size,
     clip_to_half,
+    convert_by_rows,
     display_window,
     make_finite,
-    margins_of,
+    overscan_margins,
 )
 from clpipe.images.samples import digest_of, read_part, read_samples, with_digest
-from clpipe.images.statements import Statements, over_black, statements
+from clpipe.images.statements import Statements, over_black, read_statements
 from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.panorama import Panorama
@@ -35,7 +35,7 @@ from clpipe.stage import Kind
 
 RENDER_SUFFIXES = (".exr", ".hdr", ".pfm", ".tif", ".tiff")
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".bmp", ".tga", ".webp")
-WHOLE = (oiio.UINT8, oiio.UINT16, oiio.UINT32, oiio.INT8, oiio.INT16, oiio.INT32)
+INTEGER_TYPES = (oiio.UINT8, oiio.UINT16, oiio.UINT32, oiio.INT8, oiio.INT16, oiio.INT32)
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def read_image(
     path: Path,
     mosaic: bool = False,
     layer: str | None = None,
-    max_pixels: int = USUAL_MAX_PIXELS,
+    max_pixels: int = DEFAULT_MAX_PIXELS,
     overscan: bool = False,
 ) -> SourceImage:
     """Read the picture of a file as linear sRGB, in its display window, with finite samples.
@@ -118,12 +118,12 @@ def read_image(
         pixels = np.stack([pixels] * 3, axis=-1)
         warnings.append(GREY)
     elif not mosaic:
-        pixels, said = _in_srgb(path, pixels, stated)
-        warnings += said
+        pixels, notes = _to_srgb(path, pixels, stated)
+        warnings += notes
     # Values beyond half are so bright that clipping loses nothing, and squares cannot overflow.
-    if not mosaic and pixels.dtype == np.float32 and (beyond := clip_to_half(pixels)):
-        samples = "1 sample" if beyond == 1 else f"{beyond} samples"
-        were = "was" if beyond == 1 else "were"
+    if not mosaic and pixels.dtype == np.float32 and (clipped := clip_to_half(pixels)):
+        samples = "1 sample" if clipped == 1 else f"{clipped} samples"
+        were = "was" if clipped == 1 else "were"
         warnings.append(f"{samples} beyond {HALF_MAX:g}, the range of half, {were} clipped")
     return replace(image, pixels=pixels, warnings=tuple(warnings))
 
@@ -131,7 +131,7 @@ def read_image(
 GREY = "the file has only luminance, so the picture is grey"
 
 
-def _in_srgb(path: Path, light: Array, stated: Statements) -> tuple[Array, list[str]]:
+def _to_srgb(path: Path, light: Array, stated: Statements) -> tuple[Array, list[str]]:
     """Return light in linear sRGB, converted from the file's primaries, and warnings.
 
     Raises:
@@ -141,7 +141,7 @@ def _in_srgb(path: Path, light: Array, stated: Statements) -> tuple[Array, list[
     if matrix is None:
         return light, []
     with np.errstate(all="ignore"):  # overflow is clipped later
-        converted = by_rows(
+        converted = convert_by_rows(
             lambda rows: np.nan_to_num(rows.astype(np.float32) @ matrix.T, copy=False), light
         )
     return converted, ["its colours were converted to linear sRGB"]
@@ -165,7 +165,7 @@ class ReadOptions:
     """
 
     layer: str | None = None
-    max_pixels: int = USUAL_MAX_PIXELS
+    max_pixels: int = DEFAULT_MAX_PIXELS
     transfer: str | None = None
     overscan: bool = False
 
@@ -224,13 +224,17 @@ def _read_encoded(path: Path, max_pixels: int) -> _Encoded | None:
         names = list(spec.channelnames)
         picture = picture_channels(names)
         channels = picture[1] if picture else tuple(i for i, n in enumerate(names) if n == "Y")
-        if file.format_name() == "openexr" or spec.format.basetype not in WHOLE or not channels:
+        if (
+            file.format_name() == "openexr"
+            or spec.format.basetype not in INTEGER_TYPES
+            or not channels
+        ):
             return None
         check_size(path, spec.width, spec.height, max_pixels)
-        stated = statements(path, file)
+        stated = read_statements(path, file)
         has_alpha = 0 <= spec.alpha_channel < spec.nchannels
-        wanted = (*channels, *([spec.alpha_channel] if has_alpha else []))
-        samples = read_samples(path, file, 0, wanted, oiio.FLOAT)  # scales whole numbers to 0..1
+        indices = (*channels, *([spec.alpha_channel] if has_alpha else []))
+        samples = read_samples(path, file, 0, indices, oiio.FLOAT)  # scales whole numbers to 0..1
         rgb = samples[..., : len(channels)]
         rgb = 1 - rgb if stated.is_inverted else rgb
         attributes, shot = photograph_attributes(spec)
@@ -256,17 +260,17 @@ def _as_light(path: Path, encoded: _Encoded, transfer: str) -> SourceImage:
         opaque = np.where(alpha > 0, alpha, np.float32(1))[..., np.newaxis]
         pixels = np.minimum(pixels / opaque, 1)
     curve = TRANSFERS[transfer]
-    light: Array = by_rows(lambda rows: curve(rows.astype(np.float64)), pixels)
-    light, said = _in_srgb(path, light, stated)
+    light: Array = convert_by_rows(lambda rows: curve(rows.astype(np.float64)), pixels)
+    light, notes = _to_srgb(path, light, stated)
     if alpha is not None:
         light = over_black(light, alpha)
-    warnings = (*stated.warnings_with(transfer), *said, *([GREY] if encoded.is_grey else []))
+    warnings = (*stated.warnings_with(transfer), *notes, *([GREY] if encoded.is_grey else []))
     attributes = {**image.attributes, "orientation": "1"}
     return replace(image, pixels=stated.upright(light), warnings=warnings, attributes=attributes)
 
 
 def read_finished(
-    path: Path, max_pixels: int = USUAL_MAX_PIXELS, grey: bool = False
+    path: Path, max_pixels: int = DEFAULT_MAX_PIXELS, grey: bool = False
 ) -> SourceImage | None:
     """Read a finished picture (JPEG, PNG, TIFF): display values, (height, width, 3), 0..1.
 
@@ -310,8 +314,8 @@ def _decode(
         spec = file.spec()
         data, display = (spec.width, spec.height), (spec.full_width, spec.full_height)
         x, y = spec.x - spec.full_x, spec.y - spec.full_y
-        margins = margins_of(x, y, data, display) if overscan else NO_MARGINS
-        stated = statements(path, file, location.xyz)
+        margins = overscan_margins(x, y, data, display) if overscan else NO_MARGINS
+        stated = read_statements(path, file, location.xyz)
         pixels, digest = with_digest(
             path, lambda: read_part(path, file, location, mosaic, max_pixels, margins)
         )
@@ -322,7 +326,7 @@ def _decode(
                 pixels = over_black(pixels, alpha[..., 0])
             pixels = stated.upright(pixels)
         image = SourceImage(
-            *(pixels, digest, location.layer, (), own_attributes(spec), shot_attributes(spec)),
+            *(pixels, digest, location.layer, (), clpipe_attributes(spec), shot_attributes(spec)),
             margins=margins,
             envmap=str(spec.getattribute("textureformat") or ""),
             part=location.part,
@@ -337,11 +341,11 @@ def _decode_luminance_chroma(
     """Return the picture of a file whose chroma is subsampled; see :func:`_decode`."""
     window = read_luminance_chroma(path, max_pixels)
     data, display = window.pixels.shape[1::-1], (window.width, window.height)
-    margins = margins_of(window.x, window.y, data, display) if overscan else NO_MARGINS
-    width, height = margins.around(*display)
+    margins = overscan_margins(window.x, window.y, data, display) if overscan else NO_MARGINS
+    width, height = margins.image_size(*display)
     check_size(path, width, height, max_pixels)
-    place = window.x + margins.left, window.y + margins.top
-    pixels = display_window(window.pixels, *place, width, height)
+    position = window.x + margins.left, window.y + margins.top
+    pixels = display_window(window.pixels, *position, width, height)
     header = window.attributes
     stated = Statements(header.get("chromaticities"), header.get("adoptedNeutral"))
     return SourceImage(pixels, digest_of(path), "", (), {}, margins=margins), stated

@@ -12,14 +12,14 @@ from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.base.types import Array
-from clpipe.images.layers import MOST_PARTS, PictureLocation, mosaic_channel, picture_channels
+from clpipe.images.layers import MAX_PARTS, PictureLocation, mosaic_channel, picture_channels
 from clpipe.images.openexr import read_channels
 from clpipe.images.openimageio import damage_text, open_image, read_with_pillow
-from clpipe.images.pixels import USUAL_MAX_PIXELS, check_size, display_window
+from clpipe.images.pixels import DEFAULT_MAX_PIXELS, check_size, display_window
 from clpipe.reference.geometry import Margins
 
 LARGE_FILE = 4 << 20  # bytes; for smaller files, starting a thread takes longer than the SHA-256
-READ_AT_ONCE = 8  # channels; those of a picture may be hundreds apart
+MAX_CHANNEL_SPAN = 8  # channels; those of a picture may be hundreds apart
 
 
 def read_samples(path: Path, file: Any, part: int, channels: Sequence[int], type_: Any) -> Array:
@@ -35,7 +35,7 @@ def read_samples(path: Path, file: Any, part: int, channels: Sequence[int], type
             "image to its own file"
         )
     first, last = min(channels), max(channels) + 1
-    if last - first > READ_AT_ONCE:
+    if last - first > MAX_CHANNEL_SPAN:
         planes = [read_samples(path, file, part, [i], type_) for i in channels]
         return np.concatenate(planes, axis=-1)
     data = file.read_image(part, 0, first, last, type_)
@@ -70,34 +70,34 @@ def read_part(
     spec, channels = file.spec(), location.channels
     formats = spec.channelformats or [spec.format] * spec.nchannels
     types = {formats[i].basetype for i in channels}
-    whole = mosaic and types <= {oiio.UINT16, oiio.UINT32}
-    if not whole and not types <= {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}:
+    is_integer = mosaic and types <= {oiio.UINT16, oiio.UINT32}
+    if not is_integer and not types <= {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}:
         raise ImageError(
             f"{path}: this {file.format_name().upper()} file has samples of type {spec.format}, "
             "but linear light in floats is expected",
             "For a render, add --transfer srgb or linear (in Python, transfer='srgb'). For a "
             "photograph, use -c unprocess (config='unprocess')",
         )
-    width, height = margins.around(spec.full_width, spec.full_height)
+    width, height = margins.image_size(spec.full_width, spec.full_height)
     check_size(path, width, height, max_pixels)
     check_size(path, spec.width, spec.height, max_pixels)
     # Whole numbers keep their type, because OpenImageIO would scale them to 0..1 as floats.
-    type_ = types.pop() if whole else oiio.HALF if types == {oiio.HALF} else oiio.FLOAT
+    type_ = types.pop() if is_integer else oiio.HALF if types == {oiio.HALF} else oiio.FLOAT
     pixels = None
-    if file.format_name() == "openexr" and not whole:
+    if file.format_name() == "openexr" and not is_integer:
         names = [spec.channelnames[i] for i in channels]
         pixels = read_channels(path, names, (spec.height, spec.width))
     if pixels is None:
         pixels = read_samples(path, file, location.part, channels, type_)
-    if whole:
+    if is_integer:
         pixels = pixels.astype(np.float32)
-    place = spec.x - spec.full_x + margins.left, spec.y - spec.full_y + margins.top
-    if (*place, spec.width, spec.height) != (0, 0, width, height):
-        pixels = display_window(pixels, *place, width, height)
+    position = spec.x - spec.full_x + margins.left, spec.y - spec.full_y + margins.top
+    if (*position, spec.width, spec.height) != (0, 0, width, height):
+        pixels = display_window(pixels, *position, width, height)
     return pixels if len(channels) > 1 else np.ascontiguousarray(pixels[..., 0])
 
 
-def read_whole_numbers(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> Array:
+def read_whole_numbers(path: Path, max_pixels: int = DEFAULT_MAX_PIXELS) -> Array:
     """Return the first channel of a picture as it is stored: (height, width), uint8 or uint16.
 
     Raises:
@@ -114,7 +114,7 @@ def read_whole_numbers(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> Array:
         return read_samples(path, file, 0, (0,), spec.format.basetype)[..., 0]
 
 
-def photograph_facts(path: Path) -> tuple[float | None, int]:
+def photograph_info(path: Path) -> tuple[float | None, int]:
     """Return the ISO in a finished picture's EXIF, or None, and the number of bits per sample.
 
     Raises:
@@ -134,7 +134,7 @@ def holds_mosaic(path: Path) -> bool:
     """
     with open_image(path) as file:
         parts: list[list[str]] = []
-        while len(parts) < MOST_PARTS and file.seek_subimage(len(parts), 0):
+        while len(parts) < MAX_PARTS and file.seek_subimage(len(parts), 0):
             parts.append(list(file.spec().channelnames))
     return not any(map(picture_channels, parts)) and any(map(mosaic_channel, parts))
 
@@ -149,8 +149,8 @@ def with_digest(path: Path, read: Callable[[], Array]) -> tuple[Array, str]:
     """
     if stamp_of(path)[0] < LARGE_FILE:
         return read(), digest_of(path)
-    with ThreadPoolExecutor(1) as beside:
-        digest = beside.submit(digest_of, path)
+    with ThreadPoolExecutor(1) as executor:
+        digest = executor.submit(digest_of, path)
         return read(), digest.result()
 
 

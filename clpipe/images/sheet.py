@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from clpipe.images.preview import thumbnail
 
-SHOWN = (".jpg", ".png", ".tif")  # extensions of pictures that can be on a sheet
+SHEET_SUFFIXES = (".jpg", ".png", ".tif")  # extensions of pictures that can be on a sheet
 
 THUMBNAIL = 240  # px, the longer side
 TEXT = 14  # px high

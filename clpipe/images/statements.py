@@ -13,7 +13,7 @@ from clpipe.base.types import Array, Floats
 from clpipe.images import png, radiance
 from clpipe.images.colour import CIE_XYZ
 from clpipe.images.openimageio import radiance_header
-from clpipe.images.pixels import by_rows
+from clpipe.images.pixels import convert_by_rows
 from clpipe.images.tags import FLIPS, upright
 
 
@@ -48,21 +48,21 @@ class Statements:
         """Return the warnings if samples are decoded with a transfer curve."""
         if self.curve in ("", transfer):
             return self.warnings
-        said = f"its transfer curve {self.curve} is not applied; it is read as {transfer}"
-        return (*self.warnings, said)
+        note = f"its transfer curve {self.curve} is not applied; it is read as {transfer}"
+        return (*self.warnings, note)
 
     def light(self, pixels: Array) -> Array:
         """Return linear light: converted from a Radiance picture's samples, otherwise unchanged."""
         if (header := self.header) is None:
             return pixels
-        return by_rows(lambda rows: radiance.to_light(rows, header), pixels)
+        return convert_by_rows(lambda rows: radiance.to_light(rows, header), pixels)
 
     def upright(self, pixels: Array) -> Array:
         """Return pixels rotated upright."""
         return pixels if self.orientation == 1 else upright(pixels, self.orientation)
 
 
-def statements(path: Path, file: Any, xyz: bool = False) -> Statements:
+def read_statements(path: Path, file: Any, xyz: bool = False) -> Statements:
     """Return what a file states about the samples of its current part.
 
     Args:

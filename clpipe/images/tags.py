@@ -106,8 +106,8 @@ def shot_to_attributes(shot: Mapping[str, float | str], orientation: int) -> dic
 
 def exposed_attributes(attributes: Mapping[str, str], tags: Tags) -> dict[str, str]:
     """Return the attribute of an image's tags with the exposure that the chain has applied."""
-    said = {"exposure": tags.exposure, "bias": tags.bias}
-    return {"exif": json.dumps({**json.loads(attributes.get("exif", "{}")), **said})}
+    exposure_values = {"exposure": tags.exposure, "bias": tags.bias}
+    return {"exif": json.dumps({**json.loads(attributes.get("exif", "{}")), **exposure_values})}
 
 
 def from_attributes(attributes: Mapping[str, str], default: Tags) -> tuple[Tags, int]:
@@ -119,8 +119,8 @@ def from_attributes(attributes: Mapping[str, str], default: Tags) -> tuple[Tags,
         ImageError: the attributes are damaged.
     """
     try:
-        own = json.loads(attributes.get("exif", "{}"))
-        tags = _adapter().validate_python({**vars(default), **own})
+        stored = json.loads(attributes.get("exif", "{}"))
+        tags = _adapter().validate_python({**vars(default), **stored})
     except (ValueError, TypeError):
         raise ImageError(DAMAGED) from None
     return tags, orientation_of(attributes)

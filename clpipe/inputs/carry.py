@@ -10,7 +10,7 @@ import numpy as np
 
 from clpipe.base.digests import digests, stamp_of
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.reading import unchanged
+from clpipe.base.reading import check_unchanged
 from clpipe.base.types import Array
 from clpipe.chain.carry import AovSpec
 from clpipe.chain.chain import Chain
@@ -109,7 +109,7 @@ def carry(
             its kind is unknown.
     """
     full_size = source.pixels.shape[1::-1]
-    width, height = source.margins.inside(*full_size)
+    width, height = source.margins.frame_size(*full_size)
     found = find_carried_layers(path, layers)
     read: list[Layer] = []
     attributes: dict[str, str] = {}
@@ -140,7 +140,7 @@ def read_layer_samples(
     Raises:
         ImageError: the layer is damaged, or differs from the image in size.
     """
-    with unchanged(layer.file):
+    with check_unchanged(layer.file):
         pixels, place, layer_size = read_layer(layer.file, layer.location, max_pixels)
     if layer_size != size:
         raise ImageError(

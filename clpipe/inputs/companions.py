@@ -9,10 +9,10 @@ from pathlib import Path
 
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError
-from clpipe.base.text import alike, either, one_line
+from clpipe.base.text import one_line, quote_alternatives, similar_names
 from clpipe.chain.carry import AovSpec
-from clpipe.images.kinds import CHANNELS, kind_named, vectors_of
-from clpipe.images.passes import LayerLocation, find_layers, kind_of
+from clpipe.images.kinds import MIN_CHANNELS, flow_vectors, kind_from_name
+from clpipe.images.passes import LayerLocation, find_layers, layer_kind
 from clpipe.reference.carried import RESAMPLING, LayerKind, Vector
 
 CARRIED = "carried"  # in file names: the carried layers of NAME are in NAME.carried.exr
@@ -35,7 +35,7 @@ class LayerSource:
     @property
     def vectors(self) -> tuple[Vector, ...]:
         """The vectors in its channels; empty unless its kind is flow."""
-        found = vectors_of(self.location.name or self.name, self.location.channels)
+        found = flow_vectors(self.location.name or self.name, self.location.channels)
         return found if self.kind == "flow" else ()
 
 
@@ -105,8 +105,8 @@ class LayerFinder:
                 return [self._layer_source(spec, file, each) for each in named]
         layers = [each.without_rank for file in self.layers for each in self._layers_in(file)]
         names = dict.fromkeys(layer.rpartition(".")[2] for layer in layers if layer)
-        similar = alike(spec.name, names)
-        hint = f" (did you mean {either(similar)}?)" if similar else ""
+        similar = similar_names(spec.name, names)
+        hint = f" (did you mean {quote_alternatives(similar)}?)" if similar else ""
         files = [file.name for file in self.layers if file != self.path]
         where = f"the file and {', '.join(files)} have" if files else "the file has"
         expected = f"{self.path.stem}_{one_line(spec.name)}.exr"
@@ -166,22 +166,22 @@ class LayerFinder:
         return self.layers[file]
 
     def _layer_source(self, spec: AovSpec, file: Path, location: LayerLocation) -> LayerSource:
-        kind = spec.kind or kind_of(spec.name, location)
+        kind = spec.kind or layer_kind(spec.name, location)
         if kind is None:
             raise ImageError(
                 f"{file}: the kind of its layer {spec.name} is not known from the name. Add it: "
                 f"--carry {spec.name}:KIND, where KIND is one of {', '.join(RESAMPLING)}"
             )
-        min_channels = CHANNELS.get(kind, 1)
+        min_channels = MIN_CHANNELS.get(kind, 1)
         if len(location.channels) < min_channels:
             raise ImageError(
                 f"{file}: its layer {spec.name} has {len(location.channels)} "
                 f"channel{'s' * (len(location.channels) > 1)}, but a layer of {kind} needs "
                 f"{min_channels} or more; choose another kind with --carry {spec.name}:KIND"
             )
-        is_named = location.name and not (location.is_alone and file != self.path)
+        is_named = location.name and not (location.is_bare_channel and file != self.path)
         layer = location.name if is_named else spec.name
-        alone = location.is_alone and file == self.path
+        alone = location.is_bare_channel and file == self.path
         channels = [name if alone else f"{layer}.{name}" for name in location.channels]
         return LayerSource(spec.name, kind, file, location, tuple(channels))
 
@@ -192,7 +192,7 @@ def _named(file: Path, name: str, locations: Sequence[LayerLocation]) -> list[La
     Raises:
         ImageError: several layers have that name.
     """
-    found = [each for each in locations if each.answers_to(name)]
+    found = [each for each in locations if each.matches(name)]
     exact = [each for each in found if each.name.lower() == name.lower()]
     names = sorted({each.without_rank for each in found})
     if len(names) > 1 and len(exact) != 1:
@@ -258,5 +258,5 @@ def owner_of(path: Path) -> str | None:
     """
     stem = path.stem
     split = max(map(stem.rfind, SEPARATORS))
-    is_companion = split > 0 and (stem[split + 1 :] == CARRIED or kind_named(stem[split + 1 :]))
+    is_companion = split > 0 and (stem[split + 1 :] == CARRIED or kind_from_name(stem[split + 1 :]))
     return str(path.with_name(stem[:split])) if is_companion else None

@@ -12,7 +12,7 @@ from clpipe.chain.depth import depth_steps
 from clpipe.images.pixels import display_window
 from clpipe.inputs.carry import file_record, read_layer_samples
 from clpipe.inputs.companions import LayerFinder, LayerSource
-from clpipe.reference.defocus import Depth, checked_depth
+from clpipe.reference.defocus import Depth, parse_depth
 from clpipe.reference.geometry import Margins
 
 DEFAULT_LAYERS = ("Depth", "Z", "ZDepth", "Distance")  # names of layers, in order of preference
@@ -42,12 +42,12 @@ def read_depth(
     """
     step, method = next(iter(depth_steps(chain).items()))
     layer = _find(path, step, method.layer, [each.pattern for each in carried if each.pattern])
-    pixels, (x, y) = read_layer_samples(layer, path, margins.inside(width, height), max_pixels)
+    pixels, (x, y) = read_layer_samples(layer, path, margins.frame_size(width, height), max_pixels)
     place = x + margins.left, y + margins.top
     depths = pixels[..., :1].astype(np.float32)
     window = display_window(depths, *place, width, height, outside=np.inf)
     try:
-        depth = checked_depth(window[..., 0])
+        depth = parse_depth(window[..., 0])
     except ImageError as error:
         raise ImageError(f"{layer.file}: layer {layer.name}: {error}") from None
     return Depth(depth, {"layer": layer.name, **file_record(path, layer.file)})

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_input
 from clpipe.base.text import printable, whole_number
-from clpipe.base.urls import is_glob, is_url, listed, path_of, url_of
+from clpipe.base.urls import is_glob, is_url, list_urls, path_of, url_of
 from clpipe.chain.rendition import Rendition
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import PICTURE_SUFFIXES, RENDER_SUFFIXES
@@ -220,7 +220,7 @@ def _jobs_at_url(url: str, endings: Sequence[str], excluded: Exclusion) -> list[
         return [Job(path_of(url), url.rpartition("/")[2])]
     root = url.rstrip("/")
     jobs = []
-    for each in listed(url):
+    for each in list_urls(url):
         is_below = each.startswith(f"{root}/") and not is_pattern
         key = each.removeprefix(f"{root}/") if is_below else each.rpartition("/")[2]
         hidden = any(part.startswith(".") for part in key.split("/"))

@@ -11,7 +11,7 @@ from pathlib import Path
 from clpipe.base.errors import ImageError, KindError, RequestError
 from clpipe.base.reading import parse_json
 from clpipe.chain.chain import Chain, Step
-from clpipe.chain.identity import name_in, of_frame
+from clpipe.chain.identity import frame_key, name_of_key
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.rendition import CLEAN
@@ -37,11 +37,11 @@ def attributes_of(step: Step, chain: Chain, key: str, frame: int | None = None) 
     is_noisy = step.method.next_context(step.context).noise is not None
     settings = chain.settings
     if settings.noise_key:
-        settings = replace(settings, noise_key=of_frame(settings.noise_key, frame))
+        settings = replace(settings, noise_key=frame_key(settings.noise_key, frame))
     return {
         "stage": step.name,
         "kind": step.stage.writes.label,
-        "image_key": of_frame(key, frame),
+        "image_key": frame_key(key, frame),
         "settings": json.dumps(settings.record()),
         **({} if is_noisy else {NOISE: CLEAN if step.context.clean else "none"}),
     }
@@ -116,7 +116,7 @@ class KeptLoader:
             KindError: the step at ``start_at`` does not read this kind of image.
         """
         key = source.attributes.get("image_key", key)
-        request = self.request.for_image(name_in(key), self.request.image)  # draws the same
+        request = self.request.for_image(name_of_key(key), self.request.image)  # draws the same
         chain = self._chain_for(request, path, source.attributes)
         warnings = list(source.warnings)
         if not self._is_next(chain, source.attributes):
@@ -140,7 +140,7 @@ class KeptLoader:
             ) from None
         noise = attributes.get(NOISE)
         if noise == CLEAN and not any(step.adds_noise for step in chain.steps):
-            return chain.cleaned()
+            return chain.without_noise_or_denoising()
         return _without_input_noise(chain) if noise in ("none", CLEAN) else chain
 
     @staticmethod
@@ -159,7 +159,7 @@ def _without_input_noise(chain: Chain) -> Chain:
     steps: list[Step] = []
     noise = None
     for step in chain.steps:
-        steps.append(replace(step, context=step.context.but(noise=noise)))
+        steps.append(replace(step, context=step.context.replace(noise=noise)))
         noise = step.method.next_context(steps[-1].context).noise
     return replace(chain, steps=tuple(steps))
 
@@ -176,7 +176,7 @@ def _entries_of(kind: str, chain: Chain) -> str:
     names = [
         name
         for name, stage in stages.items()
-        if kind in [each.label for each in (stage.reads, *stage.also)]
+        if kind in [each.label for each in (stage.reads, *stage.also_reads)]
     ]
     if not names:
         return f"no stage of the chain reads {kind}"

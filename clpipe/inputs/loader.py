@@ -10,21 +10,21 @@ import numpy as np
 
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, KindError, NoPictureError, RequestError
-from clpipe.base.reading import unchanged
+from clpipe.base.reading import check_unchanged
 from clpipe.chain.chain import Chain
-from clpipe.chain.entering import enter
+from clpipe.chain.entering import prepare_image
 from clpipe.chain.exposures import exposures_of
 from clpipe.chain.identity import image_key
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import RENDER
-from clpipe.chain.making import entry
+from clpipe.chain.making import entry_kind
 from clpipe.chain.methods import base_name, stage_named
-from clpipe.chain.overscan import steps_of_overscan
+from clpipe.chain.overscan import overscan_step_count
 from clpipe.chain.registry import stage_in
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
-from clpipe.images.claims import Claim, claim_of, plain_claim
-from clpipe.images.pixels import USUAL_MAX_PIXELS
+from clpipe.images.claims import MemoryClaim, claim_of, mosaic_claim
+from clpipe.images.pixels import DEFAULT_MAX_PIXELS
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import (
     PICTURE_SUFFIXES,
@@ -112,10 +112,10 @@ class ImageLoader:
         """The kind of image that the chain reads, except for raws."""
         start_at = self.request.start_at
         if start_at is None:
-            return entry(self.settings)
+            return entry_kind(self.settings)
         stage = stage_named("--start-at", base_name(start_at))
         try:
-            return self.chain.source if stage.also else stage.reads
+            return self.chain.source if stage.also_reads else stage.reads
         except RequestError:  # only the chain in a kept image's attributes has the stage
             return stage.reads
 
@@ -127,7 +127,7 @@ class ImageLoader:
     @cached_property
     def reads_overscan(self) -> bool:
         """Whether the overscan of renders is read."""
-        return self.kept is not None or steps_of_overscan(self.chain) > 0
+        return self.kept is not None or overscan_step_count(self.chain) > 0
 
     @cached_property
     def raw(self) -> RawLoader:
@@ -163,10 +163,10 @@ class ImageLoader:
         if self.kept:
             return list(jobs)
         wide, shutter = wide_lens_of(self.settings), shutter_of(self.settings)
-        if wide and shutter and shutter.layer_of_light:
+        if wide and shutter and shutter.light_layer:
             raise RequestError(
                 f"{stage_in(StageRole.SHUTTER).name}.flicker_layer: found "
-                f"{shutter.layer_of_light}, but panoramas have no light layers; remove this "
+                f"{shutter.light_layer}, but panoramas have no light layers; remove this "
                 "parameter, and all light flickers"
             )
         return group_panoramas(exposures(jobs, self.settings), wide)
@@ -185,24 +185,26 @@ class ImageLoader:
         if not all(id(job) in checked or carries(job.path) for job in jobs):
             check_cameras(self.settings)
 
-    def claim(self, job: Job) -> Claim:
+    def claim(self, job: Job) -> MemoryClaim:
         """Return the size and memory that a job's headers claim, without reading pixels.
 
         The claim is 0 if the file has too many pixels to be read. For a file that cannot be opened,
         it is one pixel per byte.
         """
-        max_pixels = self.request.max_pixels or USUAL_MAX_PIXELS
+        max_pixels = self.request.max_pixels or DEFAULT_MAX_PIXELS
         dump = self.settings.dump_format
         if dump and may_be_dump(job.path):
-            claim = plain_claim(dump.width, dump.height)
+            claim = mosaic_claim(dump.width, dump.height)
         else:
             mosaic = len(self.reads.channels) == 1
             found = claim_of(job.path, mosaic)
-            claim = found or plain_claim(min(stamp_of(job.path)[0], max_pixels), 1)
+            claim = found or mosaic_claim(min(stamp_of(job.path)[0], max_pixels), 1)
         if claim.width * claim.height > max_pixels:
-            return plain_claim(0, 0)
+            return mosaic_claim(0, 0)
         files = len(job.paths) if job.is_panorama else 1
-        return Claim(claim.width, claim.height * files, claim.image * files, claim.reading * files)
+        return MemoryClaim(
+            claim.width, claim.height * files, claim.image * files, claim.reading * files
+        )
 
     def has_readable_header(self, job: Job) -> bool:
         """Return whether the header of a job's file can be read."""
@@ -226,14 +228,14 @@ class ImageLoader:
             spans = exposures.spans if exposures else (Span(),)
             source = average(job, self._read, resolved, spans)
         else:
-            with unchanged(job.path):
+            with check_unchanged(job.path):
                 source = self._read(job.path)
         if source.envmap == CUBE_MAP:
             raise ImageError(
                 f"{job.path}: this is a cube map, not a picture. To view it through a wide lens, "
                 f"add --set {stage_in(StageRole.VIEW).name}.method=kannala_brandt"
             )
-        width, height = source.margins.inside(*source.pixels.shape[1::-1])
+        width, height = source.margins.frame_size(*source.pixels.shape[1::-1])
         if job.size and job.size != (width, height):
             raise ImageError(
                 f"{job.path}: this image has {width}x{height} pixels, but its camera in --poses "
@@ -246,7 +248,7 @@ class ImageLoader:
         """Return the shutter that combines a job's files or layers, or None for a single layer."""
         shutter = shutter_of(self.settings)
         is_render = self.kept is None and not self.raw.is_raw(job.path)
-        is_lit = shutter is not None and bool(shutter.layer_of_light) and is_render
+        is_lit = shutter is not None and bool(shutter.light_layer) and is_render
         return shutter if job.subframes or is_lit else None
 
     def _read(self, path: Path, layer: str | None = None) -> SourceImage:
@@ -255,7 +257,7 @@ class ImageLoader:
         request = self.request
         options = ReadOptions(
             layer or request.layer,
-            request.max_pixels or USUAL_MAX_PIXELS,
+            request.max_pixels or DEFAULT_MAX_PIXELS,
             request.transfer,
             self.reads_overscan,
         )
@@ -274,13 +276,15 @@ class ImageLoader:
         if loaded is None:
             return None
         source, request = loaded.source, self.request
-        carried, max_pixels = request.aov_specs(), request.max_pixels or USUAL_MAX_PIXELS
+        carried, max_pixels = request.aov_specs(), request.max_pixels or DEFAULT_MAX_PIXELS
 
         def depth(chain: Chain, width: int, height: int, margins: Margins) -> Depth:
             return read_depth(job.at("middle"), chain, width, height, margins, carried, max_pixels)
 
         around = source.panorama
-        entry_ = enter(loaded.chain, source.pixels, source.margins, depth, source.shot, around)
+        entry_ = prepare_image(
+            loaded.chain, source.pixels, source.margins, depth, source.shot, around
+        )
         if entry_.pixels is source.pixels and not (
             entry_.margins or entry_.depth or entry_.warnings
         ):
@@ -327,7 +331,7 @@ class ImageLoader:
             ImageError: a layer is missing, or does not fit the image.
         """
         request = self.request
-        max_pixels = request.max_pixels or USUAL_MAX_PIXELS
+        max_pixels = request.max_pixels or DEFAULT_MAX_PIXELS
         layers = request.aov_specs()
         moments = ("middle", "start", "end") if request.truth_at == "all" else (request.truth_at,)
         arguments = loaded.source, loaded.chain, layers, max_pixels, orientation

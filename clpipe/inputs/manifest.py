@@ -10,13 +10,13 @@ from typing import Any, Protocol
 
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import check_exists, read_bytes
-from clpipe.base.text import one_of
-from clpipe.base.urls import fetch, is_url, joined
+from clpipe.base.text import unknown_name
+from clpipe.base.urls import fetch, is_url, join_url
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import TABLES, check_type
 from clpipe.chain.methods import TABLE_MODELS, base_name
 from clpipe.chain.options import OPTIONS
-from clpipe.chain.paths import from_folder
+from clpipe.chain.paths import resolve_paths
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import toml_value, value_text
@@ -123,7 +123,7 @@ def manifest_text(folder: Path, rows: Sequence[Row]) -> bytes:
         below = os.path.relpath(path, os.path.abspath(folder))
         cells = {"path": path if below.startswith("../") else below, "name": row.name}
         cells["frames"] = "" if row.frames is None else str(row.frames)
-        for key, value in from_folder(Path.cwd(), row.values).items():
+        for key, value in resolve_paths(Path.cwd(), row.values).items():
             table = value if key not in TOP_LEVEL_KEYS and isinstance(value, Mapping) else None
             named = {key: value} if table is None else {f"{key}.{k}": v for k, v in table.items()}
             cells |= {name: _cell(each) for name, each in named.items()}
@@ -195,7 +195,7 @@ def check_rows(
                     check_cameras(row_settings)
                     for step in others:
                         if step not in (*TOP_LEVEL_KEYS, *TABLES, *steps):
-                            raise RequestError(one_of("stage in this chain", step, steps))
+                            raise RequestError(unknown_name("stage in this chain", step, steps))
                 checked_settings[cache_key] = row_settings
             for key, value in independent.items():
                 check_type(key, value)
@@ -248,16 +248,16 @@ def _check_column(name: str) -> None:
                 f"{name} is not a column, but each of its parameters is; use {name}.PARAMETER"
             )
         raise RequestError(
-            one_of("column", name, (*NON_SETTINGS, *TOP_LEVEL_KEYS)) + ", or stage.parameter"
+            unknown_name("column", name, (*NON_SETTINGS, *TOP_LEVEL_KEYS)) + ", or stage.parameter"
         )
     if dot and step not in TABLES:
         if stage is None:
-            raise RequestError(f"{name}: {one_of('stage', step, (*all_stages(), *TABLES))}")
+            raise RequestError(f"{name}: {unknown_name('stage', step, (*all_stages(), *TABLES))}")
         names = dict.fromkeys(n for method in stage.methods for n in method.model_fields)
         if parameter not in ("method", *names):
-            raise RequestError(one_of(f"parameter of {step}", parameter, ("method", *names)))
+            raise RequestError(unknown_name(f"parameter of {step}", parameter, ("method", *names)))
     elif dot and parameter not in (fields := TABLE_MODELS[step].model_fields):
-        raise RequestError(one_of(f"key of {step}", parameter, fields))
+        raise RequestError(unknown_name(f"key of {step}", parameter, fields))
 
 
 def _row(
@@ -291,9 +291,9 @@ def _row(
             values[column] = value.split()
         elif column in TOP_LEVEL_KEYS:
             values[column] = value
-    image_path = joined(folder, path)
+    image_path = join_url(folder, path)
     key = name or (image_path.name if is_url(path) else key_of(folder, image_path))
-    values = from_folder(folder, values)
+    values = resolve_paths(folder, values)
     return Row(image_path, key, name, shared.setdefault(repr(values), values), frames, location)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.reading import unchanged
+from clpipe.base.reading import check_unchanged
 from clpipe.base.types import Array
 from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import Settings
@@ -27,7 +27,7 @@ from clpipe.reference.panorama import (
     Views,
 )
 from clpipe.stage import StageRole
-from clpipe.stages.projection import Wide
+from clpipe.stages.projection import WideAngle
 
 FACES = 6
 RIGHT_ANGLE = 90.0
@@ -54,7 +54,7 @@ class Rig:
         """Return the view called ``name`` of a file with this width and height in px."""
         rotation, camera = self.views[name]
         if camera is None:
-            return View.of_angle(rotation, width, height, self.angle)
+            return View.from_angle(rotation, width, height, self.angle)
         return View(rotation, *camera, width, height)
 
     def split_name(self, path: Path) -> tuple[str, str] | None:
@@ -70,16 +70,16 @@ class Rig:
         return None
 
 
-def wide_lens_of(settings: Settings) -> Wide | None:
+def wide_lens_of(settings: Settings) -> WideAngle | None:
     """Return the wide lens of a chain, which projects panoramas, or None."""
     name = stage_in(StageRole.VIEW).name
     if name not in settings.step_names:
         return None
     method = settings.method(name)
-    return method if isinstance(method, Wide) else None
+    return method if isinstance(method, WideAngle) else None
 
 
-def rig_for(wide: Wide) -> Rig:
+def rig_for(wide: WideAngle) -> Rig:
     """Return the rig of a wide lens: the one in its file ``views``, or a cube.
 
     Raises:
@@ -114,11 +114,11 @@ def rig_for(wide: Wide) -> Rig:
     return Rig(views, source=str(path))
 
 
-def _angle(wide: Wide) -> float:
+def _angle(wide: WideAngle) -> float:
     return wide.face_angle or RIGHT_ANGLE
 
 
-def group_panoramas(jobs: Sequence[Job], wide: Wide | None) -> list[Job]:
+def group_panoramas(jobs: Sequence[Job], wide: WideAngle | None) -> list[Job]:
     """Return the jobs, with the files of one panorama joined into one job.
 
     That job has the files' name without the name of the view. A file that is not a view stays a
@@ -162,7 +162,7 @@ def group_panoramas(jobs: Sequence[Job], wide: Wide | None) -> list[Job]:
     return result
 
 
-def read_panorama(job: Job, read: Callable[[Path], SourceImage], wide: Wide) -> SourceImage:
+def read_panorama(job: Job, read: Callable[[Path], SourceImage], wide: WideAngle) -> SourceImage:
     """Return the image of a job for a wide lens: an atlas of all views, with its panorama.
 
     A render that is not a panorama, according to its header and name, is returned unchanged.
@@ -172,7 +172,7 @@ def read_panorama(job: Job, read: Callable[[Path], SourceImage], wide: Wide) -> 
     """
     sources: list[SourceImage] = []
     for path in job.paths:
-        with unchanged(path):
+        with check_unchanged(path):
             sources.append(read(path))
     first = sources[0]
     for path, other in zip(job.paths, sources, strict=True):
@@ -191,7 +191,7 @@ def read_panorama(job: Job, read: Callable[[Path], SourceImage], wide: Wide) -> 
 
 
 def panorama_of(
-    paths: Sequence[Path], wide: Wide, envmap: str, width: int, height: int
+    paths: Sequence[Path], wide: WideAngle, envmap: str, width: int, height: int
 ) -> Panorama | None:
     """Return the panorama that files form, or None for a single view, which any render can be.
 

@@ -19,8 +19,8 @@ from clpipe.chain.registry import all_stages, stage_in
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
 from clpipe.images.dump import Dump, read_dump
-from clpipe.images.pixels import USUAL_MAX_PIXELS
-from clpipe.images.raw import RAW_SUFFIXES, RawFacts, read_facts, read_raw
+from clpipe.images.pixels import DEFAULT_MAX_PIXELS
+from clpipe.images.raw import RAW_SUFFIXES, RawInfo, read_raw, read_raw_info
 from clpipe.images.read import RENDER_SUFFIXES, SourceImage
 from clpipe.images.tags import Tags, to_attributes
 from clpipe.inputs.plausibility import brightness_warnings, input_warnings
@@ -35,7 +35,7 @@ UNKNOWN_COLOURS = "its colour matrix is unknown, so colours stay in the sensor's
 class RawImage(SourceImage):
     """A mosaic in DN, (height, width), with its metadata, or with the settings of a dump."""
 
-    facts: RawFacts | Dump = field(kw_only=True)
+    facts: RawInfo | Dump = field(kw_only=True)
 
 
 def may_be_dump(path: Path) -> bool:
@@ -59,14 +59,14 @@ class RawLoader:
         is_dump = self.dump is not None and may_be_dump(path)
         return path.suffix.lower() in RAW_SUFFIXES or is_dump
 
-    def _facts(self, path: Path) -> RawFacts | Dump:
+    def _facts(self, path: Path) -> RawInfo | Dump:
         if self.dump and may_be_dump(path):
             return self.dump
-        return read_facts(path, self._max_pixels)
+        return read_raw_info(path, self._max_pixels)
 
     @property
     def _max_pixels(self) -> int:
-        return self.request.max_pixels or USUAL_MAX_PIXELS
+        return self.request.max_pixels or DEFAULT_MAX_PIXELS
 
     def read(self, path: Path) -> RawImage:
         """Return the image of a raw or dump.
@@ -117,7 +117,7 @@ class RawLoader:
     def _chain_from(self, settings: Settings) -> Chain:
         return self.request.chain_from(settings, self.request.start_at or first_raw_step(settings))
 
-    def _chain(self, path: Path, facts: RawFacts | Dump) -> tuple[Chain, list[str]]:
+    def _chain(self, path: Path, facts: RawInfo | Dump) -> tuple[Chain, list[str]]:
         """Return the chain for a raw, and warnings about missing or wrong metadata."""
         embedded, warnings = settings_of(facts)
         parameters = dict(embedded.parameters)
@@ -126,14 +126,14 @@ class RawLoader:
         if balance in warnings and own.parameters.get(balance):
             del parameters[balance]  # the user's setting replaces the fallback
         settings = self.request.settings(replace(embedded, parameters=parameters)).drawn("")
-        if isinstance(facts, RawFacts):  # its DN are linear, even if those of renders are not
+        if isinstance(facts, RawInfo):  # its DN are linear, even if those of renders are not
             raw_steps = [name for name in settings.parameters if writes_raw(name)]
             remaining = {k: own for k, own in settings.parameters.items() if k not in raw_steps}
             settings = replace(settings, parameters=remaining)
         camera = load_camera(settings.camera)
         low, high = camera.iso_range
         iso = min(max(settings.iso, low), high)
-        is_iso_of_file = isinstance(facts, RawFacts) and settings.iso == facts.iso
+        is_iso_of_file = isinstance(facts, RawInfo) and settings.iso == facts.iso
         if is_iso_of_file and iso != settings.iso:
             warnings["iso"] = (
                 f"its ISO of {settings.iso:g} is outside the range of camera {camera.name}, "
@@ -144,7 +144,7 @@ class RawLoader:
         self._check(path, facts, chain)
         return chain, _remaining(warnings, chain, embedded)
 
-    def _check(self, path: Path, facts: RawFacts | Dump, chain: Chain) -> None:
+    def _check(self, path: Path, facts: RawInfo | Dump, chain: Chain) -> None:
         """Check that a chain can process a raw.
 
         Raises:
@@ -160,14 +160,14 @@ class RawLoader:
         name = stage_name(StageRole.PATTERN)
         own = settings.parameters.get(name, {})
         pattern = own.get("array") or own.get("pattern", "RGGB")
-        if parse_array(pattern).rows != chain.steps[0].context.filters.rows:
+        if parse_array(pattern).rows != chain.steps[0].context.filter_array.rows:
             raise ImageError(
                 f"{path}: its CFA pattern is {pattern}, but the chain has no {name} stage to set "
                 f"it. Add {name} and the stages that produce DN; they do not run on a raw"
             )
         name = stage_name(StageRole.LEVELS)
         levels = settings.parameters.get(name, {})
-        if isinstance(facts, RawFacts) and not {"black_level", "white_level"} <= levels.keys():
+        if isinstance(facts, RawInfo) and not {"black_level", "white_level"} <= levels.keys():
             raise ImageError(
                 f"{path}: its levels are impossible: black {facts.black_level}, white "
                 f"{facts.white_level}; set {name}.black_level and {name}.white_level"
@@ -221,7 +221,7 @@ def stage_name(role: StageRole) -> str:
     return stage_in(role).name
 
 
-def settings_of(facts: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
+def settings_of(facts: RawInfo | Dump) -> tuple[Settings, dict[str, str]]:
     """Return the settings from a raw's metadata, and warnings by topic."""
     balance, colours = stage_name(StageRole.BALANCE), stage_name(StageRole.COLOURS)
     light_parameters: dict[str, dict[str, Any]] = {
@@ -288,7 +288,7 @@ def camera_named(make: str, model: str) -> Camera | None:
     return load_camera(name) if name else None
 
 
-def tags_of(facts: RawFacts, chain: Chain) -> Tags:
+def tags_of(facts: RawInfo, chain: Chain) -> Tags:
     """Return the EXIF of the picture of a raw. Its ISO is the file's, unless the user set one."""
     low, high = chain.camera.iso_range
     is_iso_of_file = facts.iso is not None and chain.iso == min(max(facts.iso, low), high)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import RequestError
-from clpipe.base.text import several
+from clpipe.base.text import as_texts
 from clpipe.camera.profile import load_camera
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.settings import Settings, overlay
@@ -122,7 +122,7 @@ def split_series(
         if key in settings and not isinstance(settings[key], Mapping)
     }
     isos = check_isos(series_values["iso"]) if "iso" in series_values else ()
-    series = Series(several(series_values.get("camera")), isos, always)
+    series = Series(as_texts(series_values.get("camera")), isos, always)
     others = {key: value for key, value in settings.items() if key not in series_values}
     return series, others | series.common
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from clpipe.base.digests import joint_digest
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.reading import unchanged
+from clpipe.base.reading import check_unchanged
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import Settings
@@ -38,7 +38,7 @@ def shutter_of(settings: Settings) -> Rows | None:
     shutter = settings.method(name)
     if not isinstance(shutter, Rows):
         return None
-    return shutter if shutter.subframes > 1 or shutter.layer_of_light else None
+    return shutter if shutter.subframes > 1 or shutter.light_layer else None
 
 
 def exposures(jobs: Sequence[Job], settings: Settings) -> list[Job]:
@@ -93,9 +93,9 @@ def average(
     totals: Floats = np.empty(0, np.float32)
     weights: list[tuple[Doubles, Doubles]] = []  # of a frame, and in addition of its light layer
     for number, path in enumerate(job.paths):
-        with unchanged(path):
+        with check_unchanged(path):
             source = read(path, None)
-            light = read(path, shutter.layer_of_light) if shutter.layer_of_light else None
+            light = read(path, shutter.light_layer) if shutter.light_layer else None
         pixels = source.pixels
         if pixels.ndim != 3:
             raise ImageError(
@@ -107,7 +107,7 @@ def average(
             shutter = shutter.with_defaults(exposure_time=time)
             size = len(job.paths), pixels.shape[0], source.margins
             for each in range(len(spans)):
-                sub_shutter = shutter.during(spans, each)
+                sub_shutter = shutter.for_exposure(spans, each)
                 unlit, lit = (
                     weights_of(sub_shutter, *size, lit=is_lit) for is_lit in (False, True)
                 )
@@ -185,13 +185,13 @@ def weights_of(
     Overscan rows have the weights of the picture's first or last row, because there are no frames
     from before or after.
     """
-    _, height = margins.inside(0, rows)
+    _, height = margins.frame_size(0, rows)
     in_picture = np.clip(np.arange(rows) - margins.top, 0, height - 1)
     return shutter.weights(frames, height, lit)[:, in_picture]
 
 
 def _size(source: SourceImage, pixels: Array) -> str:
     """Return the size of a picture and its overscan as text."""
-    width, height = source.margins.inside(*pixels.shape[1::-1])
+    width, height = source.margins.frame_size(*pixels.shape[1::-1])
     overscan = f" with {tuple(source.margins)} px of overscan" if source.margins else ""
     return f"{width}x{height}{overscan}"

@@ -53,7 +53,7 @@ class PixelMapping:
         at = (np.asarray(points, np.float64) + corner).T
         if self.geometry is None:
             return np.asarray(at.T)
-        whole = self.margins.around(self.width, self.height)
+        whole = self.margins.image_size(self.width, self.height)
         start = at * (np.array(self.picture_size) / np.array(whole))[:, None]
         mapped = destinations(self.geometry, (at[0], at[1]), (start[0], start[1]), *whole)
         return np.stack(mapped, -1)
@@ -86,7 +86,7 @@ class PixelMapping:
         Raises:
             RequestError: a stage that moves pixels contradicts them.
         """
-        size = self.margins.around(self.width, self.height)
+        size = self.margins.image_size(self.width, self.height)
         return self.geometry.intrinsics(before, *size) if self.geometry else before
 
 
@@ -145,7 +145,7 @@ def warp_mask(mask: Array, mapping: PixelMapping) -> Array:
     """Return a mask of the render, (height, width) of 0 and 1, warped into the picture."""
     layer = Layer("label", mask[..., None], mapping.margins.left, mapping.margins.top)
     (warped,), _ = warp(
-        [layer], mapping.geometry, *mapping.margins.around(mapping.width, mapping.height)
+        [layer], mapping.geometry, *mapping.margins.image_size(mapping.width, mapping.height)
     )
     return np.asarray(warped[..., 0])
 

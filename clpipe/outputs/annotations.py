@@ -11,7 +11,7 @@ from typing import Any
 
 from clpipe.base.errors import ClpipeError, ImageError, RequestError
 from clpipe.chain.chain import Chain
-from clpipe.chain.formats import ending_of
+from clpipe.chain.formats import extension_of
 from clpipe.chain.overscan import with_overscan
 from clpipe.chain.rendition import NOISY, Rendition
 from clpipe.chain.request import Request
@@ -112,7 +112,7 @@ def _pictures(
         raise ImageError("annotations of panoramas cannot be warped by a wide lens")
     parts = chain.geometry.parts if chain.geometry else ()
     width, height = render_size
-    size = chain.size(*chain.margins.around(width, height))
+    size = chain.size(*chain.margins.image_size(width, height))
     if size != (values["width"], values["height"]):
         raise ImageError(
             f"the annotations are for a render of {width}x{height} pixels, whose picture would "
@@ -129,7 +129,7 @@ def _pictures(
             )
         return
     side = values["request"]["patch"]
-    ending, rendition = ending_of(values["request"]["formats"][0]), Rendition.from_record(values)
+    ending, rendition = extension_of(values["request"]["formats"][0]), Rendition.from_record(values)
     stem = Path(values["name"]).name
     for number, patch in enumerate(values["patches"]):
         left, top = patch["place"]

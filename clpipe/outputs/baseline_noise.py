@@ -12,7 +12,7 @@ import numpy as np
 from clpipe.base.types import Array, Doubles, Floats, Mask
 from clpipe.chain.rendition import IID, Rendition
 from clpipe.images.encoding import Encoding
-from clpipe.images.jpeg import JpegEncoding, through_jpeg
+from clpipe.images.jpeg import JpegEncoding, jpeg_round_trip
 from clpipe.outputs.noise_areas import FLAT, HALVED, covariance, halved, select_flat
 from clpipe.reference.curve import to_8_bit
 from clpipe.stage import run_reference
@@ -83,7 +83,9 @@ class NoiseMatcher:
         if not self.matching.jpeg:
             return np.clip(picture, 0, 1)
         encoding = JpegEncoding(self.encoding.jpeg_quality, self.encoding.jpeg_subsampling)
-        return np.asarray(through_jpeg(to_8_bit(picture), encoding) / np.float32(255), np.float32)
+        return np.asarray(
+            jpeg_round_trip(to_8_bit(picture), encoding) / np.float32(255), np.float32
+        )
 
     def _selected(self, picture: Floats) -> Floats:
         """Return the pixels in which noise is matched, (pixel, 3)."""

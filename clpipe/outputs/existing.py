@@ -15,7 +15,7 @@ from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.base.system import open_plain
 from clpipe.base.urls import url_of
-from clpipe.images.whole import is_whole
+from clpipe.images.whole import is_complete
 from clpipe.inputs.find import Job
 from clpipe.outputs.plan import OutputPlan, RenditionFiles
 from clpipe.outputs.program import program_digest
@@ -148,7 +148,7 @@ def _check_written_by_clpipe(path: Path, sidecar: Path | None, written_at: int) 
             f"{path}: clpipe did not write this file, or it was changed later, and {OVERWRITTEN}"
         )
     # A file that differs without having been modified was damaged by the disk.
-    if sidecar and os.lstat(path).st_ctime_ns > written_at and is_whole(path):
+    if sidecar and os.lstat(path).st_ctime_ns > written_at and is_complete(path):
         raise ImageError(
             f"{path}: this file was changed after clpipe wrote it (its SHA-256 differs from that "
             f"in {sidecar.name}), and {OVERWRITTEN}"

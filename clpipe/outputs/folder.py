@@ -9,9 +9,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from clpipe.base.errors import RequestError
-from clpipe.base.files import shortened
-from clpipe.base.memory import in_words
-from clpipe.base.system import HOLDABLE, hold, let_go, open_plain, reserve
+from clpipe.base.files import shorten_name
+from clpipe.base.memory import format_bytes
+from clpipe.base.system import LOCKABLE_BYTES, close_and_remove, lock_range, open_plain, reserve
 from clpipe.inputs.find import Job, Shard
 from clpipe.outputs.patches import without_patch
 
@@ -21,7 +21,7 @@ MIN_FREE = 8 * 2**20  # bytes; a disk with less free space counts as full
 
 LOCK = ".clpipe.lock"
 
-UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # temporary names of whole_file
+UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # temporary files of atomic_file
 
 # Locks of this process: the file, its descriptor, and the first byte and length of the locked part.
 _locks: set[tuple[Path, int, int, int]] = set()
@@ -38,7 +38,7 @@ def write_problem(folder: Path, with_space: bool = True) -> str:
             if with_space:
                 reserve(file, MIN_FREE)
     except OSError as error:
-        needed = f" ({in_words(MIN_FREE)} are needed)" if error.errno == errno.ENOSPC else ""
+        needed = f" ({format_bytes(MIN_FREE)} are needed)" if error.errno == errno.ENOSPC else ""
         return f"cannot write to this directory: {error.strerror}{needed}"
     finally:
         with contextlib.suppress(OSError):
@@ -65,15 +65,15 @@ def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
     if reason := write_problem(folder, with_space=False):
         raise RequestError(f"{folder}: {reason}")
     # Each shard locks its part of a file that stays empty.
-    start = HOLDABLE * (shard.number - 1) // shard.of
-    length = HOLDABLE * shard.number // shard.of - start
+    start = LOCKABLE_BYTES * (shard.number - 1) // shard.of
+    length = LOCKABLE_BYTES * shard.number // shard.of - start
     entry = folder / LOCK, _locked(folder / LOCK, length, start), start, length
     _locks.add(entry)
     try:
         yield
     finally:
         _locks.discard(entry)
-        let_go(*entry)
+        close_and_remove(*entry)
 
 
 def release_folders() -> None:
@@ -83,7 +83,7 @@ def release_folders() -> None:
     """
     while _locks:
         with contextlib.suppress(OSError):
-            let_go(*_locks.pop())
+            close_and_remove(*_locks.pop())
 
 
 def _locked(path: Path, length: int, start: int) -> int:
@@ -98,7 +98,7 @@ def _locked(path: Path, length: int, start: int) -> int:
         except OSError as error:
             raise RequestError(f"{path}: this file cannot be locked: {error.strerror}") from None
         try:
-            is_ours = hold(lock, start, length)
+            is_ours = lock_range(lock, start, length)
         except OSError:
             return lock  # a file system without locks
         if not is_ours:
@@ -116,7 +116,7 @@ def _locked(path: Path, length: int, start: int) -> int:
 def remove_unfinished(folder: Path, jobs: Iterable[Job], patches: bool = False) -> None:
     """Remove the unfinished files of these jobs, or of their patches, that a killed run left."""
     stem_parts = (os.path.split(job.stem) for job in jobs)
-    stems = {os.path.join(folder, shortened(name)) for folder, name in stem_parts}
+    stems = {os.path.join(folder, shorten_name(name)) for folder, name in stem_parts}
 
     def is_of_jobs(stem: str) -> bool:
         return stem in stems or (patches and without_patch(stem) in stems)

@@ -28,8 +28,8 @@ def motion_records(chain: Chain, source: SourceImage) -> dict[str, Any]:
     if poses is None or step is None or not isinstance(step.method, Rows):
         return {}
     exposures = exposures_of(chain)
-    shutter = step.method.during(exposures.spans, 0) if exposures else step.method
-    _, rows = source.margins.inside(*source.pixels.shape[1::-1])
+    shutter = step.method.for_exposure(exposures.spans, 0) if exposures else step.method
+    _, rows = source.margins.frame_size(*source.pixels.shape[1::-1])
     readout = float(shutter.times(rows)[-1])
     span = shutter.duration(rows)
     times = (np.arange(len(poses)) + 0.5) * span / len(poses)

@@ -27,13 +27,13 @@ def negative_of(chain: Chain) -> Negative:
     Raises:
         RequestError: the chain has no raw, or one that DNG cannot hold.
     """
-    is_input = chain.maker_of_raw is None
+    is_input = chain.raw_step_name is None
     if is_input and chain.source is not Kind.RAW:
         raise RequestError(
             "--format dng writes the raw in DN that quantize produces, but this chain starts on "
             f"{chain.source.label} and has no quantize; add quantize, or use another format"
         )
-    context, final_context = chain.context_of_raw, chain.context_after
+    context, final_context = chain.raw_context, chain.context_after
     is_balanced = is_input and chain.step_in(StageRole.BALANCE) is not None
     gains = final_context.applied_gains if is_balanced else context.gains
     # A raw that is the input has the levels of normalize.
@@ -43,7 +43,7 @@ def negative_of(chain: Chain) -> Negative:
     if white != int(white):
         raise RequestError(
             f"--format dng: found a white level of {white:g}, but DNG needs whole DN; use "
-            f"--set {chain.maker_of_raw or chain.step_names[0]}.white_level={white:.0f}"
+            f"--set {chain.raw_step_name or chain.step_names[0]}.white_level={white:.0f}"
         )
     if context.knots:
         raise RequestError(
@@ -58,10 +58,10 @@ def negative_of(chain: Chain) -> Negative:
     later_matrix = (
         final_context.colours if is_input and final_context.colours != context.colours else None
     )
-    array = _balanced(context.filters, gains)
+    array = _balanced(context.filter_array, gains)
     check_array(array)
     return Negative(
-        step=chain.maker_of_raw,
+        step=chain.raw_step_name,
         array=array,
         black_level=black,
         white_level=int(white),

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from clpipe.chain.formats import DNG, ending_of
+from clpipe.chain.formats import DNG, extension_of
 from clpipe.chain.render_camera import Matrix, Vector
 from clpipe.chain.rendition import BASELINES, NOISY, PICTURES, Rendition, Role
 from clpipe.outputs.carried import carried_files
@@ -116,7 +116,7 @@ def picture_of(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
     formats = [each for each in values["request"]["formats"] if each != DNG]
     if not formats:
         return None
-    file = sidecar.with_name(f"{sidecar.name.removesuffix(SIDECAR)}{ending_of(formats[0])}")
+    file = sidecar.with_name(f"{sidecar.name.removesuffix(SIDECAR)}{extension_of(formats[0])}")
     return file if file.name in output_entries(values) and file.exists() else None
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, Step
-from clpipe.chain.drawing import uniforms
-from clpipe.chain.options import PER_IMAGE
+from clpipe.chain.drawing import uniform_numbers
+from clpipe.chain.options import DEFAULT_PATCHES
 from clpipe.chain.truth import signal_and_noise, variance_of
 from clpipe.engine.extents import Box
 from clpipe.images.tags import FLIPS, upright
@@ -102,7 +102,7 @@ class Patches:
     """
 
     size: int
-    per_image: int | Literal["grid"] = PER_IMAGE
+    per_image: int | Literal["grid"] = DEFAULT_PATCHES
     augment: bool = False
 
     def __post_init__(self) -> None:
@@ -138,7 +138,7 @@ class Patches:
                 f"its picture has {width}x{height} pixels, but patches need "
                 f"{self.size}x{self.size}; choose smaller patches, or exclude this image"
             )
-        return PatchLayout(self, width, height, chain.filters.pattern, chain.seed)
+        return PatchLayout(self, width, height, chain.filter_array.pattern, chain.seed)
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ class PatchLayout:
         """
         size, is_grid = self.patches.size, self.patches.per_image == "grid"
         names = ("turn",) if is_grid else ("turn", "left", "top")
-        drawn = uniforms(
+        drawn = uniform_numbers(
             f"patch:{self.seed}:{key}:{epoch}",
             [f"{number}.{name}" for number in numbers for name in names],
         )
@@ -283,7 +283,7 @@ def variance_at(noise: Sequence[Step], signal: Array, patch: Patch | None) -> Ar
     if patch is None:
         return variance_of(noise, signal)
     # Padding aligns the patch with the pattern, so that its first pixel has the right colour.
-    y_period, x_period = noise[0].context.filters.period
+    y_period, x_period = noise[0].context.filter_array.period
     x, y = patch.left % x_period, patch.top % y_period
     padded = np.pad(signal, ((y, 0), (x, 0), (0, 0))[: signal.ndim], mode="edge")
     return variance_of(noise, padded)[y:, x:]
@@ -297,7 +297,7 @@ def metadata_of(chain: Chain) -> dict[str, Any]:
     except RequestError:  # there is no raw
         return facts
     return facts | {
-        "cfa": chain.filters.pattern,
+        "cfa": chain.filter_array.pattern,
         "black_level": float(raw.black_level),
         "white_level": float(raw.white_level),
         "gains": np.array([raw.array.gains[0], 1, raw.array.gains[1]], np.float32),

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 from clpipe.base.errors import RequestError
 from clpipe.chain.chain import Chain
-from clpipe.chain.formats import DNG, FORMATS, NPY, ending_of
+from clpipe.chain.formats import DNG, FORMATS, NPY, extension_of
 from clpipe.chain.rendition import (
     BASELINES,
-    FIRST,
+    DEFAULT_RENDITION,
     FLOAT_MOSAICS,
     PICTURES,
     VARIANCE,
@@ -163,10 +163,11 @@ class OutputPlan:
             self._check_patches(chain)
         endings: dict[str, str] = {}
         for format_ in self.formats:
-            other = endings.setdefault(ending_of(format_), format_)
+            other = endings.setdefault(extension_of(format_), format_)
             if other != format_:
                 raise RequestError(
-                    f"--format {other} and {format_} would both write NAME.{ending_of(format_)}; "
+                    f"--format {other} and {format_} would both write "
+                    f"NAME.{extension_of(format_)}; "
                     "use one run for each, with different output directories"
                 )
         self._check_paths(jobs)
@@ -178,7 +179,7 @@ class OutputPlan:
             RequestError: they cannot.
         """
         for format_ in self.formats:
-            if format_ == DNG or FORMATS[format_].ending == "exr":
+            if format_ == DNG or FORMATS[format_].extension == "exr":
                 raise RequestError(
                     f"--patch: patches cannot be written as {format_}; use --format npy, png, tif "
                     "or jpg"
@@ -219,7 +220,11 @@ class OutputPlan:
                     jobs_by_path[path] = job
 
     def path(
-        self, job: Job, ending: str, rendition: Rendition = FIRST, patch: int | None = None
+        self,
+        job: Job,
+        ending: str,
+        rendition: Rendition = DEFAULT_RENDITION,
+        patch: int | None = None,
     ) -> Path:
         """Return the path of a job's file. ``patch`` is the number of a patch."""
         return Path(self.name(job, file_suffix(ending, rendition, patch)))
@@ -242,10 +247,10 @@ class OutputPlan:
         if found := self._suffix_cache.get(rendition):
             return found
         numbers = range(self.patches.min_count) if self.patches else (None,)
-        formats = [ending_of(format_) for format_ in self.formats_of(rendition)]
+        formats = [extension_of(format_) for format_ in self.formats_of(rendition)]
         carried = self.carried_suffixes(rendition).values()
         pictures = [file_suffix(each, rendition, n) for n in numbers for each in formats]
-        pictures += [file_suffix(each, FIRST, n) for n in numbers for each in carried]
+        pictures += [file_suffix(each, DEFAULT_RENDITION, n) for n in numbers for each in carried]
         kept = [f"{step}.{self.kept_format}" for step in self.kept_steps(rendition)]
         others = [file_suffix(each, rendition, n) for n in numbers for each in kept]
         found = file_suffix(SIDECAR, rendition), pictures, others

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 from clpipe.base.errors import KeyedError, RequestError
-from clpipe.chain.baseline import baseline_of, matching_of
+from clpipe.chain.baseline import baseline_of, noise_matching
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.formats import DNG, FORMATS
-from clpipe.chain.identity import noise_key, of_bracket
+from clpipe.chain.identity import bracket_key, noise_key
 from clpipe.chain.registry import stage_in
 from clpipe.chain.rendition import (
     BASELINES,
@@ -138,11 +138,13 @@ def recipes(selected: Iterable[Rendition], chain: Chain, key: str) -> list[Recip
     matchers: dict[float | None, NoiseMatcher] = {}  # baselines of one exposure share theirs
     for each in selected:
         exposed_chain = chain if each.ev is None else with_exposure(chain, each.ev)
-        exposed_key = of_bracket(key, each.ev or 0.0)
+        exposed_key = bracket_key(key, each.ev or 0.0)
         recipe = Recipe(each, *chain_and_noise(each.role, exposed_chain), exposed_key)
         if each.role in BASELINES:
             matcher = NoiseMatcher(
-                reference_pictures(each), matching_of(exposed_chain), exposed_chain.settings.output
+                reference_pictures(each),
+                noise_matching(exposed_chain),
+                exposed_chain.settings.output,
             )
             recipe = replace(recipe, matcher=matchers.setdefault(each.ev, matcher))
         found.append(recipe)
@@ -179,7 +181,7 @@ def with_exposure(chain: Chain, ev: float) -> Chain:
             f"--bracket: {ev:+g} EV added to {step.name}.ev={before:g} is not allowed; {error}"
         ) from None
     if settings.noise_key:
-        settings = replace(settings, noise_key=of_bracket(settings.noise_key, ev))
+        settings = replace(settings, noise_key=bracket_key(settings.noise_key, ev))
     method = settings.method(step.name).resolve(step.context)
     steps = (replace(s, method=method) if s is step else s for s in chain.steps)
     return replace(chain, steps=tuple(steps), settings=settings)

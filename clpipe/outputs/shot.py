@@ -52,13 +52,13 @@ def sensor_width_of(
         stated_values: values in the image's metadata.
     """
     optics = chain.optics
-    stated = None if optics.is_sensor_of_lens else optics.sensor_width
+    stated = None if optics.has_lens_sensor else optics.sensor_width
     if stated := stated or stated_values.get("sensor_width"):
         return stated
     focal_length = optics.focal_length or stated_values.get("focal_length")
     if focal_length is None or source.pixels.ndim != 3:
         return None
-    width, height = source.margins.inside(*source.pixels.shape[1::-1])
+    width, height = source.margins.frame_size(*source.pixels.shape[1::-1])
     camera = chain.intrinsics_of_render(width, height, source.shot)
     return focal_length / camera.fx * max(width, height) if camera else None
 

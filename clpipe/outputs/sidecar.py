@@ -17,7 +17,7 @@ from typing import Any
 from pydantic_core import from_json
 
 from clpipe.base.errors import ImageError
-from clpipe.base.files import keep_names, write_whole
+from clpipe.base.files import sync_folder, write_atomic
 from clpipe.base.reading import parse_json, read_bytes
 
 SIDECAR = "json"  # the extension of sidecars
@@ -145,8 +145,8 @@ def write_sidecar(path: Path, record: Mapping[str, Any]) -> None:
     Raises:
         ImageError: it cannot be written.
     """
-    write_whole(path, sidecar_bytes(record))
-    keep_names(path.parent)
+    write_atomic(path, sidecar_bytes(record))
+    sync_folder(path.parent)
 
 
 def remove_sidecar(path: Path) -> None:
@@ -157,7 +157,7 @@ def remove_sidecar(path: Path) -> None:
     """
     try:
         path.unlink()
-        keep_names(path.parent, at_once=True)
+        sync_folder(path.parent, immediately=True)
     except FileNotFoundError:
         pass
     except OSError as error:

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from clpipe.base.errors import ImageError, OutputError
-from clpipe.base.files import Stored, keep_names
+from clpipe.base.files import Stored, sync_folder
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, Step
-from clpipe.chain.formats import DNG, FORMATS, NPY, Format, ending_of
+from clpipe.chain.formats import DNG, FORMATS, NPY, Format, extension_of
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.dng import write_dng
@@ -154,13 +154,13 @@ class OutputWriter(OutputPlan):
             margins = NO_MARGINS if step.method.geometry() else step.method.margins
             outputs[path] = write_floats(path, result.kept[step.name], step, 1, False, margins)
         for format_ in self.formats_of(rendition):
-            ending, final = ending_of(format_), result.final
+            ending, final = extension_of(format_), result.final
             path = self.path(job, ending, rendition, patch)
             if format_ == DNG:
                 negative, tags_of_raw = negative_of(chain), tags
                 raw = result.kept[negative.step] if negative.step else source.pixels
                 if negative.step:
-                    tags_of_raw = tags_after(chain.through([negative.step]), source, tags)
+                    tags_of_raw = tags_after(chain.up_to([negative.step]), source, tags)
                 outputs[path] = write_dng(path, raw, negative, tags_of_raw, source_orientation)
             elif ending not in (NPY, "exr"):
                 pixels = upright(display_samples(result, FORMATS[format_]), orientation)
@@ -190,7 +190,7 @@ class OutputWriter(OutputPlan):
                 return
             folder.mkdir(parents=True, exist_ok=True)
             for parent in folder.relative_to(self.folder).parents:
-                keep_names(self.folder / parent)
+                sync_folder(self.folder / parent)
         except OSError as error:
             raise ImageError(f"{folder}: this folder cannot be created: {error.strerror}") from None
 

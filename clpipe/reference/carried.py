@@ -25,7 +25,7 @@ RESAMPLING: dict[LayerKind, str] = {
     "colour": "bilinear",
 }
 
-TIE = 1e-6  # px: distance from the border of two pixels up to which a position is on it
+TIE_DISTANCE = 1e-6  # px: distance from the border of two pixels up to which a position is on it
 
 BLOCK = 1 << 17  # pixels that are warped at a time
 
@@ -52,7 +52,7 @@ class Layer:
 
 
 @dataclass(frozen=True)
-class Move:
+class PixelOrigins:
     """The origin of some pixels of a result.
 
     Args:
@@ -88,10 +88,10 @@ def warp(
     """
     columns, rows = geometry.size(width, height) if geometry else (width, height)
     results = [
-        np.empty((rows, columns, layer.pixels.shape[2]), _type_of(layer)) for layer in layers
+        np.empty((rows, columns, layer.pixels.shape[2]), _result_dtype(layer)) for layer in layers
     ]
     valid = np.ones((rows, columns), np.float16)
-    on_one = [_cells_of(layer) for layer in layers] if geometry else []
+    surface_cells = [_single_surface_cells(layer) for layer in layers] if geometry else []
     step = max(BLOCK // columns, 1)
     for top in range(0, rows, step):
         part = slice(top, min(top + step, rows))
@@ -100,27 +100,31 @@ def warp(
         inside = _within(at[0], at[1], width, height)
         at = np.where(inside, at[0], 0), np.where(inside, at[1], 0)
         one_surface = np.ones(at[0].shape, bool)
-        for layer, own in zip(layers, on_one, strict=False):
-            if own is not None:
+        for layer, cells in zip(layers, surface_cells, strict=False):
+            if cells is not None:
                 corner = np.floor(at[1] - layer.y + 0.5), np.floor(at[0] - layer.x + 0.5)
-                one_surface &= own[_clipped(corner[0], len(own)), _clipped(corner[1], own.shape[1])]
-        moved = (_off_ties(at[0], y), _off_ties(at[1], x)) if geometry else (0.0, 0.0)
-        of_pixel = at[0] + moved[0], at[1] + moved[1]
+                one_surface &= cells[
+                    _clamped_index(corner[0], len(cells)), _clamped_index(corner[1], cells.shape[1])
+                ]
+        offsets = (_tie_offset(at[0], y), _tie_offset(at[1], x)) if geometry else (0.0, 0.0)
+        nearest_position = at[0] + offsets[0], at[1] + offsets[1]
         for layer, result in zip(layers, results, strict=True):
-            of_layer = at[0] - layer.x, at[1] - layer.y
+            layer_position = at[0] - layer.x, at[1] - layer.y
             known = inside & _within(
-                of_layer[0], of_layer[1], layer.pixels.shape[1], layer.pixels.shape[0]
+                layer_position[0], layer_position[1], layer.pixels.shape[1], layer.pixels.shape[0]
             )
-            samples = nearest(layer.pixels, of_pixel[0] - layer.x, of_pixel[1] - layer.y)
+            samples = nearest(
+                layer.pixels, nearest_position[0] - layer.x, nearest_position[1] - layer.y
+            )
             if geometry is not None and layer.kind != "label":
-                blended = _blended(layer, *of_layer)
-                everywhere = layer.kind == "colour"
-                samples = np.where(everywhere | one_surface[..., None], blended, samples)
+                blended = _blended(layer, *layer_position)
+                is_colour = layer.kind == "colour"
+                samples = np.where(is_colour | one_surface[..., None], blended, samples)
                 if layer.kind == "normal":
-                    samples = _as_long_as_1(samples)
+                    samples = _normalized(samples)
                 elif layer.kind == "flow":
-                    move = Move(geometry, width, height, (x, y), at)
-                    samples = mapped(samples, layer.vectors, move)
+                    move = PixelOrigins(geometry, width, height, (x, y), at)
+                    samples = map_flow(samples, layer.vectors, move)
             if layer.kind == "depth":
                 valid[part] *= (samples > 0).all(-1)
             result[part] = np.where(known[..., np.newaxis], samples, 0)
@@ -128,7 +132,7 @@ def warp(
     return results, valid
 
 
-def _cells_of(layer: Layer) -> Mask | None:
+def _single_surface_cells(layer: Layer) -> Mask | None:
     """The parts of a layer that show one surface, see :func:`clpipe.reference.surfaces.cells`."""
     if layer.kind == "depth":
         return surfaces.cells(_inverse(layer.pixels), surfaces.DEPTH)
@@ -155,14 +159,14 @@ def _blended(layer: Layer, x: Array, y: Array) -> Array:
         return np.asarray(1 / bilinear(_inverse(layer.pixels), x, y))
 
 
-def _off_ties(place: Array, other: Array) -> Array:
+def _tie_offset(position: Array, other: Array) -> Array:
     """Return an offset that moves positions on the border of two pixels into one of them.
 
     The other one is chosen in each second line, so that nearest-neighbour values do not shift to
     one side.
 
     """
-    on_border = abs(place - np.rint(place)) < TIE
+    on_border = abs(position - np.rint(position)) < TIE_DISTANCE
     return np.where(on_border, np.where(np.floor(other) % 2 == 0, -0.25, 0.25), 0.0)
 
 
@@ -173,8 +177,8 @@ def nearest(pixels: Array, x: Array, y: Array) -> Array:
     [1, 2]
     """
     rows, columns, channels = pixels.shape
-    place = _clipped(y, rows) * columns + _clipped(x, columns)
-    return pixels.reshape(-1, channels).take(place, axis=0)
+    index = _clamped_index(y, rows) * columns + _clamped_index(x, columns)
+    return pixels.reshape(-1, channels).take(index, axis=0)
 
 
 def bilinear(pixels: Array, x: Array, y: Array) -> Array:
@@ -198,12 +202,14 @@ def bilinear(pixels: Array, x: Array, y: Array) -> Array:
     return total
 
 
-def _clipped(place: Array, size: int) -> Array:
+def _clamped_index(position: Array, size: int) -> Array:
     """Return the numbers of the rows or columns that contain positions, or are nearest to them."""
-    return np.clip(place, 0, size - 1).astype(np.intp)  # positive values are truncated, not rounded
+    return np.clip(position, 0, size - 1).astype(
+        np.intp
+    )  # positive values are truncated, not rounded
 
 
-def mapped(samples: Array, vectors: Sequence[Vector], move: Move) -> Array:
+def map_flow(samples: Array, vectors: Sequence[Vector], move: PixelOrigins) -> Array:
     """Convert flow between positions of an image to flow between positions of its result.
 
     A vector from p to p + v becomes one from the new position of p to that of p + v. The other
@@ -221,20 +227,22 @@ def mapped(samples: Array, vectors: Sequence[Vector], move: Move) -> Array:
             for at, (channel, sign) in zip(move.origins, channels, strict=True)
         ]
         size = move.width, move.height
-        there = destinations(move.geometry, (ends[0], ends[1]), move.to, *size, move.origins)
-        for to, end, (channel, sign) in zip(move.to, there, channels, strict=True):
+        end_positions = destinations(
+            move.geometry, (ends[0], ends[1]), move.to, *size, move.origins
+        )
+        for to, end, (channel, sign) in zip(move.to, end_positions, channels, strict=True):
             result[..., channel] = sign * (end - to)
     return result
 
 
-def _as_long_as_1(normals: Array) -> Array:
+def _normalized(normals: Array) -> Array:
     """Scale the first three channels of normals to length 1; those of length 0 stay 0."""
     length = np.linalg.norm(normals[..., :3], axis=-1, keepdims=True)
     scaled = normals[..., :3] / np.where(length > 0, length, 1)
     return np.concatenate([scaled, normals[..., 3:]], axis=-1)
 
 
-def _type_of(layer: Layer) -> np.dtype:
+def _result_dtype(layer: Layer) -> np.dtype:
     """Return the type of a layer's samples after warping."""
     blended = layer.kind not in ("depth", "label") and layer.pixels.dtype.kind != "f"
     return np.dtype(np.float32) if blended or layer.kind == "flow" else layer.pixels.dtype

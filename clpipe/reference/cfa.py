@@ -33,17 +33,17 @@ def sites(pattern: str) -> dict[str, tuple[slice, slice]]:
     if pattern not in PATTERNS:
         rows = pattern.split("/")
         count = Counter("".join(rows))
-        seen: Counter[str] = Counter()
+        counter: Counter[str] = Counter()
         found = {}
         for y, row in enumerate(rows):
             for x, letter in enumerate(row):
-                seen[letter] += 1
-                name = f"{letter}{seen[letter]}" if count[letter] > 1 else letter
+                counter[letter] += 1
+                name = f"{letter}{counter[letter]}" if count[letter] > 1 else letter
                 found[name] = np.s_[y :: len(rows), x :: len(row)]
         return found
     x, y = red_site(pattern)
-    places = {"R": (y, x), "G1": (y, 1 - x), "G2": (1 - y, x), "B": (1 - y, 1 - x)}
-    return {name: np.s_[row::2, column::2] for name, (row, column) in places.items()}
+    positions = {"R": (y, x), "G1": (y, 1 - x), "G2": (1 - y, x), "B": (1 - y, 1 - x)}
+    return {name: np.s_[row::2, column::2] for name, (row, column) in positions.items()}
 
 
 def by_site(

@@ -14,10 +14,10 @@ Knots = tuple[tuple[float, float], ...]
 OCTAVES = 7
 
 
-def usual_knots(white: float, result: float) -> Knots:
+def default_knots(white: float, result: float) -> Knots:
     """Return knots close to a square root, where shot noise has one size: (DN, result).
 
-    >>> usual_knots(16384, 128)[:3], usual_knots(16384, 128)[-1]
+    >>> default_knots(16384, 128)[:3], default_knots(16384, 128)[-1]
     (((0.0, 0.0), (1.0, 1.0), (4.0, 2.0)), (16384.0, 128.0))
     """
     inner = [
@@ -28,19 +28,19 @@ def usual_knots(white: float, result: float) -> Knots:
     return ((0.0, 0.0), *((float(x), float(y)) for x, y in inner))
 
 
-def knots_in(pairs: Sequence[Sequence[float]]) -> Knots:
+def parse_knots(pairs: Sequence[Sequence[float]]) -> Knots:
     """Return knots from pairs of numbers.
 
     Raises:
         ValueError: they are not pairs, do not begin at 0, or do not rise.
 
-    >>> knots_in([[0, 0], [1023, 511], [4095, 1023]])[1]
+    >>> parse_knots([[0, 0], [1023, 511], [4095, 1023]])[1]
     (1023.0, 511.0)
     """
-    right = len(pairs) > 1 and all(len(pair) == 2 for pair in pairs)
-    knots = tuple((float(pair[0]), float(pair[-1])) for pair in pairs) if right else ()
+    are_pairs = len(pairs) > 1 and all(len(pair) == 2 for pair in pairs)
+    knots = tuple((float(pair[0]), float(pair[-1])) for pair in pairs) if are_pairs else ()
     rising = all(a[0] < b[0] and a[1] < b[1] for a, b in pairwise(knots))
-    if not right or not rising or knots[0] != (0, 0):
+    if not are_pairs or not rising or knots[0] != (0, 0):
         raise ValueError(
             f"knots: found {pairs}; expected pairs of DN before and after, from [0, 0] on, rising "
             "in both"
@@ -56,10 +56,10 @@ def pieces_of(knots: Knots, inverse: bool = False) -> Floats:
     return np.ascontiguousarray(np.column_stack([points[:-1], slopes]), np.float32)
 
 
-def along_pieces(x: Floats, pieces: Floats) -> Floats:
+def apply_pieces(x: Floats, pieces: Floats) -> Floats:
     """Return the curve at these values.
 
-    >>> along_pieces(np.float32([1, 3]), pieces_of(((0, 0), (2, 2), (4, 3)))).tolist()
+    >>> apply_pieces(np.float32([1, 3]), pieces_of(((0, 0), (2, 2), (4, 3)))).tolist()
     [1.0, 2.5]
     """
     begin, value, slope = pieces[0]

@@ -14,7 +14,7 @@ from clpipe.reference.image import tap
 NEGLIGIBLE = 5e-4  # share of the light that may be omitted, from the smallest weights
 
 
-def taps_of(spread: Doubles) -> Floats:
+def taps_of(psf: Doubles) -> Floats:
     """Return the taps of a point spread function: (tap, 5) float32, by rows.
 
     Each tap is dx and dy in px, and the weights of that pixel for red, green and blue, each with
@@ -23,7 +23,7 @@ def taps_of(spread: Doubles) -> Floats:
     >>> taps_of(np.float64([[0.5, 0, 0.5]])[..., None].repeat(3, 2)).tolist()
     [[-1.0, 0.0, 0.5, 0.5, 0.5], [1.0, 0.0, 0.5, 0.5, 0.5]]
     """
-    mirrored = spread[::-1, ::-1]
+    mirrored = psf[::-1, ::-1]
     largest = mirrored.max(2)
     ascending = np.argsort(largest, axis=None, kind="stable")
     light = np.cumsum(largest.ravel()[ascending])
@@ -32,12 +32,12 @@ def taps_of(spread: Doubles) -> Floats:
     rows, columns = np.nonzero(kept.reshape(largest.shape))
     weights = mirrored[rows, columns]
     weights = weights / weights.sum(0)
-    places = np.stack([columns - spread.shape[1] // 2, rows - spread.shape[0] // 2], 1)
-    return np.ascontiguousarray(np.hstack([places, weights]), np.float32)
+    offsets = np.stack([columns - psf.shape[1] // 2, rows - psf.shape[0] // 2], 1)
+    return np.ascontiguousarray(np.hstack([offsets, weights]), np.float32)
 
 
 @traceable
-def reach_of(taps: Floats) -> int:
+def tap_radius(taps: Floats) -> int:
     """Return the largest distance of a tap along a row or a column, in px."""
     return int(abs(taps[:, :2]).max())
 

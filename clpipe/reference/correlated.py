@@ -25,10 +25,12 @@ def mixing(red_green: float, red_blue: float, green_blue: float) -> tuple[np.flo
     green = math.sqrt(max(1 - red_green**2, 0.0))
     rest = green_blue - red_green * red_blue
     shared = rest / green if green > TOLERANCE else 0.0
-    left = 1 - red_blue**2 - shared**2
-    if left < -TOLERANCE or (green <= TOLERANCE < abs(rest)):
+    remaining = 1 - red_blue**2 - shared**2
+    if remaining < -TOLERANCE or (green <= TOLERANCE < abs(rest)):
         raise ValueError("no three channels can be correlated like this")
-    return tuple(map(np.float32, (red_green, green, red_blue, shared, math.sqrt(max(left, 0.0)))))
+    return tuple(
+        map(np.float32, (red_green, green, red_blue, shared, math.sqrt(max(remaining, 0.0))))
+    )
 
 
 def correlated_normals(

@@ -12,7 +12,7 @@ from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.reference.image import tap
 
-HIDDEN = 1.0  # a weight, see aperture_taps
+HIDDEN_WEIGHT = 1.0  # a weight, see aperture_taps
 FAR = 1e9  # from here on, a surface is infinitely far; Blender's sky is at 1e10
 
 
@@ -31,10 +31,10 @@ class Depth:
     derived: BoundedCache[Any] = field(default_factory=lambda: BoundedCache(2))
 
 
-NOWHERE = Depth(np.full((1, 1), np.inf, np.float32))
+NO_SURFACE = Depth(np.full((1, 1), np.inf, np.float32))
 
 
-def checked_depth(pixels: Array) -> Floats:
+def parse_depth(pixels: Array) -> Floats:
     """Convert a stored depth, (height, width), to float32.
 
     Values of :data:`FAR` and more become infinite. So does 0, which Mitsuba writes for rays without
@@ -72,24 +72,24 @@ def aperture_taps(blades: int, largest: float) -> Floats:
     >>> aperture_taps(0, 0.75)[:, :3].astype(int).tolist()
     [[0, -1, 1], [-1, 0, 1], [0, 0, 0], [1, 0, 1], [0, 1, 1]]
     """
-    reach = reach_of(largest)
+    reach = disc_reach(largest)
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1].astype(np.float64)
     radius = np.hypot(x, y)
     # The nearest pixels have by far the largest weights.
-    hidden = HIDDEN / (1 + (x * x + y * y) ** 2)
+    hidden = HIDDEN_WEIGHT / (1 + (x * x + y * y) ** 2)
     if blades:
         sides = (2 * np.arange(blades) + 1) * np.pi / blades
-        across = np.multiply.outer(np.sin(sides), x) + np.multiply.outer(np.cos(sides), y)
-        radius = across.max(0) / np.cos(np.pi / blades)
+        projection = np.multiply.outer(np.sin(sides), x) + np.multiply.outer(np.cos(sides), y)
+        radius = projection.max(0) / np.cos(np.pi / blades)
     kept = radius < largest + 0.5
     taps = [x[kept], y[kept], radius[kept], hidden[kept]]
     return np.ascontiguousarray(np.stack(taps, 1), np.float32)
 
 
-def reach_of(largest: float) -> int:
+def disc_reach(largest: float) -> int:
     """Return how far a disc with its soft edge extends along a row or column, in px.
 
-    >>> reach_of(0), reach_of(1.5), reach_of(16), reach_of(0.75)
+    >>> disc_reach(0), disc_reach(1.5), disc_reach(16), disc_reach(0.75)
     (0, 1, 16, 1)
     """
     return int(np.ceil(largest + 0.5)) - 1
@@ -117,26 +117,29 @@ def defocus(image: Floats, radii: Floats, taps: Floats) -> Floats:
         taps: see :func:`aperture_taps`.
     """
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
-    own, size = radii, abs(radii)
+    centre, size = radii, abs(radii)
     area = _area(size)
     # of the surfaces in front, level and behind
     light: Floats = np.zeros((3, *image.shape), np.float32)
     total: Floats = np.zeros((3, *radii.shape), np.float32)
     free: Floats = np.zeros(radii.shape, np.float32)
     for dx, dy, edge, hidden in taps:
-        there = tap(radii, int(dx), int(dy))
-        disc = abs(there)
+        neighbour = tap(radii, int(dx), int(dy))
+        disc = abs(neighbour)
         weight = np.clip(disc + (half - edge), zero, one) / _area(disc)
-        nearer, farther = np.clip(own - there, zero, one), np.clip(there - own, zero, one)
+        nearer, farther = (
+            np.clip(centre - neighbour, zero, one),
+            np.clip(neighbour - centre, zero, one),
+        )
         level = one - nearer - farther
         shares = np.stack([nearer * weight, level * weight, farther * (weight + hidden)])
         light += shares[..., None] * tap(image, int(dx), int(dy))
         total += shares
         free += (one - nearer) * (np.clip(size + (half - edge), zero, one) / area)
     in_front, level, behind = total
-    left = one - np.minimum(in_front, one)
-    covered = np.where(behind > 0, left * np.minimum(level / free, one), left)
-    of_behind = (left - covered) / np.where(behind > 0, behind, one)
+    remaining = one - np.minimum(in_front, one)
+    covered = np.where(behind > 0, remaining * np.minimum(level / free, one), remaining)
+    of_behind = (remaining - covered) / np.where(behind > 0, behind, one)
     shares = np.stack([one / np.maximum(in_front, one), covered / level, of_behind])
     return np.asarray((light * shares[..., None]).sum(0))
 

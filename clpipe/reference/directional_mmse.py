@@ -16,10 +16,10 @@ from clpipe.reference.filter_array import FilterArray
 from clpipe.reference.image import mirrored
 from clpipe.reference.linear_mmse import (
     SIDE,
-    best,
+    apply_filters,
     covariance,
     distances,
-    filtered,
+    mmse_filters,
     windows,
 )
 
@@ -34,7 +34,7 @@ CHROMAS = (0.002, 0.3)
 NOISE = 2.5e-5
 MODELS = DIRECTIONS * len(CHROMAS)
 REACH = 2  # px: errors are averaged over 5x5
-UNSEEN = np.float32(1e-6)  # a negligible squared error: a thousandth of white
+ERROR_FLOOR = np.float32(1e-6)  # a negligible squared error: a thousandth of white
 
 
 @lru_cache(maxsize=16)
@@ -49,24 +49,24 @@ def models(array: FilterArray) -> tuple[Floats, Floats]:
     between, centre = distances()
     rows, columns = array.period
     colours = np.zeros((rows, columns, SIDE**2, MODELS, 3), np.float32)
-    misses = np.zeros(colours.shape[:-1], np.float32)
+    error_filters = np.zeros(colours.shape[:-1], np.float32)
     middle = SIDE**2 // 2
     for direction in range(DIRECTIONS):
         angle = direction * np.pi / DIRECTIONS
         taps, to_centre = _correlation(between, angle), _correlation(centre, angle)
-        for row, column, seen in windows(array):
+        for row, column, responses in windows(array):
             for number, chroma in enumerate(CHROMAS, direction * len(CHROMAS)):
-                made = best(seen, taps, to_centre, chroma, NOISE)
-                colours[row, column, :, number] = made
+                model_filters = mmse_filters(responses, taps, to_centre, chroma, NOISE)
+                colours[row, column, :, number] = model_filters
                 # The row of a precision matrix is the value minus its best estimate.
-                beside = np.linalg.inv(covariance(seen, taps, chroma, NOISE))[middle]
-                misses[row, column, :, number] = beside / beside[middle]
-    return colours, misses
+                precision_row = np.linalg.inv(covariance(responses, taps, chroma, NOISE))[middle]
+                error_filters[row, column, :, number] = precision_row / precision_row[middle]
+    return colours, error_filters
 
 
-def _correlation(apart: Doubles, angle: float) -> Doubles:
+def _correlation(distances: Doubles, angle: float) -> Doubles:
     """Return the correlation of colours at these distances, (2, ...) in px, for one direction."""
-    x, y = apart
+    x, y = distances
     along = (x * np.cos(angle) + y * np.sin(angle)) / ALONG
     across = (y * np.cos(angle) - x * np.sin(angle)) / ACROSS
     return np.asarray(np.exp(-(np.hypot(along, across) ** SHAPE)))
@@ -74,33 +74,33 @@ def _correlation(apart: Doubles, angle: float) -> Doubles:
 
 def errors(mosaic: Floats, array: FilterArray) -> Floats:
     """Return the squared error of each model at each sample: (height, width, model)."""
-    _, misses = models(array)
-    return np.square(filtered(mosaic, array.period, misses))
+    _, error_filters = models(array)
+    return np.square(apply_filters(mosaic, array.period, error_filters))
 
 
-def trust(squared: Floats) -> Floats:
+def model_weights(squared: Floats) -> Floats:
     """Return the weight of each model, (height, width, model), from :func:`errors`; the sum is 1.
 
-    >>> trust(np.float32([[[0.01, 0.02]]])).astype(float).round(3).tolist()
+    >>> model_weights(np.float32([[[0.01, 0.02]]])).astype(float).round(3).tolist()
     [[[0.941, 0.059]]]
     """
     height, width = squared.shape[:2]
     wide = mirrored(squared, REACH)
-    around = np.zeros_like(squared)
+    mean_errors = np.zeros_like(squared)
     for dy in range(2 * REACH + 1):
         for dx in range(2 * REACH + 1):
-            around += wide[dy : dy + height, dx : dx + width]
-    around = around * np.float32(1 / (2 * REACH + 1) ** 2) + UNSEEN
-    weights = np.square(np.square(around.min(axis=-1, keepdims=True) / around))
+            mean_errors += wide[dy : dy + height, dx : dx + width]
+    mean_errors = mean_errors * np.float32(1 / (2 * REACH + 1) ** 2) + ERROR_FLOOR
+    weights = np.square(np.square(mean_errors.min(axis=-1, keepdims=True) / mean_errors))
     return weights / weights.sum(axis=-1, keepdims=True)
 
 
 def directional_mmse(mosaic: Floats, array: FilterArray) -> Floats:
     """Return RGB, (height, width, 3), from a white-balanced mosaic, (height, width)."""
     colours, _ = models(array)
-    weights = trust(errors(mosaic, array))
+    weights = model_weights(errors(mosaic, array))
     result = np.zeros((*mosaic.shape, 3), np.float32)
     for number in range(MODELS):
-        made = np.ascontiguousarray(colours[:, :, :, number])
-        result += weights[..., number, None] * filtered(mosaic, array.period, made)
+        model_filters = np.ascontiguousarray(colours[:, :, :, number])
+        result += weights[..., number, None] * apply_filters(mosaic, array.period, model_filters)
     return result

@@ -10,7 +10,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from clpipe.base.errors import RequestError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.reference.cfa import PATTERNS, Pattern
 
@@ -22,7 +22,7 @@ LANES = 16  # the most lanes of a device: entries after a row of a table, so tha
 # colours, like ideal dyes. The arrays are those of Bayer (R, G, B), Yamanaka, US 4,054,906, Compton
 # and Hamilton, US 8,139,130, and others. A mono sensor has no filter. An RGB render contains no
 # near infrared: that channel sees a quarter of a clear one.
-PASSES: dict[str, tuple[float, ...]] = {
+TRANSMISSIONS: dict[str, tuple[float, ...]] = {
     "R": (1, 0, 0),
     "G": (0, 1, 0),
     "B": (0, 0, 1),
@@ -39,11 +39,11 @@ PASSES: dict[str, tuple[float, ...]] = {
 # The law of Malus gives the light at any angle. Unpolarised light is gray.
 POLARISERS = {"H": 0, "D": 45, "V": 90, "A": 135}
 ANGLES = (0, 60, 120)
-PASSES |= {
+TRANSMISSIONS |= {
     letter: tuple((1 + 2 * np.cos(np.deg2rad(2 * (angle - own)))) / 3 for own in ANGLES)
     for letter, angle in POLARISERS.items()
 }
-LETTERS = "".join(PASSES)
+LETTERS = "".join(TRANSMISSIONS)
 
 MONO = "L"  # the pattern of a sensor without filters
 
@@ -107,8 +107,8 @@ class FilterArray:
 
     @cached_property
     def channels(self) -> tuple[str, ...]:
-        """Its channels, each once, in the order of :data:`PASSES`."""
-        return tuple(letter for letter in PASSES if any(letter in row for row in self.rows))
+        """Its channels, each once, in the order of :data:`TRANSMISSIONS`."""
+        return tuple(letter for letter in TRANSMISSIONS if any(letter in row for row in self.rows))
 
     @property
     def is_gray(self) -> bool:
@@ -133,7 +133,7 @@ class FilterArray:
         >>> parse_array("x-trans").with_gains((2.0, 1.6)) == parse_array("x-trans")
         True
         """
-        mixes = any(np.count_nonzero(PASSES[letter]) > 1 for letter in self.channels)
+        mixes = any(np.count_nonzero(TRANSMISSIONS[letter]) > 1 for letter in self.channels)
         if not mixes or self.is_polarised:
             return self
         return replace(self, gains=gains, is_balanced=is_balanced)
@@ -148,7 +148,7 @@ class FilterArray:
         [1.0, 1.0, 1.0]
         """
         if not self.is_balanced:
-            return {letter: np.array(PASSES[letter], np.float64) for letter in self.channels}
+            return {letter: np.array(TRANSMISSIONS[letter], np.float64) for letter in self.channels}
         raw = {letter: self._raw(letter) for letter in self.channels}
         return {letter: row / row.sum() for letter, row in raw.items()}
 
@@ -165,16 +165,16 @@ class FilterArray:
 
     def _raw(self, letter: str) -> Doubles:
         red, blue = (1.0, 1.0) if letter in POLARISERS else self.gains
-        return np.array(PASSES[letter]) / (red, 1.0, blue)
+        return np.array(TRANSMISSIONS[letter]) / (red, 1.0, blue)
 
-    def by_place(self, values: Mapping[str, float]) -> Floats:
+    def by_position(self, values: Mapping[str, float]) -> Floats:
         """Return the value of the channel at each position of a period: (row, column)."""
         found: Floats = np.vectorize(values.__getitem__, [np.float32])(self.letters)
         return found
 
     def spread(self, values: Mapping[str, float], shape: tuple[int, ...]) -> Floats:
         """Return the value of the channel at each pixel of an image, (height, width)."""
-        return tiled(self.by_place(values), shape)
+        return tiled(self.by_position(values), shape)
 
 
 def tiled(period: Floats, shape: tuple[int, ...]) -> Floats:
@@ -212,7 +212,9 @@ def parse_array(text: str, gains: tuple[float, float] = (1.0, 1.0)) -> FilterArr
     """
     rows = tuple(NAMED.get(text, text).split("/"))
     if "/" not in text and text not in NAMED and not set(text) <= {*LETTERS}:
-        raise RequestError(f"{one_of('filter array', text, NAMED)}; or use rows, for example RG/GB")
+        raise RequestError(
+            f"{unknown_name('filter array', text, NAMED)}; or use rows, for example RG/GB"
+        )
     unknown = sorted(set("".join(rows)) - {*LETTERS})
     if unknown:
         raise RequestError(f"{text!r} contains {unknown[0]!r}; a channel is one of {LETTERS}")
@@ -230,21 +232,21 @@ def parse_array(text: str, gains: tuple[float, float] = (1.0, 1.0)) -> FilterArr
     return array
 
 
-def beyond(size: int, period: int, reach: int) -> Array:
+def periodic_indices(size: int, period: int, reach: int) -> Array:
     """Return the pixel to use at each position from ``-reach`` to ``size + reach``.
 
     Outside an edge, it is the nearest one at a distance of whole periods, so that its channel is
     that of the array. A period of at most 2 is mirrored (reflect-101), which continues it as well.
     So is a side that is shorter than a period.
 
-    >>> beyond(5, 3, 2).tolist(), beyond(2, 3, 2).tolist()
+    >>> periodic_indices(5, 3, 2).tolist(), periodic_indices(2, 3, 2).tolist()
     ([1, 2, 0, 1, 2, 3, 4, 2, 3], [0, 1, 0, 1, 0, 1])
     """
-    place = np.arange(-reach, size + reach)
+    positions = np.arange(-reach, size + reach)
     if period <= MIRRORED or size < period:
-        around = max(2 * (size - 1), 1)
-        within = place % around
-        return np.asarray(np.where(within < size, within, around - within))
-    before = place % period
-    behind = place - period * ((place - size) // period + 1)
-    return np.where(place < 0, before, np.where(place >= size, behind, place))
+        mirror_period = max(2 * (size - 1), 1)
+        phase = positions % mirror_period
+        return np.asarray(np.where(phase < size, phase, mirror_period - phase))
+    before = positions % period
+    after = positions - period * ((positions - size) // period + 1)
+    return np.where(positions < 0, before, np.where(positions >= size, after, positions))

@@ -17,7 +17,7 @@ from clpipe.reference.resample import Bins, Resampling, sizes
 class Margins(NamedTuple):
     """How far an image extends outside the frame, in px: overscan.
 
-    >>> Margins(3, 2, 1, 0).inside(10, 8), bool(NO_MARGINS)
+    >>> Margins(3, 2, 1, 0).frame_size(10, 8), bool(NO_MARGINS)
     ((6, 6), False)
     """
 
@@ -29,11 +29,11 @@ class Margins(NamedTuple):
     def __bool__(self) -> bool:
         return any(self)
 
-    def inside(self, width: int, height: int) -> tuple[int, int]:
+    def frame_size(self, width: int, height: int) -> tuple[int, int]:
         """Return the width and height of the frame, from those of the image."""
         return width - self.left - self.right, height - self.top - self.bottom
 
-    def around(self, width: int, height: int) -> tuple[int, int]:
+    def image_size(self, width: int, height: int) -> tuple[int, int]:
         """Return the width and height of the image, from those of the frame."""
         return width + self.left + self.right, height + self.top + self.bottom
 
@@ -65,7 +65,7 @@ class Geometry(Protocol):
         """
         ...
 
-    def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
+    def intrinsics(self, known: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
         """Return the intrinsics of the output, from those of the input; None if not known.
 
         Raises:
@@ -74,7 +74,7 @@ class Geometry(Protocol):
         ...
 
 
-class Destined:
+class ForwardMapped:
     """A geometry that maps positions of the image forward to its result."""
 
     def destinations(
@@ -91,7 +91,7 @@ class Destined:
 
 
 @dataclass(frozen=True)
-class Scaling(Destined):
+class Scaling(ForwardMapped):
     """Fewer rows and columns, each by at most one resampling; the first edges stay.
 
     >>> import numpy as np
@@ -128,14 +128,14 @@ class Scaling(Destined):
     def destinations(
         self, x: Array, y: Array, at: tuple[Array, Array], width: int, height: int
     ) -> tuple[Array, Array]:
-        """See :meth:`Destined.destinations`; exact at the edges."""
+        """See :meth:`ForwardMapped.destinations`; exact at the edges."""
         columns, rows = self.size(width, height)
         across, down = self.shown(width, height)
         return x * columns / across, y * rows / down
 
-    def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
+    def intrinsics(self, known: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
         """See :meth:`Geometry.intrinsics`."""
-        return before and before.scaled(*self.size(width, height), self.shown(width, height))
+        return known and known.scaled(*self.size(width, height), self.shown(width, height))
 
 
 @dataclass(frozen=True)
@@ -167,12 +167,12 @@ class Composition:
             x, y = part.origins(x, y, *size)
         return x, y
 
-    def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
+    def intrinsics(self, known: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
         """See :meth:`Geometry.intrinsics`."""
         for part in self.parts:
-            before = part.intrinsics(before, width, height)
+            known = part.intrinsics(known, width, height)
             width, height = part.size(width, height)
-        return before
+        return known
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ class Orientation:
         x, y = (y, x) if self.transposed else (x, y)
         return width - x if self.mirrored else x, height - y if self.upside_down else y
 
-    def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
+    def intrinsics(self, known: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
         """See :meth:`Geometry.intrinsics`; a rotated image has none of these models."""
         return None
 
@@ -214,12 +214,12 @@ class Crop:
         """See :meth:`Geometry.origins`."""
         return x + self.left, y + self.top
 
-    def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
+    def intrinsics(self, known: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
         """See :meth:`Geometry.intrinsics`."""
-        if before is None:
+        if known is None:
             return None
-        cx, cy = before.cx - self.left, before.cy - self.top
-        return replace(before, width=self.width, height=self.height, cx=cx, cy=cy)
+        cx, cy = known.cx - self.left, known.cy - self.top
+        return replace(known, width=self.width, height=self.height, cx=cx, cy=cy)
 
 
 RESIDUAL = 1e-6  # px, in the input of a geometry
@@ -238,14 +238,14 @@ def destinations(
     """Return the positions in a geometry's output for positions of its input: inverse of origins.
 
     Newton's method in two dimensions, the Jacobian by finite differences, until a position's origin
-    has an error below :data:`RESIDUAL`. A :class:`Destined` geometry computes it directly.
+    has an error below :data:`RESIDUAL`. A :class:`ForwardMapped` geometry computes it directly.
 
     Args:
         geometry: how the pixels move.
         to: x and y of the positions, float64 of any shape.
         start: positions of the output nearby, of the same shape.
         width, height: of the input.
-        at: see :meth:`Destined.destinations`; None is the positions themselves.
+        at: see :meth:`ForwardMapped.destinations`; None is the positions themselves.
 
     Returns:
         x and y; NaN if no position is found, for example beyond the radius where a lens folds.
@@ -257,39 +257,43 @@ def destinations(
     ([7.0], [2.0])
     """
     parts = geometry.parts if isinstance(geometry, Composition) else (geometry,)
-    if parts and isinstance(parts[0], Destined):
+    if parts and isinstance(parts[0], ForwardMapped):
         first = parts[0].destinations(*to, at or to, width, height)
         size = parts[0].size(width, height)
         return destinations(Composition(parts[1:]), first, start, *size) if parts[1:] else first
     shape = to[0].shape
-    goal = np.stack([np.ravel(each) for each in to]).astype(np.float64)
+    targets = np.stack([np.ravel(each) for each in to]).astype(np.float64)
     found = np.stack([np.ravel(each) for each in start]).astype(np.float64)
     result = np.full_like(found, np.nan)
     right, down = np.array([[STEP], [0]]), np.array([[0], [STEP]])
 
-    def origins(places: Array) -> Array:
-        return np.stack(geometry.origins(places[0], places[1], width, height))
+    def origins(positions: Array) -> Array:
+        return np.stack(geometry.origins(positions[0], positions[1], width, height))
 
-    left = np.flatnonzero(np.isfinite(goal).all(0))
-    goal, found = goal[:, left], found[:, left]
+    remaining = np.flatnonzero(np.isfinite(targets).all(0))
+    targets, found = targets[:, remaining], found[:, remaining]
     with np.errstate(all="ignore"):  # diverging positions become NaN
         for _ in range(ITERATIONS):
-            here = origins(found)
-            error = goal - here
-            near = np.hypot(error[0], error[1]) <= RESIDUAL
-            result[:, left[near]] = found[:, near]
-            going = ~near & np.isfinite(error).all(0)
-            left, goal, found = left[going], goal[:, going], found[:, going]
-            if not left.size:
+            current = origins(found)
+            error = targets - current
+            converged = np.hypot(error[0], error[1]) <= RESIDUAL
+            result[:, remaining[converged]] = found[:, converged]
+            unconverged = ~converged & np.isfinite(error).all(0)
+            remaining, targets, found = (
+                remaining[unconverged],
+                targets[:, unconverged],
+                found[:, unconverged],
+            )
+            if not remaining.size:
                 break
-            here, error = here[:, going], error[:, going]
-            by_x = (origins(found + right) - here) / STEP
-            by_y = (origins(found + down) - here) / STEP
-            area = by_x[0] * by_y[1] - by_x[1] * by_y[0]
+            current, error = current[:, unconverged], error[:, unconverged]
+            by_x = (origins(found + right) - current) / STEP
+            by_y = (origins(found + down) - current) / STEP
+            determinant = by_x[0] * by_y[1] - by_x[1] * by_y[0]
             found = found + np.stack(
                 [
-                    (error[0] * by_y[1] - error[1] * by_y[0]) / area,
-                    (error[1] * by_x[0] - error[0] * by_x[1]) / area,
+                    (error[0] * by_y[1] - error[1] * by_y[0]) / determinant,
+                    (error[1] * by_x[0] - error[0] * by_x[1]) / determinant,
                 ]
             )
     return result[0].reshape(shape), result[1].reshape(shape)

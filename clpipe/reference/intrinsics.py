@@ -24,9 +24,9 @@ COEFFICIENTS = {
     OPENCV_FISHEYE: ("k1", "k2", "k3", "k4"),
 }
 
-LAWSON = 40  # iterations of a fit
+LAWSON_ITERATIONS = 40  # iterations of a fit
 
-AGREEMENT = 0.01  # of focal lengths; those in mm are often rounded
+FOCAL_TOLERANCE = 0.01  # of focal lengths; those in mm are often rounded
 
 
 @dataclass(frozen=True)
@@ -74,22 +74,26 @@ class Intrinsics:
         >>> Intrinsics.of_render(400, 300, {"focal_length": 50.0, "sensor_width": 40.0}).fx
         500.0
         """
-        said = {name: places.get(name, name) for name in shot}
-        found = {said["fx"]: shot["fx"]} if "fx" in shot else {}
+        labels = {name: places.get(name, name) for name in shot}
+        focal_lengths = {labels["fx"]: shot["fx"]} if "fx" in shot else {}
         if "camera_angle_x" in shot:
-            found[said["camera_angle_x"]] = width / 2 / math.tan(shot["camera_angle_x"] / 2)
+            focal_lengths[labels["camera_angle_x"]] = (
+                width / 2 / math.tan(shot["camera_angle_x"] / 2)
+            )
         pitches = {}
         if "sensor_width" in shot:
             pitches["sensor_width"] = shot["sensor_width"] / max(width, height)
         if "pixel_pitch" in shot:
             pitches["pixel_pitch"] = shot["pixel_pitch"] / 1000
         for name, pitch in pitches.items() if "focal_length" in shot else ():
-            found[f"{said['focal_length']} and {said[name]}"] = shot["focal_length"] / pitch
-        if not found:
+            focal_lengths[f"{labels['focal_length']} and {labels[name]}"] = (
+                shot["focal_length"] / pitch
+            )
+        if not focal_lengths:
             return None
-        (first, fx), *others = found.items()
+        (first, fx), *others = focal_lengths.items()
         for other, length in others:
-            if abs(length - fx) > AGREEMENT * fx:
+            if abs(length - fx) > FOCAL_TOLERANCE * fx:
                 raise RequestError(
                     f"{first} makes the focal length of this render of {width}x{height} pixels "
                     f"{fx:g} px, but {other} {length:g} px; correct or remove one"
@@ -105,9 +109,9 @@ class Intrinsics:
             shown: the columns and rows that it shows, from the upper left corner.
         """
         x, y = width / shown[0], height / shown[1]
-        places = self.fx * x, self.fy * y, self.cx * x, self.cy * y
+        parameters = self.fx * x, self.fy * y, self.cx * x, self.cy * y
         residual = self.residual * max(x, y)
-        return Intrinsics(width, height, *places, self.model, self.distortion, residual)
+        return Intrinsics(width, height, *parameters, self.model, self.distortion, residual)
 
     def polynomial(self) -> "Intrinsics":
         """Return the same camera by the model of :data:`POLYNOMIAL`, fitted if necessary.
@@ -115,30 +119,30 @@ class Intrinsics:
         The radial factor is then ``1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8``, like in nerfstudio, and
         the focal length is adjusted. ``residual`` is the largest error of the fit in the image.
         """
-        own = self.distortion
-        under = [own.get(f"k{i}", 0.0) for i in (4, 5, 6)]
-        named = {name: own.get(name, 0.0) for name in ("k1", "k2", "k3", "p1", "p2")}
-        if not any(under):
+        coefficients = self.distortion
+        denominator = [coefficients.get(f"k{i}", 0.0) for i in (4, 5, 6)]
+        named = {name: coefficients.get(name, 0.0) for name in ("k1", "k2", "k3", "p1", "p2")}
+        if not any(denominator):
             return replace(self, model=POLYNOMIAL, distortion={**named, "k4": 0.0})
-        over = [named[f"k{i}"] for i in (1, 2, 3)]
+        numerator = [named[f"k{i}"] for i in (1, 2, 3)]
 
-        def bent(r: Array) -> Array:
+        def distorted(r: Array) -> Array:
             powers = np.stack([r**2, r**4, r**6])
-            return np.asarray(r * (1 + over @ powers) / (1 + under @ powers))
+            return np.asarray(r * (1 + numerator @ powers) / (1 + denominator @ powers))
 
         corners = [(x - self.cx) / self.fx for x in (0, self.width)]
         heights = [(y - self.cy) / self.fy for y in (0, self.height)]
         corner = max(math.hypot(x, y) for x in corners for y in heights)
         r = np.linspace(0, 4 * corner, 4096)
-        seen = bent(r)
-        rising = np.flatnonzero(np.diff(seen) <= 0)
+        radii = distorted(r)
+        rising = np.flatnonzero(np.diff(radii) <= 0)
         last = rising[0] + 1 if rising.size else len(r)
-        shown = np.linspace(0, 1, 512)[1:] * min(corner, seen[:last].max())
-        r = np.interp(shown, seen[:last], r[:last])
-        first, *k, off = smallest_error(np.stack([r, r**3, r**5, r**7, r**9], 1), bent(r))
+        shown = np.linspace(0, 1, 512)[1:] * min(corner, radii[:last].max())
+        r = np.interp(shown, radii[:last], r[:last])
+        first, *k, error = minimax_fit(np.stack([r, r**3, r**5, r**7, r**9], 1), distorted(r))
         fitted = {f"k{i}": c / first for i, c in enumerate(k, 1)}
         tangential = {name: named[name] / first for name in ("p1", "p2")}
-        residual = self.residual + off * max(self.fx, self.fy)
+        residual = self.residual + error * max(self.fx, self.fy)
         return replace(
             self,
             fx=self.fx * first,
@@ -154,7 +158,7 @@ class Intrinsics:
         return {**asdict(self), "distortion": {n: self.distortion.get(n, 0.0) for n in names}}
 
 
-def smallest_error(terms: Array, values: Array) -> list[float]:
+def minimax_fit(terms: Array, values: Array) -> list[float]:
     """Return the factors of terms, (place, term), that fit values best, and their largest error.
 
     Least squares with weights that grow where the error is large (Lawson, 1961).
@@ -162,7 +166,7 @@ def smallest_error(terms: Array, values: Array) -> list[float]:
     scale = abs(terms).max(0)
     weights = np.ones(len(values))
     best: tuple[float, Array] = np.inf, np.zeros(len(scale))
-    for _ in range(LAWSON):
+    for _ in range(LAWSON_ITERATIONS):
         root = np.sqrt(weights)[:, None]
         found, *_ = np.linalg.lstsq(terms / scale * root, values * root[:, 0], rcond=None)
         error = abs(terms / scale @ found - values)

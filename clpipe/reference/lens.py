@@ -18,9 +18,9 @@ from clpipe.reference.radial import (
     STRAIGHT,
     Radial,
     even_powers,
-    farthest_of,
     fold_radius,
-    grown_by,
+    inverse_ratio,
+    inversion_radius,
 )
 
 
@@ -32,8 +32,8 @@ class DistortionMap:
         radial: the model of green, and without lateral colour of all channels.
         tangential: p1 and p2 of Brown and Conrady's model.
         focal: fx and fy in px, the model's unit.
-        share: without ``focal``, the focal length over the longer side. Without either, the unit is
-            that of lateral colour.
+        relative_focal_length: without ``focal``, the focal length over the longer side. Without
+            either, the unit is that of lateral colour.
         centre: the principal point in px from the corner; None, for one coordinate or both, is the
             centre.
         red, blue: lateral colour: r of red, or blue, from r of green, in the image; r = 1 is half
@@ -48,7 +48,7 @@ class DistortionMap:
     radial: Radial = STRAIGHT
     tangential: tuple[float, float] = (0.0, 0.0)
     focal: tuple[float, float] | None = None
-    share: float | None = None
+    relative_focal_length: float | None = None
     centre: tuple[float | None, float | None] = (None, None)
     red: Radial = STRAIGHT
     blue: Radial = STRAIGHT
@@ -60,7 +60,13 @@ class DistortionMap:
     def _hash(self) -> int:
         return hash(
             (
-                *(self.radial, self.tangential, self.focal, self.share, self.centre),
+                *(
+                    self.radial,
+                    self.tangential,
+                    self.focal,
+                    self.relative_focal_length,
+                    self.centre,
+                ),
                 *(self.red, self.blue, self.half_diagonals, self.fit, self.margins),
             )
         )
@@ -76,7 +82,11 @@ class DistortionMap:
 
     def unit(self, width: int, height: int) -> tuple[float, float]:
         """Return r = 1 for an image of this size, in px across and down."""
-        side = self.share * max(width, height) if self.share else self.side(width, height)
+        side = (
+            self.relative_focal_length * max(width, height)
+            if self.relative_focal_length
+            else self.side(width, height)
+        )
         return self.focal or (side, side)
 
     def side(self, width: int, height: int) -> float:
@@ -88,13 +98,13 @@ class DistortionMap:
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """See :meth:`clpipe.reference.geometry.Geometry.size`."""
-        return self.margins.inside(width, height)
+        return self.margins.frame_size(width, height)
 
     def origins(self, x: Array, y: Array, width: int, height: int) -> tuple[Array, Array]:
         """See :meth:`clpipe.reference.geometry.Geometry.origins`."""
-        return self.seen(x, y, width, height)
+        return self.source_positions(x, y, width, height)
 
-    def seen(
+    def source_positions(
         self, x: Array, y: Array, width: int, height: int, lateral: Radial | None = None
     ) -> tuple[Array, Array]:
         """Return the positions in the render that positions of the image show, in px, float64.
@@ -108,11 +118,11 @@ class DistortionMap:
             ImageError: the lens folds the image over, or no scale avoids void pixels.
         """
         scale = self.scale(width, height)
-        bend = _Bend(self, *self.size(width, height), scale)
-        u, v = bend.seen(x, y, lateral or STRAIGHT)
+        scaled_lens = _ScaledLens(self, *self.size(width, height), scale)
+        u, v = scaled_lens.source_positions(x, y, lateral or STRAIGHT)
         return u + self.margins.left, v + self.margins.top
 
-    def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
+    def intrinsics(self, known: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
         """See :meth:`clpipe.reference.geometry.Geometry.intrinsics`.
 
         Those of the render are for its part without margins. If they are not known, they follow
@@ -120,47 +130,47 @@ class DistortionMap:
         Conrady, the fisheye's, poly3 and poly5. The model ptlens, whose powers are odd, is fitted
         by them.
         """
-        longer = self.scale(width, height)
+        scale = self.scale(width, height)
         width, height = self.size(width, height)
         unit = self.unit(width, height)
         middle = width / 2, height / 2
         centre = [m if c is None else c for c, m in zip(self.centre, middle, strict=True)]
-        counts = bool(self.focal or self.share)
-        if before is None:
-            if not counts:
+        has_focal = bool(self.focal or self.relative_focal_length)
+        if known is None:
+            if not has_focal:
                 return None
-            before = Intrinsics(width, height, *unit, centre[0], centre[1])
-        own = {"cx": centre[0], "cy": centre[1]} | (
-            {"fx": unit[0], "fy": unit[1]} if counts else {}
+            known = Intrinsics(width, height, *unit, centre[0], centre[1])
+        stated = {"cx": centre[0], "cy": centre[1]} | (
+            {"fx": unit[0], "fy": unit[1]} if has_focal else {}
         )
-        for name, value in own.items():
-            if not np.isclose(value, known := getattr(before, name), rtol=1e-6):
+        for name, value in stated.items():
+            if not np.isclose(value, rendered := getattr(known, name), rtol=1e-6):
                 raise RequestError(
                     f"distortion: its {name} is {value:g} px, but that of the render is "
-                    f"{known:g} px; set render.{name} and distortion to the same value, or only "
+                    f"{rendered:g} px; set render.{name} and distortion to the same value, or only "
                     "one of them"
                 )
-        is_square = counts or np.isclose(before.fx, before.fy, rtol=1e-4)
-        bend = _Bend(self, width, height, longer)
-        model = even_powers(self.radial, bend.corner / longer, bend.farthest)
-        if before.model != PINHOLE or not is_square or model is None:
+        is_square = has_focal or np.isclose(known.fx, known.fy, rtol=1e-4)
+        scaled_lens = _ScaledLens(self, width, height, scale)
+        model = even_powers(self.radial, scaled_lens.corner / scale, scaled_lens.farthest)
+        if known.model != PINHOLE or not is_square or model is None:
             return None
-        above, below, off = model
+        above, below, error = model
         if len(above) > (5 if self.radial.of_angle else 4) or len(below) > 4:
             return None
-        grown = 1.0 if counts else before.fx / unit[0]  # r over the radius in focal lengths
+        ratio = 1.0 if has_focal else known.fx / unit[0]  # r over the radius in focal lengths
         first, *others = above
-        k = [c / first * grown ** (2 * i) for i, c in enumerate(others, 1)]
-        residual = off * max(unit) * longer
-        longer *= first
-        places = before.fx * longer, before.fy * longer, before.cx, before.cy
+        k = [c / first * ratio ** (2 * i) for i, c in enumerate(others, 1)]
+        residual = error * max(unit) * scale
+        scale *= first
+        parameters = known.fx * scale, known.fy * scale, known.cx, known.cy
         named = {f"k{i}": value for i, value in enumerate(k, 1)}
         if self.radial.of_angle:
-            return Intrinsics(width, height, *places, OPENCV_FISHEYE, named)
-        under = {f"k{i + 3}": c * grown ** (2 * i) for i, c in enumerate(below) if i}
+            return Intrinsics(width, height, *parameters, OPENCV_FISHEYE, named)
+        denominator = {f"k{i + 3}": c * ratio ** (2 * i) for i, c in enumerate(below) if i}
         p1, p2 = self.tangential
-        named |= {**under, "p1": p1, "p2": p2}
-        return Intrinsics(width, height, *places, FULL_OPENCV, named, residual)
+        named |= {**denominator, "p1": p1, "p2": p2}
+        return Intrinsics(width, height, *parameters, FULL_OPENCV, named, residual)
 
     def scale(self, width: int, height: int) -> float:
         """Return the factor by which ``fit`` lengthens an image's focal length; 1 without it.
@@ -183,7 +193,7 @@ class DistortionMap:
         return replace(self, margins=NO_MARGINS)
 
 
-class _Bend:
+class _ScaledLens:
     """A lens and an image of some size, scaled by ``scale``; margins are outside the image."""
 
     def __init__(self, lens: DistortionMap, width: int, height: int, scale: float) -> None:
@@ -193,11 +203,11 @@ class _Bend:
         self.centre = tuple(m if c is None else c for c, m in zip(lens.centre, middle, strict=True))
         self.size = width, height
         left, top, right, bottom = lens.margins
-        away = self._corners(0, 0, width, height)
-        self.corner = float(np.hypot(*(away / self.unit).T).max())
-        self.corner_side = float(np.hypot(*(away / self.side).T).max()) / scale
-        away = self._corners(-left, -top, width + right, height + bottom)
-        self.farthest = float(np.hypot(*(away / self.unit).T).max())  # of the input
+        offsets = self._corners(0, 0, width, height)
+        self.corner = float(np.hypot(*(offsets / self.unit).T).max())
+        self.corner_side = float(np.hypot(*(offsets / self.side).T).max()) / scale
+        offsets = self._corners(-left, -top, width + right, height + bottom)
+        self.farthest = float(np.hypot(*(offsets / self.unit).T).max())  # of the input
         self._check(lens.radial, self.farthest, self.corner, "distortion", max(self.unit))
         for lateral in (lens.red, lens.blue):
             self._check(lateral, self.corner_side, self.corner_side, "lateral colour", self.side)
@@ -218,12 +228,12 @@ class _Bend:
             what, unit: for the message.
         """
         at = None if radial.is_identity else fold_radius(radial, farthest)
-        if at is not None and not radial.bent(np.array(at)) > corner:
+        if at is not None and not radial.distort(np.array(at)) > corner:
             raise self.folded(what, at, at * unit)
 
     def folded(self, what: str, r: float, px: float) -> ImageError:
         """Return the error for coefficients that fold the image over at some radius."""
-        width, height = self.lens.margins.around(*self.size)
+        width, height = self.lens.margins.image_size(*self.size)
         less = ", or less overscan" if self.lens.margins else ""
         return ImageError(
             f"distortion: these coefficients fold the image over. The {what} folds at r = "
@@ -232,15 +242,15 @@ class _Bend:
             f"a longer focal length{less}"
         )
 
-    def seen(self, x: Array, y: Array, lateral: Radial) -> tuple[Array, Array]:
-        """See :meth:`DistortionMap.seen`."""
+    def source_positions(self, x: Array, y: Array, lateral: Radial) -> tuple[Array, Array]:
+        """See :meth:`DistortionMap.source_positions`."""
         lens = self.lens
         dx, dy = (x - self.centre[0]) / self.scale, (y - self.centre[1]) / self.scale
         # The radius of green at which the channel's radius is the pixel's.
-        grown = grown_by(lateral, np.hypot(dx, dy) / self.side, self.corner_side)
-        dx, dy = dx * grown / self.unit[0], dy * grown / self.unit[1]
-        grown = grown_by(lens.radial, np.hypot(dx, dy), self.farthest)
-        ux, uy = dx * grown, dy * grown
+        ratio = inverse_ratio(lateral, np.hypot(dx, dy) / self.side, self.corner_side)
+        dx, dy = dx * ratio / self.unit[0], dy * ratio / self.unit[1]
+        ratio = inverse_ratio(lens.radial, np.hypot(dx, dy), self.farthest)
+        ux, uy = dx * ratio, dy * ratio
         if any(lens.tangential):
             ux, uy = self._with_tangential(ux, uy, dx, dy)
         return self.centre[0] + ux * self.unit[0], self.centre[1] + uy * self.unit[1]
@@ -248,35 +258,38 @@ class _Bend:
     def _with_tangential(self, ux: Array, uy: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
         """Newton's method in two dimensions, from the inverse of the radial part."""
         lens, (p1, p2) = self.lens, self.lens.tangential
-        farthest = farthest_of(lens.radial, self.farthest)
-        begun = ux, uy
+        farthest = inversion_radius(lens.radial, self.farthest)
+        initial = ux, uy
         slope = np.zeros(())
         for _ in range(50):
             r = np.maximum(np.hypot(ux, uy), 1e-12)
             within = np.minimum(r, farthest)
-            bent, slope = lens.radial.bent(within), lens.radial.slope(within)
-            beyond = max(float(lens.radial.slope(np.array(farthest))), 0.25)
-            bent, slope = bent + (r - within) * beyond, np.where(r > farthest, beyond, slope)
-            ratio = bent / r
-            turn = (slope - ratio) / (r * r)  # of the ratio, over r
+            distorted, slope = lens.radial.distort(within), lens.radial.slope(within)
+            outer_slope = max(float(lens.radial.slope(np.array(farthest))), 0.25)
+            distorted, slope = (
+                distorted + (r - within) * outer_slope,
+                np.where(r > farthest, outer_slope, slope),
+            )
+            ratio = distorted / r
+            curvature = (slope - ratio) / (r * r)  # of the ratio, over r
             fx = ux * ratio + 2 * p1 * ux * uy + p2 * (r * r + 2 * ux * ux) - dx
             fy = uy * ratio + p1 * (r * r + 2 * uy * uy) + 2 * p2 * ux * uy - dy
-            xx = ratio + ux * ux * turn + 2 * p1 * uy + 6 * p2 * ux
-            xy = ux * uy * turn + 2 * p1 * ux + 2 * p2 * uy
-            yy = ratio + uy * uy * turn + 6 * p1 * uy + 2 * p2 * ux
-            area = xx * yy - xy * xy
-            safe = np.where(np.abs(area) > 1e-6, area, 1e-6)
+            xx = ratio + ux * ux * curvature + 2 * p1 * uy + 6 * p2 * ux
+            xy = ux * uy * curvature + 2 * p1 * ux + 2 * p2 * uy
+            yy = ratio + uy * uy * curvature + 6 * p1 * uy + 2 * p2 * ux
+            determinant = xx * yy - xy * xy
+            safe = np.where(np.abs(determinant) > 1e-6, determinant, 1e-6)
             ux, uy = ux - (yy * fx - xy * fy) / safe, uy - (xx * fy - xy * fx) / safe
             if max(np.abs(fx).max(initial=0), np.abs(fy).max(initial=0)) < RESIDUAL:
                 break
-        wrong = ~((area > 0) & (np.hypot(fx, fy) < 1e-9))
+        wrong = ~((determinant > 0) & (np.hypot(fx, fy) < 1e-9))
         if wrong.any():
-            r = np.hypot(*begun)
+            r = np.hypot(*initial)
             within = wrong & (r <= self.farthest)
             if within.any():
                 first = float(r[within].min())
                 raise self.folded("distortion", first, first * max(self.unit))
-            ux, uy = np.where(wrong, begun[0], ux), np.where(wrong, begun[1], uy)
+            ux, uy = np.where(wrong, initial[0], ux), np.where(wrong, initial[1], uy)
         return ux, uy
 
 
@@ -298,9 +311,9 @@ def fitting_scale(lens: DistortionMap, width: int, height: int) -> float:
 
     def is_full(scale: float) -> bool:
         try:
-            bend = _Bend(lens, width, height, scale)
+            scaled_lens = _ScaledLens(lens, width, height, scale)
             channels = dict.fromkeys((lens.red, STRAIGHT, lens.blue))
-            places = [bend.seen(x, y, each) for each in channels]
+            positions = [scaled_lens.source_positions(x, y, each) for each in channels]
         except ImageError:  # the lens folds this far outside
             return False
         return all(
@@ -308,10 +321,10 @@ def fitting_scale(lens: DistortionMap, width: int, height: int) -> float:
             and v.min() >= -top
             and u.max() <= width + right
             and v.max() <= height + bottom
-            for u, v in places
+            for u, v in positions
         )
 
-    _Bend(lens, width, height, 1.0)  # rejects a lens that folds the image
+    _ScaledLens(lens, width, height, 1.0)  # rejects a lens that folds the image
     low, high = 1 / 8, 8.0
     if not is_full(high):
         raise ImageError(

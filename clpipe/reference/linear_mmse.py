@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 
 from clpipe.base.types import Doubles, Floats
-from clpipe.reference.filter_array import FilterArray, beyond
+from clpipe.reference.filter_array import FilterArray, periodic_indices
 
 RADIUS = 3  # px: windows of 7x7
 SIDE = 2 * RADIUS + 1
@@ -20,7 +20,7 @@ SIDE = 2 * RADIUS + 1
 # the variance CHROMA each. Both are isotropic, with a correlation of NEIGHBOURS to the power of the
 # distance in px. Chosen on eight images of the Kodak set, for RGGB, quad and X-Trans
 # (docs/quality.md).
-NEIGHBOURS = 0.95
+CORRELATION = 0.95
 CHROMA = 0.05
 NOISE = 1e-4  # variance of the rest that the model does not describe
 
@@ -32,12 +32,12 @@ def filters(array: FilterArray) -> Floats:
     The filters keep samples of red, green or blue, and do not change a flat colour. For an array
     that cannot distinguish all colours, flat grey does not change.
     """
-    between, centre = (NEIGHBOURS ** np.hypot(*apart) for apart in distances())
+    between, centre = (CORRELATION ** np.hypot(*offsets) for offsets in distances())
     rows, columns = array.period
-    made = np.zeros((rows, columns, SIDE**2, 3), np.float32)
-    for row, column, seen in windows(array):
-        made[row, column] = best(seen, between, centre, CHROMA, NOISE)
-    return made
+    result = np.zeros((rows, columns, SIDE**2, 3), np.float32)
+    for row, column, responses in windows(array):
+        result[row, column] = mmse_filters(responses, between, centre, CHROMA, NOISE)
+    return result
 
 
 def distances() -> tuple[Doubles, Doubles]:
@@ -47,8 +47,8 @@ def distances() -> tuple[Doubles, Doubles]:
     """
     span = np.arange(-RADIUS, RADIUS + 1.0)
     x, y = np.tile(span, SIDE), np.repeat(span, SIDE)
-    places = np.stack([x, y])
-    return places[:, :, None] - places[:, None], places
+    positions = np.stack([x, y])
+    return positions[:, :, None] - positions[:, None], positions
 
 
 def windows(array: FilterArray) -> Iterator[tuple[int, int, Doubles]]:
@@ -63,16 +63,21 @@ def windows(array: FilterArray) -> Iterator[tuple[int, int, Doubles]]:
             yield row, column, np.array([array.responses[letter] for letter in letters])
 
 
-def covariance(seen: Doubles, between: Doubles, chroma: float, noise: float) -> Doubles:
+def covariance(
+    responses: Doubles, tap_correlation: Doubles, chroma: float, noise: float
+) -> Doubles:
     """Return the covariance of a window's samples under a model, (tap, tap).
 
     Args:
-        seen: the response of each tap to a colour, (tap, 3).
-        between: the correlation of two taps' colours, (tap, tap).
+        responses: the response of each tap to a colour, (tap, 3).
+        tap_correlation: the correlation of two taps' colours, (tap, tap).
         chroma: the variance of chroma, relative to that of luma.
         noise: the variance of the rest that the model does not describe.
     """
-    return np.asarray(between * (seen @ _colours(chroma) @ seen.T) + noise * np.eye(len(seen)))
+    return np.asarray(
+        tap_correlation * (responses @ _colours(chroma) @ responses.T)
+        + noise * np.eye(len(responses))
+    )
 
 
 def _colours(chroma: float) -> Doubles:
@@ -81,53 +86,63 @@ def _colours(chroma: float) -> Doubles:
     return np.asarray(gray + chroma * (np.eye(3) - gray / 3))
 
 
-def best(seen: Doubles, between: Doubles, centre: Doubles, chroma: float, noise: float) -> Doubles:
+def mmse_filters(
+    responses: Doubles,
+    tap_correlation: Doubles,
+    centre_correlation: Doubles,
+    chroma: float,
+    noise: float,
+) -> Doubles:
     """Return the filters of one position, (tap, channel), with the least mean square error.
 
     Flat colours are exact, and a sample of red, green or blue is kept.
 
     Args:
-        seen: the response of each tap to a colour, (tap, 3).
-        between: the correlation of the colours of two taps, (tap, tap).
-        centre: the correlation of the colours of a tap and the centre, (tap,).
+        responses: the response of each tap to a colour, (tap, 3).
+        tap_correlation: the correlation of the colours of two taps, (tap, tap).
+        centre_correlation: the correlation of the colours of a tap and the centre, (tap,).
         chroma: the variance of chroma, relative to that of luma.
         noise: the variance of the rest that the model does not describe.
     """
-    samples = covariance(seen, between, chroma, noise)
-    wanted = centre[:, None] * (seen @ _colours(chroma))
-    tells_colours = np.linalg.matrix_rank(seen, 1e-3) == 3
-    exact = np.eye(3) if tells_colours else np.ones((3, 1))  # flat colours, in columns
-    lit = seen @ exact
-    both = np.linalg.solve(samples, np.concatenate([wanted, lit], axis=1))
-    free, flat = both[:, :3], both[:, 3:]
-    lacking = exact.T - lit.T @ free
-    made = np.asarray(free + flat @ np.linalg.solve(lit.T @ flat, lacking))
-    middle = len(seen) // 2
+    samples = covariance(responses, tap_correlation, chroma, noise)
+    cross_covariance = centre_correlation[:, None] * (responses @ _colours(chroma))
+    has_colours = np.linalg.matrix_rank(responses, 1e-3) == 3
+    exact = np.eye(3) if has_colours else np.ones((3, 1))  # flat colours, in columns
+    flat_samples = responses @ exact
+    solution = np.linalg.solve(samples, np.concatenate([cross_covariance, flat_samples], axis=1))
+    free, flat = solution[:, :3], solution[:, 3:]
+    residual = exact.T - flat_samples.T @ free
+    result = np.asarray(free + flat @ np.linalg.solve(flat_samples.T @ flat, residual))
+    middle = len(responses) // 2
     # a colour that was sampled
-    if 1 in seen[middle].tolist() and np.isclose(seen[middle].sum(), 1):
-        made[:, seen[middle].argmax()] = np.arange(len(seen)) == middle
-    return made
+    if 1 in responses[middle].tolist() and np.isclose(responses[middle].sum(), 1):
+        result[:, responses[middle].argmax()] = np.arange(len(responses)) == middle
+    return result
 
 
 def linear_mmse(mosaic: Floats, array: FilterArray) -> Floats:
     """Return RGB, (height, width, 3), from a white-balanced mosaic, (height, width)."""
-    return filtered(mosaic, array.period, filters(array))
+    return apply_filters(mosaic, array.period, filters(array))
 
 
-def filtered(mosaic: Floats, period: tuple[int, int], made: Floats) -> Floats:
+def apply_filters(mosaic: Floats, period: tuple[int, int], filters_: Floats) -> Floats:
     """Apply filters by position to a mosaic: (height, width, channel).
 
     Args:
         mosaic: (height, width).
         period: period of its array, which continues it outside its edges.
-        made: the filters, (row, column, tap, channel), for a multiple of the period.
+        filters_: the filters, (row, column, tap, channel), for a multiple of the period.
     """
     height, width = mosaic.shape
-    wide = mosaic[np.ix_(beyond(height, period[0], RADIUS), beyond(width, period[1], RADIUS))]
-    down, across = np.arange(height) % made.shape[0], np.arange(width) % made.shape[1]
-    result = np.zeros((height, width, made.shape[-1]), np.float32)
+    padded = mosaic[
+        np.ix_(
+            periodic_indices(height, period[0], RADIUS), periodic_indices(width, period[1], RADIUS)
+        )
+    ]
+    down, across = np.arange(height) % filters_.shape[0], np.arange(width) % filters_.shape[1]
+    result = np.zeros((height, width, filters_.shape[-1]), np.float32)
     for tap in range(SIDE**2):
         y, x = divmod(tap, SIDE)
-        weights = made[:, :, tap][np.ix_(down, across)]
-        result += weights * wide[y : y + height, x : x + width, None]
+        weights = filters_[:, :, tap][np.ix_(down, across)]
+        result += weights * padded[y : y + height, x : x + width, None]
     return result

@@ -16,5 +16,5 @@ def median_filter(image: Floats, size: int) -> Floats:
     [[9.0, 2.0, 3.0, 3.0, 3.0]]
     """
     reach = range(-(size // 2), size // 2 + 1)
-    around = [tap(image, dx, dy) for dy in reach for dx in reach]
-    return np.median(np.stack(around), axis=0).astype(np.float32)
+    window = [tap(image, dx, dy) for dy in reach for dx in reach]
+    return np.median(np.stack(window), axis=0).astype(np.float32)

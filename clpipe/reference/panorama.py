@@ -16,7 +16,7 @@ from clpipe.reference.carried import bilinear, nearest
 from clpipe.reference.warp import FILTERS
 
 BORDER = 4  # px; filters extend 3 px around a position
-ROUNDS = 2  # to fill borders; in the second pass also from each other
+BORDER_PASSES = 2  # to fill borders; in the second pass also from each other
 EDGE = 1e-6  # of a view's side: distance outside it up to which a direction still belongs to it
 
 Rotation = tuple[tuple[float, float, float], ...]
@@ -66,7 +66,7 @@ class Panorama(Protocol):
         """Its description, as JSON values."""
         ...
 
-    def places(self, rays: Array) -> tuple[Array, Array]:
+    def positions(self, rays: Array) -> tuple[Array, Array]:
         """Return the positions of directions in the atlas, x and y in px; NaN outside all views."""
         ...
 
@@ -93,8 +93,8 @@ class Panorama(Protocol):
         sides = ((self.border, self.border), (self.border, self.border), (0, 0))
         whole = np.concatenate([np.pad(image, sides, "edge") for image in images])
         row, column, x, y = self._borders
-        for _ in range(ROUNDS if filter_ else 0):
-            whole[row, column] = sampled(whole, x, y, filter_)
+        for _ in range(BORDER_PASSES if filter_ else 0):
+            whole[row, column] = sample(whole, x, y, filter_)
         return whole
 
     @cached_property
@@ -104,7 +104,7 @@ class Panorama(Protocol):
         is_border = np.ones((height // self.count, width), bool)
         is_border[self.border : -self.border, self.border : -self.border] = False
         row, column = np.nonzero(np.tile(is_border, (self.count, 1)))
-        x, y = self.places(self.rays(column + 0.5, row + 0.5))
+        x, y = self.positions(self.rays(column + 0.5, row + 0.5))
         known = np.isfinite(x)
         return row[known], column[known], x[known], y[known]
 
@@ -122,7 +122,7 @@ class View:
     height: int
 
     @classmethod
-    def of_angle(cls, rotation: Rotation, width: int, height: int, angle: float) -> "View":
+    def from_angle(cls, rotation: Rotation, width: int, height: int, angle: float) -> "View":
         """Return a view with a horizontal field of view in degrees."""
         f = width / 2 / np.tan(np.radians(angle / 2))
         return cls(rotation, f, f, width / 2, height / 2, width, height)
@@ -154,16 +154,16 @@ class Views(Panorama):
     @property
     def size(self) -> tuple[int, int]:
         """See :attr:`Panorama.size`."""
-        first, more = self.views[0], 2 * self.border
-        return first.width + more, (first.height + more) * len(self.views)
+        first, margin = self.views[0], 2 * self.border
+        return first.width + margin, (first.height + margin) * len(self.views)
 
     @property
     def record(self) -> dict[str, Any]:
         """See :attr:`Panorama.record`; the rotations lead from a view's axes to the image's."""
         return {"views": [asdict(view) for view in self.views]}
 
-    def places(self, rays: Array) -> tuple[Array, Array]:
-        """See :meth:`Panorama.places`."""
+    def positions(self, rays: Array) -> tuple[Array, Array]:
+        """See :meth:`Panorama.positions`."""
         best = np.full(rays.shape[1:], -np.inf)
         found_x, found_y = np.full(best.shape, np.nan), np.full(best.shape, np.nan)
         for number, view in enumerate(self.views):
@@ -191,9 +191,9 @@ class Views(Panorama):
         for each, view in enumerate(self.views):
             right = (x - self.border - view.cx) / view.fx
             down = (y - each * pitch - self.border - view.cy) / view.fy
-            own = np.stack([right, down, np.ones_like(right)])
-            turned = np.tensordot(np.array(view.rotation, float), own, 1)
-            result = np.where(number == each, turned, result)
+            view_rays = np.stack([right, down, np.ones_like(right)])
+            rotated = np.tensordot(np.array(view.rotation, float), view_rays, 1)
+            result = np.where(number == each, rotated, result)
         return result
 
 
@@ -229,8 +229,8 @@ class LatitudeLongitude(Panorama):
         less = 1 if self.on_edges else 0
         return 2 * np.pi / max(self.width - less, 1), np.pi / max(self.height - less, 1)
 
-    def places(self, rays: Array) -> tuple[Array, Array]:
-        """See :meth:`Panorama.places`."""
+    def positions(self, rays: Array) -> tuple[Array, Array]:
+        """See :meth:`Panorama.positions`."""
         across, down = self._steps
         longitude = np.arctan2(rays[0], rays[2])
         latitude = np.arctan2(rays[1], np.hypot(rays[0], rays[2]))
@@ -248,7 +248,7 @@ class LatitudeLongitude(Panorama):
         return np.stack([np.sin(longitude) * flat, np.sin(latitude), np.cos(longitude) * flat])
 
 
-def sampled(pixels: Array, x: Array, y: Array, filter_: str) -> Array:
+def sample(pixels: Array, x: Array, y: Array, filter_: str) -> Array:
     """Return pixels, (rows, columns, channel), at positions between their centres.
 
     Args:
@@ -270,6 +270,6 @@ def sampled(pixels: Array, x: Array, y: Array, filter_: str) -> Array:
     total = np.zeros((len(x), pixels.shape[2]))
     for j, down in enumerate(of_row):
         for i, across in enumerate(of_column):
-            taken = nearest(pixels, left + (first + i), top + (first + j))
-            total += (across * down)[:, None] * taken
+            samples = nearest(pixels, left + (first + i), top + (first + j))
+            total += (across * down)[:, None] * samples
     return total.astype(pixels.dtype)

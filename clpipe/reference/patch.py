@@ -30,11 +30,11 @@ def patch_distances(planes: Floats, reach: int, step: int = 1) -> Iterator[tuple
     [0.0, 3.0, 3.0, 3.0, 0.0, 0.0]
     """
     height, width = planes.shape[:2]
-    around = mirrored(planes, reach + 1)
-    centre = around[reach:, reach:][: height + 2, : width + 2]
+    padded = mirrored(planes, reach + 1)
+    centre = padded[reach:, reach:][: height + 2, : width + 2]
     offsets = range(-reach, reach + 1, step)
     for dx, dy in ((dx, dy) for dy in offsets for dx in offsets):
-        other = around[reach + dy :, reach + dx :][: height + 2, : width + 2]
+        other = padded[reach + dy :, reach + dx :][: height + 2, : width + 2]
         squared = ((other - centre) ** 2).sum(-1)
         down = squared[:-2] + squared[1:-1] + squared[2:]
         yield dx, dy, down[:, :-2] + down[:, 1:-1] + down[:, 2:]

@@ -19,7 +19,7 @@ RESIDUAL = 1e-12
 SAMPLES = 2049  # of a radial model, as starting points for its inverse
 # The model continues outside the corner for this share of its radius, for interpolation. After
 # that, it continues as a straight line.
-BEYOND = 1.25
+EXTENSION = 1.25
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Radial:
     With ``of_angle``, they are polynomials of atan(r), the angle to the axis.
 
     >>> cubic = Radial((0.0, 1.0, 0.0, -0.1))
-    >>> float(cubic.bent(np.array(0.5))), float(cubic.slope(np.array(0.5)))
+    >>> float(cubic.distort(np.array(0.5))), float(cubic.slope(np.array(0.5)))
     (0.4875, 0.925)
     """
 
@@ -38,14 +38,17 @@ class Radial:
     of_angle: bool = False
 
     @classmethod
-    def of(cls, *numerator: float, below: tuple[float, ...] = (), of_angle: bool = False) -> Self:
+    def of(
+        cls, *numerator: float, denominator: tuple[float, ...] = (), of_angle: bool = False
+    ) -> Self:
         """Return the model N(r) / (1 + M(r)), each polynomial from r^1 up, without trailing zeros.
 
         >>> Radial.of(1.0, 0.0, 0.0).is_identity
         True
         """
         above, under = (
-            tuple(map(float, np.trim_zeros(c, "b"))) for c in ((0.0, *numerator), (1.0, *below))
+            tuple(map(float, np.trim_zeros(c, "b")))
+            for c in ((0.0, *numerator), (1.0, *denominator))
         )
         return cls(above, under, of_angle)
 
@@ -54,20 +57,20 @@ class Radial:
         """Whether every r_d is r."""
         return self == STRAIGHT
 
-    def bent(self, r: Array) -> Array:
+    def distort(self, r: Array) -> Array:
         """Return r_d, the radius in the image, of r, the radius without the lens; float64."""
         x = np.arctan(r) if self.of_angle else r
         return polyval(x, self.numerator) / polyval(x, self.denominator)
 
     def slope(self, r: Array) -> Array:
-        """Return the derivative of :meth:`bent`."""
+        """Return the derivative of :meth:`distort`."""
         x = np.arctan(r) if self.of_angle else r
         n, m = polyval(x, self.numerator), polyval(x, self.denominator)
         dn, dm = polyval(x, polyder(self.numerator)), polyval(x, polyder(self.denominator))
         slope = (dn * m - n * dm) / (m * m)
         return slope / (1 + r * r) if self.of_angle else slope
 
-    def unbent(self, r_d: Array, farthest: float) -> Array:
+    def undistort(self, r_d: Array, farthest: float) -> Array:
         """Return r of each r_d, by Newton's method to :data:`RESIDUAL`.
 
         Args:
@@ -78,16 +81,16 @@ class Radial:
         if self.is_identity:
             return r_d
         known = np.linspace(0, farthest, SAMPLES)
-        bent = self.bent(known)
-        inside = np.minimum(r_d, bent[-1])
-        r = np.interp(inside, bent, known)
+        distort = self.distort(known)
+        inside = np.minimum(r_d, distort[-1])
+        r = np.interp(inside, distort, known)
         for _ in range(20):
-            error = self.bent(r) - inside
+            error = self.distort(r) - inside
             if np.abs(error).max(initial=0) < RESIDUAL:
                 break
             r = np.clip(r - error / np.maximum(self.slope(r), 1e-9), 0, farthest)
         # A slope near 0 would move points outside the image far away.
-        slope = max(float(self.slope(known[-1])), 0.25 * bent[-1] / farthest)
+        slope = max(float(self.slope(known[-1])), 0.25 * distort[-1] / farthest)
         return r + (r_d - inside) / slope
 
 
@@ -115,18 +118,18 @@ def fold_radius(radial: Radial, farthest: float) -> float | None:
     return high
 
 
-def farthest_of(radial: Radial, corner: float) -> float:
+def inversion_radius(radial: Radial, corner: float) -> float:
     """Return the radius up to which a model is inverted: slightly outside the corner."""
-    at = fold_radius(radial, BEYOND * corner)
-    return BEYOND * corner if at is None else max(0.999 * at, min(corner, at))
+    at = fold_radius(radial, EXTENSION * corner)
+    return EXTENSION * corner if at is None else max(0.999 * at, min(corner, at))
 
 
-def grown_by(radial: Radial, r_d: Array, corner: float) -> Array:
+def inverse_ratio(radial: Radial, r_d: Array, corner: float) -> Array:
     """Return r over r_d, the inverse of a model as a factor."""
     if radial.is_identity:
         return np.ones_like(r_d)
     at_centre = 1 / radial.slope(np.zeros(()))
-    r = radial.unbent(r_d, farthest_of(radial, corner))
+    r = radial.undistort(r_d, inversion_radius(radial, corner))
     return np.divide(r, r_d, out=np.full_like(r_d, at_centre), where=r_d > 0)
 
 
@@ -149,7 +152,7 @@ def even_powers(
         return list(above[::2]), list(below[::2]), 0.0
     if radial.of_angle:
         return None
-    bound = farthest_of(radial, farthest)
-    longest = min(float(radial.unbent(np.array([corner]), bound)[0]), bound)
+    bound = inversion_radius(radial, farthest)
+    longest = min(float(radial.undistort(np.array([corner]), bound)[0]), bound)
     r = longest * (1 - np.cos(np.linspace(0, np.pi, 201))) / 2  # close together at both ends
-    return fit_even(r, radial.bent(r))
+    return fit_even(r, radial.distort(r))

@@ -91,7 +91,7 @@ class Taps:
         return int(self.table.shape[1])
 
 
-class AlongAxis:
+class AxisResampler:
     """The base of resamplings that reduce rows or columns; see :class:`Resampler`."""
 
     parameters: ClassVar[Parameters] = (
@@ -115,7 +115,7 @@ class AlongAxis:
         """Return the taps of the new rows or columns of an image of ``size``."""
         raise NotImplementedError(type(self).__name__)
 
-    def along(self, width: int, height: int) -> int:
+    def axis_length(self, width: int, height: int) -> int:
         """Return the side of an image that becomes shorter."""
         return height if self.axis == "rows" else width
 
@@ -126,7 +126,7 @@ class AlongAxis:
 
     def values(self, width: int, height: int) -> Mapping[str, Any]:
         """See :meth:`Resampler.values`."""
-        taps = self.taps(self.along(width, height))
+        taps = self.taps(self.axis_length(width, height))
         counts = {"count": np.uint32(taps.count), "stride": np.uint32(taps.stride)}
         return {"first": taps.first, "table": taps.table, **counts}
 
@@ -134,12 +134,12 @@ class AlongAxis:
         """See :meth:`Resampler.needed`."""
         if axis != self.axis:
             return start, stop
-        taps = self.taps(self.along(*size))
+        taps = self.taps(self.axis_length(*size))
         return int(taps.first[start]), int(taps.first[stop - 1]) + taps.count
 
 
 @dataclass(frozen=True)
-class Resampling(AlongAxis):
+class Resampling(AxisResampler):
     """A reduction of the rows, or columns, of an image.
 
     Args:
@@ -171,13 +171,13 @@ class Resampling(AlongAxis):
         """See :meth:`Resampler.reach`."""
         if axis != self.axis:
             return low, high
-        before = self.along(*size)
+        before = self.axis_length(*size)
         taps, after = self.taps(before).count + 1, self.size(before)
         return -(-low * before // after) + taps, -(-high * before // after) + taps
 
 
 @dataclass(frozen=True)
-class Bins(AlongAxis):
+class Bins(AxisResampler):
     """Binning: each new row, or column, is the mean of the next ``factor`` old ones.
 
     Lines after the last whole bin are cropped. A side that is shorter than a bin is one bin.
@@ -200,7 +200,7 @@ class Bins(AlongAxis):
         return max(size // self.factor, 1)
 
     def shown(self, size: int) -> int:
-        """See :meth:`AlongAxis.shown`.
+        """See :meth:`AxisResampler.shown`.
 
         >>> [Bins("rows", 3).shown(n) for n in (2, 3, 8)]
         [2, 3, 6]
@@ -237,24 +237,24 @@ def _taps(resampling: Resampling, size: int) -> Taps:
     ratio = size / count
     line = np.arange(count)[:, None]
 
-    def weights(places: Array) -> Array:
+    def weights(positions: Array) -> Array:
         # The distance of two centres, in whole numbers up to the division.
-        distance = (2 * places * count - (2 * line + 1) * size + count) / (2 * count)
+        distance = (2 * positions * count - (2 * line + 1) * size + count) / (2 * count)
         return resampling.weight(distance, ratio)
 
     reach = int(np.ceil(resampling.support * ratio + 1))
     centre = (2 * line + 1) * size // (2 * count)
-    around = centre + np.arange(-reach, reach + 1)
-    counts = (weights(around) != 0) & (around >= 0) & (around < size)
-    lowest = np.where(counts, around, size).min(1)
-    width = int((np.where(counts, around, 0).max(1) - lowest).max()) + 1
+    candidates = centre + np.arange(-reach, reach + 1)
+    has_weight = (weights(candidates) != 0) & (candidates >= 0) & (candidates < size)
+    lowest = np.where(has_weight, candidates, size).min(1)
+    width = int((np.where(has_weight, candidates, 0).max(1) - lowest).max()) + 1
     first = np.minimum(lowest, size - width)
-    own = weights(first[:, None] + np.arange(width))
-    own = (own / own.sum(1, keepdims=True)).astype(np.float32)
+    tap_weights = weights(first[:, None] + np.arange(width))
+    tap_weights = (tap_weights / tap_weights.sum(1, keepdims=True)).astype(np.float32)
     padded = np.minimum(np.arange(count + PADDING), count - 1)
-    first, own = first[padded].astype(np.int32), own[padded]
-    table = own if resampling.axis == "rows" else own.T
-    return Taps(first, own, np.ascontiguousarray(table))
+    first, tap_weights = first[padded].astype(np.int32), tap_weights[padded]
+    table = tap_weights if resampling.axis == "rows" else tap_weights.T
+    return Taps(first, tap_weights, np.ascontiguousarray(table))
 
 
 @lru_cache(maxsize=64)
@@ -262,8 +262,12 @@ def _taps_of_bins(bins: Bins, size: int) -> Taps:
     count, factor = bins.size(size), min(bins.factor, size)
     padded = np.minimum(np.arange(count + PADDING), count - 1)
     first = (padded * factor).astype(np.int32)
-    own = np.full((len(padded), factor), 1 / factor, np.float32)
-    return Taps(first, own, own if bins.axis == "rows" else np.ascontiguousarray(own.T))
+    tap_weights = np.full((len(padded), factor), 1 / factor, np.float32)
+    return Taps(
+        first,
+        tap_weights,
+        tap_weights if bins.axis == "rows" else np.ascontiguousarray(tap_weights.T),
+    )
 
 
 def overlap(distance: Array, ratio: float) -> Array:
@@ -289,7 +293,7 @@ def lanczos3(distance: Array, ratio: float) -> Array:
     return np.where(np.abs(x) < 3, np.sinc(x) * np.sinc(x / 3), 0)
 
 
-def resample(image: Floats, resampling: AlongAxis) -> Floats:
+def resample(image: Floats, resampling: AxisResampler) -> Floats:
     """Return the smaller image, (height, width[, channel]) float32; taps are summed in order.
 
     >>> halved = Resampling("columns", 0.5, overlap, 0.5)

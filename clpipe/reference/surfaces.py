@@ -8,19 +8,19 @@ import numpy as np
 from clpipe.base.types import Array, Mask
 
 # a slope steeper by this factor than both adjacent slopes is an edge between surfaces
-STEEPER = 3.0
+EDGE_STEEPNESS = 3.0
 
 
 @dataclass(frozen=True)
 class Tolerance:
     """The allowed difference of neighbours on one surface: absolute, and relative."""
 
-    least: float = 0.0
-    share: float = 0.0
+    absolute: float = 0.0
+    relative: float = 0.0
 
 
 # For inverse depth, which is linear on a plane; for normals; for flow in px.
-DEPTH, NORMAL, FLOW = Tolerance(share=1e-3), Tolerance(least=0.02), Tolerance(least=0.05)
+DEPTH, NORMAL, FLOW = Tolerance(relative=1e-3), Tolerance(absolute=0.02), Tolerance(absolute=0.05)
 
 
 def cells(values: Array, tolerance: Tolerance | None) -> Mask:
@@ -45,10 +45,10 @@ def cells(values: Array, tolerance: Tolerance | None) -> Mask:
     down = _linked(values.swapaxes(0, 1), tolerance).swapaxes(0, 1)
     padded = np.pad(across, ((1, 1), (1, 1)), constant_values=True)
     padded[0, 1:-1], padded[-1, 1:-1] = across[0], across[-1]
-    sideways = padded[:-1] & padded[1:]
+    joined = padded[:-1] & padded[1:]
     padded = np.pad(down, ((1, 1), (1, 1)), constant_values=True)
     padded[1:-1, 0], padded[1:-1, -1] = down[:, 0], down[:, -1]
-    return np.asarray(sideways & padded[:, :-1] & padded[:, 1:])
+    return np.asarray(joined & padded[:, :-1] & padded[:, 1:])
 
 
 def _linked(values: Array, tolerance: Tolerance | None) -> Mask:
@@ -61,9 +61,9 @@ def _linked(values: Array, tolerance: Tolerance | None) -> Mask:
         step = values[:, 1:] - values[:, :-1]
         larger = np.maximum(abs(values[:, 1:]), abs(values[:, :-1]))
         size = abs(step)
-        near = size <= tolerance.least + tolerance.share * larger
+        near = size <= tolerance.absolute + tolerance.relative * larger
         mode: Any = "reflect" if step.shape[1] > 1 else "constant"
         padded = np.pad(step, ((0, 0), (1, 1), (0, 0)), mode=mode)
-        around = np.minimum(padded[:, :-2] * np.sign(step), padded[:, 2:] * np.sign(step))
-        expected = size <= STEEPER * around
+        adjacent = np.minimum(padded[:, :-2] * np.sign(step), padded[:, 2:] * np.sign(step))
+        expected = size <= EDGE_STEEPNESS * adjacent
         return np.asarray((near | expected).all(-1) & np.isfinite(step).all(-1))

@@ -20,7 +20,7 @@ SPACING = 0.5  # px at most between the positions that make up a streak
 
 
 @dataclass(frozen=True)
-class Turning:
+class CameraRotation:
     """A camera that rotates evenly about an axis in its image plane.
 
     In the middle of the exposure, the image is unchanged. Let a point be at (u, v), in focal
@@ -32,8 +32,8 @@ class Turning:
     Args:
         rotation: in degrees in total, above 0.
         angle: direction in which the image centre moves, in degrees, from right towards up.
-        focal_length: px; None is ``share``.
-        share: the focal length over the longer side of the image.
+        focal_length: px; None is ``relative_focal_length``.
+        relative_focal_length: the focal length over the longer side of the image.
         centre: the principal point in px from the frame's corner; None, for one coordinate or both,
             is the centre.
         margins: how far the image extends outside the frame, about whose centre it rotates.
@@ -52,7 +52,7 @@ class Turning:
     rotation: float
     angle: float
     focal_length: float | None = None
-    share: float | None = None
+    relative_focal_length: float | None = None
     centre: tuple[float | None, float | None] = (None, None)
     margins: Margins = NO_MARGINS
 
@@ -71,9 +71,9 @@ class Turning:
         Raises:
             ImageError: a corner of the image leaves the range of a pinhole camera.
         """
-        turns = _turns(self, 2 * self.farthest(width, height))
+        turns = _rotation_table(self, 2 * self.max_distance(width, height))
         x, y = math.cos(math.radians(self.angle)), -math.sin(math.radians(self.angle))
-        across, down = self.middle(width, height)
+        across, down = self.principal_point(width, height)
         places = {"x": x, "y": y, "middle_x": across - 0.5, "middle_y": down - 0.5}
         numbers = {name: np.float32(n) for name, n in places.items()}
         focal = np.float32(self.focal(width, height))
@@ -83,45 +83,45 @@ class Turning:
         """Return the focal length in px, for an image of this size."""
         if self.focal_length:
             return self.focal_length
-        assert self.share
-        return self.share * max(self.margins.inside(width, height))
+        assert self.relative_focal_length
+        return self.relative_focal_length * max(self.margins.frame_size(width, height))
 
-    def middle(self, width: int, height: int) -> tuple[float, float]:
+    def principal_point(self, width: int, height: int) -> tuple[float, float]:
         """Return the principal point, from the image's corner, px."""
-        middle = (side / 2 for side in self.margins.inside(width, height))
-        x, y = (m if c is None else c for m, c in zip(middle, self.centre, strict=True))
+        principal_point = (side / 2 for side in self.margins.frame_size(width, height))
+        x, y = (m if c is None else c for m, c in zip(principal_point, self.centre, strict=True))
         return self.margins.left + x, self.margins.top + y
 
-    def farthest(self, width: int, height: int) -> float:
+    def max_distance(self, width: int, height: int) -> float:
         """Return the largest distance, in px, of a pixel's light from its position in mid-exposure.
 
         Raises:
             ImageError: see :meth:`values`.
         """
-        turn = math.radians(self.rotation) / 2
-        x, y = self.middle(width, height)
+        half_rotation = math.radians(self.rotation) / 2
+        x, y = self.principal_point(width, height)
         focal = self.focal(width, height)
         u = math.hypot(max(x, width - x), max(y, height - y)) / focal  # of a corner
-        if math.atan(u) + turn > math.radians(85):
+        if math.atan(u) + half_rotation > math.radians(85):
             raise ImageError(
                 f"motion_blur: a rotation of {self.rotation:g} degrees at a focal length of "
                 f"{focal:g} px moves the corners of {width}x{height} pixels to "
-                f"{math.degrees(math.atan(u) + turn):.0f} degrees from the axis; at most 85 are "
-                "allowed. Set a smaller rotation or a longer focal length"
+                f"{math.degrees(math.atan(u) + half_rotation):.0f} degrees from the axis; at most "
+                "85 are allowed. Set a smaller rotation or a longer focal length"
             )
-        w = math.cos(turn) - u * math.sin(turn)
-        along, aside = math.sin(turn) * (1 + u * u) / w, u * (1 / w - 1)
-        return math.hypot(along, aside) * focal
+        w = math.cos(half_rotation) - u * math.sin(half_rotation)
+        along, across = math.sin(half_rotation) * (1 + u * u) / w, u * (1 / w - 1)
+        return math.hypot(along, across) * focal
 
     def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
         """See :meth:`Resampler.needed`."""
-        reach = math.ceil(self.farthest(*size)) + 1
+        reach = math.ceil(self.max_distance(*size)) + 1
         lines = size[1] if axis == "rows" else size[0]
         return max(start - reach, 0), min(stop + reach, lines)
 
     def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
         """See :meth:`Resampler.reach`."""
-        reach = math.ceil(self.farthest(*size)) + 1
+        reach = math.ceil(self.max_distance(*size)) + 1
         return low + reach, high + reach
 
     def reference(self, image: Floats) -> Floats:
@@ -133,12 +133,15 @@ class Turning:
         columns = np.arange(width, dtype=np.float32)
         rows = np.arange(height, dtype=np.float32)[:, None]
         px, py = (columns - values["middle_x"]) / focal, (rows - values["middle_y"]) / focal
-        along, aside = px * x + py * y, py * x - px * y
+        along, perpendicular = px * x + py * y, py * x - px * y
         total = np.zeros_like(image)
         turns = values["turns"].reshape(-1, 3)
         for sine, cosine, versine in turns:
             scale = focal / (cosine + along * sine)
-            du, dv = -sine * (one + along * along) * scale, aside * (versine - along * sine) * scale
+            du, dv = (
+                -sine * (one + along * along) * scale,
+                perpendicular * (versine - along * sine) * scale,
+            )
             across = np.clip(du * x - dv * y, -columns, np.float32(width - 1) - columns)
             down = np.clip(du * y + dv * x, -rows, np.float32(height - 1) - rows)
             for c in range(3):
@@ -147,9 +150,9 @@ class Turning:
 
 
 @lru_cache(maxsize=64)
-def _turns(turning: Turning, length: float) -> Floats:
+def _rotation_table(turning: CameraRotation, length: float) -> Floats:
     """Return sine, cosine and 1 minus cosine for each moment of a streak."""
     count = max(math.ceil(length / SPACING), 1)
-    turn = np.deg2rad(turning.rotation) * ((np.arange(count) + 0.5) / count - 0.5)
-    table = np.stack([np.sin(turn), np.cos(turn), 2 * np.sin(turn / 2) ** 2], -1)
+    angles = np.deg2rad(turning.rotation) * ((np.arange(count) + 0.5) / count - 0.5)
+    table = np.stack([np.sin(angles), np.cos(angles), 2 * np.sin(angles / 2) ** 2], -1)
     return np.ascontiguousarray(table, np.float32).reshape(-1)

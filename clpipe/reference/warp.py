@@ -2,7 +2,7 @@
 
 The map is computed exactly at the nodes of a grid. Between them it is interpolated with cubic
 polynomials (Lagrange's, through four nodes), in float32 and in the kernel's order. The grid is as
-coarse as possible with an error below :data:`WITHIN` at the centres of its cells.
+coarse as possible with an error below :data:`MAX_ERROR` at the centres of its cells.
 """
 
 from collections.abc import Iterator, Mapping
@@ -20,9 +20,9 @@ from clpipe.reference.lens import DistortionMap
 from clpipe.reference.radial import Radial
 from clpipe.reference.resample import Axis, Parameters, lanczos3
 
-WITHIN = 0.003  # px, of the map at the centre of a cell
+MAX_ERROR = 0.003  # px, of the map at the centre of a cell
 STEPS = (64, 32, 16, 8, 4, 2, 1)  # px from node to node
-MOST_NODES = 2**22
+MAX_NODES = 2**22
 FIELDS = 8  # of a node: x and y of red, green and blue, and two for alignment
 
 
@@ -62,10 +62,10 @@ class Grid:
         """The nodes in the kernel's layout."""
         return np.ascontiguousarray(self.nodes).reshape(-1)
 
-    def at(self, place: Array, axis: int) -> tuple[Array, list[Floats]]:
+    def at(self, positions: Array, axis: int) -> tuple[Array, list[Floats]]:
         """Return, for rows (axis 0) or columns, the first of four adjacent nodes, and weights."""
-        first = np.clip(place // self.step - 1, 0, self.nodes.shape[axis] - 4)
-        t = (place - first * self.step).astype(np.float32) * np.float32(1 / self.step)
+        first = np.clip(positions // self.step - 1, 0, self.nodes.shape[axis] - 4)
+        t = (positions - first * self.step).astype(np.float32) * np.float32(1 / self.step)
         return first, lagrange(t)
 
     def fields(self, rows: Array, columns: Array) -> Iterator[Floats]:
@@ -74,8 +74,8 @@ class Grid:
         lines = sum_of(w[:, None, None] * self.nodes[first + k] for k, w in enumerate(weights))
         first, weights = self.at(columns, 1)
         for field in range(6):
-            own = lines[:, :, field]
-            yield sum_of(w * own[:, first + k] for k, w in enumerate(weights))
+            field_lines = lines[:, :, field]
+            yield sum_of(w * field_lines[:, first + k] for k, w in enumerate(weights))
 
 
 def sum_of(terms: Iterator[Floats]) -> Floats:
@@ -102,7 +102,7 @@ def lagrange(t: Floats) -> list[Floats]:
     ]
 
 
-class Gathering:
+class GatherResampler:
     """A resampler that gathers each pixel at its own position, with one of :data:`FILTERS`."""
 
     filter: str
@@ -129,15 +129,15 @@ class Gathering:
     def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
         """See :meth:`Resampler.reach`."""
         first, last = self.lines(axis, *size)
-        of_image, of_picture = size[1 if axis == "rows" else 0], len(first)
-        line = np.arange(of_picture) * of_image
-        before = int((-(-line // of_picture) - first).max())
-        behind = int((last - line // of_picture).max())
-        low, high = (-(-each * of_image // of_picture) for each in (low, high))
-        return max(low + before, 0), max(high + behind + 1, 0)
+        input_size, output_size = size[1 if axis == "rows" else 0], len(first)
+        line = np.arange(output_size) * input_size
+        before = int((-(-line // output_size) - first).max())
+        after = int((last - line // output_size).max())
+        low, high = (-(-each * input_size // output_size) for each in (low, high))
+        return max(low + before, 0), max(high + after + 1, 0)
 
 
-def within_border(first: Array, last: Array, size: int, support: int) -> tuple[Array, Array]:
+def with_mirrored_lines(first: Array, last: Array, size: int, support: int) -> tuple[Array, Array]:
     """Return lines of an image, with those that its border mirrors, as many as the filter needs."""
     first = np.clip(np.minimum(first, size - 1 - support), 0, size - 1)
     last = np.clip(np.maximum(last, support), 0, size - 1)
@@ -145,7 +145,7 @@ def within_border(first: Array, last: Array, size: int, support: int) -> tuple[A
 
 
 @dataclass(frozen=True)
-class Warp(Gathering):
+class Warp(GatherResampler):
     """A lens as a resampling of the image, see :class:`clpipe.reference.resample.Resampler`.
 
     Args:
@@ -193,8 +193,8 @@ class Warp(Gathering):
         columns, rows = self.resized(width, height)
         fields = self.grid(width, height).fields(np.arange(rows), np.arange(columns))
         result = np.empty((rows, columns, 3), np.float32)
-        for channel, ways in enumerate(zip(fields, fields, strict=True)):
-            result[..., channel] = gather(image[..., channel], *ways, FILTERS[self.filter])
+        for channel, offsets in enumerate(zip(fields, fields, strict=True)):
+            result[..., channel] = gather(image[..., channel], *offsets, FILTERS[self.filter])
         return result
 
 
@@ -208,7 +208,7 @@ def gather(plane: Floats, across: Floats, down: Floats, polynomials: Floats) -> 
     """
     height, width = plane.shape
     rows, columns = across.shape
-    around = mirrored(plane, len(polynomials) // 2)
+    padded = mirrored(plane, len(polynomials) // 2)
     column, across = _split(across, np.arange(columns))
     row, down = _split(down, np.arange(rows)[:, None])
     inside = _is_inside(column, across, width) & _is_inside(row, down, height)
@@ -217,7 +217,7 @@ def gather(plane: Floats, across: Floats, down: Floats, polynomials: Floats) -> 
     for j, of_row in enumerate(polynomials):
         line = np.zeros((rows, columns), np.float32)
         for k, of_column in enumerate(polynomials):
-            line = line + _horner(of_column, across) * around[row + (j + 1), column + (k + 1)]
+            line = line + _horner(of_column, across) * padded[row + (j + 1), column + (k + 1)]
         total = total + _horner(of_row, down) * line
     return np.where(inside, total, np.float32(0))
 
@@ -245,14 +245,14 @@ def _horner(polynomial: Floats, x: Floats) -> Floats:
 def _grid(lens: DistortionMap, width: int, height: int) -> Grid:
     for step in STEPS:
         down, across = (max(-(-size // step) + 1, 4) for size in lens.size(width, height)[::-1])
-        if down * across > MOST_NODES:
+        if down * across > MAX_NODES:
             break
         nodes = np.zeros((down, across, FIELDS), np.float32)
         rows, columns = np.arange(down) * step, np.arange(across) * step
         for field, distances in enumerate(_distances(lens, width, height, rows, columns)):
             nodes[..., field] = distances
         grid = Grid(step, nodes)
-        if step == 1 or _error(lens, width, height, grid) <= WITHIN:
+        if step == 1 or _error(lens, width, height, grid) <= MAX_ERROR:
             return grid
     raise ImageError(
         f"distortion: the map of {width}x{height} pixels bends too sharply to be interpolated; "
@@ -269,10 +269,14 @@ def _distances(
     green: tuple[Array, Array] | None = None
     for lateral in (lens.red, Radial(), lens.blue):
         if lateral.is_identity:
-            green = green or lens.seen(x, y, width, height)
-        place = green if lateral.is_identity and green else lens.seen(x, y, width, height, lateral)
-        yield place[0] - x
-        yield place[1] - y
+            green = green or lens.source_positions(x, y, width, height)
+        position = (
+            green
+            if lateral.is_identity and green
+            else lens.source_positions(x, y, width, height, lateral)
+        )
+        yield position[0] - x
+        yield position[1] - y
 
 
 def _error(lens: DistortionMap, width: int, height: int, grid: Grid) -> float:
@@ -287,9 +291,9 @@ def _error(lens: DistortionMap, width: int, height: int, grid: Grid) -> float:
     pairs = zip(exact, near, strict=True)
     for (dx, near_dx), (dy, near_dy) in zip(pairs, pairs, strict=True):
         x, y = dx + columns, dy + rows[:, None]
-        seen = (x > -2) & (x < width + 1) & (y > -2) & (y < height + 1)
+        is_visible = (x > -2) & (x < width + 1) & (y > -2) & (y < height + 1)
         error = np.hypot(near_dx - dx, near_dy - dy)
-        largest = max(largest, float(error[seen].max(initial=0)))
+        largest = max(largest, float(error[is_visible].max(initial=0)))
     return largest
 
 
@@ -301,29 +305,29 @@ OVERSHOOT = (1.632**2 - 1) / 2
 
 @lru_cache(maxsize=32)
 def _lines(warp: Warp, axis: Axis, width: int, height: int) -> tuple[Array, Array]:
-    """See :meth:`Gathering.lines`."""
+    """See :meth:`GatherResampler.lines`."""
     grid, support = warp.grid(width, height), warp.support
     sizes = warp.resized(width, height)
     # How far the pixels among each four by four nodes look to either side, of all channels.
-    around = sliding_window_view(grid.nodes[..., :6], (4, 4), (0, 1))
-    low, high = around.min((-2, -1)), around.max((-2, -1))
-    beyond = OVERSHOOT * (high - low) + 0.01
-    low, high = (np.floor(each) for each in (low - beyond, high + beyond))
-    ends = []
+    windows = sliding_window_view(grid.nodes[..., :6], (4, 4), (0, 1))
+    low, high = windows.min((-2, -1)), windows.max((-2, -1))
+    overshoot = OVERSHOOT * (high - low) + 0.01
+    low, high = (np.floor(each) for each in (low - overshoot, high + overshoot))
+    visible = []
     for number, size in enumerate((width, height)):
         begin = np.arange(low.shape[1 - number]) * grid.step
         end = np.minimum(begin + 3 * grid.step, sizes[number] - 1)
         shape = (1, -1) if number == 0 else (-1, 1)
         first = begin.reshape(shape) + low[..., number::2].min(-1)
         last = end.reshape(shape) + high[..., number::2].max(-1)
-        ends.append((last >= -1) & (first <= size))
-    seen = ends[0] & ends[1]  # the others see no part of the image
+        visible.append((last >= -1) & (first <= size))
+    is_visible = visible[0] & visible[1]  # the others see no part of the image
     number, size = (1, height) if axis == "rows" else (0, width)
-    least = np.where(seen, low[..., number::2].min(-1), np.inf).min(number)
-    most = np.where(seen, high[..., number::2].max(-1), -np.inf).max(number)
+    least = np.where(is_visible, low[..., number::2].min(-1), np.inf).min(number)
+    most = np.where(is_visible, high[..., number::2].max(-1), -np.inf).max(number)
     line = np.arange(sizes[number])
     window = np.clip(line // grid.step - 1, 0, len(least) - 1)
     same = line + (warp.lens.margins.top if axis == "rows" else warp.lens.margins.left)
     first = np.where(np.isinf(least[window]), same, line + least[window] - (support - 1))
     last = np.where(np.isinf(most[window]), same, line + most[window] + support)
-    return within_border(first, last, size, support)
+    return with_mirrored_lines(first, last, size, support)

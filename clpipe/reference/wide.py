@@ -12,7 +12,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
-from clpipe.reference.intrinsics import OPENCV_FISHEYE, Intrinsics, smallest_error
+from clpipe.reference.intrinsics import OPENCV_FISHEYE, Intrinsics, minimax_fit
 
 Coefficients = tuple[float, ...]
 
@@ -126,7 +126,7 @@ class WideLens:
         ratio = np.sin(theta) / np.where(r > 0, r, 1)
         return np.stack([across * ratio, down * ratio, np.cos(theta)])
 
-    def seen(self, rays: Array) -> tuple[Array, Array]:
+    def project(self, rays: Array) -> tuple[Array, Array]:
         """Return the positions in the image, x and y, of directions, (3, ...).
 
         NaN outside the field of view. It is the inverse of :meth:`rays`.
@@ -146,7 +146,7 @@ class WideLens:
         if self.model != "kannala_brandt":
             angles, radii = (each[:: ANGLES // 512] for each in _table(self))
             odd = np.stack([angles**n for n in (1, 3, 5, 7, 9)], 1)
-            longer, *k, off = smallest_error(odd[1:], radii[1:])
+            longer, *k, off = minimax_fit(odd[1:], radii[1:])
             k = [each / longer for each in k]
         fx, fy = self.fx * longer, self.fy * longer
         named = {f"k{i}": each for i, each in enumerate(k, 1)}

@@ -8,10 +8,10 @@ from datetime import datetime
 from functools import cached_property
 from typing import Any
 
-from clpipe.base.memory import in_words
-from clpipe.base.text import duration, one_line
+from clpipe.base.memory import format_bytes
+from clpipe.base.text import format_duration, one_line
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS
-from clpipe.engine.clipping import MUCH
+from clpipe.engine.clipping import WARNING_SHARE
 from clpipe.reports.run import Run, RunPicture
 
 TIMES = 60  # intervals of a run, at most
@@ -157,11 +157,11 @@ def totals(run: Run, found: Sequence[Session]) -> list[tuple[str, str]]:
         left_out = last.count(LEFT_OUT)
         rows += [("Left out", f"{left_out:,}")] if left_out else []
         if last.seconds > 0:
-            rows.append(("Time of the last run", duration(last.seconds)))
+            rows.append(("Time of the last run", format_duration(last.seconds)))
         if last.speed:
             rows.append(("Speed of the last run", f"{last.speed:.3g} MP/s"))
         if peak := number(last.end.get("peak_memory")):
-            rows.append(("Peak memory", in_words(peak)))
+            rows.append(("Peak memory", format_bytes(peak)))
     return rows
 
 
@@ -295,6 +295,6 @@ def anomalies(picture: RunPicture) -> list[str]:
     """Return what is unusual in a picture: missing or changed files, clipping, warnings."""
     found = [blob.problem for blob in picture.files.values() if blob.problem]
     clipped = number(picture.value("clipped"))
-    if clipped >= MUCH:
+    if clipped >= WARNING_SHARE:
         found.append(f"{clipped * 100:.0f} % of its pixels are clipped")
     return found + warnings_of(picture)

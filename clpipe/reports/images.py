@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.analysis.crops import HEIGHT, WIDTH, Place, choose_places
+from clpipe.analysis.crops import HEIGHT, WIDTH, Crop, choose_crops
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
 from clpipe.chain.rendition import BASELINES, NOISY, PICTURES
-from clpipe.images.preview import decoded, jpeg_bytes, reduced, thumbnail_bytes
+from clpipe.images.preview import decode_8_bit, jpeg_bytes, reduce, thumbnail_bytes
 from clpipe.reports.figures import anomalies, number
 from clpipe.reports.run import Blob, Run, RunPicture
 
@@ -185,7 +185,7 @@ class ComparedImage:
     width: int  # px, of the picture
     height: int
     reduction: int  # the reduction factor; 1 is full resolution
-    places: Sequence[Place]  # regions of interest; reduced images have these at full resolution
+    places: Sequence[Crop]  # regions of interest; reduced images have these at full resolution
     views: list[dict[str, Any]] = field(default_factory=list)  # label, image, crops
     stage_thumbnails: list[dict[str, str]] = field(
         default_factory=list
@@ -215,7 +215,7 @@ class ComparedImage:
             budget: the budget that the view uses.
         """
         if self.reduction > 1:
-            image = jpeg_uri(reduced(pixels, self.reduction), REDUCED_QUALITY)
+            image = jpeg_uri(reduce(pixels, self.reduction), REDUCED_QUALITY)
             crops = [jpeg_uri(place.of(pixels)) for place in self.places]
         else:
             image, crops = jpeg_uri(pixels), []
@@ -225,7 +225,7 @@ class ComparedImage:
         return True
 
 
-def places_of(pixels: Array, reduction: int) -> list[Place]:
+def places_of(pixels: Array, reduction: int) -> list[Crop]:
     """Return regions of interest of a picture.
 
     Args:
@@ -234,11 +234,11 @@ def places_of(pixels: Array, reduction: int) -> list[Place]:
             picture. Regions of reduced pictures are enlarged to CROP px.
     """
     height, width = pixels.shape[:2]
-    small = reduced(pixels, reduction)
+    small = reduce(pixels, reduction)
     if small.shape[1] < WIDTH or small.shape[0] < HEIGHT:
-        found = [Place("middle", 0, 0, small.shape[1], small.shape[0])]
+        found = [Crop("middle", 0, 0, small.shape[1], small.shape[0])]
     else:
-        found = choose_places((), small.astype(np.float32) / np.float32(255))
+        found = choose_crops((), small.astype(np.float32) / np.float32(255))
     if reduction == 1:
         return found
     wide, high = min(CROP[0], width), min(CROP[1], height)
@@ -298,7 +298,7 @@ def compared_image(
     views.sort(key=lambda view: not view[0].endswith(PICTURE))
     for label, file in views if len(views) > 1 else views + comparison:
         try:
-            pixels = decoded(checked(file), file.name)
+            pixels = decode_8_bit(checked(file), file.name)
         except ImageError as error:
             problems.append(str(error))
             continue
@@ -367,7 +367,7 @@ def add_stages(shown: ComparedImage, picture: RunPicture, budget: Budget) -> Non
     """
     for name, file in _kept(picture):
         try:
-            pixels = decoded(checked(file), file.name)
+            pixels = decode_8_bit(checked(file), file.name)
         except ImageError:
             continue
         is_alike = pixels.shape[:2] == (shown.height, shown.width)

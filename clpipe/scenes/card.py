@@ -10,7 +10,7 @@ from pathlib import Path
 from clpipe.base.about import __version__
 from clpipe.base.files import write_new
 from clpipe.chain.rendition import Rendition
-from clpipe.images.sheet import SHOWN, contact_sheet
+from clpipe.images.sheet import SHEET_SUFFIXES, contact_sheet
 from clpipe.inputs.carry_panorama import DISTANCE
 from clpipe.outputs.camera_files import FILES, write_camera_files
 from clpipe.scenes.members import PICTURE, Member, members_of, splits_of
@@ -120,7 +120,7 @@ def _sheet(folder: Path, members: Sequence[Member]) -> bytes | None:
         + [folder / path for path in _truths(next(iter(row.values())))]
         for _, row in rows
     ]
-    if not rows or not all(path.suffix in SHOWN for row in pictures for path in row):
+    if not rows or not all(path.suffix in SHEET_SUFFIXES for row in pictures for path in row):
         return None
     titles = [column or PICTURE for column in columns] + list(_truths(rows[0][1][columns[0]], True))
     return contact_sheet(pictures, [view for view, _ in rows], titles)

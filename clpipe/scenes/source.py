@@ -12,7 +12,7 @@ from clpipe.base.digests import digests
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import write_new
 from clpipe.base.reading import check_exists
-from clpipe.images.passes import find_layers, kind_of
+from clpipe.images.passes import find_layers, layer_kind
 from clpipe.inputs.find import Job
 from clpipe.scenes.blender import Renderer, RenderError, Rendering, Scene
 from clpipe.scenes.record import read_record, write_record
@@ -121,7 +121,7 @@ def layers_in(folder: Path) -> tuple[str, ...]:
         layers_of_file: dict[str, str] = {
             each.without_rank.rpartition(".")[2]: kind
             for each in found
-            if (kind := kind_of(each.name, each)) and kind != "colour" and each.name
+            if (kind := layer_kind(each.name, each)) and kind != "colour" and each.name
         }
         common = (
             layers_of_file

@@ -18,4 +18,4 @@ def period_of(period: tuple[int, ...]) -> dict[str, CompileTime]:
 def levels_table(array: FilterArray, inverse: bool) -> Floats:
     """Return the level of white at each position, or its inverse, for kernels: (row, column)."""
     levels = {k: 1 / v if inverse else v for k, v in array.levels.items()}
-    return kernel_table(array.by_place(levels))
+    return kernel_table(array.by_position(levels))

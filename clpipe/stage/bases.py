@@ -23,25 +23,25 @@ class Unchanged(Method):
     def passes(self) -> tuple[Pass, ...]:
         return ()
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return image
 
 
-class FromLens(Method):
+class LensMethod(Method):
     """An effect of the lens that ``--lens`` names, from lensfun's data."""
 
     method: ClassVar = "lens"
     kernel: ClassVar = ""
 
-    def of_lens(self, lens: LensCalibration | None) -> Method:
+    def for_lens(self, lens: LensCalibration | None) -> Method:
         """Return the method for a lens; one that does nothing if lensfun has no data."""
         raise NotImplementedError(type(self).__name__)
 
     def resolve(self, context: Context) -> Method:
-        return self.of_lens(context.optics.calibration).resolve(context)
+        return self.for_lens(context.optics.calibration).resolve(context)
 
 
-class AboutAxis(Method):
+class PrincipalPointMethod(Method):
     """A method that measures positions from the principal point."""
 
     cx: float | None = parameter(
@@ -60,7 +60,7 @@ class AboutAxis(Method):
     )
 
 
-class InFocalLengths(Method):
+class FocalLengthMethod(Method):
     """A method that is defined in focal lengths: in px, or in mm with the width of the sensor."""
 
     alternatives: ClassVar = frozenset({"fx", "focal_length"})
@@ -82,7 +82,7 @@ class InFocalLengths(Method):
     )
 
     @property
-    def share(self) -> float | None:
+    def relative_focal_length(self) -> float | None:
         """The focal length over the longer side; None if it is in px, or not known."""
         if self.fx or not (self.focal_length and self.sensor_width):
             return None
@@ -95,14 +95,14 @@ class InFocalLengths(Method):
             RequestError: it is not known. The check takes place when a chain is resolved, because
                 options may choose the method, and each row of a manifest its camera.
         """
-        if not self.fx and not self.share:
+        if not self.fx and not self.relative_focal_length:
             raise RequestError(
                 f"{stage}: {self.method} needs a focal length; set fx (px), or focal_length and "
                 "sensor_width (mm), here or in render"
             )
 
 
-class OfDepth(Method):
+class DepthMethod(Method):
     """A method that needs the depth of its image, from :attr:`Context.depth`."""
 
     layer: str = parameter("", "Depth layer; by default one with a usual name.")
@@ -150,7 +150,7 @@ class Curve(Method):
     def arguments(self, context: Context) -> Arguments:
         return {"table": self.table()}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return np.asarray(self.table()[curve_index(image)])
 
 
@@ -180,8 +180,8 @@ class GaussianNoise(SignalMethod):
     def passes(self) -> tuple[Pass, ...]:
         return self.draw() if self.sigma else ()
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        return before + np.float32(self.sigma) ** 2
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
+        return input_variance + np.float32(self.sigma) ** 2
 
     def arguments(self, context: Context) -> Arguments:
         return {"sigma": self.sigma}

@@ -21,12 +21,12 @@ def variants(method: type[Method]) -> Iterator[dict[str, Any]]:
     every variant.
     """
     yield {}
-    for name, declared in method.model_fields.items():
-        extra: Any = declared.json_schema_extra
-        choices = get_args(declared.annotation)
-        named = get_origin(declared.annotation) is typing.Literal and choices != PATTERNS
-        if extra["structural"] and named:
-            yield from ({name: choice} for choice in choices if choice != declared.default)
+    for name, field in method.model_fields.items():
+        extra: Any = field.json_schema_extra
+        choices = get_args(field.annotation)
+        is_choice = get_origin(field.annotation) is typing.Literal and choices != PATTERNS
+        if extra["structural"] and is_choice:
+            yield from ({name: choice} for choice in choices if choice != field.default)
     yield from map(dict, method.other_examples)
 
 
@@ -44,5 +44,5 @@ def run_reference(
     """
     context = Context(load_camera(DEFAULT_CAMERA), iso, pattern)
     resolved = method.resolve(context)
-    stream = {owner: stream_of(owner.value, resolved.method) for owner in NoiseScope}
+    stream = {scope: stream_of(scope.value, resolved.method) for scope in NoiseScope}
     return resolved.reference(image, ReferenceContext(context, stream, {}))

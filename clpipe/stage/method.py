@@ -93,7 +93,7 @@ class Method(BaseModel):
         other._margins = margins
         return other
 
-    def as_for(self, other: "Method") -> Self:
+    def with_image_state_of(self, other: "Method") -> Self:
         """Return the (resolved) method for the image that belongs to another one of its step."""
         return self.with_margins(other.margins)
 
@@ -108,8 +108,8 @@ class Method(BaseModel):
     def with_optics(self, context: Context) -> Self:
         """Return a copy in which known optics replace the parameters that are None."""
         names = optics_names(type(self))
-        known = {name: getattr(context.optics, name) for name in names}
-        return self.with_defaults(**known) if known else self
+        values = {name: getattr(context.optics, name) for name in names}
+        return self.with_defaults(**values) if values else self
 
     def next_context(self, context: Context) -> Context:
         """Return the context of the next step, from this (resolved) method's."""
@@ -145,28 +145,28 @@ class Method(BaseModel):
         """
         return self.resolve(context).without_noise()
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats | None:
         """Return the noise variance after this (resolved) method, from the variance before it.
 
         A method that adds independent noise adds its variance; one that scales the image scales it.
 
         Args:
-            before: the variance in the image that the method reads, in its unit squared. It is
-                float32 of the image's shape, or of shape () if it is the same everywhere. It is not
-                modified.
+            input_variance: the variance in the image that the method reads, in its unit squared. It
+                is float32 of the image's shape, or of shape () if it is the same everywhere. It is
+                not modified.
             signal: that image without noise, (height, width[, channel]).
             context: the context of the step.
 
         Returns:
             The variance in the image that the method writes; None if it cannot be computed.
         """
-        return None if self.passes() else before
+        return None if self.passes() else input_variance
 
     def arguments(self, context: Context) -> Arguments:
         """Return the kernel arguments by name, from the resolved parameters."""
         return {}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         """Run the stage in NumPy: (height, width[, channel]) float32 in and out."""
         raise NotImplementedError(type(self).__name__)
 
@@ -207,10 +207,10 @@ class Stage:
 
     ``explain`` describes in a few lines how automatic parameters follow from the context.
 
-    ``also`` lists further kinds that the stage may read and then also writes.
+    ``also_reads`` lists further kinds that the stage may read and then also writes.
 
-    ``role`` defines how code outside its chain uses it. ``usual`` returns the method to use if
-    nothing is set, from the context of the step. None stands for the default.
+    ``role`` defines how code outside its chain uses it. ``default_method`` returns the method to
+    use if nothing is set, from the context of the step. None stands for the default.
     """
 
     name: str
@@ -220,11 +220,11 @@ class Stage:
     methods: tuple[type[Method], ...]
     explain: Callable[[Context], str] | None = None
     folder: Path | None = None  # of a plug-in's kernel files
-    also: tuple[Kind, ...] = ()
+    also_reads: tuple[Kind, ...] = ()
     role: StageRole | None = None
-    usual: Callable[[Context], Method | None] | None = None
+    default_method: Callable[[Context], Method | None] | None = None
 
-    def chosen(self, method: Method, is_set: bool, context: Context) -> Method:
+    def method_at_step(self, method: Method, is_set: bool, context: Context) -> Method:
         """Return the method at a position of a chain: the one that is set, or the usual one.
 
         Args:
@@ -232,13 +232,13 @@ class Stage:
             is_set: whether the settings mention the stage.
             context: context of the step.
         """
-        usual = None if is_set or not self.usual else self.usual(context)
-        return usual or method
+        default_method = None if is_set or not self.default_method else self.default_method(context)
+        return default_method or method
 
-    def reading(self, kind: Kind | None) -> "Stage":
+    def for_kind(self, kind: Kind | None) -> "Stage":
         """Return the stage for an entering image of a kind; itself if it does not read this
         kind."""
-        return replace(self, reads=kind, writes=kind) if kind in self.also and kind else self
+        return replace(self, reads=kind, writes=kind) if kind in self.also_reads and kind else self
 
     @cached_property
     def by_name(self) -> dict[str, type[Method]]:

@@ -151,7 +151,7 @@ class Pass:
         return *self.arguments, *further
 
     @property
-    def gives(self) -> tuple[str, ...]:
+    def provides(self) -> tuple[str, ...]:
         """The arguments that it provides for later passes: its estimates, and its table."""
         estimates = self.access.estimates if isinstance(self.access, Reduction) else ()
         return *estimates, self.writes

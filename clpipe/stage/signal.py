@@ -36,10 +36,10 @@ Signal: TypeAlias = Any
 Numbers: TypeAlias = Mapping[str, Any]  # np.float32 each, or a tensor (sample, 1, 1)
 
 
-Own: TypeAlias = Callable[[Any, Context], tuple[Any, ...]]
+ExtraArguments: TypeAlias = Callable[[Any, Context], tuple[Any, ...]]
 
 
-def nothing(method: Any, context: Context) -> tuple[Any, ...]:
+def no_arguments(method: Any, context: Context) -> tuple[Any, ...]:
     """Return no further arguments."""
     return ()
 
@@ -85,13 +85,15 @@ class Backend(ABC):
         """Repeat a cell of 2x2 numbers, (..., 1, 1) each, over the image."""
 
     @abstractmethod
-    def fixed(self, make: Callable[..., Floats], own: Own = nothing) -> Signal:
+    def fixed(
+        self, function: Callable[..., Floats], extra: ExtraArguments = no_arguments
+    ) -> Signal:
         """Return values that are fixed to a sensor.
 
         Args:
-            make: a NumPy function of the height, the width, the stream of the sensor, and ``own``.
-                Returns (height or 1, width).
-            own: further arguments, from the method and its context.
+            function: a NumPy function of the height, the width, the stream of the sensor, and
+                ``extra``. Returns (height or 1, width).
+            extra: further arguments, from the method and its context.
         """
 
 
@@ -117,11 +119,11 @@ class SignalMethod(Method):
         """Return whether PyTorch can use :meth:`apply`: a subclass may have its own reference."""
         return cls.reference is SignalMethod.reference
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         if not self.passes():
             return image
-        numbers = numbers_in(self.arguments(given.context))
-        result: Floats = self.apply(image, numbers, NumpyBackend(self, given, image.shape))
+        numbers = scalar_arguments(self.arguments(inputs.context))
+        result: Floats = self.apply(image, numbers, NumpyBackend(self, inputs, image.shape))
         return result
 
 
@@ -135,7 +137,7 @@ def sensor_bits(height: int, width: int, stream: Stream) -> NDArray[np.int32]:
     return upper_bits(word_at((height, width), 0, stream))
 
 
-def numbers_in(arguments: Mapping[str, Any]) -> dict[str, np.float32]:
+def scalar_arguments(arguments: Mapping[str, Any]) -> dict[str, np.float32]:
     """Return the numbers among the arguments of a kernel."""
     return {
         name: np.float32(value)
@@ -150,12 +152,12 @@ class NumpyBackend(Backend):
 
     Args:
         method: the (resolved) method.
-        given: its context and streams.
+        inputs: its context and streams.
         size: height and width of the image.
     """
 
     method: Method
-    given: ReferenceContext
+    inputs: ReferenceContext
     size: tuple[int, ...]
 
     where = staticmethod(np.where)
@@ -169,21 +171,23 @@ class NumpyBackend(Backend):
     tap = staticmethod(tap)
 
     @property
-    def _own(self) -> Stream:
-        return self.given.stream[NoiseScope.IMAGE]
+    def _stream(self) -> Stream:
+        return self.inputs.stream[NoiseScope.IMAGE]
 
     def normals(self, draw: int = 0) -> Signal:
-        return normal_at(self.size, draw, self._own)
+        return normal_at(self.size, draw, self._stream)
 
     def words(self, draw: int = 0) -> Any:
-        return word_at(self.size, draw, self._own)
+        return word_at(self.size, draw, self._stream)
 
     def lines(self, count: int) -> Signal:
-        return normal_of_line(count, self._own)
+        return normal_of_line(count, self._stream)
 
     def uniform(self) -> Signal:
         zero = np.zeros((1, 1), np.uint32)
-        word = philox(zero, zero, zero, np.full((1, 1), self._own.stage, np.uint32), self._own)[0]
+        word = philox(
+            zero, zero, zero, np.full((1, 1), self._stream.stage, np.uint32), self._stream
+        )[0]
         return upper_bits(word).astype(np.float32) * np.float32(4.6566129e-10)
 
     def rows(self) -> Signal:
@@ -194,7 +198,9 @@ class NumpyBackend(Backend):
         repeats = (height + 1) // 2, (width + 1) // 2
         return np.tile(np.block(cell), repeats)[:height, :width]
 
-    def fixed(self, make: Callable[..., Floats], own: Own = nothing) -> Signal:
+    def fixed(
+        self, function: Callable[..., Floats], extra: ExtraArguments = no_arguments
+    ) -> Signal:
         height, width = self.size[:2]
-        stream = self.given.stream.get(NoiseScope.CAMERA)
-        return make(height, width, stream, *own(self.method, self.given.context))
+        stream = self.inputs.stream.get(NoiseScope.CAMERA)
+        return function(height, width, stream, *extra(self.method, self.inputs.context))

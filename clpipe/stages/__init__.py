@@ -1,8 +1,8 @@
 """The stages, one per file or folder, and the default chain.
 
 Each file declares one stage: its methods, their parameters, kernels and NumPy references. Every
-module here must define ``STAGE``; :func:`own_stages` imports them all, so no other list exists.
-Code that several stages share belongs in ``reference`` or ``stage``. This package imports
+module here must define ``STAGE``; :func:`built_in_stages` imports them all, so no other list
+exists. Code that several stages share belongs in ``reference`` or ``stage``. This package imports
 ``images``, ``stage``, ``reference``, ``camera`` and ``base``.
 """
 
@@ -51,7 +51,7 @@ DEFAULT_CHAIN = (
 
 
 @cache
-def own_stages() -> dict[str, Stage]:
+def built_in_stages() -> dict[str, Stage]:
     """Return clpipe's built-in stages by name: the default chain in its order, then the others."""
     stages: dict[str, Stage] = {
         module.name: import_module(f"{__name__}.{module.name}").STAGE

@@ -75,9 +75,9 @@ class Sine(SignalMethod):
     def passes(self) -> tuple[Pass, ...]:
         if not self.amplitude:
             return ()
-        given = ("frequency", "amplitude")
+        names = ("frequency", "amplitude")
         return (
-            Pass("wave_of_lines", LineTable("rows"), given, writes="wave", random=NoiseScope.IMAGE),
+            Pass("wave_of_lines", LineTable("rows"), names, writes="wave", random=NoiseScope.IMAGE),
             Pass("banding", arguments=("wave",)),
         )
 
@@ -90,8 +90,8 @@ class Sine(SignalMethod):
     def arguments(self, context: Context) -> Arguments:
         return {"frequency": self.frequency, "amplitude": self.amplitude}
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        return before + np.float32(self.amplitude) ** 2 / np.float32(2)
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
+        return input_variance + np.float32(self.amplitude) ** 2 / np.float32(2)
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:

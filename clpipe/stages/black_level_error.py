@@ -78,25 +78,25 @@ class Offsets(SignalMethod):
             Pass("black_level_error", arguments=("in_even", "in_odd")),
         )
 
-    def _places(self, pattern: str) -> dict[tuple[int, int], np.float32]:
+    def _bias_by_site(self, pattern: str) -> dict[tuple[int, int], np.float32]:
         """Return the fixed offset at a column and row of the filter array."""
         red, with_red, with_blue, blue = map(float32, self.bias or (0.0,) * 4)
         green = with_red if "R" in pattern[:2] else with_blue
-        others = with_blue if "R" in pattern[:2] else with_red
-        own = {"R": (red, red), "B": (blue, blue), "G": (green, others)}
-        return {(k % 2, k // 2): own[colour][k // 2] for k, colour in enumerate(pattern)}
+        other_green = with_blue if "R" in pattern[:2] else with_red
+        by_colour = {"R": (red, red), "B": (blue, blue), "G": (green, other_green)}
+        return {(k % 2, k // 2): by_colour[colour][k // 2] for k, colour in enumerate(pattern)}
 
     def arguments(self, context: Context) -> Arguments:
-        places = self._places(context.pattern)
+        biases = self._bias_by_site(context.pattern)
         return {
             "column_0": CompileTime("0u"),
             "column_1": CompileTime("1u"),
-            **{f"bias_{column}{row}": bias for (column, row), bias in places.items()},
+            **{f"bias_{column}{row}": bias for (column, row), bias in biases.items()},
             "sigma": self.sigma,
         }
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        return before + np.float32(self.sigma) ** 2
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
+        return input_variance + np.float32(self.sigma) ** 2
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:

@@ -18,7 +18,7 @@ from clpipe.stage import (
     parameter,
 )
 
-REACH = 16  # px
+RADIUS = 16  # px
 
 
 class NoBlooming(Unchanged):
@@ -61,7 +61,7 @@ class Column(SignalMethod):
         )
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("blooming", Stencil(REACH), ("full", "first", "spill")),)
+        return (Pass("blooming", Stencil(RADIUS), ("full", "first", "spill")),)
 
     def arguments(self, context: Context) -> Arguments:
         first, spill = float32((1 - self.spill) / 2), float32(self.spill)
@@ -71,11 +71,11 @@ class Column(SignalMethod):
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
         full, weight = n["full"], n["first"]
         excess = (y - full).clip(min=0)
-        got = 0.0
-        for k in range(1, REACH + 1):
-            got = got + (backend.tap(excess, 0, -k) + backend.tap(excess, 0, k)) * weight
+        received = 0.0
+        for k in range(1, RADIUS + 1):
+            received = received + (backend.tap(excess, 0, -k) + backend.tap(excess, 0, k)) * weight
             weight = weight * n["spill"]
-        return backend.minimum(backend.minimum(y, full) + got, full)
+        return backend.minimum(backend.minimum(y, full) + received, full)
 
 
 STAGE = Stage(

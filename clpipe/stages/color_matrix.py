@@ -95,7 +95,7 @@ class FixedMatrix(Method):
 
     def next_context(self, context: Context) -> Context:
         colours = np.array(self.matrix) @ context.colours
-        return context.but(colours=as_tuples(colours.tolist()))
+        return context.replace(colours=as_tuples(colours.tolist()))
 
     @property
     def _array(self) -> Floats:
@@ -107,7 +107,7 @@ class FixedMatrix(Method):
     def arguments(self, context: Context) -> Arguments:
         return dict(zip(NAMES, self._array.ravel(), strict=True))
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return apply_matrix(image, self._array)
 
 

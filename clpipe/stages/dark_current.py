@@ -98,7 +98,7 @@ class Thermal(SignalMethod):
 
     def resolve(self, context: Context) -> "Thermal":
         camera = context.camera
-        own = self.with_defaults(
+        resolved = self.with_defaults(
             exposure_time=context.exposure_time or 0.0,
             reference_temperature=camera.dark_current_temperature,
             current=camera.dark_current,
@@ -106,7 +106,7 @@ class Thermal(SignalMethod):
             spread=camera.dark_current_spread,
             per_electron=camera.signal_of(1.0, context.iso),
         )
-        return own.with_defaults(temperature=own.reference_temperature)
+        return resolved.with_defaults(temperature=resolved.reference_temperature)
 
     @property
     def electrons(self) -> float:
@@ -147,17 +147,17 @@ class Thermal(SignalMethod):
         mean, spread, electron = self._charge
         return {"mean": mean, "spread": spread, "per_electron": electron}
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         if not self.electrons:
-            return before
+            return input_variance
         mean, spread, electron = self._charge
-        return before + (mean * electron + spread * spread)
+        return input_variance + (mean * electron + spread * spread)
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
-        more = backend.fixed(charge_of_sensor) * n["spread"]
-        shot = backend.square_root((more + n["mean"]).clip(min=0) * n["per_electron"])
-        return y + more + backend.normals(1) * shot
+        offset = backend.fixed(charge_of_sensor) * n["spread"]
+        shot = backend.square_root((offset + n["mean"]).clip(min=0) * n["per_electron"])
+        return y + offset + backend.normals(1) * shot
 
 
 def charge_of_sensor(height: int, width: int, stream: Stream) -> Floats:

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import field_validator
 
 from clpipe.base.errors import ImageError
-from clpipe.base.reading import read_when_changed
+from clpipe.base.reading import cached_by_mtime
 from clpipe.base.tracing import float32
 from clpipe.base.types import Array, Floats
 from clpipe.reference.random import Stream, normal_of, philox
@@ -29,7 +29,9 @@ from clpipe.stage import (
     parameter,
 )
 
-MAPS = 4  # products of a curve over the rows and one over the columns: two for each of the two maps
+PRODUCTS = (
+    4  # products of a curve over the rows and one over the columns: two for each of the two maps
+)
 
 
 def curve(count: int, number: int, per_px: np.float32, stream: Stream) -> Floats:
@@ -57,8 +59,8 @@ def curve(count: int, number: int, per_px: np.float32, stream: Stream) -> Floats
     stage, draw = np.full(1, stream.stage, np.uint32), np.full(1, number, np.uint32)
     total = np.zeros(count, np.float32)
     for k, weight in enumerate(weights):
-        place = (whole + k).astype(np.uint32)
-        total = total + normal_of(philox(place, zero, draw, stage, stream)[0]) * weight
+        knot = (whole + k).astype(np.uint32)
+        total = total + normal_of(philox(knot, zero, draw, stage, stream)[0]) * weight
     return np.asarray(total * np.float32(0.24078))
 
 
@@ -112,7 +114,7 @@ class Smooth(SignalMethod):
     def passes(self) -> tuple[Pass, ...]:
         if not self.slope and not self.offset:
             return ()
-        tables = [f"{axis}_{k}" for k in range(MAPS) for axis in ("rows", "columns")]
+        tables = [f"{axis}_{k}" for k in range(PRODUCTS) for axis in ("rows", "columns")]
         return (
             *(
                 Pass(
@@ -139,17 +141,17 @@ class Smooth(SignalMethod):
 
     def arguments(self, context: Context) -> Arguments:
         slope, offset = self._amplitudes(context.iso)
-        numbers = {f"curve_{k}": CompileTime(f"{k}u") for k in range(2 * MAPS)}
+        numbers = {f"curve_{k}": CompileTime(f"{k}u") for k in range(2 * PRODUCTS)}
         return {**numbers, "per_px": self._per_px, "slope": slope, "offset": offset}
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         """The variance of the noise: a smooth map that is the same in every frame adds none."""
-        return before
+        return input_variance
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
         of_iso = backend.fixed(shading, lambda method, _: (method._per_px, 0))
-        fixed = backend.fixed(shading, lambda method, _: (method._per_px, MAPS))
+        fixed = backend.fixed(shading, lambda method, _: (method._per_px, PRODUCTS))
         return y + (of_iso * n["slope"] + fixed * n["offset"])
 
 
@@ -161,34 +163,34 @@ def shading(height: int, width: int, stream: Stream, per_px: np.float32, first: 
     return down[:, None] * across + other_down[:, None] * other_across
 
 
-def measured(path: str) -> Floats:
+def read_map(path: str) -> Floats:
     """Return the map in a file of one channel, (height, width), DN. A changed file is read again.
 
     Raises:
         ValueError: the file cannot be read, or does not contain such a map.
     """
     try:
-        return _measured(path)
+        return _read_map(path)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
     except ImageError as error:
         raise ValueError(str(error)) from None
 
 
-@read_when_changed
-def _measured(path: str) -> Floats:
+@cached_by_mtime
+def _read_map(path: str) -> Floats:
     from clpipe.images.read import read_image  # this import is slow and rarely needed
 
     return np.asarray(read_image(Path(path), mosaic=True).pixels, np.float32)
 
 
-def combined(slope: str | None, offset: str | None, iso: float, unit: float) -> Floats:
+def combine_maps(slope: str | None, offset: str | None, iso: float, unit: float) -> Floats:
     """Return the map ISO * k + b, in signal units, from two files, one of which may be absent.
 
     Raises:
         ValueError: the two maps differ in size.
     """
-    maps = [measured(path) for path in (slope, offset) if path]
+    maps = [read_map(path) for path in (slope, offset) if path]
     if len({each.shape for each in maps}) > 1:
         sizes = " and ".join(f"{w}x{h}" for h, w in (each.shape for each in maps))
         raise ValueError(f"slope_file and offset_file differ in size: {sizes}")
@@ -220,15 +222,15 @@ class File(SignalMethod):
 
     @field_validator("slope_file", "offset_file")
     @classmethod
-    def _readable(cls, path: str | None) -> str | None:
+    def _check_file(cls, path: str | None) -> str | None:
         if path is not None:
-            measured(path)
+            read_map(path)
         return path
 
     def resolve(self, context: Context) -> "File":
-        own = self.with_defaults(unit=context.camera.signal_range)
-        combined(own.slope_file, own.offset_file, context.iso, own.unit or 1.0)
-        return own
+        resolved = self.with_defaults(unit=context.camera.signal_range)
+        combine_maps(resolved.slope_file, resolved.offset_file, context.iso, resolved.unit or 1.0)
+        return resolved
 
     def passes(self) -> tuple[Pass, ...]:
         if not self.slope_file and not self.offset_file:
@@ -236,15 +238,15 @@ class File(SignalMethod):
         return (Pass("dark_shading_file", arguments=("map", "width", "height", "per_px")),)
 
     def _map(self, iso: float) -> Floats:
-        return combined(self.slope_file, self.offset_file, iso, self.unit or 1.0)
+        return combine_maps(self.slope_file, self.offset_file, iso, self.unit or 1.0)
 
     def arguments(self, context: Context) -> Arguments:
         if not self.passes():
             return {}
-        own = self._map(context.iso)
-        height, width = own.shape
+        shading_map = self._map(context.iso)
+        height, width = shading_map.shape
         sizes = {"width": np.int32(width), "height": np.int32(height)}
-        return {"map": own, **sizes, "per_px": 1 / self.block}
+        return {"map": shading_map, **sizes, "per_px": 1 / self.block}
 
     def without_noise(self) -> Method | None:
         return None if self.passes() else self
@@ -255,13 +257,14 @@ class File(SignalMethod):
 
     def at_iso(self, height: int, width: int, iso: float) -> Floats:
         """Return the map that is added, (height, width), in signal units."""
-        own = self._map(iso)
+        shading_map = self._map(iso)
         (up, down, v), (left, right, x) = (
-            between(n, np.float32(1 / self.block), count)
-            for n, count in zip((height, width), own.shape, strict=True)
+            sample_positions(n, np.float32(1 / self.block), count)
+            for n, count in zip((height, width), shading_map.shape, strict=True)
         )
         rows = [
-            own[row][:, left] + (own[row][:, right] - own[row][:, left]) * x for row in (up, down)
+            shading_map[row][:, left] + (shading_map[row][:, right] - shading_map[row][:, left]) * x
+            for row in (up, down)
         ]
         upper, lower = rows
         total: Floats = upper + (lower - upper) * v[:, None]
@@ -273,7 +276,7 @@ def map_at_iso(height: int, width: int, stream: Stream, method: File, iso: float
     return method.at_iso(height, width, iso)
 
 
-def between(pixels: int, per_px: np.float32, count: int) -> tuple[Array, Array, Floats]:
+def sample_positions(pixels: int, per_px: np.float32, count: int) -> tuple[Array, Array, Floats]:
     """Return the samples before and after each pixel of a row, and the weight of the second."""
     half, zero = np.float32(0.5), np.float32(0)
     t = (np.arange(pixels, dtype=np.float32) + half) * per_px - half

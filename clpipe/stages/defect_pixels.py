@@ -21,7 +21,7 @@ from clpipe.stage import (
     sensor_bits,
 )
 
-WORDS = 1 << 31  # number of different random words that choose the pixels
+RANDOM_WORDS = 1 << 31  # number of different random words that choose the pixels
 DEFAULT_LEVEL = 0.1  # signal units; chosen to be visible, if the camera has no value
 
 
@@ -75,7 +75,9 @@ class Random(SignalMethod):
     def limits(self) -> tuple[int, int]:
         """Return the words below which a pixel is hot, and above which it is dead."""
         assert self.hot_share is not None and self.dead_share is not None
-        return round(self.hot_share * WORDS), WORDS - 1 - round(self.dead_share * WORDS)
+        return round(self.hot_share * RANDOM_WORDS), RANDOM_WORDS - 1 - round(
+            self.dead_share * RANDOM_WORDS
+        )
 
     def arguments(self, context: Context) -> Arguments:
         hot_limit, dead_limit = self.limits()
@@ -86,9 +88,9 @@ class Random(SignalMethod):
             "hot_level": self.hot_level,
         }
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         """The variance without defect pixels, which are few and not part of the noise model."""
-        return before
+        return input_variance
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:

@@ -8,13 +8,13 @@ from pydantic import field_validator, model_validator
 
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
-from clpipe.reference.defocus import NOWHERE, Depth, aperture_taps, defocus, reach_of
+from clpipe.reference.defocus import NO_SURFACE, Depth, aperture_taps, defocus, disc_reach
 from clpipe.stage import (
     Arguments,
     Context,
-    InFocalLengths,
+    DepthMethod,
+    FocalLengthMethod,
     Kind,
-    OfDepth,
     Pass,
     ReferenceContext,
     Stage,
@@ -23,8 +23,8 @@ from clpipe.stage import (
     parameter,
 )
 
-LARGEST = 31  # px, radius of a disc
-VECTOR = 16  # lanes at most
+MAX_RADIUS = 31  # px, radius of a disc
+MAX_LANES = 16  # lanes at most
 
 
 class InFocus(Unchanged):
@@ -34,7 +34,7 @@ class InFocus(Unchanged):
     summary: ClassVar = "everything is in focus"
 
 
-class ThinLens(InFocalLengths, OfDepth):
+class ThinLens(FocalLengthMethod, DepthMethod):
     """A thin lens: a point at distance z becomes a disc of diameter c.
 
     c = f^2 |z - zf| / (N z (zf - f)), with focal length f, f-number N and focus distance zf
@@ -93,18 +93,18 @@ class ThinLens(InFocalLengths, OfDepth):
         "px",
         structural=True,
         ge=1,
-        le=LARGEST,
+        le=MAX_RADIUS,
     )
 
     @field_validator("blades")
     @classmethod
-    def _closed(cls, blades: int) -> int:
+    def _check_blades(cls, blades: int) -> int:
         if blades in range(1, 5):
             raise ValueError("an aperture has 5 to 9 blades, or 0 for a round one")
         return blades
 
     @model_validator(mode="after")
-    def _one_size(self) -> "ThinLens":
+    def _check_pixel_size(self) -> "ThinLens":
         if self.sensor_width and self.pixel_pitch:
             raise ValueError(
                 "set either sensor_width or pixel_pitch: both define the size of a pixel"
@@ -123,30 +123,34 @@ class ThinLens(InFocalLengths, OfDepth):
         """
         metres = context.optics.focus_distance
         distance = 3.0 if metres is None else metres / self.depth_scale
-        own = self.with_optics(context).with_defaults(f_number=2.8, focus_distance=distance)
-        if not own.sensor_width:
-            if own.fx and own.focal_length:
-                own = own.with_defaults(pixel_pitch=own.focal_length / own.fx * 1000)
-            elif own.fx and not own.pixel_pitch:
+        resolved = self.with_optics(context).with_defaults(f_number=2.8, focus_distance=distance)
+        if not resolved.sensor_width:
+            if resolved.fx and resolved.focal_length:
+                resolved = resolved.with_defaults(
+                    pixel_pitch=resolved.focal_length / resolved.fx * 1000
+                )
+            elif resolved.fx and not resolved.pixel_pitch:
                 raise RequestError(
-                    f"defocus: the focal length is {own.fx:g} px, and its length in mm is not "
+                    f"defocus: the focal length is {resolved.fx:g} px, and its length in mm is not "
                     "known; set focal_length, sensor_width (mm) or pixel_pitch (um), here or "
                     "in render"
                 )
-            own = own.with_defaults(pixel_pitch=context.camera.pixel_pitch)
-            if not own.pixel_pitch:
+            resolved = resolved.with_defaults(pixel_pitch=context.camera.pixel_pitch)
+            if not resolved.pixel_pitch:
                 raise RequestError(
                     "defocus.sensor_width: the pixel size is needed, and the profile of camera "
                     f"{context.camera.name} does not contain it; set sensor_width in mm, or "
                     "pixel_pitch in um"
                 )
-            if own.fx:
-                own = own.with_defaults(focal_length=own.fx * own.pixel_pitch / 1000)
-        if not own.fx:
-            own = own.with_defaults(focal_length=50.0)
-        if own.focal_length:
-            own.check_focus(own.focal_length)
-        return own
+            if resolved.fx:
+                resolved = resolved.with_defaults(
+                    focal_length=resolved.fx * resolved.pixel_pitch / 1000
+                )
+        if not resolved.fx:
+            resolved = resolved.with_defaults(focal_length=50.0)
+        if resolved.focal_length:
+            resolved.check_focus(resolved.focal_length)
+        return resolved
 
     @property
     def focus(self) -> float:
@@ -183,13 +187,13 @@ class ThinLens(InFocalLengths, OfDepth):
 
     def camera(self, width: int, height: int) -> tuple[float, float]:
         """Return the focal length and the pixel pitch, in mm, for an image of this size."""
-        side = max(self.margins.inside(width, height))
+        side = max(self.margins.frame_size(width, height))
         pitch = self.sensor_width / side if self.sensor_width else (self.pixel_pitch or 0.0) / 1000
         return self.focal_length or (self.fx or 0.0) * pitch, pitch
 
     def passes(self) -> tuple[Pass, ...]:
-        given = ("radii", "columns", "rows", "reach", "taps", "count")
-        return (Pass("defocus", Stencil(self.max_radius), given),)
+        names = ("radii", "columns", "rows", "reach", "taps", "count")
+        return (Pass("defocus", Stencil(self.max_radius), names),)
 
     def radii(self, depth: Floats) -> Floats:
         """Return the radii of the discs in px, without the limit; negative for near points.
@@ -203,12 +207,12 @@ class ThinLens(InFocalLengths, OfDepth):
         nearness = np.float32(self.focus / (self.depth_scale * 1000.0)) / depth
         return np.asarray(np.float32(widest) * (1 - nearness))
 
-    def clipped(self, depth: Floats) -> Floats:
+    def limited_radii(self, depth: Floats) -> Floats:
         """Return the radii that are used, see :meth:`radii`, limited to ``max_radius``."""
         return np.clip(self.radii(depth), -self.max_radius, self.max_radius)
 
     def arguments(self, context: Context) -> Arguments:
-        depth = _depth_in(context)
+        depth = _depth_of(context)
         radii, reach, taps = depth.derived.get(self, lambda: self._tables(depth.pixels))
         return {
             "radii": radii,
@@ -221,24 +225,24 @@ class ThinLens(InFocalLengths, OfDepth):
 
     def _tables(self, depth: Floats) -> tuple[Floats, int, Floats]:
         """Return the radii with a border, the border's width, and the taps of the largest disc."""
-        radii = self.clipped(depth)
+        radii = self.limited_radii(depth)
         largest = float(np.ceil(abs(radii).max() * 4)) / 4  # so that many images share a few tables
-        reach = reach_of(largest)
-        border = ((reach, reach), (reach, reach + VECTOR))
+        reach = disc_reach(largest)
+        border = ((reach, reach), (reach, reach + MAX_LANES))
         return np.pad(radii, border, "reflect"), reach, aperture_taps(self.blades, largest)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        taps = self.arguments(given.context)["taps"]
-        depth = np.broadcast_to(_depth_in(given.context).pixels, image.shape[:2])
-        radii = self.clipped(depth)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        taps = self.arguments(inputs.context)["taps"]
+        depth = np.broadcast_to(_depth_of(inputs.context).pixels, image.shape[:2])
+        radii = self.limited_radii(depth)
         assert isinstance(taps, np.ndarray)
         return defocus(image, radii, taps)
 
 
-def _depth_in(context: Context) -> Depth:
+def _depth_of(context: Context) -> Depth:
     """Return the depth of the image. Without an image, everything is infinitely far."""
     if context.depth is None:
-        return NOWHERE
+        return NO_SURFACE
     depth: Any = context.depth()
     assert depth is not None, "the image is still there"
     return depth

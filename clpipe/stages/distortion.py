@@ -20,15 +20,15 @@ from clpipe.reference import warp
 from clpipe.reference.lens import DistortionMap
 from clpipe.reference.radial import Radial
 from clpipe.stage import (
-    AboutAxis,
     Arguments,
     CompileTime,
     Context,
-    FromLens,
-    InFocalLengths,
+    FocalLengthMethod,
     Kind,
+    LensMethod,
     Method,
     Pass,
+    PrincipalPointMethod,
     ReferenceContext,
     Resample,
     Stage,
@@ -55,7 +55,7 @@ def filter_arguments(name: str) -> Arguments:
     }
 
 
-class HasPicture(AboutAxis):
+class WarpMethod(PrincipalPointMethod):
     """Parameters that every lens model has."""
 
     fit: bool = parameter(
@@ -68,19 +68,19 @@ class HasPicture(AboutAxis):
     )
 
 
-class DistortionOfLens(FromLens, HasPicture):
+class LensDistortion(LensMethod, WarpMethod):
     """Distortion of the lens that ``--lens`` names, from lensfun; without it, none."""
 
     summary: ClassVar = "distortion of the lens that --lens names; none without it"
 
-    def of_lens(self, lens: LensCalibration | None) -> Method:
+    def for_lens(self, lens: LensCalibration | None) -> Method:
         if lens is None or not lens.distortion:
             return NoDistortion()
-        own, table = dict(self), dict(lens.distortion)
-        return STAGE.by_name[table.pop("method")](**own, **table)
+        parameters, table = dict(self), dict(lens.distortion)
+        return STAGE.by_name[table.pop("method")](**parameters, **table)
 
 
-class Distortion(HasPicture):
+class Distortion(WarpMethod):
     """A lens's distortion and lateral colour, in one resampling."""
 
     kernel: ClassVar = "distortion"
@@ -136,14 +136,14 @@ class Distortion(HasPicture):
     def arguments(self, context: Context) -> Arguments:
         return filter_arguments(self.filter)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return self.resampling.reference(image) if self.passes() else image
 
 
 Coefficient = Annotated[float, Field(ge=-1e4, le=1e4)]
 
 
-class OfCamera(InFocalLengths, Distortion):
+class FocalLengthDistortion(FocalLengthMethod, Distortion):
     """A model that is defined in focal lengths."""
 
     fy: float | None = parameter(
@@ -156,28 +156,28 @@ class OfCamera(InFocalLengths, Distortion):
         Raises:
             RequestError: it is not known.
         """
-        own = self.with_optics(context)
-        own.check_focal_length("distortion")
-        return own.with_defaults(fy=own.fx)
+        resolved = self.with_optics(context)
+        resolved.check_focal_length("distortion")
+        return resolved.with_defaults(fy=resolved.fx)
 
     def estimates_for(self, width: int, height: int) -> Mapping[str, float]:
         """Return the factor by which ``fit`` changes the focal length, and the result in px."""
-        found = super().estimates_for(width, height)
-        if not found:
-            return found
+        estimates = super().estimates_for(width, height)
+        if not estimates:
+            return estimates
         lens = self.lens()
         unit = lens.unit(*lens.size(width, height))
-        fx, fy = (found["focal_length_factor"] * each for each in unit)
-        return {**found, "fx": fx, "fy": fy}
+        fx, fy = (estimates["focal_length_factor"] * each for each in unit)
+        return {**estimates, "fx": fx, "fy": fy}
 
     def lens(self) -> DistortionMap:
         lens = super().lens()
         if self.fx and self.fy:
             return replace(lens, focal=(self.fx, self.fy))
-        return replace(lens, share=self.share)
+        return replace(lens, relative_focal_length=self.relative_focal_length)
 
 
-class BrownConrady(OfCamera):
+class BrownConrady(FocalLengthDistortion):
     """x_d = x R(r) + 2 p1 x y + p2 (r^2 + 2 x^2), y_d likewise: OpenCV's and COLMAP's model.
 
     The radial factor is ``R = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)``. x
@@ -208,14 +208,14 @@ class BrownConrady(OfCamera):
     p2: Coefficient = parameter(0.0, "Tangential coefficient, horizontal.")
 
     def radial(self) -> Radial:
-        below = (0.0, self.k4, 0.0, self.k5, 0.0, self.k6)
-        return Radial.of(1.0, 0.0, self.k1, 0.0, self.k2, 0.0, self.k3, below=below)
+        denominator = (0.0, self.k4, 0.0, self.k5, 0.0, self.k6)
+        return Radial.of(1.0, 0.0, self.k1, 0.0, self.k2, 0.0, self.k3, denominator=denominator)
 
     def lens(self) -> DistortionMap:
         return replace(super().lens(), tangential=(self.p1, self.p2))
 
 
-class Fisheye(OfCamera):
+class Fisheye(FocalLengthDistortion):
     """r_d = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8), a = atan(r): OpenCV's fisheye model.
 
     r starts at the principal point and is in focal lengths (Kannala and Brandt, PAMI 2006; COLMAP
@@ -238,7 +238,7 @@ class Fisheye(OfCamera):
         return Radial.of(*powers, of_angle=True)
 
 
-class OfLensfun(Distortion):
+class LensfunDistortion(Distortion):
     """A model of lensfun, in the units of lensfun's lateral colour."""
 
     unit: float | None = parameter(
@@ -252,7 +252,7 @@ class OfLensfun(Distortion):
         return replace(super().lens(), half_diagonals=self.unit)
 
 
-class Poly3(OfLensfun):
+class Poly3(LensfunDistortion):
     """r_d = r (1 - k1 + k1 r^2), lensfun's model of that name."""
 
     method: ClassVar = "poly3"
@@ -265,7 +265,7 @@ class Poly3(OfLensfun):
         return Radial.of(1 - self.k1, 0.0, self.k1)
 
 
-class Poly5(OfLensfun):
+class Poly5(LensfunDistortion):
     """r_d = r (1 + k1 r^2 + k2 r^4), lensfun's model of that name."""
 
     method: ClassVar = "poly5"
@@ -279,7 +279,7 @@ class Poly5(OfLensfun):
         return Radial.of(1.0, 0.0, self.k1, 0.0, self.k2)
 
 
-class PtLens(OfLensfun):
+class PtLens(LensfunDistortion):
     """r_d = r (a r^3 + b r^2 + c r + 1 - a - b - c), lensfun's and Hugin's model of that name."""
 
     method: ClassVar = "ptlens"
@@ -299,5 +299,5 @@ STAGE = Stage(
     "Apply a lens's distortion and lateral colour.",
     Kind.RGB,
     Kind.RGB,
-    (DistortionOfLens, NoDistortion, BrownConrady, Fisheye, Poly3, Poly5, PtLens),
+    (LensDistortion, NoDistortion, BrownConrady, Fisheye, Poly3, Poly5, PtLens),
 )

@@ -20,9 +20,9 @@ from clpipe.stage import (
 )
 from clpipe.stages import tone_curve
 from clpipe.stages.tone_curve import standard
-from clpipe.stages.tone_curve.hue import inside_of, keep_hue
+from clpipe.stages.tone_curve.hue import clip_to_unit, keep_hue
 from clpipe.stages.tone_curve.neutral import A, B, C, D, inverse_neutral
-from clpipe.stages.tone_curve.table import table_of
+from clpipe.stages.tone_curve.table import load_table
 
 
 @lru_cache(maxsize=16)
@@ -32,7 +32,7 @@ def inverse_table(path: str) -> Floats:
     Raises:
         ValueError: the file contains no curve, or the curve falls somewhere, or it never rises.
     """
-    table = table_of(path).astype(np.float64)
+    table = load_table(path).astype(np.float64)
     if np.any(np.diff(table) < 0) or table[-1] <= table[0]:
         raise ValueError(f"{path}: only a rising curve can be inverted")
     linear = tabulate(lambda x: x).astype(np.float64)
@@ -54,8 +54,8 @@ class Standard(standard.Standard):
     def arguments(self, context: Context) -> Arguments:
         return self.numbers(standard.GREY_OUT)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        inside = inside_of(image)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        inside = clip_to_unit(image)
         to_high = inside.max(-1, keepdims=True)
         high = self.inverse(to_high)
         part = high / (self.colourfulness(high) * np.maximum(to_high, np.float32(1e-9)))
@@ -76,7 +76,7 @@ class Neutral(Method):
     def arguments(self, context: Context) -> Arguments:
         return {"a": A, "b": B, "c": C, "d": D}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return keep_hue(image, inverse_neutral)
 
 

@@ -8,7 +8,7 @@ from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import by_site
 from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stage, StageRole
-from clpipe.stages.white_balance.gains import CameraGains, OfArray
+from clpipe.stages.white_balance.gains import ArrayMethod, CameraGains
 
 
 class Gains(CameraGains):
@@ -31,11 +31,11 @@ class Gains(CameraGains):
         return float32(1 / red), float32(1 / blue)
 
     def resolve(self, context: Context) -> CameraGains:
-        own = super().resolve(context)
-        return ArrayGains.on(context.array, own) if context.array else own
+        resolved = super().resolve(context)
+        return ArrayGains.for_array(context.array, resolved) if context.array else resolved
 
     def next_context(self, context: Context) -> Context:
-        return context.but(gains=self.gains)
+        return context.replace(gains=self.gains)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("inverse_white_balance", arguments=("pattern", "red", "blue")),)
@@ -44,25 +44,25 @@ class Gains(CameraGains):
         red, blue = self.factors
         return {"pattern": context.cfa, "red": red, "blue": blue}
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         red, blue = (np.float32(gain**-2) for gain in self.gains)
-        return before * by_site(signal.shape[:2], context.pattern, red, np.float32(1), blue)
+        return input_variance * by_site(signal.shape[:2], context.pattern, red, np.float32(1), blue)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         red, blue = self.factors
-        return image * by_site(image.shape, given.context.pattern, red, np.float32(1), blue)
+        return image * by_site(image.shape, inputs.context.pattern, red, np.float32(1), blue)
 
 
-class ArrayGains(OfArray, Gains):
+class ArrayGains(ArrayMethod, Gains):
     """Division by the gains on any filter array: white fills the most sensitive channel."""
 
     function: ClassVar = "white_to_level"
     inverse: ClassVar = False
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        return before * self.factors_at(signal.shape[:2]) ** 2
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
+        return input_variance * self.factors_at(signal.shape[:2]) ** 2
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return image * self.factors_at(image.shape)
 
 

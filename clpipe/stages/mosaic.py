@@ -50,15 +50,15 @@ class Bayer(Method):
     )
 
     def next_context(self, context: Context) -> Context:
-        return context.but(pattern=self.pattern, array=None)
+        return context.replace(pattern=self.pattern, array=None)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("mosaic", arguments=("pattern",)),)
 
     def arguments(self, context: Context) -> Arguments:
-        return {"pattern": context.but(pattern=self.pattern).cfa}
+        return {"pattern": context.replace(pattern=self.pattern).cfa}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         red, green, blue = np.moveaxis(image, -1, 0)
         return by_site(image.shape, self.pattern, red, green, blue)
 
@@ -95,7 +95,7 @@ class AnyArray(Method):
     )
 
     def resolve(self, context: Context) -> "Method":
-        array = self._laid(context)  # or it is rejected
+        array = self._parsed(context)  # or it is rejected
         if array.is_polarised and context.colours != IDENTITY:
             raise KeyedError(
                 "mosaic.array",
@@ -104,21 +104,21 @@ class AnyArray(Method):
             )
         return self
 
-    def _laid(self, context: Context) -> FilterArray:
-        return parse_array(self.array).with_gains(context.gains_of_light)
+    def _parsed(self, context: Context) -> FilterArray:
+        return parse_array(self.array).with_gains(context.illuminant_gains)
 
     def next_context(self, context: Context) -> Context:
-        return context.with_array(self._laid(context))
+        return context.with_array(self._parsed(context))
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("filter_array", arguments=("responses", *PERIOD)),)
 
     def arguments(self, context: Context) -> Arguments:
-        array = self._laid(context)
+        array = self._parsed(context)
         return {"responses": responses_table(array), **period_of(array.period)}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        table = responses_of(self._laid(given.context))
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        table = responses_of(self._parsed(inputs.context))
         red, green, blue = (tiled(table[:, c], image.shape) for c in range(3))
         return (image[..., 0] * red + image[..., 1] * green) + image[..., 2] * blue
 
@@ -126,7 +126,7 @@ class AnyArray(Method):
 def responses_of(array: FilterArray) -> Floats:
     """Return the transmission of the filter at each position: (row, colour, column)."""
     colours = [{k: float(v[c]) for k, v in array.responses.items()} for c in range(3)]
-    return np.stack([array.by_place(each) for each in colours], axis=1)
+    return np.stack([array.by_position(each) for each in colours], axis=1)
 
 
 @lru_cache(maxsize=64)  # the same object for the same array, so that it is uploaded once
@@ -135,7 +135,7 @@ def responses_table(array: FilterArray) -> Floats:
     return kernel_table(responses_of(array))
 
 
-def _of_camera(context: Context) -> Method | None:
+def _camera_default(context: Context) -> Method | None:
     if not (name := context.camera.filter_array):
         return None
     array = parse_array(name)
@@ -149,5 +149,5 @@ STAGE = Stage(
     Kind.MOSAIC,
     (Bayer, AnyArray),
     role=StageRole.PATTERN,
-    usual=_of_camera,
+    default_method=_camera_default,
 )

@@ -30,7 +30,7 @@ from clpipe.stage import (
 # highest PSNR for the image in tests/data, ISO 1600 to 12800. tools/pages/quality.py measures that
 # PSNR.
 FACTOR = 1.3
-LARGEST = 15  # px, of the window
+MAX_SIZE = 15  # px, of the window
 
 
 class NonLocalMeans(Method):
@@ -51,7 +51,7 @@ class NonLocalMeans(Method):
 
     size: int = parameter(
         13,
-        f"Width of the window: odd, 1 to {LARGEST}; 1 leaves the mosaic unchanged.",
+        f"Width of the window: odd, 1 to {MAX_SIZE}; 1 leaves the mosaic unchanged.",
         "px",
         structural=True,
     )
@@ -77,8 +77,8 @@ class NonLocalMeans(Method):
 
     @field_validator("size")
     @classmethod
-    def _odd(cls, size: int) -> int:
-        return odd_size(size, LARGEST)
+    def _check_odd(cls, size: int) -> int:
+        return odd_size(size, MAX_SIZE)
 
     def resolve(self, context: Context) -> "NonLocalMeans":
         if self.a is not None and self.b is not None:
@@ -143,9 +143,9 @@ class NonLocalMeans(Method):
             **self.numbers(context),
         }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        n = self.numbers(given.context)
-        shape, pattern = image.shape, given.context.pattern
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        n = self.numbers(inputs.context)
+        shape, pattern = image.shape, inputs.context.pattern
         one = np.float32(1)
         sensor = image * by_site(shape, pattern, n["red_inverse"], one, n["blue_inverse"])
         stable = stabilized(sensor, n["a"], n["offset"], n["root_of_offset"])

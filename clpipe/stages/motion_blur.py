@@ -9,16 +9,16 @@ from pydantic import model_validator
 from clpipe.base.errors import RequestError
 from clpipe.base.tracing import traceable
 from clpipe.base.types import Floats
-from clpipe.reference.convolve import convolve, reach_of, taps_of
-from clpipe.reference.turning import BILINEAR, Turning
+from clpipe.reference.convolve import convolve, tap_radius, taps_of
+from clpipe.reference.turning import BILINEAR, CameraRotation
 from clpipe.stage import (
-    AboutAxis,
     Arguments,
     Context,
-    InFocalLengths,
+    FocalLengthMethod,
     Kind,
     Method,
     Pass,
+    PrincipalPointMethod,
     ReferenceContext,
     Resample,
     Stage,
@@ -26,8 +26,8 @@ from clpipe.stage import (
     parameter,
 )
 
-LONGEST = 200.0  # px
-PARTS = 64  # per pixel of a streak's length, one tap each
+MAX_LENGTH = 200.0  # px
+TAPS_PER_PIXEL = 64  # per pixel of a streak's length, one tap each
 
 
 @traceable
@@ -44,17 +44,17 @@ def streak(length: float, angle: float) -> Floats:
     >>> streak(2.0, 0.0)[:, 2].round(3).tolist()
     [0.25, 0.5, 0.25]
     """
-    count = int(np.ceil(length * PARTS))
+    count = int(np.ceil(length * TAPS_PER_PIXEL))
     along = ((np.arange(count) + 0.5) / count - 0.5) * length
     x, y = along * np.cos(np.deg2rad(angle)), -along * np.sin(np.deg2rad(angle))
     reach = int(np.ceil(length / 2)) + 1
-    spread = np.zeros((2 * reach + 1, 2 * reach + 1))
+    image = np.zeros((2 * reach + 1, 2 * reach + 1))
     for dx in (0, 1):
         for dy in (0, 1):
             columns, rows = np.floor(x).astype(int) + dx, np.floor(y).astype(int) + dy
-            share = (1 - abs(x - columns)) * (1 - abs(y - rows))
-            np.add.at(spread, (rows + reach, columns + reach), share)
-    return taps_of(spread[..., None].repeat(3, 2) / count)
+            weight = (1 - abs(x - columns)) * (1 - abs(y - rows))
+            np.add.at(image, (rows + reach, columns + reach), weight)
+    return taps_of(image[..., None].repeat(3, 2) / count)
 
 
 class Linear(Method):
@@ -85,7 +85,7 @@ class Linear(Method):
         "px",
         "from rotation, else 0",
         ge=0,
-        le=LONGEST,
+        le=MAX_LENGTH,
     )
     angle: float = parameter(
         0.0, "Direction of the streak, from right towards up.", "degrees", ge=-360, le=360
@@ -109,7 +109,7 @@ class Linear(Method):
     )
 
     @model_validator(mode="after")
-    def _one_measure(self) -> "Linear":
+    def _check_length(self) -> "Linear":
         if self.length is not None and self.rotation is not None:
             raise ValueError("set either length or rotation: both define the length of the streak")
         return self
@@ -120,20 +120,20 @@ class Linear(Method):
         Raises:
             RequestError: the focal length is not known in px, or the streak is too long.
         """
-        own = self.with_optics(context)
-        if not own.rotation:
-            return own.with_defaults(length=0.0)
-        if not own.fx:
+        resolved = self.with_optics(context)
+        if not resolved.rotation:
+            return resolved.with_defaults(length=0.0)
+        if not resolved.fx:
             raise RequestError(
                 "motion_blur: rotation needs a focal length; set fx, in px, here or in render"
             )
-        length = float(own.fx * np.tan(np.deg2rad(own.rotation)))
-        if length > LONGEST:
+        length = float(resolved.fx * np.tan(np.deg2rad(resolved.rotation)))
+        if length > MAX_LENGTH:
             raise RequestError(
-                f"motion_blur: rotation {own.rotation:g} at fx {own.fx:g} makes a streak of "
-                f"{length:.0f} px; at most {LONGEST:g} px are allowed, so lower rotation"
+                f"motion_blur: rotation {resolved.rotation:g} at fx {resolved.fx:g} makes a streak "
+                f"of {length:.0f} px; at most {MAX_LENGTH:g} px are allowed, so lower rotation"
             )
-        return own.model_copy(update={"length": length, "rotation": None})
+        return resolved.model_copy(update={"length": length, "rotation": None})
 
     @property
     def pixels(self) -> float:
@@ -148,7 +148,7 @@ class Linear(Method):
     def passes(self) -> tuple[Pass, ...]:
         if not self.pixels:
             return ()
-        radius = reach_of(self.taps)
+        radius = tap_radius(self.taps)
         return (Pass("convolve", Stencil(radius), ("taps", "count")),)
 
     def arguments(self, context: Context) -> Arguments:
@@ -156,22 +156,22 @@ class Linear(Method):
             return {}
         return {"taps": self.taps, "count": np.int32(len(self.taps))}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return convolve(image, self.taps) if self.pixels else image
 
 
-class Perspective(InFocalLengths, AboutAxis):
+class Perspective(FocalLengthMethod, PrincipalPointMethod):
     """Streaks of a rotating camera, with their perspective at each position of the image.
 
     The camera rotates evenly about an axis in its image plane. It shows the render unchanged in the
     middle of the exposure. Each pixel is the mean of the light it received, from
-    :class:`clpipe.reference.turning.Turning`.
+    :class:`clpipe.reference.turning.CameraRotation`.
 
     >>> from clpipe.stage import run_reference
     >>> dots = np.zeros((1, 201, 3), np.float32)
     >>> dots[0, [30, 100]] = 1
-    >>> turning = Perspective(rotation=1.6, fx=100.0)
-    >>> streaks = run_reference(turning, dots)[0, :, 0].astype(float)  # 2.8 and 4.2 px long
+    >>> rotation_warp = Perspective(rotation=1.6, fx=100.0)
+    >>> streaks = run_reference(rotation_warp, dots)[0, :, 0].astype(float)  # 2.8 and 4.2 px long
     >>> streaks[98:103].round(2).tolist(), streaks[28:33].round(2).tolist()
     ([0.03, 0.29, 0.36, 0.29, 0.03], [0.14, 0.24, 0.24, 0.24, 0.13])
     """
@@ -200,28 +200,30 @@ class Perspective(InFocalLengths, AboutAxis):
         Raises:
             RequestError: the rotation is not 0, and the focal length is not known.
         """
-        own = self.with_optics(context)
-        if own.rotation:
-            own.check_focal_length("motion_blur")
-        return own
+        resolved = self.with_optics(context)
+        if resolved.rotation:
+            resolved.check_focal_length("motion_blur")
+        return resolved
 
     @property
-    def turning(self) -> Turning:
+    def rotation_warp(self) -> CameraRotation:
         """The geometry from render to image."""
         centre = self.cx, self.cy
-        return Turning(self.rotation, self.angle, self.fx, self.share, centre, self.margins)
+        return CameraRotation(
+            self.rotation, self.angle, self.fx, self.relative_focal_length, centre, self.margins
+        )
 
     def passes(self) -> tuple[Pass, ...]:
         if not self.rotation:
             return ()
-        turning = self.turning
-        return (Pass("turned", Resample(turning, 1), ("filter",)),)
+        rotation_warp = self.rotation_warp
+        return (Pass("turned", Resample(rotation_warp, 1), ("filter",)),)
 
     def arguments(self, context: Context) -> Arguments:
         return {"filter": BILINEAR} if self.rotation else {}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return self.turning.reference(image) if self.rotation else image
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return self.rotation_warp.reference(image) if self.rotation else image
 
 
 STAGE = Stage(

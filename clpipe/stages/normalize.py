@@ -8,7 +8,7 @@ from pydantic import model_validator
 from clpipe.base.errors import RequestError
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
-from clpipe.reference.companding import along_pieces, knots_in, pieces_of
+from clpipe.reference.companding import apply_pieces, parse_knots, pieces_of
 from clpipe.stage import (
     Arguments,
     Backend,
@@ -59,7 +59,7 @@ class Linear(SignalMethod):
     )
 
     @model_validator(mode="after")
-    def _ordered(self) -> "Linear":
+    def _check_levels(self) -> "Linear":
         black, white = self.black_level, self.white_level
         if black is not None and white is not None and white <= black:
             raise ValueError(
@@ -86,15 +86,15 @@ class Linear(SignalMethod):
         black = camera.black_level if context.black_level is None else context.black_level
         white = camera.white_level if context.white_level is None else context.white_level
         first = black + (white - black) / context.full_scale
-        filled = self.with_defaults(black_level=black, white_level=first)
-        return type(self).model_validate(dict(filled))
+        resolved = self.with_defaults(black_level=black, white_level=first)
+        return type(self).model_validate(dict(resolved))
 
     def next_context(self, context: Context) -> Context:
         if context.full_scale == 1 or context.white_level is None or context.black_level is None:
             return context
         assert self.black_level is not None and self.white_level is not None
-        whole = context.white_level - context.black_level
-        return context.but(full_scale=whole / (self.white_level - self.black_level))
+        full_range = context.white_level - context.black_level
+        return context.replace(full_scale=full_range / (self.white_level - self.black_level))
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("normalize_levels", arguments=("black_level", "scale")),)
@@ -104,9 +104,9 @@ class Linear(SignalMethod):
         scale = float32(1 / (self.white_level - self.black_level))
         return {"black_level": self.black_level, "scale": scale}
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         assert self.black_level is not None and self.white_level is not None
-        return before * np.float32((self.white_level - self.black_level) ** -2)
+        return input_variance * np.float32((self.white_level - self.black_level) ** -2)
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
@@ -133,9 +133,9 @@ class Pwl(Linear):
     )
 
     @model_validator(mode="after")
-    def _rising(self) -> "Pwl":
+    def _check_knots(self) -> "Pwl":
         if self.knots is not None:
-            knots_in(self.knots)
+            parse_knots(self.knots)
         return self
 
     def resolve(self, context: Context) -> "Linear":
@@ -144,26 +144,26 @@ class Pwl(Linear):
         Raises:
             RequestError: no knots are known, or those of quantize differ.
         """
-        filled = self._with_levels(context)
+        resolved = self._with_levels(context)
         if self.knots is None and not context.knots:
             raise RequestError(
                 "normalize.method=pwl: no knots are known; set normalize.knots, or use "
                 "quantize.method=pwl"
             )
-        if self.knots and context.knots and knots_in(self.knots) != context.knots:
+        if self.knots and context.knots and parse_knots(self.knots) != context.knots:
             raise RequestError(
                 f"normalize.knots: {self.knots} differ from those of quantize, "
                 f"{[list(pair) for pair in context.knots]}; remove normalize.knots"
             )
-        return filled.with_defaults(knots=[list(pair) for pair in context.knots])
+        return resolved.with_defaults(knots=[list(pair) for pair in context.knots])
 
     @property
     def _pieces(self) -> Floats:
         assert self.knots is not None
-        return pieces_of(knots_in(self.knots), inverse=True)
+        return pieces_of(parse_knots(self.knots), inverse=True)
 
     def next_context(self, context: Context) -> Context:
-        return super().next_context(context).but(knots=())
+        return super().next_context(context).replace(knots=())
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("expand", arguments=("black_level", "scale", "pieces", "count")),)
@@ -172,11 +172,11 @@ class Pwl(Linear):
         count = CompileTime(str(len(self._pieces)))
         return {**super().arguments(context), "pieces": self._pieces, "count": count}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return super().reference(along_pieces(image, self._pieces), given)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return super().reference(apply_pieces(image, self._pieces), inputs)
 
 
-def _of_curve(context: Context) -> Method | None:
+def _curve_default(context: Context) -> Method | None:
     return Pwl() if context.knots else None
 
 
@@ -187,5 +187,5 @@ STAGE = Stage(
     Kind.MOSAIC,
     (Linear, Pwl),
     role=StageRole.LEVELS,
-    usual=_of_curve,
+    default_method=_curve_default,
 )

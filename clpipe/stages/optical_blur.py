@@ -11,7 +11,7 @@ from pydantic import field_validator
 from clpipe.base.errors import ImageError
 from clpipe.base.tracing import int32, traceable
 from clpipe.base.types import Doubles, Floats
-from clpipe.reference.convolve import NEGLIGIBLE, blur, convolve, reach_of, taps_of
+from clpipe.reference.convolve import NEGLIGIBLE, blur, convolve, tap_radius, taps_of
 from clpipe.stage import (
     Arguments,
     CompileTime,
@@ -27,40 +27,44 @@ from clpipe.stage import (
 )
 
 WAVELENGTHS = (0.600, 0.540, 0.460)  # um, about the middle of the passbands of red, green and blue
-LARGEST = 65  # px, of a measured function
-FINE = 8  # samples per pixel for the calculation of diffraction
-INSIDE = 0.995  # share of the light of a diffraction pattern that is kept: its rings are infinite
-GOOD_LENS = 0.4  # px
-UNROLLED = 3  # px; a wider blur takes two launches, one along rows and one along columns
+MAX_PSF_SIZE = 65  # px, of a measured function
+OVERSAMPLING = 8  # samples per pixel for the calculation of diffraction
+ENCLOSED_ENERGY = (
+    0.995  # share of the light of a diffraction pattern that is kept: its rings are infinite
+)
+DEFAULT_SIGMA = 0.4  # px
+MAX_UNROLLED_RADIUS = 3  # px; a wider blur takes two launches, one along rows and one along columns
 
 
-def along(sigma: float, low_pass: float, pixel_area: float) -> Doubles:
+def line_spread(sigma: float, low_pass: float, pixel_area: float) -> Doubles:
     """Return the light of a pixel along a row or a column: (pixel,) of odd length, of sum 1.
 
     The light is uniform over the pixel's square, blurred by a Gaussian, doubled by the low-pass
     filter, and collected by photosites of some side. All arguments are in px; see :class:`Lens`.
 
-    >>> along(0, 0, 0).tolist(), along(0, 1, 0).tolist(), along(0.3, 0, 0).round(2).tolist()
-    ([0.0, 1.0, 0.0], [0.25, 0.5, 0.25], [0.0, 0.05, 0.9, 0.05, 0.0])
+    >>> line_spread(0, 0, 0).tolist(), line_spread(0, 1, 0).tolist()
+    ([0.0, 1.0, 0.0], [0.25, 0.5, 0.25])
+    >>> line_spread(0.3, 0, 0).round(2).tolist()
+    [0.0, 0.05, 0.9, 0.05, 0.0]
     """
     reach = int(np.ceil(4 * sigma + (low_pass + pixel_area) / 2 + 0.5))
     edges = np.arange(-reach, reach + 2) - 0.5
-    parts = 64 if pixel_area else 1
-    places = ((np.arange(parts) + 0.5) / parts - 0.5) * pixel_area
-    places = np.concatenate([places - low_pass / 2, places + low_pass / 2])
-    from_edges = edges[:, None] - places
+    samples = 64 if pixel_area else 1
+    positions = ((np.arange(samples) + 0.5) / samples - 0.5) * pixel_area
+    positions = np.concatenate([positions - low_pass / 2, positions + low_pass / 2])
+    from_edges = edges[:, None] - positions
     if sigma:
-        below = (1 + np.vectorize(erf)(from_edges / (sigma * sqrt(2)))) / 2
+        cumulative = (1 + np.vectorize(erf)(from_edges / (sigma * sqrt(2)))) / 2
     else:
-        below = (np.sign(from_edges) + 1) / 2
-    light = np.diff(below, axis=0).mean(1)
+        cumulative = (np.sign(from_edges) + 1) / 2
+    light = np.diff(cumulative, axis=0).mean(1)
     return np.asarray(light / light.sum(), np.float64)
 
 
-def diffracted(
+def diffraction_psf(
     sigma: float, low_pass: float, pixel_area: float, f_number: float, pitch: float
 ) -> Doubles:
-    """Return the light of :func:`along` with diffraction: a point spread function.
+    """Return the light of :func:`line_spread` with diffraction: a point spread function.
 
     It has the shape (height, width, 3), and is the Fourier transform of the product of all transfer
     functions. That of a round aperture is (2 / pi)(acos(v) - v sqrt(1 - v^2)), v = frequency *
@@ -71,28 +75,32 @@ def diffracted(
         f_number: of the lens.
         pitch: of the photosites, in um.
     """
-    size = 2 * LARGEST * FINE
-    frequency = np.fft.fftfreq(size, 1 / FINE)  # cycles per pixel
-    one = np.exp(-2 * (np.pi * sigma * frequency) ** 2) * np.cos(np.pi * low_pass * frequency)
-    one *= np.sinc(pixel_area * frequency) * np.sinc(frequency)
+    size = 2 * MAX_PSF_SIZE * OVERSAMPLING
+    frequency = np.fft.fftfreq(size, 1 / OVERSAMPLING)  # cycles per pixel
+    axis_transfer = np.exp(-2 * (np.pi * sigma * frequency) ** 2) * np.cos(
+        np.pi * low_pass * frequency
+    )
+    axis_transfer *= np.sinc(pixel_area * frequency) * np.sinc(frequency)
     radial = np.hypot(frequency[:, None], frequency)
     planes = []
     for wavelength in WAVELENGTHS:
         v = np.minimum(radial * wavelength * f_number / pitch, 1)
         transfer = 2 / np.pi * (np.arccos(v) - v * np.sqrt(1 - v**2))
-        light = np.fft.ifft2(transfer * one[:, None] * one).real[::FINE, ::FINE]
+        light = np.fft.ifft2(transfer * axis_transfer[:, None] * axis_transfer).real[
+            ::OVERSAMPLING, ::OVERSAMPLING
+        ]
         planes.append(np.fft.fftshift(np.maximum(light, 0)))
-    spread = np.stack(planes, -1)
-    middle = spread.shape[0] // 2
-    for reach in range(LARGEST // 2 + 1):
-        part = spread[middle - reach : middle + reach + 1, middle - reach : middle + reach + 1]
-        if (part.sum((0, 1)) >= INSIDE * spread.sum((0, 1))).all():
+    psf = np.stack(planes, -1)
+    centre = psf.shape[0] // 2
+    for reach in range(MAX_PSF_SIZE // 2 + 1):
+        part = psf[centre - reach : centre + reach + 1, centre - reach : centre + reach + 1]
+        if (part.sum((0, 1)) >= ENCLOSED_ENERGY * psf.sum((0, 1))).all():
             break
     return np.asarray(part / part.sum((0, 1)))
 
 
 @lru_cache(maxsize=16)
-def measured(path: str) -> Doubles:
+def read_psf(path: str) -> Doubles:
     """Return the point spread function in an image file, (height, width, 3), each channel of sum 1.
 
     Raises:
@@ -105,10 +113,10 @@ def measured(path: str) -> Doubles:
     except ImageError as error:
         raise ValueError(str(error)) from None
     height, width = pixels.shape[:2]
-    if height % 2 == 0 or width % 2 == 0 or max(height, width) > LARGEST:
+    if height % 2 == 0 or width % 2 == 0 or max(height, width) > MAX_PSF_SIZE:
         raise ValueError(
-            f"{path}: a point spread function has odd sides up to {LARGEST} px, and its middle "
-            f"pixel is the centre; this image is {width}x{height}"
+            f"{path}: a point spread function has odd sides up to {MAX_PSF_SIZE} px, and its "
+            f"middle pixel is the centre; this image is {width}x{height}"
         )
     if pixels.min() < 0:
         raise ValueError(
@@ -123,24 +131,24 @@ def measured(path: str) -> Doubles:
 
 @traceable
 @lru_cache(maxsize=64)
-def half_of(sigma: float, low_pass: float, pixel_area: float) -> Floats:
-    """Return the middle and one side of :func:`along`, without negligible weights.
+def half_line_spread(sigma: float, low_pass: float, pixel_area: float) -> Floats:
+    """Return the middle and one side of :func:`line_spread`, without negligible weights.
 
-    >>> [round(float(weight), 2) for weight in half_of(0.4, 0, 0)]
+    >>> [round(float(weight), 2) for weight in half_line_spread(0.4, 0, 0)]
     [0.79, 0.11]
     """
-    light = along(sigma, low_pass, pixel_area)
+    light = line_spread(sigma, low_pass, pixel_area)
     side = light[len(light) // 2 :]
-    from_there_on = 2 * np.cumsum(side[::-1])[::-1]
-    kept = side[from_there_on > NEGLIGIBLE / 2]
+    remaining_light = 2 * np.cumsum(side[::-1])[::-1]
+    kept = side[remaining_light > NEGLIGIBLE / 2]
     return np.asarray(kept / (2 * kept.sum() - kept[0]), np.float32)
 
 
 @traceable
 @lru_cache(maxsize=64)
 def line_taps(sigma: float, low_pass: float, pixel_area: float) -> tuple[Floats, Floats]:
-    """Return the taps of :func:`half_of` along a row, and those along a column."""
-    side = half_of(sigma, low_pass, pixel_area).astype(np.float64)
+    """Return the taps of :func:`half_line_spread` along a row, and those along a column."""
+    side = half_line_spread(sigma, low_pass, pixel_area).astype(np.float64)
     row = np.concatenate([side[:0:-1], side])[None, :, None].repeat(3, 2)
     return taps_of(row), taps_of(row.transpose(1, 0, 2))
 
@@ -152,14 +160,14 @@ def lens_taps(
 ) -> Floats:
     """Return the taps of a lens; see :class:`Lens`. An ``f_number`` of 0 disables diffraction."""
     if f_number:
-        spread = diffracted(sigma, low_pass, pixel_area, f_number, pitch)
+        kernel = diffraction_psf(sigma, low_pass, pixel_area, f_number, pitch)
     else:
-        one = along(sigma, low_pass, pixel_area)
-        spread = np.multiply.outer(one, one)[..., None].repeat(3, 2)
-    return taps_of(convolved(measured(psf), spread) if psf else spread)
+        line = line_spread(sigma, low_pass, pixel_area)
+        kernel = np.multiply.outer(line, line)[..., None].repeat(3, 2)
+    return taps_of(convolve_psfs(read_psf(psf), kernel) if psf else kernel)
 
 
-def convolved(first: Doubles, second: Doubles) -> Doubles:
+def convolve_psfs(first: Doubles, second: Doubles) -> Doubles:
     """Return the convolution of two point spread functions."""
     height, width = (a + b - 1 for a, b in zip(first.shape, second.shape[:2], strict=False))
     total = np.zeros((height, width, 3))
@@ -201,7 +209,7 @@ class Lens(Method):
         None,
         "Sigma of the lens's aberrations; 0 disables them.",
         "px",
-        f"{GOOD_LENS:g}, 0 with a psf",
+        f"{DEFAULT_SIGMA:g}, 0 with a psf",
         ge=0,
         le=8,
     )
@@ -237,9 +245,9 @@ class Lens(Method):
 
     @field_validator("psf")
     @classmethod
-    def _readable(cls, psf: str | None) -> str | None:
+    def _check_psf(cls, psf: str | None) -> str | None:
         if psf is not None:
-            measured(psf)
+            read_psf(psf)
         return psf
 
     def resolve(self, context: Context) -> Self:
@@ -249,14 +257,14 @@ class Lens(Method):
                 "pixel_pitch: diffraction needs it, and the profile of camera "
                 f"{context.camera.name} does not contain it; set it in um"
             )
-        return self.with_defaults(sigma=0.0 if self.psf else GOOD_LENS, pixel_pitch=pitch)
+        return self.with_defaults(sigma=0.0 if self.psf else DEFAULT_SIGMA, pixel_pitch=pitch)
 
     @property
-    def _by_lines(self) -> tuple[float, float, float] | None:
-        """The arguments of :func:`along` if it describes the whole blur, else None."""
+    def _separable_arguments(self) -> tuple[float, float, float] | None:
+        """The arguments of :func:`line_spread` if it describes the whole blur, else None."""
         assert self.sigma is not None
-        whole = self.f_number is None and self.psf is None
-        return (self.sigma, self.low_pass, self.pixel_area) if whole else None
+        is_separable = self.f_number is None and self.psf is None
+        return (self.sigma, self.low_pass, self.pixel_area) if is_separable else None
 
     @property
     def _taps(self) -> Floats:
@@ -267,14 +275,14 @@ class Lens(Method):
         )
 
     def passes(self) -> tuple[Pass, ...]:
-        lines = self._by_lines
+        lines = self._separable_arguments
         if lines is None:
-            radius = reach_of(self._taps)
+            radius = tap_radius(self._taps)
             return (Pass("convolve", Stencil(radius), ("taps", "count")),)
-        reach = len(half_of(*lines)) - 1
+        reach = len(half_line_spread(*lines)) - 1
         if reach == 0:
             return ()
-        if reach <= UNROLLED:
+        if reach <= MAX_UNROLLED_RADIUS:
             return (Pass("blur", Stencil(reach), ("reach", "weights")),)
         across, down = (("across", "count"), ("down", "count"))
         return (
@@ -283,22 +291,22 @@ class Lens(Method):
         )
 
     def arguments(self, context: Context) -> Arguments:
-        lines = self._by_lines
+        lines = self._separable_arguments
         if lines is None:
             return {"taps": self._taps, "count": int32(len(self._taps))}
-        weights = half_of(*lines)
-        if len(weights) - 1 <= UNROLLED:
+        weights = half_line_spread(*lines)
+        if len(weights) - 1 <= MAX_UNROLLED_RADIUS:
             return {"reach": CompileTime(str(len(weights) - 1)), "weights": weights}
         across, down = line_taps(*lines)
         return {"across": across, "down": down, "count": int32(len(across))}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        own = self.resolve(given.context)
-        lines = own._by_lines
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        resolved = self.resolve(inputs.context)
+        lines = resolved._separable_arguments
         if lines is None:
-            return convolve(image, own._taps)
-        weights = half_of(*lines)
-        if len(weights) - 1 <= UNROLLED:
+            return convolve(image, resolved._taps)
+        weights = half_line_spread(*lines)
+        if len(weights) - 1 <= MAX_UNROLLED_RADIUS:
             return blur(image, weights)
         across, down = line_taps(*lines)
         return convolve(convolve(image, across), down)

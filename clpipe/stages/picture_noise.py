@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from clpipe.base.errors import RequestError
-from clpipe.base.reading import parse_json, read_bytes, read_when_changed
+from clpipe.base.reading import cached_by_mtime, parse_json, read_bytes
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.correlated import correlated_normals, mixing
@@ -34,20 +34,26 @@ from clpipe.stage import (
     parameter,
 )
 
-ENTRIES = 256  # of the kernel's table
+TABLE_SIZE = 256  # of the kernel's table
 UNKNOWN = "unknown"  # the ISO of images in a report that do not state theirs
-RESOLVED = 65  # entries of a measured curve in the resolved parameters, and so in the sidecar
+RESOLVED_SIZE = 65  # entries of a measured curve in the resolved parameters, and so in the sidecar
 CHANNELS = Kind.DISPLAY.channels
-MIXING = ("green_red", "green_green", "blue_red", "blue_green", "blue_blue")  # kernel arguments
+MIXING_NAMES = (
+    "green_red",
+    "green_green",
+    "blue_red",
+    "blue_green",
+    "blue_blue",
+)  # kernel arguments
 
 Sigma = Annotated[float, Field(ge=0, le=1)]
-Sigmas = Annotated[tuple[Sigma, ...], Field(strict=False, min_length=2, max_length=ENTRIES)]
+Sigmas = Annotated[tuple[Sigma, ...], Field(strict=False, min_length=2, max_length=TABLE_SIZE)]
 
 
 Correlation = Annotated[float, Field(ge=-1, le=1)]
 
 
-class Matched(Method):
+class NoiseMatching(Method):
     """Parameters for matching the noise of the finished image to measured noise."""
 
     match: Literal["picture", "flat", "halved"] = parameter(
@@ -60,7 +66,7 @@ class Matched(Method):
     )
 
 
-class NoNoise(Unchanged, Matched):
+class NoNoise(Unchanged, NoiseMatching):
     """No noise on the finished image; with ``clpipe run --truth iid``, how to match the noise."""
 
     method: ClassVar = "none"
@@ -73,14 +79,14 @@ class NoNoise(Unchanged, Matched):
     )
 
 
-def _as_three(value: Any) -> Any:
+def _per_channel(value: Any) -> Any:
     """Convert one number to three equal ones, and a list, which TOML gives, to a tuple."""
     if isinstance(value, float | int) and not isinstance(value, bool):
         return (float(value),) * 3
     return tuple(value) if isinstance(value, list) else value
 
 
-class IndependentNoise(Matched):
+class IndependentNoise(NoiseMatching):
     """Gaussian noise, independent in each pixel and image; sigma is set or measured."""
 
     alternatives: ClassVar = frozenset({"sigma", "measured"})
@@ -101,20 +107,20 @@ class IndependentNoise(Matched):
 
     @field_validator("measured")
     @classmethod
-    def _readable(cls, path: str) -> str:
+    def _check_report(cls, path: str) -> str:
         if path:
             measured_noise(path)
         return path
 
     @field_validator("correlation")
     @classmethod
-    def _possible(cls, values: tuple[float, float, float] | None) -> Any:
+    def _check_correlation(cls, values: tuple[float, float, float] | None) -> Any:
         if values:
             mixing(*values)
         return values
 
     @model_validator(mode="after")
-    def _at_most_one(self) -> Self:
+    def _check_source(self) -> Self:
         if getattr(self, "sigma", None) is not None and self.measured:
             raise ValueError("sigma and measured are both set; set one of them")
         return self
@@ -159,16 +165,16 @@ class IndependentNoise(Matched):
             )
         return self.with_defaults(correlation=self.noise(iso).correlation)
 
-    def normals(self, image: Floats, given: ReferenceContext) -> Floats:
+    def normals(self, image: Floats, inputs: ReferenceContext) -> Floats:
         """Return the normals of each sample, (height, width, 3), from the image's stream."""
         assert self.correlation is not None
-        stream = given.stream[NoiseScope.IMAGE]
+        stream = inputs.stream[NoiseScope.IMAGE]
         return correlated_normals(image.shape, stream, mixing(*self.correlation))
 
     def mixing_arguments(self) -> dict[str, Argument]:
         """Return the kernel's arguments for the correlation."""
         assert self.correlation is not None
-        return dict(zip(MIXING, mixing(*self.correlation), strict=True))
+        return dict(zip(MIXING_NAMES, mixing(*self.correlation), strict=True))
 
 
 class IidGaussian(IndependentNoise):
@@ -187,7 +193,7 @@ class IidGaussian(IndependentNoise):
     summary: ClassVar = "independent Gaussian noise of one sigma: the usual baseline"
     example: ClassVar = {"sigma": [0.05, 0.02, 0.1], "correlation": [0.6, -0.3, 0.5]}
 
-    sigma: Annotated[tuple[Sigma, Sigma, Sigma], BeforeValidator(_as_three)] | None = parameter(
+    sigma: Annotated[tuple[Sigma, Sigma, Sigma], BeforeValidator(_per_channel)] | None = parameter(
         None,
         "Standard deviation: one number, or one each for red, green and blue.",
         "of full scale",
@@ -201,7 +207,7 @@ class IidGaussian(IndependentNoise):
         return correlated.with_defaults(sigma=self.noise(context.iso).sigma)
 
     def passes(self) -> tuple[Pass, ...]:
-        names = ("red", "green", "blue", *MIXING)
+        names = ("red", "green", "blue", *MIXING_NAMES)
         return (Pass("picture_noise", arguments=names, random=NoiseScope.IMAGE),)
 
     def arguments(self, context: Context) -> Arguments:
@@ -209,8 +215,8 @@ class IidGaussian(IndependentNoise):
         sigmas = zip(("red", "green", "blue"), map(float32, self.sigma), strict=True)
         return {**dict(sigmas), **self.mixing_arguments()}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return image + self.normals(image, given) * np.array(self.sigma, np.float32)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return image + self.normals(image, inputs) * np.array(self.sigma, np.float32)
 
 
 class IntensityDependent(IndependentNoise):
@@ -247,8 +253,8 @@ class IntensityDependent(IndependentNoise):
         correlated = self.with_correlation(context.iso)
         if self.sigma is not None:
             return correlated
-        places = np.linspace(0, 1, RESOLVED)
-        curves = (np.interp(places, *c).clip(0, 1) for c in self.noise(context.iso).curves)
+        intensities = np.linspace(0, 1, RESOLVED_SIZE)
+        curves = (np.interp(intensities, *c).clip(0, 1) for c in self.noise(context.iso).curves)
         sigma = tuple(tuple(curve.round(6).tolist()) for curve in curves)
         return correlated.with_defaults(sigma=sigma)
 
@@ -258,23 +264,23 @@ class IntensityDependent(IndependentNoise):
         return _table(self.sigma)
 
     def passes(self) -> tuple[Pass, ...]:
-        names = ("sigmas", *MIXING)
+        names = ("sigmas", *MIXING_NAMES)
         return (Pass("picture_noise", arguments=names, random=NoiseScope.IMAGE),)
 
     def arguments(self, context: Context) -> Arguments:
         return {"sigmas": self.table(), **self.mixing_arguments()}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        place = to_8_bit(image) + np.arange(3) * ENTRIES
-        return image + self.normals(image, given) * self.table()[place]
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        index = to_8_bit(image) + np.arange(3) * TABLE_SIZE
+        return image + self.normals(image, inputs) * self.table()[index]
 
 
 @lru_cache(maxsize=16)
 def _table(sigma: tuple[Any, ...]) -> Floats:
-    places = np.linspace(0, 1, ENTRIES)
+    intensities = np.linspace(0, 1, TABLE_SIZE)
     curves = sigma if isinstance(sigma[0], tuple) else (sigma,) * 3
-    each = [np.interp(places, np.linspace(0, 1, len(curve)), curve) for curve in curves]
-    return np.concatenate(each).astype(np.float32)
+    sampled = [np.interp(intensities, np.linspace(0, 1, len(curve)), curve) for curve in curves]
+    return np.concatenate(sampled).astype(np.float32)
 
 
 class MeasuredNoise(NamedTuple):
@@ -308,7 +314,7 @@ def measured_noise(path: str) -> Mapping[float | None, Mapping[str, MeasuredNois
         raise ValueError(f"cannot be read: {error.strerror}") from None
 
 
-@read_when_changed
+@cached_by_mtime
 def _measured_noise(path: str) -> Mapping[float | None, Mapping[str, MeasuredNoise]]:
     try:
         report = parse_json(read_bytes(Path(path)))
@@ -332,13 +338,13 @@ def _measured_noise(path: str) -> Mapping[float | None, Mapping[str, MeasuredNoi
     )
 
 
-def _noise_of(report: Any, where: str, curve: str, averaged: int = 1) -> MeasuredNoise:
+def _noise_of(report: Any, area: str, curve: str, averaged: int = 1) -> MeasuredNoise:
     """Return the noise in one area of a report, after averaging this number of pixels.
 
     The curves are scaled to the sigma there. Rounding is not included, because the noisy image will
     be rounded again.
     """
-    covariance = np.array(report["covariance"][where], float)
+    covariance = np.array(report["covariance"][area], float)
     variance = np.diag(covariance)
     are_variances = ((variance >= 0) & (variance <= 1)).all() and np.isfinite(covariance).all()
     if covariance.shape != (3, 3) or not are_variances:
@@ -357,15 +363,17 @@ def _noise_of(report: Any, where: str, curve: str, averaged: int = 1) -> Measure
     return MeasuredNoise(sigmas, curves, pairs)
 
 
-def _curve_of(record: Any, wanted: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _curve_of(record: Any, target_sigma: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return a curve of a report, scaled so that all of its samples together have one sigma."""
     mean, sigma, samples = (np.array(record[key], float) for key in ("mean", "sigma", "samples"))
     are_noise = ((sigma >= 0) & (sigma <= 1) & (samples > 0)).all()
     is_curve = mean.shape == sigma.shape == samples.shape == (mean.size,) and mean.size > 0
     if not (is_curve and are_noise and np.isfinite(mean).all()):
         raise TypeError
-    whole = np.sqrt(np.average(sigma**2, weights=samples))
-    return tuple(mean.tolist()), tuple((sigma * (wanted / whole if whole else 0)).tolist())
+    overall_sigma = np.sqrt(np.average(sigma**2, weights=samples))
+    return tuple(mean.tolist()), tuple(
+        (sigma * (target_sigma / overall_sigma if overall_sigma else 0)).tolist()
+    )
 
 
 STAGE = Stage(

@@ -49,9 +49,9 @@ class Gaussian(GaussianNoise):
     def draw(self) -> tuple[Pass, ...]:
         return (Pass("prnu", arguments=("sigma",), random=NoiseScope.CAMERA),)
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        """(1 + sigma^2) * before + sigma^2 * signal^2, exact for independent noise."""
-        return (signal * signal + before) * np.float32(self.sigma) ** 2 + before
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
+        """(1 + sigma^2) * input_variance + sigma^2 * signal^2, exact for independent noise."""
+        return (signal * signal + input_variance) * np.float32(self.sigma) ** 2 + input_variance
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:

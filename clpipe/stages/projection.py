@@ -39,7 +39,7 @@ class NoProjection(Unchanged):
     summary: ClassVar = "keep the render's perspective"
 
 
-class Wide(Method):
+class WideAngle(Method):
     """A wide lens with a sensor."""
 
     kernel: ClassVar = "projection"
@@ -97,7 +97,7 @@ class Wide(Method):
     )
 
     _panorama: Panorama | None = PrivateAttr(None)
-    _shot: tuple[tuple[str, float], ...] = PrivateAttr(())
+    _optics: tuple[tuple[str, float], ...] = PrivateAttr(())
 
     def with_panorama(self, panorama: Panorama) -> Self:
         """Return the (resolved) method for an image that is the atlas of a panorama."""
@@ -105,15 +105,15 @@ class Wide(Method):
         other._panorama = panorama
         return other
 
-    def as_for(self, other: Method) -> Self:
-        own = super().as_for(other)
-        around = other._panorama if isinstance(other, Wide) else None
-        return own.with_panorama(around) if around else own
+    def with_image_state_of(self, other: Method) -> Self:
+        updated = super().with_image_state_of(other)
+        panorama = other._panorama if isinstance(other, WideAngle) else None
+        return updated.with_panorama(panorama) if panorama else updated
 
     def resolve(self, context: Context) -> Self:
-        own = self.model_copy()
-        own._shot = tuple(context.optics.known.items())
-        return own
+        resolved = self.model_copy()
+        resolved._optics = tuple(context.optics.known.items())
+        return resolved
 
     def next_context(self, context: Context) -> Context:
         return context.without_view()
@@ -124,17 +124,17 @@ class Wide(Method):
 
     def _lens(self, coefficients: tuple[float, ...], fx: float, fy: float) -> WideLens:
         """A lens of the method's model."""
-        whole = WideLens(self.method, coefficients, fx, fy, self.field_of_view)
+        full_lens = WideLens(self.method, coefficients, fx, fy, self.field_of_view)
         if self.width and self.height:
             size = self.width, self.height
         else:
-            width, height = whole.picture
+            width, height = full_lens.picture
             size = self.width or width, self.height or height
-        return replace(whole, size=size, centre=(self.cx, self.cy))
+        return replace(full_lens, size=size, centre=(self.cx, self.cy))
 
     def geometry(self) -> Projection:
-        facts = self._panorama, self.source == "map", self.face_angle, self._shot
-        return Projection(self.lens(), self.filter, *facts)
+        source = self._panorama, self.source == "map", self.face_angle, self._optics
+        return Projection(self.lens(), self.filter, *source)
 
     def passes(self) -> tuple[Pass, ...]:
         projection = self.geometry()
@@ -144,11 +144,11 @@ class Wide(Method):
     def arguments(self, context: Context) -> Arguments:
         return filter_arguments(self.filter)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return self.geometry().reference(image)
 
 
-class InPixels(Wide):
+class PixelFocalLengths(WideAngle):
     """A model that is defined in focal lengths."""
 
     fx: float | None = parameter(
@@ -182,7 +182,7 @@ class InPixels(Wide):
 EXAMPLE: Mapping[str, Any] = {"face_angle": 30.0, "width": 203, "height": 150}
 
 
-class KannalaBrandt(InPixels):
+class KannalaBrandt(PixelFocalLengths):
     """r = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8), where a is the angle to the axis.
 
     OpenCV's fisheye model, COLMAP's OPENCV_FISHEYE (Kannala and Brandt, PAMI 2006). With zeros it
@@ -202,7 +202,7 @@ class KannalaBrandt(InPixels):
         return self.k1, self.k2, self.k3, self.k4
 
 
-class Unified(InPixels):
+class Unified(PixelFocalLengths):
     """The enhanced unified camera model, EUCM (Khomutenko, Garcia and Martinet, RA-L 2016).
 
     With beta = 1 it is the unified model of Geyer and Daniilidis, with xi = alpha / (1 - alpha).
@@ -219,7 +219,7 @@ class Unified(InPixels):
         return self.alpha, self.beta
 
 
-class DoubleSphere(InPixels):
+class DoubleSphere(PixelFocalLengths):
     """The double-sphere camera model (Usenko, Demmel and Cremers, 3DV 2018)."""
 
     method: ClassVar = "double_sphere"
@@ -235,7 +235,7 @@ class DoubleSphere(InPixels):
         return self.xi, self.alpha
 
 
-class FTheta(Wide):
+class FTheta(WideAngle):
     """r = k1 a + k2 a^2 + k3 a^3 + k4 a^4 + k5 a^5 in px, where a is the angle in radians.
 
     NVIDIA's F-theta model by its polynomial from angles to pixels.

@@ -9,10 +9,10 @@ from pydantic import model_validator
 from clpipe.base.types import Floats
 from clpipe.reference.companding import (
     Knots,
-    along_pieces,
-    knots_in,
+    apply_pieces,
+    default_knots,
+    parse_knots,
     pieces_of,
-    usual_knots,
 )
 from clpipe.stage import (
     Arguments,
@@ -65,7 +65,7 @@ class Linear(SignalMethod):
     )
 
     @model_validator(mode="after")
-    def _ordered(self) -> "Linear":
+    def _check_levels(self) -> "Linear":
         if None not in (self.black_level, self.white_level) and self._range <= 0:
             raise ValueError(
                 f"white_level must be above black_level; they are {self.white_level} and "
@@ -92,13 +92,13 @@ class Linear(SignalMethod):
         if bits and bits != camera.bits:
             scale = (2**bits - 1) / (2**camera.bits - 1)
             black, white = float(round(black * scale)), float(round(white * scale))
-        filled = self.with_defaults(black_level=black, white_level=white)
-        assert filled.white_level is not None
-        filled = filled.with_defaults(bits=max(int(filled.white_level).bit_length(), 8))
-        return type(self).model_validate(dict(filled))
+        resolved = self.with_defaults(black_level=black, white_level=white)
+        assert resolved.white_level is not None
+        resolved = resolved.with_defaults(bits=max(int(resolved.white_level).bit_length(), 8))
+        return type(self).model_validate(dict(resolved))
 
     def next_context(self, context: Context) -> Context:
-        return context.but(black_level=self.black_level, white_level=self.white_level)
+        return context.replace(black_level=self.black_level, white_level=self.white_level)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("quantize", arguments=("range", "black_level", "white_level")),)
@@ -110,10 +110,10 @@ class Linear(SignalMethod):
             "white_level": self.white_level,
         }
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats | None:
         """The variance in DN^2: rounding adds 1/12. Clipping reduces it, which is not modelled."""
         scale = self._range / context.full_scale
-        return before * np.float32(scale**2) + np.float32(1 / 12)
+        return input_variance * np.float32(scale**2) + np.float32(1 / 12)
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
@@ -146,10 +146,10 @@ class Pwl(Linear):
     )
 
     @model_validator(mode="after")
-    def _rising(self) -> "Pwl":
+    def _check_knots(self) -> "Pwl":
         if self.knots is None:
             return self
-        last = knots_in(self.knots)[-1]
+        last = parse_knots(self.knots)[-1]
         if last[1] >= 2**self.result_bits:
             raise ValueError(
                 f"knots: the last output is {last[1]:g}, which does not fit in "
@@ -163,20 +163,20 @@ class Pwl(Linear):
         return self
 
     def resolve(self, context: Context) -> "Linear":
-        filled = super().resolve(context)
-        assert isinstance(filled, Pwl)
-        assert filled.white_level is not None
-        usual = usual_knots(filled.white_level, 2**self.result_bits - 1)
-        filled = filled.with_defaults(knots=[list(pair) for pair in usual])
-        return type(self).model_validate(dict(filled))
+        resolved = super().resolve(context)
+        assert isinstance(resolved, Pwl)
+        assert resolved.white_level is not None
+        default = default_knots(resolved.white_level, 2**self.result_bits - 1)
+        resolved = resolved.with_defaults(knots=[list(pair) for pair in default])
+        return type(self).model_validate(dict(resolved))
 
     @property
     def _knots(self) -> Knots:
         assert self.knots is not None
-        return knots_in(self.knots)
+        return parse_knots(self.knots)
 
     def next_context(self, context: Context) -> Context:
-        return super().next_context(context).but(knots=self._knots)
+        return super().next_context(context).replace(knots=self._knots)
 
     def passes(self) -> tuple[Pass, ...]:
         names = ("range", "black_level", "white_level", "pieces", "count")
@@ -187,11 +187,11 @@ class Pwl(Linear):
         count = CompileTime(str(len(pieces)))
         return {**super().arguments(context), "pieces": pieces, "count": count}
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats | None:
         return None
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return np.rint(along_pieces(super().reference(image, given), pieces_of(self._knots)))
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return np.rint(apply_pieces(super().reference(image, inputs), pieces_of(self._knots)))
 
 
 STAGE = Stage(

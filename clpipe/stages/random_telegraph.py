@@ -22,7 +22,7 @@ from clpipe.stage import (
     sensor_bits,
 )
 
-WORDS = 1 << 31  # number of different random words that choose the pixels
+RANDOM_WORDS = 1 << 31  # number of different random words that choose the pixels
 
 
 class TwoLevels(SignalMethod):
@@ -66,11 +66,11 @@ class TwoLevels(SignalMethod):
     def passes(self) -> tuple[Pass, ...]:
         if not self.share or not self.amplitude:
             return ()
-        given = ("limit", "scale", "amplitude")
+        names = ("limit", "scale", "amplitude")
         return (
             Pass(
                 "telegraph_levels",
-                arguments=given,
+                arguments=names,
                 writes="levels",
                 kind=Kind.PAIR,
                 random=NoiseScope.CAMERA,
@@ -79,19 +79,21 @@ class TwoLevels(SignalMethod):
         )
 
     @property
-    def _chosen(self) -> tuple[np.int32, np.float32]:
+    def _limit_and_scale(self) -> tuple[np.int32, np.float32]:
         """Return the words below which a pixel is chosen, and 1 over their number."""
         assert self.share is not None
-        limit = round(self.share * WORDS)
+        limit = round(self.share * RANDOM_WORDS)
         return int32(limit), float32(1 / max(limit, 1))
 
     def arguments(self, context: Context) -> Arguments:
-        limit, scale = self._chosen
+        limit, scale = self._limit_and_scale
         return {"limit": limit, "scale": scale, "amplitude": self.amplitude}
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         """The mean variance over the sensor: share * E[A^2] / 4, E[A^2] = 2 amplitude^2."""
-        return before + np.float32(self.share) * np.float32(self.amplitude) ** 2 / np.float32(2)
+        return input_variance + np.float32(self.share) * np.float32(
+            self.amplitude
+        ) ** 2 / np.float32(2)
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
@@ -102,7 +104,7 @@ class TwoLevels(SignalMethod):
 
 def levels_of_sensor(height: int, width: int, stream: Stream, share: float) -> Floats:
     """Return the distance of a pixel's two levels over the mean distance, and 0 without levels."""
-    bits, limit = sensor_bits(height, width, stream), round(share * WORDS)
+    bits, limit = sensor_bits(height, width, stream), round(share * RANDOM_WORDS)
     return np.where(bits < limit, exponential_of(bits, limit), np.float32(0))
 
 

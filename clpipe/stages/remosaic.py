@@ -13,7 +13,7 @@ from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern
 from clpipe.reference.filter_array import FilterArray, kernel_table, parse_array
 from clpipe.reference.geometry import Scaling
-from clpipe.reference.linear_mmse import RADIUS, filtered, filters
+from clpipe.reference.linear_mmse import RADIUS, apply_filters, filters
 from clpipe.reference.resample import Bins, resample
 from clpipe.stage import (
     PERIOD,
@@ -55,7 +55,7 @@ class Binning(Method):
     _factor: int = PrivateAttr(2)
 
     def resolve(self, context: Context) -> Self:
-        array = context.filters
+        array = context.filter_array
         factor = next((n for n in (3, 2) if binned(array, n)), None)
         if factor is None:
             raise RequestError(
@@ -67,11 +67,13 @@ class Binning(Method):
         return other
 
     def next_context(self, context: Context) -> Context:
-        array = binned(context.filters, self._factor)
+        array = binned(context.filter_array, self._factor)
         assert array
-        of_one, noise = self._factor**2, context.noise
-        less = noise and replace(noise, a=noise.a / of_one, b=noise.b / of_one)
-        return context.with_array(array).but(noise=less)
+        pixels_per_cell, noise = self._factor**2, context.noise
+        binned_noise = noise and replace(
+            noise, a=noise.a / pixels_per_cell, b=noise.b / pixels_per_cell
+        )
+        return context.with_array(array).replace(noise=binned_noise)
 
     @property
     def bins(self) -> tuple[Bins, Bins]:
@@ -88,7 +90,7 @@ class Binning(Method):
     def geometry(self) -> Scaling | None:
         return Scaling(self.bins)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         rows, columns = self.bins
         return resample(resample(image, rows), columns)
 
@@ -102,10 +104,10 @@ def binned(array: FilterArray, factor: int) -> FilterArray | None:
     rows, columns = array.period
     if rows % factor or columns % factor:
         return None
-    few = array.letters[::factor, ::factor]
-    if not (few.repeat(factor, 0).repeat(factor, 1) == array.letters).all():
+    reduced = array.letters[::factor, ::factor]
+    if not (reduced.repeat(factor, 0).repeat(factor, 1) == array.letters).all():
         return None
-    text = "/".join("".join(row) for row in few)
+    text = "/".join("".join(row) for row in reduced)
     return parse_array(text, array.gains)
 
 
@@ -123,31 +125,34 @@ class LinearMmse(Method):
     pattern: Pattern = parameter("RGGB", "Bayer pattern of the result.", structural=True)
 
     def next_context(self, context: Context) -> Context:
-        return context.but(array=None, pattern=self.pattern)
+        return context.replace(array=None, pattern=self.pattern)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("remosaic", Stencil(RADIUS), ("weights", *PERIOD)),)
 
     def arguments(self, context: Context) -> Arguments:
-        weights = weights_of(context.filters, self.pattern)
-        return {"weights": table_of(context.filters, self.pattern), **period_of(weights.shape[:2])}
+        weights = weights_of(context.filter_array, self.pattern)
+        return {
+            "weights": table_of(context.filter_array, self.pattern),
+            **period_of(weights.shape[:2]),
+        }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        array = given.context.filters
-        made = weights_of(array, self.pattern)
-        return filtered(image, array.period, made[..., None])[..., 0]
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        array = inputs.context.filter_array
+        weights = weights_of(array, self.pattern)
+        return apply_filters(image, array.period, weights[..., None])[..., 0]
 
 
 @lru_cache(maxsize=16)
 def weights_of(array: FilterArray, pattern: Pattern) -> Floats:
     """Return the filter at each position of the common period: (row, column, tap)."""
-    wanted = parse_array(pattern)
-    rows, columns = (math.lcm(a, b) for a, b in zip(array.period, wanted.period, strict=True))
-    made = filters(array)
-    places = np.ix_(np.arange(rows) % array.period[0], np.arange(columns) % array.period[1])
-    channel = np.vectorize("RGB".index)(np.tile(wanted.letters, (rows // 2, columns // 2)))
-    chosen = np.take_along_axis(made[places], channel[..., None, None], axis=-1)
-    return np.ascontiguousarray(chosen[..., 0])
+    target = parse_array(pattern)
+    rows, columns = (math.lcm(a, b) for a, b in zip(array.period, target.period, strict=True))
+    array_filters = filters(array)
+    positions = np.ix_(np.arange(rows) % array.period[0], np.arange(columns) % array.period[1])
+    channel = np.vectorize("RGB".index)(np.tile(target.letters, (rows // 2, columns // 2)))
+    selected = np.take_along_axis(array_filters[positions], channel[..., None, None], axis=-1)
+    return np.ascontiguousarray(selected[..., 0])
 
 
 @lru_cache(maxsize=16)  # the same object for the same array, so that it is uploaded once

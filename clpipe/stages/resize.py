@@ -44,7 +44,7 @@ class Filter(Method):
             Resampling("columns", self.scale, weight, support),
         )
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         if self.scale == 1:
             return image
         rows, columns = self.resamplings
@@ -84,5 +84,5 @@ STAGE = Stage(
     Kind.RGB,
     Kind.RGB,
     (Area, Lanczos3),
-    also=(Kind.DISPLAY,),
+    also_reads=(Kind.DISPLAY,),
 )

@@ -33,7 +33,7 @@ class Brooks2019(CameraGains):
     blue_gain: float | None = gain_parameter("blue", auto="the gain of inverse_white_balance")
 
     def resolve(self, context: Context) -> CameraGains:
-        red, blue = context.gains_of_light
+        red, blue = context.illuminant_gains
         return self.with_defaults(red_gain=red, blue_gain=blue)
 
     def passes(self) -> tuple[Pass, ...]:
@@ -43,7 +43,7 @@ class Brooks2019(CameraGains):
         red, blue = map(float32, self.gains)
         return {"red_gain": red, "blue_gain": blue}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         one = np.float32(1)
         red, green, blue = np.moveaxis(image, -1, 0)
         grey = ((red + green) + blue) * np.float32(1 / 3)

@@ -33,9 +33,9 @@ from clpipe.stages.denoise.strength import (
 # Found by experiment, with the denoising of the default chain, against the noise of real cameras'
 # images. These are the amount without noise, the amount that is added where denoising softens most,
 # and the luma noise of that maximum, in roots of the signal.
-LEAST_AMOUNT, MORE_AMOUNT, SOFTEST = 0.2, 0.55, 0.009
+MIN_AMOUNT, EXTRA_AMOUNT, SOFTEST_NOISE = 0.2, 0.55, 0.009
 THRESHOLD = 0.2  # of the luma noise; without it, small noise is sharpened and large noise is not
-LEAST_LIMIT = 0.008  # without noise; two levels of 255
+MIN_LIMIT = 0.008  # without noise; two levels of 255
 
 
 def blur_step(radius: float) -> int:
@@ -54,8 +54,8 @@ def blur_weights(radius: float) -> Floats:
     ([0.7900000214576721, 0.10999999940395355], 3)
     """
     step = blur_step(radius)
-    away = step * np.arange(max(round(2 * radius / step), 1) + 1)
-    weights = np.exp(-(away**2) / (2 * radius**2))
+    distances = step * np.arange(max(round(2 * radius / step), 1) + 1)
+    weights = np.exp(-(distances**2) / (2 * radius**2))
     return np.asarray(weights / (2 * weights.sum() - 1), np.float32)
 
 
@@ -103,9 +103,9 @@ class Unsharp(Method):
     def resolve(self, context: Context) -> Self:
         offset = offset_of_roots(context) if self.offset is None else self.offset
         noise = noise_in_roots(predicted_noise(context)[0], MID_GREY, offset)
-        x = (noise / SOFTEST) ** 2
-        amount = LEAST_AMOUNT + MORE_AMOUNT * 4 * x / (1 + x) ** 2
-        limits = {"threshold": THRESHOLD * noise, "limit": LEAST_LIMIT + noise}
+        x = (noise / SOFTEST_NOISE) ** 2
+        amount = MIN_AMOUNT + EXTRA_AMOUNT * 4 * x / (1 + x) ** 2
+        limits = {"threshold": THRESHOLD * noise, "limit": MIN_LIMIT + noise}
         return self.with_defaults(amount=amount, offset=offset, **limits)
 
     @property
@@ -140,7 +140,7 @@ class Unsharp(Method):
             "offset": self.offset,
         }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         if not self.amount:
             return image
         offset = np.float32(self.offset)

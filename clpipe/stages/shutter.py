@@ -8,7 +8,7 @@ from pydantic import PrivateAttr
 
 from clpipe.base.tracing import float32, traceable
 from clpipe.base.types import Doubles, Floats
-from clpipe.camera.optics import USUAL_TIME
+from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
 from clpipe.stage import (
     Arguments,
     Context,
@@ -123,8 +123,8 @@ class Rows(Method):
     _end: float = PrivateAttr(1.0)  # of the last exposure, in exposures of the first
 
     def resolve(self, context: Context) -> Self:
-        known = self.with_optics(context).with_defaults(exposure_time=USUAL_TIME)
-        return known.with_defaults(flicker_depth=self.depth)
+        resolved = self.with_optics(context).with_defaults(exposure_time=DEFAULT_EXPOSURE_TIME)
+        return resolved.with_defaults(flicker_depth=self.depth)
 
     def next_context(self, context: Context) -> Context:
         return replace(context, light_changes=self.subframes > 1 or bool(self.depth))
@@ -132,15 +132,15 @@ class Rows(Method):
     @property
     def depth(self) -> float:
         """Amplitude of the flicker, or share of the light that is pulsed."""
-        usual = 1.0 if self.flicker_duty else 0.0
-        return usual if self.flicker_depth is None else self.flicker_depth
+        default = 1.0 if self.flicker_duty else 0.0
+        return default if self.flicker_depth is None else self.flicker_depth
 
     @property
-    def layer_of_light(self) -> str:
+    def light_layer(self) -> str:
         """The layer with the flickering light that the image's file must contain, or ""."""
         return self.flicker_layer if self.depth else ""
 
-    def during(self, spans: tuple[Span, ...], number: int) -> Self:
+    def for_exposure(self, spans: tuple[Span, ...], number: int) -> Self:
         """Return the method for one of several exposures.
 
         Args:
@@ -152,36 +152,37 @@ class Rows(Method):
         return other
 
     @property
-    def _longest(self) -> float:
-        return self.exposure_time or USUAL_TIME
+    def _first_exposure(self) -> float:
+        return self.exposure_time or DEFAULT_EXPOSURE_TIME
 
     @property
     def time(self) -> float:
         """Exposure time of each row, s."""
-        return self._longest * self._span.length
+        return self._first_exposure * self._span.length
 
     def times(self, rows: int) -> Doubles:
         """Return when the exposure of each row starts, in s: (row,)."""
-        start = self._longest * self._span.start
+        start = self._first_exposure * self._span.start
         return np.arange(rows, dtype=np.float64) * self.line_time + start
 
     def duration(self, rows: int) -> float:
         """Return the time from the start of the first row to the end of the last row, s."""
-        return (rows - 1) * self.line_time + self._longest * self._end
+        return (rows - 1) * self.line_time + self._first_exposure * self._end
 
-    def weights(self, frames: int, rows: int, lit: bool = False) -> Doubles:
+    def weights(self, frames: int, rows: int, weighted: bool = False) -> Doubles:
         """Return the share of each row's exposure in each of the frames: (frame, row).
 
         The frames follow each other without a gap, over all of :meth:`duration`.
 
         Args:
             frames, rows: their numbers.
-            lit: weight by the flickering light over its mean; shares need not add up to 1 then.
+            weighted: weight by the flickering light over its mean; shares need not add up to 1
+            then.
         """
         starts = self.times(rows)
         bounds = np.linspace(0, self.duration(rows), frames + 1)[:, None]
-        seen = np.clip(bounds, starts, starts + self.time)
-        shares = np.diff(self._light_until(seen) if lit else seen, axis=0)
+        bounds_seen = np.clip(bounds, starts, starts + self.time)
+        shares = np.diff(self._light_until(bounds_seen) if weighted else bounds_seen, axis=0)
         return np.asarray(shares / self.time)
 
     def _light_until(self, time: Doubles) -> Doubles:
@@ -207,37 +208,37 @@ class Rows(Method):
         return self.depth * (1 - self.flicker_duty) * (self.cycles % 1) / self.cycles
 
     def passes(self) -> tuple[Pass, ...]:
-        if not self.swing or self.layer_of_light:  # which was applied when the file was read
+        if not self.swing or self.light_layer:  # which was applied when the file was read
             return ()
         table = Pass(
             "flicker_of_rows", LineTable("rows"), ("step", "start", "swing"), writes="rows"
         )
         if self.flicker_duty:
-            given = ("step", "start", "rest", "duty", "steady", "scale")
-            table = Pass("pulses_of_rows", LineTable("rows"), given, writes="rows")
+            names = ("step", "start", "rest", "duty", "steady", "scale")
+            table = Pass("pulses_of_rows", LineTable("rows"), names, writes="rows")
         return (table, Pass("flicker", arguments=("rows",)))
 
     def arguments(self, context: Context) -> Arguments:
         step = self.flicker_frequency * self.line_time % 1
-        start = self.flicker_frequency * self._longest * self._span.start
+        start = self.flicker_frequency * self._first_exposure * self._span.start
         start += self.flicker_phase / 360 - self.margins.top * step  # the image's first row
         if not self.flicker_duty:
             middle = float32((start + self.cycles / 2) % 1)
             return {"step": float32(step), "start": middle, "swing": float32(self.swing)}
         whole = float(np.floor(self.cycles))
         return {
-            "step": _turn(step),
-            "start": _turn(start),
+            "step": _phase_word(step),
+            "start": _phase_word(start),
             "rest": float32(self.cycles - whole),
             "duty": float32(self.flicker_duty),
             "steady": float32(1 - self.depth + self.depth * whole / self.cycles),
             "scale": float32(self.depth / self.flicker_duty / self.cycles),
         }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         if not self.passes():
             return image
-        n: Any = self.arguments(given.context)
+        n: Any = self.arguments(inputs.context)
         rows = np.arange(image.shape[0], dtype=np.uint32)
         if not self.flicker_duty:
             turns = rows.astype(np.float32) * n["step"] + n["start"]
@@ -251,10 +252,10 @@ class Rows(Method):
         return image * gains[:, None, None]
 
 
-def _turn(cycles: float) -> np.uint32:
+def _phase_word(cycles: float) -> np.uint32:
     """Return the fraction of a period, in units of 2^-32: its sums stay exact.
 
-    >>> int(_turn(-2.75)) == 2**30
+    >>> int(_phase_word(-2.75)) == 2**30
     True
     """
     return np.uint32(round(cycles % 1 * 2**32) % 2**32)

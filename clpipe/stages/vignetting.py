@@ -10,16 +10,16 @@ from clpipe.base.types import Floats
 from clpipe.camera.lens import LensCalibration
 from clpipe.reference.math import inverse_root
 from clpipe.stage import (
-    AboutAxis,
     Argument,
     Arguments,
     CompileTime,
     Context,
-    FromLens,
-    InFocalLengths,
+    FocalLengthMethod,
     Kind,
+    LensMethod,
     Method,
     Pass,
+    PrincipalPointMethod,
     ReferenceContext,
     Stage,
     StageRole,
@@ -37,14 +37,14 @@ class NoVignetting(Unchanged):
     summary: ClassVar = "no vignetting"
 
 
-class VignettingOfLens(FromLens):
+class LensVignetting(LensMethod):
     """Vignetting of the lens that ``--lens`` names, at the camera's f-number."""
 
     summary: ClassVar = (
         "vignetting of the lens that --lens names, at --aperture; none without these"
     )
 
-    def of_lens(self, lens: LensCalibration | None) -> Method:
+    def for_lens(self, lens: LensCalibration | None) -> Method:
         if lens is None or not lens.vignetting:
             return NoVignetting()
         table = dict(lens.vignetting)
@@ -78,10 +78,10 @@ class Pa(Method):
         return (Pass("vignetting_pa", arguments=("extent", "k1", "k2", "k3")),)
 
     def arguments(self, context: Context) -> Arguments:
-        ks = {name: float32(getattr(self, name)) for name in ("k1", "k2", "k3")}
-        return {"extent": CompileTime("e"), **ks}
+        coefficients = {name: float32(getattr(self, name)) for name in ("k1", "k2", "k3")}
+        return {"extent": CompileTime("e"), **coefficients}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         sides: Floats = np.maximum(np.array(image.shape[:2], np.float32) - 1, 1)
         corner = (sides * sides).sum(keepdims=True) * np.float32(0.25)
         r2 = _squared_radius(image) * _reciprocal(corner)
@@ -90,7 +90,7 @@ class Pa(Method):
         return image * np.maximum(gain, np.float32(0))[..., None]
 
 
-class CosineFourth(InFocalLengths, AboutAxis):
+class CosineFourth(FocalLengthMethod, PrincipalPointMethod):
     """v * cos^4 of the angle to the optical axis, which passes through the principal point.
 
     This is the illumination of a sensor by a lens without vignetting of its own. With r in focal
@@ -118,28 +118,28 @@ class CosineFourth(InFocalLengths, AboutAxis):
         Raises:
             RequestError: the focal length is not known.
         """
-        own = self.with_optics(context)
-        own.check_focal_length("vignetting")
-        return own
+        resolved = self.with_optics(context)
+        resolved.check_focal_length("vignetting")
+        return resolved
 
     def passes(self) -> tuple[Pass, ...]:
-        given = ("extent", "x", "y", "per_px", "per_side")
-        return (Pass("vignetting_cosine", arguments=given),)
+        names = ("extent", "x", "y", "per_px", "per_side")
+        return (Pass("vignetting_cosine", arguments=names),)
 
     def arguments(self, context: Context) -> Arguments:
-        per_px, per_side = self._units()
-        places = {"x": _place(self.cx, "width"), "y": _place(self.cy, "height")}
-        return {"extent": CompileTime("e"), **places, "per_px": per_px, "per_side": per_side}
+        per_px, per_side = self._inverse_focal_squared()
+        centre = {"x": _coordinate(self.cx, "width"), "y": _coordinate(self.cy, "height")}
+        return {"extent": CompileTime("e"), **centre, "per_px": per_px, "per_side": per_side}
 
-    def _units(self) -> tuple[np.float32, np.float32]:
+    def _inverse_focal_squared(self) -> tuple[np.float32, np.float32]:
         """Return 1 over the squared focal length in px, or in longer sides; the other one is 0."""
         if self.fx:
             return float32(self.fx**-2), float32(0)
         assert self.focal_length and self.sensor_width
         return float32(0), float32((self.sensor_width / self.focal_length) ** 2)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        per_px, per_side = self._units()
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        per_px, per_side = self._inverse_focal_squared()
         side: Floats = np.full(1, max(image.shape[:2]), np.float32)
         unit = per_px or per_side * _reciprocal(side * side)
         cosine = _reciprocal(_squared_radius(image, self.cx, self.cy) * unit + np.float32(1))
@@ -149,12 +149,12 @@ class CosineFourth(InFocalLengths, AboutAxis):
 def _squared_radius(image: Floats, cx: float | None = None, cy: float | None = None) -> Floats:
     """Return the squared distance of each pixel to a point, in px; None is the image centre."""
     height, width = image.shape[:2]
-    places = (width, width / 2 if cx is None else cx), (height, height / 2 if cy is None else cy)
-    dx, dy = (np.arange(n, dtype=np.float32) + np.float32(0.5) - np.float32(c) for n, c in places)
+    centres = (width, width / 2 if cx is None else cx), (height, height / 2 if cy is None else cy)
+    dx, dy = (np.arange(n, dtype=np.float32) + np.float32(0.5) - np.float32(c) for n, c in centres)
     return dx * dx + (dy * dy)[:, None]
 
 
-def _place(centre: float | None, side: str) -> Argument:
+def _coordinate(centre: float | None, side: str) -> Argument:
     """Return a coordinate of the principal point; None is the centre, which a kernel computes."""
     return CompileTime(f"0.5f * (float)e.{side}") if centre is None else float32(centre)
 
@@ -169,6 +169,6 @@ STAGE = Stage(
     "Darken the corners of the image, like a lens.",
     Kind.RGB,
     Kind.RGB,
-    (VignettingOfLens, NoVignetting, Pa, CosineFourth),
+    (LensVignetting, NoVignetting, Pa, CosineFourth),
     role=StageRole.FALLOFF,
 )

@@ -17,7 +17,7 @@ from clpipe.base.types import Floats
 from clpipe.chain.chain import Step
 from clpipe.reference.image import mirror
 from clpipe.reference.random import Stream
-from clpipe.stage.signal import Backend, Own, nothing
+from clpipe.stage.signal import Backend, ExtraArguments, no_arguments
 from clpipe.torch import numbers
 from clpipe.torch.numbers import Streams, f32
 from clpipe.torch.poisson import poisson_of
@@ -130,10 +130,12 @@ class TorchBackend(Backend):
     def _device(self) -> torch.device:
         return self.streams.keys.device
 
-    def fixed(self, make: Callable[..., Floats], own: Own = nothing) -> Tensor:
+    def fixed(
+        self, function: Callable[..., Floats], extra: ExtraArguments = no_arguments
+    ) -> Tensor:
         height, width = self.size
         maps = [
-            _fixed_map(make, self.area, stream, own(step.method, step.context), self._device)
+            _fixed_map(function, self.area, stream, extra(step.method, step.context), self._device)
             for step, stream in zip(self.steps, self.sensors, strict=True)
         ]
         pairs = list(zip(maps, self.positions, strict=True))

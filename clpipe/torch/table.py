@@ -13,7 +13,7 @@ from clpipe.chain.chain import Chain, Step
 from clpipe.reference.cfa import sites
 from clpipe.reference.random import Stream
 from clpipe.stage import NoiseScope, SignalMethod
-from clpipe.stage.signal import numbers_in
+from clpipe.stage.signal import scalar_arguments
 from clpipe.torch.backend import TorchBackend
 from clpipe.torch.numbers import Streams
 
@@ -143,7 +143,7 @@ def _variants(chains: Sequence[Chain], position: int) -> list[Variant]:
                 f"{example.name}.method={example.method.method} is not available in "
                 "clpipe.torch; use clpipe.RawNoise"
             )
-        arguments = {number: numbers_in(step.arguments) for number, step in steps.items()}
+        arguments = {number: scalar_arguments(step.arguments) for number, step in steps.items()}
         numbers = {
             name: np.array(
                 [arguments[k][name] if k in steps else 0 for k in range(len(chains))], np.float32

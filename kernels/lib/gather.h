@@ -105,8 +105,8 @@ INLINE vf gather(__global const float *row, const int *start, int tap) {
     return unspill(lanes);
 }
 
-// One channel, 0 where the lens sees nothing.
-INLINE vf bent(site at, __global const float *plane, extent from, vf across, vf down,
+// One channel at an offset from each pixel; 0 outside the input.
+INLINE vf sample_at_offset(site at, __global const float *plane, extent from, vf across, vf down,
                __global const float *filter, int taps, int powers) {
     vf u, v;
     const vi own = iota() + (vi)((int)at.x);

@@ -37,7 +37,7 @@ import numpy as np
 from PIL import Image
 
 from clpipe.analysis.matching.columns import signature
-from clpipe.analysis.signature import BRIGHTEST, DARKEST, flat_places, luma
+from clpipe.analysis.signature import BRIGHTEST, DARKEST, flat_mask, luma
 from clpipe.base.errors import ClpipeError
 from clpipe.base.types import Array, Floats, Mask
 from clpipe.images.read import read_image
@@ -241,7 +241,7 @@ def noise_rows(
             saturated = signature(*chart, patches)["kurtosis"]
             for name in names:
                 noisy, clean = (comparison.picture(developer, iso, name, n) for n in (True, False))
-                found = signature(noisy, clean, flat_places(clean) & inside(clean.shape))
+                found = signature(noisy, clean, flat_mask(clean) & inside(clean.shape))
                 made = dots(noisy, clean)
                 yield [
                     name,

@@ -29,7 +29,7 @@ import numpy as np
 
 from clpipe.analysis.matching.columns import (
     COLUMNS,
-    REACH,
+    MAX_LAG,
     Noise,
     autocorrelation,
     figures_of,
@@ -182,7 +182,7 @@ def median_figures(noises: Sequence[Noise], pairs: Sequence[Pair]) -> dict[str, 
         middle = figures[RELATIVE_TO]
         rows.append([figures[n] / middle if n.startswith("sigma") else figures[n] for n in SHOWN])
         _, cb, cr = noise.planes
-        rows[-1].append(float(autocorrelation(cb, places)[REACH, REACH + 2]))
+        rows[-1].append(float(autocorrelation(cb, places)[MAX_LAG, MAX_LAG + 2]))
         rows[-1].append(over_white(cr, places.bright, COARSE))
     with np.errstate(all="ignore"):
         medians = [

@@ -27,7 +27,7 @@ from clpipe.batch.bench import Workload, bench_batch, write_renders
 from clpipe.batch.processes import default_processes
 from clpipe.chain.request import Request
 from clpipe.engine.device import open_device
-from clpipe.images.claims import plain_claim
+from clpipe.images.claims import mosaic_claim
 
 COUNTS = (1, 2, 4)
 FEW = 40  # images, to measure the time to start
@@ -132,7 +132,7 @@ def main() -> None:
         for count, cost in costs.items():
             numbers = f"{cost.cpu:.2f} | {cost.parent:.2f} | {1e3 / cost.elapsed:.0f}"
             print(f"| {text} | {lock:.2f} | {count} | {numbers} |", flush=True)
-        claim = plain_claim(width, height)
+        claim = mosaic_claim(width, height)
         usual = default_processes(10**6, claim, options.processors)
         single = modelled(costs[1], lock, options.processors, 1)
         shared = modelled(costs[here if here in costs else 2], lock, options.processors, usual)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from clpipe.analysis.crops import HEIGHT, WIDTH, Place, choose_places
+from clpipe.analysis.crops import HEIGHT, WIDTH, Crop, choose_crops
 from clpipe.base.types import Array
 
 SCALE = 4  # enlargement of crops
@@ -43,13 +43,13 @@ def markdown(heads: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
     return "\n".join([first, "|---" * len(heads) + "|", *others])
 
 
-def significant_places(picture: Array) -> list[Place]:
+def significant_places(picture: Array) -> list[Crop]:
     """Choose two places for crops: the most saturated one, and the one with the most detail.
 
     Args:
         picture: without noise, (height, width, 3), 0 to 255.
     """
-    return choose_places(("saturated", "textured"), picture.astype(np.float32) / np.float32(255))
+    return choose_crops(("saturated", "textured"), picture.astype(np.float32) / np.float32(255))
 
 
 def sheet(columns: Sequence[str], rows: Mapping[str, Sequence[Array]]) -> Image.Image:

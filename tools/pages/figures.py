@@ -33,7 +33,7 @@ from matplotlib.figure import Figure
 
 from clpipe.analysis.comparison import Comparison, Row, compare
 from clpipe.analysis.comparison_plot import METADATA, STYLE, draw
-from clpipe.analysis.matching.columns import REACH, spectrum_of
+from clpipe.analysis.matching.columns import MAX_LAG, spectrum_of
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import WHOLE, load_picture
 from clpipe.analysis.spatial import LAGS
@@ -225,7 +225,7 @@ def statistics(picture: Path, figure: Path, title: str) -> None:
         curve, table = one.curve, one.autocorrelation
         of_picture.plot(curve.mean * LEVELS, curve.sigma * LEVELS, "o-", markersize=3, label=label)
         lags.plot(range(LAGS + 1), table[LAGS, LAGS:], "o-", markersize=3, label=label)
-        near = slice(LAGS - REACH, LAGS + REACH + 1)
+        near = slice(LAGS - MAX_LAG, LAGS + MAX_LAG + 1)
         power, radius = spectrum_of(table[near, near])
         rings = np.digitize(radius, edges := np.linspace(0, 0.5, 17))
         middles = (edges[1:] + edges[:-1]) / 2

@@ -100,11 +100,11 @@ def argument_of(key: Key) -> str:
     text = key.text if key.text[1].isupper() else key.text[0].lower() + key.text[1:]
     listed = ", ".join(f'"{name}"' for name in key.choices)
     choices = f" The choices are {listed}." if listed else ""
-    usual = f" None is {key.usual}." if key.usual else ""
+    default = f" None is {key.default_text}." if key.default_text else ""
     named = re.sub(
         r"--([a-z-]+)",
         lambda match: f"``{match[1].replace('-', '_')}``",
-        f"{key.name}: {text}{choices}{usual}",
+        f"{key.name}: {text}{choices}{default}",
     )
     return textwrap.fill(named, 100, initial_indent=" " * 8, subsequent_indent=" " * 12)
 

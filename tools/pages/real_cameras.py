@@ -15,12 +15,12 @@ from PIL import Image
 
 import clpipe
 from clpipe.analysis.matching.columns import Figures, signature
-from clpipe.analysis.signature import BIN, FEWEST, flat_places, luma, noise_of
+from clpipe.analysis.signature import BIN, MIN_SAMPLES, flat_mask, luma, noise_of
 from clpipe.analysis.spatial import LAGS, autocorrelation, count_pairs
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Runner
-from clpipe.images.jpeg import JpegEncoding, through_jpeg
+from clpipe.images.jpeg import JpegEncoding, jpeg_round_trip
 from tools.pages.comparison_page import COLUMNS, cells, sheet, significant_places
 
 ISOS = (800, 1600, 3200, 6400)
@@ -103,7 +103,7 @@ def develop(render: Floats, iso: float, device: str | None = None) -> Pair:
     output = pipeline.chain.settings.output
     written = JpegEncoding(output.jpeg_quality, output.jpeg_subsampling)
     picture = np.asarray(pipeline.process(render, "render").image)
-    return Pair(through_jpeg(picture, written), np.asarray(truth))
+    return Pair(jpeg_round_trip(picture, written), np.asarray(truth))
 
 
 def medians(pairs: Iterable[Pair]) -> dict[str, float]:
@@ -145,7 +145,7 @@ def spectrum(pair: Pair) -> tuple[Doubles, Doubles]:
     >>> bool(np.allclose(spectrum(Pair(noisy, grey))[1][2:], 1, atol=0.3))
     True
     """
-    mask = flat_places(pair.clean)
+    mask = flat_mask(pair.clean)
     noise = np.where(mask, luma(noise_of(pair.noisy, pair.clean)), 0)
     lags = np.nan_to_num(autocorrelation(noise[None].astype(np.float32), count_pairs(mask)))
     window = np.hanning(2 * LAGS + 3)[1:-1]
@@ -170,14 +170,14 @@ def sigma_by_intensity(pairs: Iterable[Pair]) -> tuple[Doubles, Doubles]:
     """
     parts = []
     for pair in pairs:
-        mask = flat_places(pair.clean)
+        mask = flat_mask(pair.clean)
         noise = luma(noise_of(pair.noisy, pair.clean))
         parts.append(np.stack([luma(pair.clean)[mask], noise[mask]]))
     level, noise = np.concatenate(parts, axis=1)
     bins = (level // BIN).astype(int)
     count = np.bincount(bins)
     variance = np.bincount(bins, noise**2) / np.maximum(count, 1)
-    full = np.flatnonzero(count >= FEWEST)
+    full = np.flatnonzero(count >= MIN_SAMPLES)
     return (full + 0.5) * BIN, np.sqrt(variance[full])
 
 

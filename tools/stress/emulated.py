@@ -38,12 +38,12 @@ RENDER = """if True:
 DEVICE = """if True:
     import json, platform
     from clpipe.engine import verdicts
-    from clpipe.engine.cpu_target import own_target
+    from clpipe.engine.cpu_target import driver_target
     from clpipe.engine.discovery import find_devices
     verdicts.LIMIT = 1200
     pocl = [d for d in find_devices() if "Portable Computing" in d.platform]
     print(json.dumps([
-        [platform.machine(), (own_target(d.version) or ("", ""))[1], d.target.name,
+        [platform.machine(), (driver_target(d.version) or ("", ""))[1], d.target.name,
         d.lanes, d.driver, d.problem] for d in pocl]))
 """
 DEVELOP = ("-m", "clpipe", "run", "render.exr", "--iso", "3200", "--keep", "quantize")

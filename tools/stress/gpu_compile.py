@@ -228,7 +228,7 @@ def chains() -> Iterator[tuple[str, Chain]]:
         yield f"{RAW}{noise}, all noise", make_chain(settings)
     for config in ("default", "paper"):
         request = Request.from_options(config=config, values={"iso": ISO})
-        yield f"{RAW}{config}", request.chain().through(["quantize"])
+        yield f"{RAW}{config}", request.chain().up_to(["quantize"])
         yield config, request.chain()
     for stage in all_stages().values():
         for method in stage.methods:

@@ -52,7 +52,7 @@ def clean_raws(paths: Sequence[Path], camera: str) -> list[Tensor]:
     pipeline = clpipe.Pipeline(
         camera=camera, iso=1600, until="normalize", skip=["noise"], quantize={"bits": 16}
     )
-    pattern = pipeline.chain.filters.pattern
+    pattern = pipeline.chain.filter_array.pattern
     found = []
     for path in paths:
         pixels = read_source(path, Kind.RGB, ReadOptions()).pixels.astype(np.float32)

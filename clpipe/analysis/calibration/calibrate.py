@@ -11,8 +11,8 @@ import numpy as np
 
 from clpipe.analysis.calibration import fixed_pattern, repeats, single_image
 from clpipe.analysis.calibration.checks import (
-    check_alike,
     check_enough,
+    check_equal_noise,
     check_rising,
     check_significant,
     check_static,
@@ -116,13 +116,13 @@ def _from_repeats(
     notes: list[str] = []
     rounding = ROUNDING if whole else 0.0
     check_enough(float(((scene > 0) & (scene < sensor.white_level)).mean()))
-    top = repeats.ceiling(scene, sensor)
+    top = repeats.clipping_level(scene, sensor)
     if top < sensor.white_level:
         notes.append(f"samples clip at {top:g} DN, below the white level of {sensor.white_level:g}")
     darkness = DarkFrames.analyse(dark, sensor, notes)
     figures = figures_of(dark, sensor, darkness)
     from_black = replace(sensor, black_level=darkness.level) if darkness else sensor
-    stack = repeats.unclipped(repeats.stacked(scene, from_black), None, top)
+    stack = repeats.unclipped(repeats.stack_frames(scene, from_black), None, top)
     check_enough(float(stack.used.mean()))
     if darkness:
         stack = stack.without_columns(darkness.columns())
@@ -152,7 +152,7 @@ def _from_repeats(
     line = fit_line([table[name] for table in tables for name in sensor.channels])
     check_static(stack, line)
     for each, what in zip(stacks, ("frame", "dark frame"), strict=False):
-        check_alike(each, line, what)
+        check_equal_noise(each, line, what)
     lines = {name: fit_channel(tables, name) for name in sensor.channels}
     pooled = check_significant(line).lowered(rounding)
     pattern = darkness.pattern(pooled, rounding) if darkness else None

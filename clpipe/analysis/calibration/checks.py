@@ -10,10 +10,10 @@ from clpipe.analysis.calibration.line_fit import Bin, Line, Table, fit_line
 from clpipe.analysis.calibration.repeats import Stack
 from clpipe.base.errors import ImageError
 
-LEAST_USED = 0.25  # share of the pixels that must be valid
-UNALIKE = 0.2  # deviation of a frame's variance from the median frame's, relative
-ROUGH = 0.4  # DN of noise below which rounding depends on the noise
-BENT = 0.1  # deviation of a bin's variance from the line, relative
+MIN_VALID_SHARE = 0.25  # share of the pixels that must be valid
+MAX_VARIANCE_DEVIATION = 0.2  # deviation of a frame's variance from the median frame's, relative
+LOW_NOISE = 0.4  # DN of noise below which rounding depends on the noise
+MAX_NONLINEARITY = 0.1  # deviation of a bin's variance from the line, relative
 
 
 def check_enough(share: float) -> None:
@@ -22,7 +22,7 @@ def check_enough(share: float) -> None:
     Raises:
         ImageError: fewer than a quarter are.
     """
-    if share < LEAST_USED:
+    if share < MIN_VALID_SHARE:
         raise ImageError(
             f"{1 - share:.0%} of the pixels, or their noise, are clipped; "
             "expose less, or check the levels"
@@ -36,7 +36,7 @@ def check_static(stack: Stack, line: Line) -> None:
         ImageError: neighbouring pixels vary together.
     """
     moving = repeats.common_motion(stack, line)
-    if moving.value > max(repeats.MOVING, 5 * moving.error):
+    if moving.value > max(repeats.MAX_MOTION, 5 * moving.error):
         share = repeats.share_beyond_noise(stack, line)
         raise ImageError(
             f"the frames do not show the same scene: neighbouring pixels share {moving.value:.0%} "
@@ -45,7 +45,7 @@ def check_static(stack: Stack, line: Line) -> None:
         )
 
 
-def check_alike(stack: Stack, line: Line, what: str) -> None:
+def check_equal_noise(stack: Stack, line: Line, what: str) -> None:
     """Check that all frames are equally noisy; ``what`` is their name in messages.
 
     Raises:
@@ -53,7 +53,7 @@ def check_alike(stack: Stack, line: Line, what: str) -> None:
     """
     noise = repeats.noise_by_frame(stack, line)
     for k, share in enumerate(noise, 1):
-        if abs(share - 1) > UNALIKE:
+        if abs(share - 1) > MAX_VARIANCE_DEVIATION:
             raise ImageError(
                 f"{what} {k} of {len(noise)} (in the order given, folders by name) has {share:.2f} "
                 "times the others' variance about the mean. Remove it if it has no noise, is a "
@@ -109,9 +109,9 @@ def line_notes(pooled: Line, rounding: float, lines: dict[str, Line] | None = No
     gain, floor = pooled.gain, pooled.floor
     if gain.error > 0.1 * gain.value:
         notes.append(f"a is known only to {gain.error / gain.value:.0%}; add frames or light")
-    if rounding and abs(floor.value) < ROUGH**2:
+    if rounding and abs(floor.value) < LOW_NOISE**2:
         notes.append(
-            f"b is {floor.value:.2f} DN^2; below {ROUGH} DN of noise, rounding depends on the "
+            f"b is {floor.value:.2f} DN^2; below {LOW_NOISE} DN of noise, rounding depends on the "
             "noise, so b is inexact"
         )
     elif floor.value < -2 * floor.error:
@@ -134,7 +134,9 @@ def linearity_notes(pooled: Line, rounding: float, bins: Sequence[Bin]) -> list[
     for one in bins:
         expected = pooled.gain.value * one.light + pooled.floor.value + rounding
         apart = one.variance - expected
-        if abs(apart) > max(BENT * expected, 6 * one.error) and abs(apart / expected) > abs(worst):
+        if abs(apart) > max(MAX_NONLINEARITY * expected, 6 * one.error) and abs(
+            apart / expected
+        ) > abs(worst):
             worst, light = apart / expected, one.light
     if not worst:
         return []

@@ -65,10 +65,10 @@ class DarkFrames:
                 f"{zeros:.1%} of the dark samples are 0 DN, so noise cannot be measured in them"
             )
         elif len(dark) > 1:
-            stack = repeats.stacked(dark.copy(), sensor, "dark frames")
+            stack = repeats.stack_frames(dark.copy(), sensor, "dark frames")
             stack.used[hot.rows, hot.columns] = False
-            stack.light[...] = stack.around[...] = 0
-            rest = stack.rest - stack.rest.mean(axis=2, keepdims=True)
+            stack.light[...] = stack.neighbour_mean[...] = 0
+            rest = stack.residuals - stack.residuals.mean(axis=2, keepdims=True)
             freedom = stack.used.sum() * stack.degrees * (1 - 1 / mean.shape[1])
             square = float((rest[:, stack.used] ** 2).sum(dtype=np.float64) / freedom)
             temporal = Estimate(square, square * float(np.sqrt(2 / freedom)))

@@ -14,7 +14,7 @@ from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.base.types import Doubles, Floats
 
-FEWEST_TIMES = 2
+MIN_TIMES = 2
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def dark_current(
         sensor: the sensor, for its filter array.
     """
     stacks = {time: frames for time, frames in sorted(stacks.items()) if len(frames) > 1}
-    if len(stacks) < FEWEST_TIMES:
+    if len(stacks) < MIN_TIMES:
         return None
     times = np.array(list(stacks))
     temporal, patterns = zip(

@@ -14,15 +14,15 @@ from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.base.types import Array, Doubles, Floats, Mask
 
-FEW_FOR_LEVELS = 4  # frames needed to measure the scatter of their levels
-FEW_FOR_JUMPS = 8  # frames needed to find pixels that jump
+MIN_FRAMES_FOR_LEVELS = 4  # frames needed to measure the scatter of their levels
+MIN_FRAMES_FOR_JUMPS = 8  # frames needed to find pixels that jump
 SAMPLES = 400_000  # of residuals, for the shape of read noise
 SHAPES = np.linspace(-0.4, 0.4, 17)  # of Tukey lambda distributions that are compared
 GROUPS = 16  # of samples, for the error of their shape
 FALSE_ALARM = 1e-4  # probability of finding a wave if there is none
 FINER = 8  # the number of frequencies to search, relative to the number of rows
 BLOCK = 32  # px, over which maps are averaged
-FEWEST_BLOCKS = 6  # along each axis
+MIN_BLOCKS = 6  # along each axis
 JUMPS = 10.0  # variance relative to other pixels, above which a pixel counts as jumping
 TINY = 1e-9  # DN^2
 WIDTH_OF_KNOTS = 0.96  # half width of the correlation of a cubic B-spline, in its knots' distance
@@ -91,12 +91,12 @@ def dark_figures(dark: Floats, sensor: Sensor, hot: Pixels) -> DarkFigures:
     rest = (dark - mean.astype(np.float32)) * np.float32((frames / max(frames - 1, 1)) ** 0.5)
     rows = rest.mean(axis=2, dtype=np.float64)
     own = without_rows(rest)
-    share, amplitude = jumps(own, good) if frames >= FEW_FOR_JUMPS else (None, None)
+    share, amplitude = jumps(own, good) if frames >= MIN_FRAMES_FOR_JUMPS else (None, None)
     return DarkFigures(
         color_bias=bias_of(levels, own, sensor.black_level),
-        black_level_error=scatter(levels, rest, sites) if frames >= FEW_FOR_LEVELS else None,
-        tukey_lambda=shape_of(own, good) if frames > 1 else None,
-        banding=wave_in(rows - rows.mean(axis=1, keepdims=True)) if frames > 1 else None,
+        black_level_error=scatter(levels, rest, sites) if frames >= MIN_FRAMES_FOR_LEVELS else None,
+        tukey_lambda=tukey_lambda_of(own, good) if frames > 1 else None,
+        banding=banding_wave(rows - rows.mean(axis=1, keepdims=True)) if frames > 1 else None,
         shading=shading_of(mean, good, sites),
         rts_share=share,
         rts_amplitude=amplitude,
@@ -150,7 +150,7 @@ def scatter(levels: Doubles, rest: Floats, sites: Sequence[tuple[slice, slice]])
     return Estimate(total - explained, total * (2 / freedom) ** 0.5).root()
 
 
-def shape_of(own: Floats, good: Mask) -> Estimate | None:
+def tukey_lambda_of(own: Floats, good: Mask) -> Estimate | None:
     """Return the shape of the Tukey lambda distribution with the L-kurtosis of read noise.
 
     L-moments (Hosking, J. R. Stat. Soc. B 1990) exist even if tails are too heavy for a fourth
@@ -197,7 +197,7 @@ def l_kurtosis(values: Array) -> float:
     return fourth / second if second else 0.0
 
 
-def wave_in(rows: Doubles) -> Wave | None:
+def banding_wave(rows: Doubles) -> Wave | None:
     """Return a wave in the means of rows, (frame, row), which has another phase in each frame."""
     from scipy import stats
 
@@ -221,7 +221,7 @@ def shading_of(mean: Doubles, good: Mask, sites: Sequence[tuple[slice, slice]]) 
     for site in sites:
         flat[site] -= np.nanmean(flat[site])
     height, width = (side // BLOCK * BLOCK for side in mean.shape)
-    if min(height, width) < FEWEST_BLOCKS * BLOCK:
+    if min(height, width) < MIN_BLOCKS * BLOCK:
         return None
     parts = flat[:height, :width].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK)
     blocks = np.nanmean(parts, axis=(1, 3))

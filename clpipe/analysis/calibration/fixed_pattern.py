@@ -12,10 +12,10 @@ from clpipe.reference.cfa import sites
 SURE = 7.0  # standard deviations, which not one of 1e8 pixels exceeds by chance
 # Choices; tests/test_calibrate.py shows what they find and reject.
 BLOCK = 16  # px of one colour, the side of a block
-LEAST_BLOCKS = 30  # flat blocks that PRNU needs
+MIN_BLOCKS = 30  # flat blocks that PRNU needs
 DARKEST = 0.05  # signal units, the least light of a block that shows PRNU
-UNEVEN = 0.03  # relative standard deviation of the scene in a flat block, at most
-LEAST_DEVIATION = 0.05  # DN, the smallest assumed deviation of a mean dark frame
+MAX_UNEVENNESS = 0.03  # relative standard deviation of the scene in a flat block, at most
+MIN_DEVIATION = 0.05  # DN, the smallest assumed deviation of a mean dark frame
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def hot_in_dark(dark: Floats, sensor: Sensor) -> Pixels:
     for site in sites(sensor.pattern).values():
         excess[site] = dark[site] - median_filter(dark[site], 3, mode="mirror")
         low, high = np.quantile(excess[site], norm.cdf([-2, 2]))
-        hot[site] = excess[site] > SURE * max((high - low) / 4, LEAST_DEVIATION)
+        hot[site] = excess[site] > SURE * max((high - low) / 4, MIN_DEVIATION)
     return _pixels(hot, excess, 1.0)
 
 
@@ -69,7 +69,7 @@ def hot_in_scene(stack: Stack, line: Line) -> Pixels:
     from scipy.ndimage import maximum_filter
 
     low, high = _extremes(stack)
-    deviation = np.sqrt(line.at(np.maximum(high, 0)) / len(stack.rest))
+    deviation = np.sqrt(line.at(np.maximum(high, 0)) / len(stack.residuals))
     excess = stack.light - high
     out = np.maximum(np.abs(excess), np.abs(stack.light - low))
     nearby = np.ones((3, 3), bool)
@@ -87,7 +87,7 @@ def dead_in_scene(stack: Stack, line: Line) -> Pixels:
     neighbours must have four times those deviations, and more than their range.
     """
     low, high = _extremes(stack)
-    dark = SURE * float(np.sqrt(line.at(np.zeros(1))[0] / len(stack.rest)))
+    dark = SURE * float(np.sqrt(line.at(np.zeros(1))[0] / len(stack.residuals)))
     lit = low > np.maximum(4 * dark, high - low)
     dead = lit & (stack.light < np.maximum(dark, low / 10))
     return _pixels(dead, stack.light - low, float(lit.mean()))
@@ -172,13 +172,13 @@ def response_pattern(stack: Stack, line: Line, dsnu: float) -> Estimate | None:
         rest = rest.reshape(-1, BLOCK, BLOCK)
         together = np.abs((rest[:, 1:, 1:] * rest[:, :-1, :-1]).mean(axis=(1, 2)))
         flat = (together < 3 / BLOCK * square) & (mean > DARKEST * stack.sensor.unit)
-        flat &= uneven < (UNEVEN * mean) ** 2 * BLOCK**2 + square * surface.shape[1]
+        flat &= uneven < (MAX_UNEVENNESS * mean) ** 2 * BLOCK**2 + square * surface.shape[1]
         squares.append(square[flat])
         lights.append(mean[flat])
     square, light = np.concatenate(squares), np.concatenate(lights)
-    if len(light) < LEAST_BLOCKS:
+    if len(light) < MIN_BLOCKS:
         return None
-    noise = line.at(light) / len(stack.rest) + dsnu
+    noise = line.at(light) / len(stack.residuals) + dsnu
     value = 0.0
     for _ in range(5):
         expected = 2 * ((noise + value * light**2) / light**2) ** 2 / freedom

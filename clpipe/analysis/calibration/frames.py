@@ -16,7 +16,7 @@ from clpipe.camera.profile import Matrix
 from clpipe.chain.making import make_chain
 from clpipe.images.attributes import read_attributes
 from clpipe.images.dump import Dump, read_dump
-from clpipe.images.raw import RAW_SUFFIXES, RawFacts, read_facts, read_raw
+from clpipe.images.raw import RAW_SUFFIXES, RawInfo, read_raw, read_raw_info
 from clpipe.images.read import RENDER_SUFFIXES, read_image
 from clpipe.inputs.kept import embedded_settings
 from clpipe.inputs.raw import may_be_dump
@@ -69,14 +69,14 @@ class CalibrationFrame:
     exposure: str  # as text, "" if unknown
     sensor: Sensor
     signal: bool = False  # whether the file has signal instead of DN
-    facts: RawFacts | Dump | None = None  # of a camera raw, or of a dump
+    facts: RawInfo | Dump | None = None  # of a camera raw, or of a dump
     gains: tuple[float, float] | None = None  # white balance, red and blue (green = 1)
     xyz_to_camera: Matrix | None = None
 
     @property
     def seconds(self) -> float | None:
         """The exposure time in s; None if the file does not state it."""
-        return self.facts.exposure if isinstance(self.facts, RawFacts) else None
+        return self.facts.exposure if isinstance(self.facts, RawInfo) else None
 
     def read(self) -> Floats:
         """Return the mosaic in DN, (height, width).
@@ -178,7 +178,7 @@ def read_frame(path: Path, overrides: FrameOverrides) -> CalibrationFrame:
 
 def _from_raw(path: Path, overrides: FrameOverrides) -> CalibrationFrame:
     """Return the frame of a camera raw."""
-    facts = read_facts(path)
+    facts = read_raw_info(path)
     iso = overrides.iso or facts.iso
     if iso is None:
         raise RequestError(f"{path}: this file does not state its ISO; add --iso")
@@ -226,7 +226,7 @@ def _from_kept(
         camera.model,
         overrides.iso or chain.iso,
         f"{ev:+g} EV",
-        _sensor(overrides, context.filters.pattern, black, white),
+        _sensor(overrides, context.filter_array.pattern, black, white),
         signal=kind == Kind.MOSAIC.label,
         gains=camera.white_balance_gains,
         xyz_to_camera=camera.xyz_to_camera,

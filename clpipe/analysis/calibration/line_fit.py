@@ -19,7 +19,7 @@ from clpipe.base.types import Array
 CLASSES = 2048  # of the instrument
 GROUPS = 64  # of rows, for the standard errors
 BINS = 32  # for pictures
-LEAST_IN_BIN = 50  # pixels
+MIN_IN_BIN = 50  # pixels
 DARKEST = 0.01  # share of the pixels that determine the first weights
 ROUNDS = 12  # of weights from the line of the round before
 
@@ -166,7 +166,7 @@ def fit_line(tables: Sequence[Table]) -> Line:
     # Variances are at least half of the darkest pixels' variance, so that no weight grows without
     # limit.
     order = np.argsort(z)
-    darkest = order[np.cumsum(count[order]) <= max(DARKEST * total, count[order[0]], LEAST_IN_BIN)]
+    darkest = order[np.cumsum(count[order]) <= max(DARKEST * total, count[order[0]], MIN_IN_BIN)]
     dark = s[darkest].sum() / count[darkest].sum()
     slope = max(s.sum() / total - dark, 0.0) / max((z @ count) / total - z.min(), 1e-9)
     least = max(0.5 * dark, 1e-9)
@@ -204,7 +204,7 @@ def binned(table: Table) -> tuple[Bin, ...]:
     sums = np.vstack([table.sums.sum(axis=0), table.squares]).reshape(5, BINS, -1).sum(axis=-1)
     bins = []
     for count, _, light, variance, square in sums.T:
-        if count >= LEAST_IN_BIN:
+        if count >= MIN_IN_BIN:
             scatter = max(square / count - (variance / count) ** 2, 0.0)
             error = float(np.sqrt(scatter / count))
             bins.append(Bin(float(light / count), float(variance / count), error, int(count)))

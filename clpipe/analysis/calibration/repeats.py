@@ -13,9 +13,9 @@ from clpipe.reference.cfa import PATTERNS, Pattern, sites
 from clpipe.reference.filter_array import MIRRORED
 
 # The limits are choices; tests/test_calibrate.py has a case on each side of the last two.
-FAR_FROM_CLIPPING = 4.0  # standard deviations of a frame
-LARGEST_FLICKER = 0.05  # of the mean brightness; more counts as another exposure
-MOVING = 0.02  # share of the variance that neighbours share; more counts as motion
+CLIPPING_MARGIN = 4.0  # standard deviations of a frame
+MAX_FLICKER = 0.05  # of the mean brightness; more counts as another exposure
+MAX_MOTION = 0.02  # share of the variance that neighbours share; more counts as motion
 
 Site = tuple[slice, slice]  # the rows and columns of a filter's place in the period
 
@@ -70,31 +70,32 @@ class Stack:
 
     Args:
         light: the mean above black, (height, width).
-        around: the mean of each pixel's neighbours of the same filter, see :func:`neighbours`.
-        rest: the frames minus their mean, (frames, height, width).
+        neighbour_mean: the mean of each pixel's neighbours of the same filter, see
+        :func:`neighbour_means`.
+        residuals: the frames minus their mean, (frames, height, width).
         sensor: pattern and levels.
         used: True for valid pixels.
     """
 
     light: Floats
-    around: Floats
-    rest: Floats
+    neighbour_mean: Floats
+    residuals: Floats
     used: Array
     sensor: Sensor
 
     @property
     def degrees(self) -> int:
         """Degrees of freedom of a pixel's variance."""
-        return len(self.rest) - 1
+        return len(self.residuals) - 1
 
     def variance(self) -> Array:
         """Return the sample variance of each pixel over the frames, DN^2."""
-        return np.einsum("kij,kij->ij", self.rest, self.rest) / self.degrees
+        return np.einsum("kij,kij->ij", self.residuals, self.residuals) / self.degrees
 
     def without_columns(self, offsets: Floats) -> "Stack":
         """Return the stack with the offsets of columns, (width,), subtracted from its light."""
         light = self.light - offsets
-        return replace(self, light=light, around=neighbours(light, self.sensor.period))
+        return replace(self, light=light, neighbour_mean=neighbour_means(light, self.sensor.period))
 
     def tables(self, variance: Array) -> dict[str, Table]:
         """Return the table of each channel, from the variances of pixels, (height, width), DN^2."""
@@ -109,13 +110,13 @@ class Stack:
             )
             s, light, around = (
                 np.concatenate([x[site][own] for site, own in zip(places, used, strict=True)])
-                for x in (variance, self.light, self.around)
+                for x in (variance, self.light, self.neighbour_mean)
             )
             tables[name] = Table.of(s, light, around, rows, self.sensor.unit, self.degrees)
         return tables
 
 
-def stacked(frames: Floats, sensor: Sensor, what: str = "frames") -> Stack:
+def stack_frames(frames: Floats, sensor: Sensor, what: str = "frames") -> Stack:
     """Return frames, (frames, height, width) in DN, as a stack in which all pixels are valid.
 
     The frames are overwritten. ``what`` is their name in messages.
@@ -134,27 +135,29 @@ def stacked(frames: Floats, sensor: Sensor, what: str = "frames") -> Stack:
     mean = frames.mean(axis=0, dtype=np.float64).astype(np.float32)
     rest = np.subtract(frames, mean, out=frames)
     light = mean - np.float32(sensor.black_level)
-    return Stack(light, neighbours(light, sensor.period), rest, np.ones(light.shape, bool), sensor)
+    return Stack(
+        light, neighbour_means(light, sensor.period), rest, np.ones(light.shape, bool), sensor
+    )
 
 
-def neighbours(image: Floats, period: tuple[int, int]) -> Floats:
+def neighbour_means(image: Floats, period: tuple[int, int]) -> Floats:
     """Return the mean of six pixels of the same filter, in the rows of a period above and below.
 
     They share no noise with the pixel, row noise included.
     """
-    above, below = beside(image.shape[0], period[0])
-    before, behind = beside(image.shape[1], period[1])
+    above, below = neighbour_indices(image.shape[0], period[0])
+    before, behind = neighbour_indices(image.shape[1], period[1])
     rows = image[above] + image[below]
     return (rows[:, before] + rows + rows[:, behind]) / np.float32(6)
 
 
-def beside(size: int, period: int) -> tuple[Array, Array]:
+def neighbour_indices(size: int, period: int) -> tuple[Array, Array]:
     """Return, for each row, the rows one period before and after it.
 
     At an end, the row on the other side is returned twice, because a mirrored row (reflect-101)
     would have other filters.
 
-    >>> [each.tolist() for each in beside(9, 4)]
+    >>> [each.tolist() for each in neighbour_indices(9, 4)]
     [[4, 5, 6, 7, 0, 1, 2, 3, 4], [4, 5, 6, 7, 8, 1, 2, 3, 4]]
     """
     place = np.arange(size)
@@ -167,7 +170,7 @@ def beside(size: int, period: int) -> tuple[Array, Array]:
     return before.clip(0, size - 1), behind.clip(0, size - 1)
 
 
-def ceiling(frames: Floats, sensor: Sensor) -> float:
+def clipping_level(frames: Floats, sensor: Sensor) -> float:
     """Return the DN at which samples clip: the largest sample if it repeats, or the white level.
 
     Many cameras clip below the white level that their files state. The largest sample repeats if at
@@ -187,11 +190,11 @@ def unclipped(stack: Stack, line: Line | None, top: float) -> Stack:
     black = stack.sensor.black_level
     if line is None:
         low, high = -black - stack.light, top - black - stack.light
-        used = (stack.rest.min(axis=0) > low) & (stack.rest.max(axis=0) < high)
+        used = (stack.residuals.min(axis=0) > low) & (stack.residuals.max(axis=0) < high)
     else:
         used = stack.used
-        for light in (stack.light, stack.around):
-            margin = FAR_FROM_CLIPPING * np.sqrt(line.at(np.maximum(light, 0)))
+        for light in (stack.light, stack.neighbour_mean):
+            margin = CLIPPING_MARGIN * np.sqrt(line.at(np.maximum(light, 0)))
             used = used & (light + margin < top - black) & (light - margin > -black)
     return replace(stack, used=used)
 
@@ -209,16 +212,16 @@ def without_flicker(stack: Stack) -> tuple[Stack, Array]:
     """
     weight = stack.used.astype(np.float32)
     light = np.einsum("ij,ij->i", weight, stack.light, dtype=np.float64)
-    rest = np.einsum("ij,kij->ki", weight, stack.rest, dtype=np.float64)
+    rest = np.einsum("ij,kij->ki", weight, stack.residuals, dtype=np.float64)
     total = light.sum()
     count = weight.sum()
-    unchanged = np.zeros(len(stack.rest))
+    unchanged = np.zeros(len(stack.residuals))
     if total <= 1e-3 * count * stack.sensor.unit:  # too dark to judge
         return stack, unchanged
     brighter = rest.sum(axis=1) / total
     scatter = rest - brighter[:, None] * light
     errors = np.sqrt((scatter**2).sum(axis=1)) / total
-    if np.abs(brighter).max() > LARGEST_FLICKER:
+    if np.abs(brighter).max() > MAX_FLICKER:
         k = int(np.abs(brighter).argmax())
         raise ImageError(
             f"frame {k + 1} of {len(brighter)} is {brighter[k]:+.0%} from the mean brightness of "
@@ -226,7 +229,7 @@ def without_flicker(stack: Stack) -> tuple[Stack, Array]:
         )
     if not (np.abs(brighter) > 4 * errors).any():
         return stack, unchanged
-    for frame, by in zip(stack.rest, brighter, strict=True):
+    for frame, by in zip(stack.residuals, brighter, strict=True):
         np.subtract(frame, np.float32(by) * stack.light, out=frame)
         np.divide(frame, np.float32(1 + by), out=frame)
     return stack, brighter
@@ -240,10 +243,10 @@ def row_offsets(stack: Stack, line: Line) -> tuple[Array, Array, Rows]:
     Returns:
         The weights, (height, width), the offsets, (frames, height) in DN, and their mean squares.
     """
-    weight = np.where(stack.used, 1 / line.at(stack.around), 0).astype(np.float32)
+    weight = np.where(stack.used, 1 / line.at(stack.neighbour_mean), 0).astype(np.float32)
     total = weight.sum(axis=1, dtype=np.float64)
     explained = np.divide(1, total, out=np.zeros_like(total), where=total > 0)
-    offsets = np.einsum("ij,kij->ki", weight, stack.rest, dtype=np.float64) * explained
+    offsets = np.einsum("ij,kij->ki", weight, stack.residuals, dtype=np.float64) * explained
     return weight, offsets, Rows((offsets**2).sum(axis=0) / stack.degrees, explained, stack.degrees)
 
 
@@ -262,7 +265,7 @@ def without_rows(stack: Stack, line: Line) -> tuple[Array, Rows]:
         computed from the pixels' variances.
     """
     weight, offsets, rows = row_offsets(stack, line)
-    stack.rest[...] -= offsets[:, :, None].astype(np.float32)
+    stack.residuals[...] -= offsets[:, :, None].astype(np.float32)
     variance = stack.variance() + rows.explained[:, None]
     explained = np.einsum("ij,ij->i", weight.astype(np.float64) ** 2, variance) * rows.explained**2
     return variance, replace(rows, explained=explained)
@@ -291,9 +294,9 @@ def common_motion(stack: Stack, line: Line) -> Estimate:
 
     It is 0 for noise, and larger for a moving scene, changing light or denoised raws.
     """
-    weight = np.where(stack.used, 1 / np.sqrt(line.at(stack.around)), 0).astype(np.float32)
+    weight = np.where(stack.used, 1 / np.sqrt(line.at(stack.neighbour_mean)), 0).astype(np.float32)
     products = squares = 0.0
-    for frame in stack.rest:
+    for frame in stack.residuals:
         standard = frame * weight
         products += float(np.vdot(standard[2:], standard[:-2]))
         squares += float(np.vdot(standard, standard))
@@ -309,8 +312,8 @@ def noise_by_frame(stack: Stack, line: Line) -> Array:
 
     Frames of one setting agree closely. A mean of frames, or a clean picture, has less noise.
     """
-    weight = np.where(stack.used, 1 / line.at(stack.around), 0)
-    squares = np.einsum("ij,kij,kij->k", weight, stack.rest, stack.rest, dtype=np.float64)
+    weight = np.where(stack.used, 1 / line.at(stack.neighbour_mean), 0)
+    squares = np.einsum("ij,kij,kij->k", weight, stack.residuals, stack.residuals, dtype=np.float64)
     return squares / np.median(squares)
 
 
@@ -322,6 +325,6 @@ def share_beyond_noise(stack: Stack, line: Line) -> float:
     from scipy.stats import chi2
 
     degrees = stack.degrees
-    ratio = (stack.variance() / line.at(stack.around))[stack.used]
+    ratio = (stack.variance() / line.at(stack.neighbour_mean))[stack.used]
     typical = np.median(ratio) / (chi2.ppf(0.5, degrees) / degrees)
     return float((ratio > typical * chi2.ppf(1 - 1e-6, degrees) / degrees).mean())

@@ -31,8 +31,8 @@ WAVELET = np.array([0.035226, 0.085441, -0.135011, -0.459878, 0.806892, -0.33267
 SCALING = np.array([0.332671, 0.806892, 0.459878, -0.135011, -0.085441, 0.035226]) / np.sqrt(2)
 # EDGE is the paper's; the others are choices. tests/test_calibrate.py holds the accuracy they give.
 LEVELS = 150  # level sets of a colour, at most
-LEAST = 400  # places in a level set, at least
-LEAST_EXPLAINED = 40  # places of a level set that the line explains, at least
+MIN_SET_SIZE = 400  # places in a level set, at least
+MIN_EXPLAINED = 40  # places of a level set that the line explains, at least
 WINDOW = 7  # px, of the smoothing and of local variances
 EDGE = 1.0  # tau, in standard deviations of the details (sec. II-B1)
 EXPLAINED = 1.4  # times the line's variance: two standard deviations of a local variance above it
@@ -42,7 +42,7 @@ Values = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Places:
+class SmoothSamples:
     """Smooth places of one colour: smoothed signal, signal and local variance of each."""
 
     smooth: Values
@@ -52,7 +52,7 @@ class Places:
     def sets(self) -> list[NDArray[np.intp]]:
         """Return the level sets as indices: places by smoothed signal, in sets of equal size."""
         order = np.argsort(self.smooth, kind="stable")
-        return np.array_split(order, min(LEVELS, len(order) // LEAST) or 1)
+        return np.array_split(order, min(LEVELS, len(order) // MIN_SET_SIZE) or 1)
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def joined(parts: Sequence[LevelSets]) -> LevelSets:
     return LevelSets(*(np.concatenate(column) for column in columns))
 
 
-def smooth_places(plane: Floats) -> Places:
+def smooth_samples(plane: Floats) -> SmoothSamples:
     """Return the smooth places in the plane of one colour, (height, width) (sec. II-A, II-B).
 
     A place is smooth if the Laplacian of the smoothed image plus the magnitude of the Laplacian's
@@ -90,11 +90,11 @@ def smooth_places(plane: Floats) -> Places:
     flat = slope + np.abs(bend) < EDGE * local
     # The filter's running sum may be negative.
     variance = np.maximum(uniform_filter(detail * detail, WINDOW, mode="mirror"), 0)
-    return Places(smooth[flat], approximation[flat], variance[flat])
+    return SmoothSamples(smooth[flat], approximation[flat], variance[flat])
 
 
 def explained_line(
-    parts: Sequence[Places], low: float, dark: Sequence[LevelSets] = ()
+    parts: Sequence[SmoothSamples], low: float, dark: Sequence[LevelSets] = ()
 ) -> tuple[float, float, LevelSets, Values]:
     """Return the line of the places that it explains, and their level sets.
 
@@ -131,7 +131,7 @@ def explained_line(
         for part, i in places:
             explained = i[part.variance[i] < EXPLAINED * np.maximum(a * part.smooth[i] + b, 1e-12)]
             # A higher minimum would drop sets that lost places by chance, which biases the line.
-            if len(explained) >= LEAST_EXPLAINED:
+            if len(explained) >= MIN_EXPLAINED:
                 mean_variance = part.variance[explained].mean() / cut
                 moments.append((part.signal[explained].mean(), mean_variance, len(explained)))
     return a, b, sets, errors
@@ -256,11 +256,11 @@ def single_image(
     low = -sensor.black_level / unit
     dark_sets = [dark] if dark else []
     places = {
-        name: [smooth_places(light[site] / unit) for site in own]
+        name: [smooth_samples(light[site] / unit) for site in own]
         for name, own in sensor.channels.items()
     }
 
-    def line(parts: Sequence[Places]) -> tuple[Line, LevelSets]:
+    def line(parts: Sequence[SmoothSamples]) -> tuple[Line, LevelSets]:
         a, b, sets, errors = explained_line(parts, low, dark_sets)
         gain, floor = Estimate(a, float(errors[0])), Estimate(b, float(errors[1]))
         pixels = int(sets.count.sum()) * 4  # a place is a detail, one of every 2x2 pixels

@@ -12,7 +12,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Doubles, Mask
 
 ROUNDING = 1 / 12  # the variance of rounding to whole DN, DN^2
-LEAST_DARK = 0.24  # DN^2: a smaller variance is due to rounding only
+MIN_DARK_VARIANCE = 0.24  # DN^2: a smaller variance is due to rounding only
 FITTED = 0.7  # of the saturation, up to which K and R are fitted
 LINEAR = 0.05, 0.95  # of the saturation, between which linearity is measured
 MOST_AT_ZERO = 0.005  # of the samples without light
@@ -203,7 +203,7 @@ def _dark_variance(dark: Temporal, pixels: int) -> tuple[Estimate, Estimate | No
         # In ms, so that squares do not lose precision.
         per_ms, found = _line(dark.time / 1e6, dark.variance)
         slope = per_ms.scaled(1e-6)
-    return (found if found.value > LEAST_DARK else Estimate(LEAST_DARK, 0.0)), slope
+    return (found if found.value > MIN_DARK_VARIANCE else Estimate(MIN_DARK_VARIANCE, 0.0)), slope
 
 
 def _dark_current(

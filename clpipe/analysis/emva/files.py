@@ -10,7 +10,7 @@ from clpipe.analysis.emva.series import read_series
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
 
-USUAL_ISO = 100.0  # of a profile if the user does not state one
+DEFAULT_ISO = 100.0  # of a profile if the user does not state one
 
 
 def measure_series(path: Path) -> tuple[Moments, Figures]:
@@ -49,5 +49,5 @@ def write_emva_profile(
     from clpipe.analysis.emva.plot import emva_png  # imports Matplotlib
 
     source = series.absolute().parent.name
-    text = emva_profile(path.stem, iso or USUAL_ISO, source, moments, found)
+    text = emva_profile(path.stem, iso or DEFAULT_ISO, source, moments, found)
     return write_with_picture(path, text, emva_png(moments, found, f"EMVA 1288: {source}"))

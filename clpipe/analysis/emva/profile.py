@@ -3,7 +3,7 @@
 from typing import Any
 
 from clpipe.analysis.calibration.dark_profile import plus_minus
-from clpipe.analysis.emva.figures import LEAST_DARK, ROUNDING, Figures, NonUniformity
+from clpipe.analysis.emva.figures import MIN_DARK_VARIANCE, ROUNDING, Figures, NonUniformity
 from clpipe.analysis.emva.moments import Moments
 from clpipe.analysis.emva.sensor import before_rounding, full_well, noisiest_light
 from clpipe.camera.text import profile_text
@@ -24,7 +24,7 @@ def emva_profile(name: str, iso: float, source: str, moments: Moments, figures: 
     """
     dark = moments.dark_stack
     dark2 = figures.dark_noise_dn.value**2
-    temporal = dark.temporal if dark2 <= LEAST_DARK else dark2
+    temporal = dark.temporal if dark2 <= MIN_DARK_VARIANCE else dark2
     black, read_noise, pattern = before_rounding(dark.mean, temporal, dark.variance.value)
     # If rounding reduces dark noise, it tilts the line of K, which goes through zero.
     used = moments.light[figures.fitted]

@@ -9,7 +9,7 @@ NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(21)
 NODE_WEIGHTS = WEIGHTS / WEIGHTS.sum()
 FINE = np.linspace(-4, 4, 161)  # standard deviations, at which rounding is sampled
 FINE_WEIGHTS = np.exp(-FINE * FINE / 2) / np.exp(-FINE * FINE / 2).sum()
-SEARCHED = np.linspace(0.6, 1.1, 2001)  # of the light that fills the sensor
+SEARCH_RANGE = np.linspace(0.6, 1.1, 2001)  # of the light that fills the sensor
 ROUNDS = 20  # of the search for a full well
 
 
@@ -84,14 +84,14 @@ def noisiest_light(gain: float, read_noise: float, prnu: float, full: float) -> 
     """
     from scipy.special import ndtr
 
-    light = SEARCHED[:, None] * full * np.maximum(1 + prnu * NODES, 0)
+    light = SEARCH_RANGE[:, None] * full * np.maximum(1 + prnu * NODES, 0)
     sigma = np.sqrt(gain * light + read_noise**2)
     u = (full - light) / sigma
     density, below = np.exp(-u * u / 2) / np.sqrt(2 * np.pi), ndtr(u)
     # The variance of a standard normal that is clipped at u.
     cut = -density + u * (1 - below)
     variance = sigma * sigma * (below - u * density + u * u * (1 - below) - cut * cut)
-    return float(SEARCHED[np.argmax(variance @ NODE_WEIGHTS)] * full / gain)
+    return float(SEARCH_RANGE[np.argmax(variance @ NODE_WEIGHTS)] * full / gain)
 
 
 def full_well(gain: float, read_noise: float, prnu: float, saturation: float) -> float:

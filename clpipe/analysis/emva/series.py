@@ -26,9 +26,9 @@ from clpipe.images.samples import read_whole_numbers
 NAME = "EMVA1288_Data.txt"
 RELEASE = "3.1"
 PAIR = 2  # frames of one exposure, for temporal figures
-MOST_BITS = 16
+MAX_BITS = 16
 SIDES = 16, 16_384  # px, least and most
-LEAST_EXPOSURES = 9  # with light; the standard asks for 50
+MIN_EXPOSURES = 9  # with light; the standard asks for 50
 NS = 1e9  # nanoseconds in a second
 FORMS = {
     "v": "v RELEASE",
@@ -161,7 +161,7 @@ def read_series(path: Path) -> Series:
         if letter == "n":
             if size:
                 raise lines.error(number, "a second line n; there can be but one")
-            limits = (("bits", 1, MOST_BITS), ("side", *SIDES), ("side", *SIDES))
+            limits = (("bits", 1, MAX_BITS), ("side", *SIDES), ("side", *SIDES))
             size = [
                 int(lines.number(number, word, *limit, whole=True))
                 for word, limit in zip(words, limits, strict=True)
@@ -214,10 +214,10 @@ def _checked(path: Path, size: Sequence[int], exposures: Sequence[Exposure]) -> 
         return tuple(sorted(kept, key=lambda e: (e.photons, e.time)))
 
     bright, dark = of(True, True), of(False, True)
-    if len(bright) < LEAST_EXPOSURES:
+    if len(bright) < MIN_EXPOSURES:
         raise RequestError(
             f"{path}: found {len(bright)} exposures of two frames with light; at least "
-            f"{LEAST_EXPOSURES} are needed, and EMVA 1288 asks for 50"
+            f"{MIN_EXPOSURES} are needed, and EMVA 1288 asks for 50"
         )
     if not dark:
         raise RequestError(f"{path}: an exposure of two frames without light (d) is missing")

@@ -10,7 +10,7 @@ import numpy as np
 from clpipe.analysis.emva.sensor import noisiest_light
 from clpipe.analysis.emva.series import NAME, NS, PAIR, Exposure, Series, series_text
 from clpipe.base.errors import RequestError
-from clpipe.base.files import check_folder, make_folder_of, write_new
+from clpipe.base.files import check_folder, create_parents, write_new
 from clpipe.camera.profile import Camera, load_camera
 from clpipe.chain.identity import image_key, noise_key
 from clpipe.chain.making import make_chain
@@ -78,21 +78,21 @@ def simulate(
     values = {"camera": camera, "iso": sensor.iso_range[0] if iso is None else iso, "seed": seed}
     settings = overlay(Settings(), values)
     efficiency = sensor.quantum_efficiency or 1.0
-    series = _planned(text, sensor, saturation_of(sensor, settings.iso) / efficiency, size)
+    series = _plan_exposures(text, sensor, saturation_of(sensor, settings.iso) / efficiency, size)
     photon = sensor.signal_of(efficiency, settings.iso)
     runner: Runner | None = None
     exposures = (*series.bright, *series.dark, series.bright_stack, series.dark_stack)
     total, done = sum(len(each.frames) for each in exposures), 0
     samples = np.uint8 if series.bits <= 8 else np.uint16
     for exposure in exposures:
-        chain = make_chain(_exposed(settings, exposure), start_at=FIRST, until=LAST)
+        chain = make_chain(_simulate_exposure(settings, exposure), start_at=FIRST, until=LAST)
         runner = (
             runner.for_chain(chain) if runner else Runner(chain, device, encode=False, final=True)
         )
         light = np.full((size.height, size.width), photon * exposure.photons, np.float32)
         for frame in exposure.frames:
             key = noise_key(settings, image_key(frame.relative_to(folder).as_posix(), ""))
-            make_folder_of(frame)
+            create_parents(frame)
             write_grey_png(frame, runner.run(light, key).image.astype(samples))
             done += 1
             watch(done, total)
@@ -103,12 +103,12 @@ def simulate(
     return series
 
 
-def _exposed(settings: Settings, exposure: Exposure) -> Settings:
+def _simulate_exposure(settings: Settings, exposure: Exposure) -> Settings:
     """Return the settings with an exposure's time, which determines the dark charge."""
     return overlay(settings, {"dark_current": {"exposure_time": exposure.time / NS}})
 
 
-def _planned(path: Path, camera: Camera, saturation: float, size: SeriesSize) -> Series:
+def _plan_exposures(path: Path, camera: Camera, saturation: float, size: SeriesSize) -> Series:
     """Return the exposures of a series, with the paths of its frames.
 
     Args:

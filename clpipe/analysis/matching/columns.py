@@ -16,23 +16,23 @@ from clpipe.analysis.edges import Slopes
 from clpipe.analysis.signature import (
     BIN,
     DARKEST,
-    FEWEST,
     LUMA,
+    MIN_SAMPLES,
     chroma,
-    flat_places,
+    flat_mask,
     luma,
     noise_of,
 )
 from clpipe.analysis.spatial import energy_left
 from clpipe.base.types import Array, Doubles, Floats, Mask
 
-REACH = 6  # px, the longest lag
+MAX_LAG = 6  # px, the longest lag
 BANDS = (0.0, 0.125, 0.25, 0.375, 0.75)  # edges in cycles per pixel; a corner is at 0.71
 LEVELS = (12, 24, 40, 64, 96, 128, 160, 192, 226)  # of luma: edges of the bins of intensity
 SHADOWS, MIDTONES = (24, 48), (64, 160)  # ranges of luma in which the skew of noise is compared
 BLOCK = 32  # px
 GROUPS = 8  # of blocks; the jackknife omits one at a time
-FEWEST_FRAMES = 4  # for tails, because the difference from a mean of few frames mixes their noise
+MIN_FRAMES = 4  # for tails, because the difference from a mean of few frames mixes their noise
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Column:
         return ours / theirs - 1 if theirs else np.nan
 
 
-FURTHER = range(3, REACH + 1)  # lags, px
+LONG_LAGS = range(3, MAX_LAG + 1)  # lags, px
 TAILS = ("kurtosis", "beyond_4_sigma")
 SKEWS = ("skew_shadows", "skew_midtones")
 EDGES = "edges"
@@ -67,13 +67,13 @@ COLUMNS: Mapping[str, Column] = {
     "diagonal": Column("luma, diagonal", 0.02),
     "two_right": Column("luma, 2 right", 0.02),
     "two_below": Column("luma, 2 below", 0.04),
-    **{f"right_{lag}": Column(f"luma, {lag} right", 0.03) for lag in FURTHER},
+    **{f"right_{lag}": Column(f"luma, {lag} right", 0.03) for lag in LONG_LAGS},
     "half": Column("luma left after 2x2", 0.02),
     "chroma_rms": Column("chroma rms, levels", 0.1, relative=True),
     "chroma_right": Column("chroma, 1 right", 0.02),
     "chroma_below": Column("chroma, 1 below", 0.03),
     "chroma_two_right": Column("chroma, 2 right", 0.04),
-    **{f"chroma_right_{lag}": Column(f"chroma, {lag} right", 0.04) for lag in FURTHER},
+    **{f"chroma_right_{lag}": Column(f"chroma, {lag} right", 0.04) for lag in LONG_LAGS},
     "red_green": Column("R-G", 0.03),
     "green_blue": Column("G-B", 0.1),
     "red_blue": Column("R-B", 0.1),
@@ -94,7 +94,7 @@ COLUMNS: Mapping[str, Column] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class ValidPixels:
     """The valid pixels of a scene, and its luma, (height, width) each.
 
     ``mask`` includes shadows, which are compared only by intensity. ``bright`` excludes them, and
@@ -110,10 +110,10 @@ class Places:
         """The valid pixels that are not dark."""
         return np.asarray(self.mask & (self.level >= DARKEST))
 
-    def without(self, left_out: Mask) -> "Places":
-        """Return the places without some pixels, (height, width)."""
+    def without(self, left_out: Mask) -> "ValidPixels":
+        """Return the valid pixels without some of them, (height, width)."""
         slopes = self.slopes and self.slopes.within(~left_out)
-        return Places(self.mask & ~left_out, self.level, slopes)
+        return ValidPixels(self.mask & ~left_out, self.level, slopes)
 
     @cached_property
     def pairs(self) -> Doubles:
@@ -162,12 +162,12 @@ def noise_of_frames(
     return Noise(noise * noise.dtype.type(scale), luma(clean) if level is None else level)
 
 
-def figures_of(noise: Noise, places: Places) -> Figures:
+def figures_of(noise: Noise, places: ValidPixels) -> Figures:
     """Return the columns of noise over all frames, in the valid pixels."""
     found, mask = dict.fromkeys(COLUMNS, np.nan), places.bright
     if not mask.any():
         return found
-    names = ("right", "below", "diagonal", "two_right", "two_below", *FURTHER_RIGHT)
+    names = ("right", "below", "diagonal", "two_right", "two_below", *LONG_LAGS_RIGHT)
     y, cb, cr = noise.planes
     luma_map, *chroma_maps = (autocorrelation(plane, places) for plane in (y, cb, cr))
     chroma_map = (chroma_maps[0] + chroma_maps[1]) / 2
@@ -181,8 +181,8 @@ def figures_of(noise: Noise, places: Places) -> Figures:
         "rms": float(np.sqrt(LUMA @ power @ LUMA)),
         "chroma_rms": float(np.sqrt(sum((p[:, mask] ** 2).mean() for p in (cb, cr)) / 2)),
         "half": energy_left(y, mask),
-        **lags(luma_map, "", names),
-        **lags(chroma_map, "chroma_", ("right", "below", "two_right", *FURTHER_RIGHT)),
+        **named_lags(luma_map, "", names),
+        **named_lags(chroma_map, "chroma_", ("right", "below", "two_right", *LONG_LAGS_RIGHT)),
         "red_green": float(red_green),
         "green_blue": float(green_blue),
         "red_blue": float(red_blue),
@@ -200,7 +200,7 @@ def signature(picture: Array, mean: Array, mask: Mask | None = None) -> Figures:
     Args:
         picture: (height, width, 3), 0 to 255.
         mean: the same scene without noise, or the mean of many pictures of it.
-        mask: the valid pixels; None uses :func:`clpipe.analysis.signature.flat_places`.
+        mask: the valid pixels; None uses :func:`clpipe.analysis.signature.flat_mask`.
 
     >>> generator = np.random.default_rng(0)
     >>> grey = np.full((200, 200, 3), 128.0)
@@ -209,18 +209,18 @@ def signature(picture: Array, mean: Array, mask: Mask | None = None) -> Figures:
     (3.0, 0.25, True)
     """
     noise = noise_of_frames([picture], mean)
-    return figures_of(noise, Places(flat_places(mean) if mask is None else mask, noise.level))
+    return figures_of(noise, ValidPixels(flat_mask(mean) if mask is None else mask, noise.level))
 
 
-PLACES = {"right": (0, 1), "below": (1, 0), "diagonal": (1, 1), "two_right": (0, 2)}
-PLACES["two_below"] = (2, 0)
-FURTHER_RIGHT = {f"right_{lag}": (0, lag) for lag in FURTHER}
-PLACES |= FURTHER_RIGHT
+LAGS = {"right": (0, 1), "below": (1, 0), "diagonal": (1, 1), "two_right": (0, 2)}
+LAGS["two_below"] = (2, 0)
+LONG_LAGS_RIGHT = {f"right_{lag}": (0, lag) for lag in LONG_LAGS}
+LAGS |= LONG_LAGS_RIGHT
 
 
-def lags(table: Doubles, prefix: str, names: Sequence[str]) -> Figures:
+def named_lags(table: Doubles, prefix: str, names: Sequence[str]) -> Figures:
     """Return named lags of a map of autocorrelation."""
-    places = {name: (REACH + PLACES[name][0], REACH + PLACES[name][1]) for name in names}
+    places = {name: (MAX_LAG + LAGS[name][0], MAX_LAG + LAGS[name][1]) for name in names}
     return {f"{prefix}{name}": float(table[place]) for name, place in places.items()}
 
 
@@ -235,15 +235,15 @@ def products(planes: Doubles) -> Doubles:
     """
     from scipy import fft
 
-    height, width = (fft.next_fast_len(size + REACH, real=True) for size in planes.shape[1:])
+    height, width = (fft.next_fast_len(size + MAX_LAG, real=True) for size in planes.shape[1:])
     waves = fft.rfft2(planes.astype(np.float32), (height, width))
     power = (waves.real**2 + waves.imag**2).sum(0)
-    steps = np.arange(-REACH, REACH + 1)
+    steps = np.arange(-MAX_LAG, MAX_LAG + 1)
     rows = fft.ifft(power, axis=0)[steps]
     return np.asarray(fft.irfft(rows, width)[:, steps], np.float64)
 
 
-def autocorrelation(plane: Doubles, places: Places) -> Doubles:
+def autocorrelation(plane: Doubles, places: ValidPixels) -> Doubles:
     """Return the autocorrelation of noise at lags up to 6 px, (13, 13) with lag 0 in the centre.
 
     It is computed over all frames. Opposite lags are averaged.
@@ -254,7 +254,7 @@ def autocorrelation(plane: Doubles, places: Places) -> Doubles:
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         covariance = products(plane * places.bright) / (places.pairs * len(plane))
-        return np.asarray(covariance / covariance[REACH, REACH])
+        return np.asarray(covariance / covariance[MAX_LAG, MAX_LAG])
 
 
 def spectrum_of(table: Doubles) -> tuple[Doubles, Doubles]:
@@ -264,8 +264,8 @@ def spectrum_of(table: Doubles) -> tuple[Doubles, Doubles]:
     the window is Bartlett's). Independent noise has 1 everywhere. Frequencies are in cycles per
     pixel.
     """
-    steps, frequency = np.arange(-REACH, REACH + 1), np.fft.fftfreq(64)
-    fall = 1 - np.abs(steps) / (REACH + 1)
+    steps, frequency = np.arange(-MAX_LAG, MAX_LAG + 1), np.fft.fftfreq(64)
+    fall = 1 - np.abs(steps) / (MAX_LAG + 1)
     waves = np.exp(-2j * np.pi * np.outer(frequency, steps))
     spectrum = (waves @ (np.nan_to_num(table) * np.outer(fall, fall)) @ waves.T).real
     return spectrum, np.hypot(frequency[:, None], frequency[None])
@@ -289,7 +289,9 @@ def by_intensity(noise: Doubles, level: Doubles) -> Figures:
     found: Figures = {}
     for low, high in itertools.pairwise(LEVELS):
         own = noise[:, (level >= low) & (level < high)]
-        found[f"sigma_{low}"] = float(np.sqrt((own**2).mean())) if own.size >= FEWEST else np.nan
+        found[f"sigma_{low}"] = (
+            float(np.sqrt((own**2).mean())) if own.size >= MIN_SAMPLES else np.nan
+        )
     for name, (low, high) in zip(SKEWS, (SHADOWS, MIDTONES), strict=True):
         found[name] = skewness(noise[:, (level >= low) & (level < high)])
     bright = level >= DARKEST
@@ -300,7 +302,7 @@ def by_intensity(noise: Doubles, level: Doubles) -> Figures:
     second = np.bincount(bins, (noise**2).sum(0))
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = second / count - (first / count) ** 2
-        kept = (count >= FEWEST) & (variance > 0)
+        kept = (count >= MIN_SAMPLES) & (variance > 0)
         z = (noise / np.sqrt(variance)[bins])[:, kept[bins]].ravel()
     if z.size:
         squares = z * z  # multiplying squares is much faster than a fourth power
@@ -315,7 +317,7 @@ def skewness(noise: Doubles) -> float:
     >>> round(skewness(np.array([[0.0, 0.0, 0.0, 4.0]] * 100)), 3), skewness(np.zeros((1, 4)))
     (1.155, nan)
     """
-    if noise.size < FEWEST or not (sigma := float(noise.std())):
+    if noise.size < MIN_SAMPLES or not (sigma := float(noise.std())):
         return float("nan")
     own = noise - noise.mean()
     return float((own * own * own).mean() / sigma**3)
@@ -327,7 +329,7 @@ def block_numbers(shape: tuple[int, ...]) -> Array:
     return np.asarray(rows[:, None] * (columns[-1] + 1) + columns[None])
 
 
-def errors_of(noise: Noise, places: Places) -> Figures:
+def errors_of(noise: Noise, places: ValidPixels) -> Figures:
     """Return the standard errors of the columns, by the jackknife over blocks (Quenouille, 1956).
 
     The blocks form eight groups, each of which is omitted once.

@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from clpipe.analysis.drawing import finish, page, png_of
 from clpipe.analysis.matching.columns import (
     COLUMNS,
-    REACH,
+    MAX_LAG,
     Noise,
-    Places,
+    ValidPixels,
     autocorrelation,
     spectrum_of,
 )
@@ -21,7 +21,7 @@ from clpipe.base.types import Doubles
 
 INKS = {"theirs": "#222222", "ours": "#c8102e"}
 STEP = 16  # levels between two points of noise by intensity
-FEWEST = 500  # samples for such a point
+MIN_SAMPLES = 500  # samples for such a point
 
 
 def draw(match: Match, path: Path) -> None:
@@ -44,7 +44,9 @@ def draw(match: Match, path: Path) -> None:
 def mean_table(match: Match, who: str, planes: Sequence[int]) -> Doubles:
     """Return the mean autocorrelation of planes (0 luma, 1 Cb, 2 Cr) of "theirs" or "ours"."""
     tables = [
-        autocorrelation(getattr(scene, who).planes[plane], Places(scene.mask, scene.theirs.level))
+        autocorrelation(
+            getattr(scene, who).planes[plane], ValidPixels(scene.mask, scene.theirs.level)
+        )
         for scene in match.noises
         for plane in planes
     ]
@@ -53,11 +55,11 @@ def mean_table(match: Match, who: str, planes: Sequence[int]) -> Doubles:
 
 def draw_lags(axes: Axes, match: Match) -> None:
     """Draw the autocorrelation of luma and chroma to the right."""
-    lags = np.arange(REACH + 1)
+    lags = np.arange(MAX_LAG + 1)
     for who, ink in INKS.items():
         for planes, style, what in (((0,), "-o", "luma"), ((1, 2), "--s", "chroma")):
             table = mean_table(match, who, planes)
-            axes.plot(lags, table[REACH, REACH:], style, color=ink, label=f"{what}, {who}")
+            axes.plot(lags, table[MAX_LAG, MAX_LAG:], style, color=ink, label=f"{what}, {who}")
     finish(axes, title="Autocorrelation", xlabel="lag right, px", ylabel="correlation")
 
 
@@ -83,7 +85,7 @@ def draw_intensity(axes: Axes, match: Match) -> None:
             power = (noise.planes[0][:, scene.mask] ** 2).mean(0)
             squares += np.bincount(bins, power, minlength=len(squares))
             count += np.bincount(bins, minlength=len(count))
-        kept = count >= FEWEST
+        kept = count >= MIN_SAMPLES
         middle = (np.arange(len(count)) + 0.5) * STEP
         sigma = np.sqrt(squares[kept] / count[kept])
         axes.plot(middle[kept], sigma, "-o", color=ink, label=who)

@@ -148,7 +148,7 @@ def measured(search: Search, found: Candidate) -> Match:
     for scene in scenes.each:
         count = len(scene.frames) if scene.own_mean else CHECKED
         noise = search.simulator.noise(settings, scene, "result", count)
-        for part, is_seen in ((~scene.kept_out, True), (scene.kept_out, False)):
+        for part, is_seen in ((~scene.holdout, True), (scene.holdout, False)):
             if (scene.flat & part).any():
                 theirs = target_of(scene, part)
                 pairs[is_seen].append((theirs, target_at(scene, noise, theirs.places)))

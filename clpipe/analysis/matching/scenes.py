@@ -11,27 +11,27 @@ import numpy as np
 
 from clpipe.analysis.edges import slopes_of
 from clpipe.analysis.matching.columns import (
-    FEWEST_FRAMES,
+    MIN_FRAMES,
     TAILS,
     Noise,
-    Places,
+    ValidPixels,
     block_numbers,
     noise_of_frames,
 )
-from clpipe.analysis.signature import BRIGHTEST, DRIFT, flat_places, luma
+from clpipe.analysis.signature import BRIGHTEST, DRIFT, flat_mask, luma
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_input
 from clpipe.base.types import Doubles, Floats, Mask
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding
 from clpipe.images.read import read_finished
 
-LARGEST = 640  # px; larger pictures are reduced to their flattest crops of CROP x CROP
+MAX_UNCROPPED = 640  # px; larger pictures are reduced to their flattest crops of CROP x CROP
 CROP = 512  # px; crops begin at multiples of 16, to align with the blocks of a JPEG
 CROPS = 4
-FEWEST_FLAT = 4000  # pixels of all scenes that are neither clipped nor near an edge
-FEWEST_OF_EACH = 1000  # such pixels of each scene
+MIN_FLAT = 4000  # pixels of all scenes that are neither clipped nor near an edge
+MIN_OF_EACH = 1000  # such pixels of each scene
 DARK = 12  # luma, above which noise is compared by intensity
-ALIKE = 1e-9  # squared levels of 255, due to rounding in a mean; noise has more
+ROUNDING_ENERGY = 1e-9  # squared levels of 255, due to rounding in a mean; noise has more
 HOLDOUT = 3  # one crop or block of this many is held out of the search
 MANY = 6  # crops from which whole ones are held out; with fewer, one might be unusual
 SMOOTH = 1.5  # px, over which the mean of a burst is smoothed before it is developed again
@@ -40,7 +40,7 @@ SHIFT = 0.5  # px, by which a frame may be shifted against its mean
 SURE = 15.0  # standard errors of white noise for a significant shift; three of a camera's noise
 SCENE_SHARE, SCENE_BLOCK = 0.05, 64  # see clpipe.analysis.repeats
 MOVED, MOVED_BLOCK = 1.0, 16  # sigma, px: a mean of a block that noise does not reach
-MOST_MOVED = 0.1  # share of the blocks
+MAX_MOVED = 0.1  # share of the blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class Scene:
 
     The mean is that of many pictures, or of the frames themselves if ``own_mean`` is set. Masks are
     (height, width). ``counted`` has the pixels that are not clipped, dark or moving. ``flat`` has
-    the flat ones among them. ``kept_out`` is held out of the search. Columns in ``left_out`` cannot
+    the flat ones among them. ``holdout`` is held out of the search. Columns in ``left_out`` cannot
     be compared.
     """
 
@@ -59,18 +59,18 @@ class Scene:
     own_mean: bool
     counted: Mask
     flat: Mask
-    kept_out: Mask
+    holdout: Mask
     jpeg: JpegEncoding | None = None
 
     @property
     def mask(self) -> Mask:
         """The flat pixels that the search uses."""
-        return np.asarray(self.flat & ~self.kept_out)
+        return np.asarray(self.flat & ~self.holdout)
 
-    def places(self, part: Mask | None = None) -> Places:
+    def places(self, part: Mask | None = None) -> ValidPixels:
         """Return the pixels in which noise is compared, in a part of the picture or everywhere."""
         slopes = slopes_of(luma(self.mean), self.counted)
-        places = Places(self.flat, self.noise.level, slopes)
+        places = ValidPixels(self.flat, self.noise.level, slopes)
         return places if part is None else places.without(~part)
 
     @cached_property
@@ -81,7 +81,7 @@ class Scene:
     @property
     def left_out(self) -> tuple[str, ...]:
         """The columns that cannot be computed from few frames without a mean."""
-        return TAILS if self.own_mean and len(self.frames) < FEWEST_FRAMES else ()
+        return TAILS if self.own_mean and len(self.frames) < MIN_FRAMES else ()
 
     @property
     def clean(self) -> Doubles:
@@ -167,17 +167,17 @@ def load_scenes(frames: Sequence[str], means: Sequence[str]) -> Scenes:
     if whole[0].left_out:
         notes.append(
             f"{len(paths)} frames without a mean: kurtosis and tails are not compared; "
-            f"they need {FEWEST_FRAMES} frames"
+            f"they need {MIN_FRAMES} frames"
         )
     pieces = [
         crop
         for scene in whole
-        for crop in ([scene] if max(scene.mask.shape) <= LARGEST else crops_of(scene))
+        for crop in ([scene] if max(scene.mask.shape) <= MAX_UNCROPPED else crops_of(scene))
     ]
     flat = sum(int(piece.mask.sum()) for piece in pieces)
-    if flat < FEWEST_FLAT:
+    if flat < MIN_FLAT:
         names, cleans = [scene.name for scene in whole], [scene.mean for scene in whole]
-        raise ImageError(too_few(names, cleans, flat, FEWEST_FLAT))
+        raise ImageError(too_few(names, cleans, flat, MIN_FLAT))
     return Scenes(with_holdout(pieces), encodings[0], tuple(notes))
 
 
@@ -232,22 +232,22 @@ def checked_scene(
         )
     clean = np.asarray(np.mean(frames, axis=0) if mean is None else mean, np.float64)
     against = str(mean_path) if mean_path else "the mean of the frames"
-    mask = flat_places(clean, DARK)
-    if mask.sum() < FEWEST_OF_EACH:
-        raise ImageError(too_few([str(paths[0])], [clean], int(mask.sum()), FEWEST_OF_EACH))
+    mask = flat_mask(clean, DARK)
+    if mask.sum() < MIN_OF_EACH:
+        raise ImageError(too_few([str(paths[0])], [clean], int(mask.sum()), MIN_OF_EACH))
     still = np.ones_like(mask)
     for path, frame in zip(paths, frames, strict=True):
-        still &= still_places(path, frame, clean, against, mask)
+        still &= static_mask(path, frame, clean, against, mask)
     if not still.all():
         notes.append(f"{paths[0]}: {(~still).mean():.1%} of the picture moves and is excluded")
     if mean is not None:
-        refuse_noisy_mean(paths[0], frames[0], mean, against)
-    level, kept_out = luma(clean), np.zeros_like(mask)
+        reject_noisy_mean(paths[0], frames[0], mean, against)
+    level, holdout = luma(clean), np.zeros_like(mask)
     counted = still & (level >= DARK) & (level <= BRIGHTEST)
-    return Scene(paths[0].stem, tuple(frames), clean, own, counted, mask & still, kept_out, jpeg)
+    return Scene(paths[0].stem, tuple(frames), clean, own, counted, mask & still, holdout, jpeg)
 
 
-def still_places(path: Path, frame: Floats, clean: Doubles, against: str, flat: Mask) -> Mask:
+def static_mask(path: Path, frame: Floats, clean: Doubles, against: str, flat: Mask) -> Mask:
     """Return the pixels in which a frame shows the same as its mean, (height, width).
 
     Raises:
@@ -259,7 +259,7 @@ def still_places(path: Path, frame: Floats, clean: Doubles, against: str, flat: 
     difference = luma(frame) - luma(clean)
     difference -= difference.mean()
     energy = float((difference**2).mean())
-    if energy < ALIKE:
+    if energy < ROUNDING_ENERGY:
         raise RequestError(
             f"{path} has the same pixels as {against}, so there is no noise; give pictures that "
             "were taken separately"
@@ -284,7 +284,7 @@ def still_places(path: Path, frame: Floats, clean: Doubles, against: str, flat: 
         )
     sigma = float(sharp[flat].std())
     moved = np.abs(block_means(sharp, MOVED_BLOCK)) > MOVED * sigma
-    if moved.mean() > MOST_MOVED:
+    if moved.mean() > MAX_MOVED:
         raise RequestError(
             f"{path}: {moved.mean():.0%} of the picture differs from {against} by more than noise; "
             "give pictures of a scene in which nothing moves"
@@ -303,7 +303,7 @@ def block_means(plane: Doubles, block: int) -> Doubles:
     return np.asarray(whole.reshape(rows, block, columns, block).mean((1, 3)))
 
 
-def refuse_noisy_mean(path: Path, frame: Floats, mean: Floats, against: str) -> None:
+def reject_noisy_mean(path: Path, frame: Floats, mean: Floats, against: str) -> None:
     """Check that a mean has less noise than its frame.
 
     Raises:
@@ -364,7 +364,7 @@ def cut(scene: Scene, at: tuple[slice, slice], place: tuple[int, int]) -> Scene:
         mean=scene.mean[at],
         counted=scene.counted[at],
         flat=scene.flat[at],
-        kept_out=scene.kept_out[at],
+        holdout=scene.holdout[at],
     )
 
 
@@ -372,10 +372,10 @@ def with_holdout(pieces: Sequence[Scene]) -> tuple[Scene, ...]:
     """Return the crops with one third held out: whole crops if there are six, otherwise blocks."""
     if len(pieces) >= MANY:
         return tuple(
-            replace(piece, kept_out=np.full_like(piece.flat, number % HOLDOUT == HOLDOUT - 1))
+            replace(piece, holdout=np.full_like(piece.flat, number % HOLDOUT == HOLDOUT - 1))
             for number, piece in enumerate(pieces)
         )
     return tuple(
-        replace(piece, kept_out=block_numbers(piece.flat.shape) % HOLDOUT == HOLDOUT - 1)
+        replace(piece, holdout=block_numbers(piece.flat.shape) % HOLDOUT == HOLDOUT - 1)
         for piece in pieces
     )

@@ -12,7 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clpipe.analysis.matching.columns import COLUMNS, Figures, Noise, Places, errors_of, figures_of
+from clpipe.analysis.matching.columns import (
+    COLUMNS,
+    Figures,
+    Noise,
+    ValidPixels,
+    errors_of,
+    figures_of,
+)
 from clpipe.analysis.matching.scenes import Scene, Scenes, crops_of
 from clpipe.analysis.matching.simulation import Simulator
 from clpipe.analysis.matching.space import (
@@ -31,17 +38,31 @@ from clpipe.engine.device import Device
 
 LOG = logging.getLogger(__name__)
 
-GLANCE, QUICK, FULL = 2, 3, 20  # steps of least squares: at first, while promising, at the end
-COARSE, FINE = 1e-3, 1e-4  # relative tolerances of least squares; the second for the last fit
-HOPELESS, PROMISING = 5.0, 1.5  # times the best cost, before and after a glance
-ENOUGH = 0.5  # residual of a typical column below which no other method is tried
+FIRST_STEPS, TRIAL_STEPS, FINAL_STEPS = (
+    2,
+    3,
+    20,
+)  # steps of least squares: at first, while promising, at the end
+COARSE_TOLERANCE, FINE_TOLERANCE = (
+    1e-3,
+    1e-4,
+)  # relative tolerances of least squares; the second for the last fit
+ABANDON_RATIO, PROMISING_RATIO = 5.0, 1.5  # times the best cost, before and after a glance
+GOOD_RESIDUAL = 0.5  # residual of a typical column below which no other method is tried
 CONVERGED = 0.95  # if a few steps leave more than this share of the cost, the fit ends
-STEP = 0.03  # of a dimension's range, for differences
-KNEE = 3.0  # larger residuals count less than their squares (soft L1)
-BETTER = 0.9  # share of the cost below which another method is chosen, because of random effects
-FEW, SMALL = 4, 384  # scenes by which methods are compared, and the size of their crops, px
+DIFFERENCE_STEP = 0.03  # of a dimension's range, for differences
+LOSS_SCALE = 3.0  # larger residuals count less than their squares (soft L1)
+IMPROVEMENT = (
+    0.9  # share of the cost below which another method is chosen, because of random effects
+)
+TRIAL_SCENES, TRIAL_CROP = (
+    4,
+    384,
+)  # scenes by which methods are compared, and the size of their crops, px
 ROUNDS = 2  # of all parts
-LAST = 20  # the duration of the last fit (all scenes at full size), as a number of trials
+FINAL_FIT_TRIALS = (
+    20  # the duration of the last fit (all scenes at full size), as a number of trials
+)
 
 
 @dataclass(frozen=True)
@@ -76,7 +97,7 @@ class Target:
     """A scene with its target columns and their standard errors."""
 
     scene: Scene
-    places: Places
+    places: ValidPixels
     figures: Figures
     errors: Figures
 
@@ -89,7 +110,7 @@ class Target:
                 continue
             difference = column.residual(ours[name], theirs)
             scale = np.hypot(column.floor, abs(column.residual(theirs + error, theirs)))
-            found.append(np.nan_to_num(difference, nan=KNEE * column.floor) / scale)
+            found.append(np.nan_to_num(difference, nan=LOSS_SCALE * column.floor) / scale)
         return np.clip(found, -30, 30)
 
 
@@ -117,10 +138,10 @@ class Search:
         self.settings = settings
         self.space = space
         self.simulator = Simulator(device)
-        self.targets = [target_of(s, ~s.kept_out) for s in scenes.each if s.mask.any()]
+        self.targets = [target_of(s, ~s.holdout) for s in scenes.each if s.mask.any()]
         self.evaluations = 0
-        self._known: dict[tuple[str, Scene], Figures] = {}  # by settings and scene
-        self._done, self._expected, self._share = 0, LAST, 0.0  # ways that are tried
+        self._cache: dict[tuple[str, Scene], Figures] = {}  # by settings and scene
+        self._trials, self._expected_trials, self._share = 0, FINAL_FIT_TRIALS, 0.0  # of trials
 
     def run(self) -> Candidate:
         """Return the best development.
@@ -128,12 +149,12 @@ class Search:
         Raises:
             StoppedError: the watch stopped the search.
         """
-        flattest = sorted(self.targets, key=lambda t: -int(t.scene.mask.sum()))[:FEW]
-        crops = [crops_of(target.scene, SMALL, 1)[0] for target in flattest]
-        few = [target_of(crop, ~crop.kept_out) for crop in crops]
-        first = self.fit(self.space.first, {}, few, QUICK)
+        flattest = sorted(self.targets, key=lambda t: -int(t.scene.mask.sum()))[:TRIAL_SCENES]
+        crops = [crops_of(target.scene, TRIAL_CROP, 1)[0] for target in flattest]
+        trial_targets = [target_of(crop, ~crop.holdout) for crop in crops]
+        first = self.fit(self.space.first, {}, trial_targets, TRIAL_STEPS)
         self.watch.advanced(0.0, first, self.scenes)
-        best = self.converged(first, few)
+        best = self.converged(first, trial_targets)
         LOG.info("start: residuals of %.2g", best.residual)
         tried = {labels(best)}
         parts, count = list(self.space.choices) * ROUNDS, len(self.space.choices)
@@ -142,29 +163,36 @@ class Search:
             if unchanged == count:
                 break
             ahead = parts[number:][: count - unchanged]  # more of them, when the best changes
-            self._expected = self._done + sum(self.ways(best, each) for each in ahead) + LAST
+            self._expected_trials = (
+                self._trials
+                + sum(self.variant_count(best, each) for each in ahead)
+                + FINAL_FIT_TRIALS
+            )
             before = best
             for choice in self.space.choices[part]:
-                best = self.told(self.attempt(best, part, choice, few, tried))
+                best = self.report(self.attempt(best, part, choice, trial_targets, tried))
             for step in steps_of(best, part):
                 for choice in variants_of(best.settings, step):
-                    variant = merged(best.choices[part], choice)
-                    best = self.told(self.attempt(best, part, variant, few, tried, own=True))
+                    variant = merge_choices(best.choices[part], choice)
+                    best = self.report(
+                        self.attempt(best, part, variant, trial_targets, tried, is_variant=True)
+                    )
             unchanged = unchanged + 1 if best is before else 1
-        last = self.fit(best.choices, best.numbers, self.targets, FULL)
-        again = self.fit(last.choices, last.numbers, self.targets, FULL)  # with a new trust region
+        last = self.fit(best.choices, best.numbers, self.targets, FINAL_STEPS)
+        # Again, with a new trust region.
+        again = self.fit(last.choices, last.numbers, self.targets, FINAL_STEPS)
         return min(last, again, key=lambda candidate: candidate.cost)
 
-    def ways(self, best: Candidate, part: str) -> int:
+    def variant_count(self, best: Candidate, part: str) -> int:
         """Return the number of choices of a part to try."""
         steps = steps_of(best, part)
         variants = sum(1 for step in steps for _ in variants_of(best.settings, step))
         return len(self.space.choices[part]) + variants
 
-    def told(self, best: Candidate) -> Candidate:
+    def report(self, best: Candidate) -> Candidate:
         """Return the best candidate, after reporting it and one more trial to the watch."""
-        self._done += 1
-        self._share = max(self._share, min(self._done / self._expected, 1.0))
+        self._trials += 1
+        self._share = max(self._share, min(self._trials / self._expected_trials, 1.0))
         self.watch.advanced(self._share, best, self.scenes)
         return best
 
@@ -175,28 +203,28 @@ class Search:
         choice: Choice,
         targets: Sequence[Target],
         tried: set[tuple[str, ...]],
-        own: bool = False,
+        is_variant: bool = False,
     ) -> Candidate:
         """Return the better of the best candidate and a variant with another choice of a part.
 
         The variant's numbers start from those of the best. Numbers of the part itself do so only if
-        the choice is the best's ``own`` method, because they differ in meaning between methods. At
-        another size, all numbers start anew.
+        ``is_variant``, the choice has the same method, because they differ in meaning between
+        methods. At another size, all numbers start anew.
         """
         choices = {**best.choices, part: choice}
         other = tuple(each.text for each in choices.values())
-        if other in tried or best.residual < ENOUGH:
+        if other in tried or best.residual < GOOD_RESIDUAL:
             return best
         tried.add(other)
-        start = {k: v for k, v in best.numbers.items() if own or k.partition(".")[0] != part}
+        start = {k: v for k, v in best.numbers.items() if is_variant or k.partition(".")[0] != part}
         if part == RESIZE:
             start = {}
         found = self.fit(choices, start, targets, 0)
-        if found.cost < HOPELESS * best.cost:
-            found = self.fit(choices, start, targets, GLANCE)
-        found = self.converged(found, targets, PROMISING * best.cost)
+        if found.cost < ABANDON_RATIO * best.cost:
+            found = self.fit(choices, start, targets, FIRST_STEPS)
+        found = self.converged(found, targets, PROMISING_RATIO * best.cost)
         LOG.debug("%s: cost %.1f, best %.1f", ", ".join(other), found.cost, best.cost)
-        if found.cost >= BETTER * best.cost:
+        if found.cost >= IMPROVEMENT * best.cost:
             return best
         LOG.info("%s: residuals of %.2g", ", ".join(other), found.residual)
         return found
@@ -211,7 +239,7 @@ class Search:
         before = np.inf
         while candidate.cost < min(limit, CONVERGED * before):
             before = candidate.cost
-            candidate = self.fit(candidate.choices, candidate.numbers, targets, QUICK)
+            candidate = self.fit(candidate.choices, candidate.numbers, targets, TRIAL_STEPS)
         return candidate
 
     def fit(
@@ -231,30 +259,30 @@ class Search:
         numbers = {d.name: start.get(d.name, d.start) for d in dimensions}
         numbers = self.scaled(settings, numbers, targets[0])
 
-        def residuals(places: Doubles) -> Doubles:
+        def residuals(positions: Doubles) -> Doubles:
             values = {
-                d.name: d.value(place - 1) for d, place in zip(dimensions, places, strict=True)
+                d.name: d.value(place - 1) for d, place in zip(dimensions, positions, strict=True)
             }
             return self.residuals(with_numbers(settings, values), targets)
 
         def made(values: Mapping[str, float], cost: float) -> Candidate:
-            own = with_numbers(settings, values)
-            return Candidate(choices, own, values, cost, typical(cost, targets))
+            is_variant = with_numbers(settings, values)
+            return Candidate(choices, is_variant, values, cost, typical_residual(cost, targets))
 
         # From 1 to 2, not from 0: SciPy's steps for differences are relative.
-        places = np.clip([1 + d.share(numbers[d.name]) for d in dimensions], 1.01, 1.99)
+        positions = np.clip([1 + d.share(numbers[d.name]) for d in dimensions], 1.01, 1.99)
         if not (dimensions and steps):
-            knee = (residuals(places) / KNEE) ** 2
-            cost = float(KNEE**2 * (np.sqrt(1 + knee) - 1).sum())  # as SciPy's soft_l1
+            knee = (residuals(positions) / LOSS_SCALE) ** 2
+            cost = float(LOSS_SCALE**2 * (np.sqrt(1 + knee) - 1).sum())  # as SciPy's soft_l1
             return made(numbers, cost)
-        tolerance = FINE if targets is self.targets else COARSE
+        tolerance = FINE_TOLERANCE if targets is self.targets else COARSE_TOLERANCE
         found = least_squares(
             residuals,
-            places,
+            positions,
             bounds=(1, 2),
-            diff_step=STEP,
+            diff_step=DIFFERENCE_STEP,
             loss="soft_l1",
-            f_scale=KNEE,
+            f_scale=LOSS_SCALE,
             max_nfev=steps,
             xtol=tolerance,
             ftol=tolerance,
@@ -298,11 +326,11 @@ class Search:
     def figures(self, settings: Settings, target: Target) -> Figures:
         """Return the columns of a scene's development, which is cached."""
         key = repr(settings), target.scene
-        if key not in self._known:
+        if key not in self._cache:
             self.evaluations += 1
             noise = self.simulator.noise(settings, target.scene, "search")
-            self._known[key] = figures_of(noise, target.places)
-        return self._known[key]
+            self._cache[key] = figures_of(noise, target.places)
+        return self._cache[key]
 
 
 def target_of(scene: Scene, part: Mask | None = None) -> Target:
@@ -310,14 +338,14 @@ def target_of(scene: Scene, part: Mask | None = None) -> Target:
     return target_at(scene, scene.noise, scene.places(part))
 
 
-def target_at(scene: Scene, noise: Noise, places: Places) -> Target:
+def target_at(scene: Scene, noise: Noise, places: ValidPixels) -> Target:
     """Return a target from noise; columns are NaN if there are too few samples for an error."""
     figures, errors = figures_of(noise, places), errors_of(noise, places)
     kept = {name: np.nan if np.isnan(errors[name]) else figures[name] for name in figures}
     return Target(scene, places, kept, errors)
 
 
-def typical(cost: float, targets: Sequence[Target]) -> float:
+def typical_residual(cost: float, targets: Sequence[Target]) -> float:
     """Return the residual of a typical column at a cost, in units of error and floor."""
     columns = sum(len(target.residuals(target.figures)) for target in targets) / len(targets)
     return float((2 * cost / columns) ** 0.5)
@@ -334,7 +362,7 @@ def steps_of(candidate: Candidate, part: str) -> list[str]:
     return [part] if part in DEVELOPMENT else [step for step in own if step.startswith("denoise")]
 
 
-def merged(first: Choice, second: Choice) -> Choice:
+def merge_choices(first: Choice, second: Choice) -> Choice:
     """Return a choice merged with a variant of it."""
     return Choice(second.text, {**first.values, **second.values}, first.stages)
 

@@ -18,7 +18,7 @@ from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
-from clpipe.images.jpeg import through_jpeg
+from clpipe.images.jpeg import jpeg_round_trip
 from clpipe.stage import Kind, Method, ReferenceContext
 
 LINEAR = 16  # scenes in linear light that are cached, for one tone curve
@@ -85,7 +85,7 @@ class Simulator:
 def finished(pixels: Array | None, scene: Scene) -> Floats:
     """Return a developed picture encoded like the scene's frames, (height, width, 3), 0 to 255."""
     assert pixels is not None
-    return (through_jpeg(pixels, scene.jpeg) if scene.jpeg else pixels).astype(np.float32)
+    return (jpeg_round_trip(pixels, scene.jpeg) if scene.jpeg else pixels).astype(np.float32)
 
 
 def gain_of(chain: Chain) -> float:

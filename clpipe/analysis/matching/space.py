@@ -161,7 +161,7 @@ def space_for(settings: Settings, iso_is_given: bool) -> Space:
     choices: dict[str, tuple[Choice, ...]] = {}
     if RESIZE not in settings.stages:
         choices[RESIZE] = (Choice("full size"), *smaller(settings))
-    choices["chroma"] = tuple(chroma_ways(settings))
+    choices["chroma"] = tuple(chroma_options(settings))
     for name in (*DEVELOPMENT, TONE):
         stage = all_stages()[name]
         added = {} if name in settings.stages else {name: BEFORE}
@@ -188,7 +188,7 @@ def smaller(settings: Settings) -> Iterator[Choice]:
                 yield Choice(f"{text}, then sharpen", values, {RESIZE: SHARPEN})
 
 
-def chroma_ways(settings: Settings) -> Iterator[Choice]:
+def chroma_options(settings: Settings) -> Iterator[Choice]:
     """Yield choices for the noise of chroma: colours of the sensor or scene, smoothed again."""
     before = SHARPEN if SHARPEN in settings.stages else BEFORE
     colours: dict[str, dict[str, Any]] = {"colours of the camera": {}}

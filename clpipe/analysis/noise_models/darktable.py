@@ -20,7 +20,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.text import one_line
 from clpipe.base.validation import first_fault
 from clpipe.camera.profile import built_in_name, load_camera
-from clpipe.camera.text import comparable
+from clpipe.camera.text import normalized_name
 
 MARK = "noiseprofiles"
 RAW_OVER_DEMOSAICED = 12.8
@@ -53,7 +53,7 @@ def parse_darktable(values: Any, path: Path, camera: str | None) -> SensorModel:
     Raises:
         RequestError: there is no such camera, or the file is not in darktable's format.
     """
-    cameras = {comparable(f"{entry[0]} {entry[1]}"): entry for entry in _all(values)}
+    cameras = {normalized_name(f"{entry[0]} {entry[1]}"): entry for entry in _all(values)}
     if not cameras:
         raise RequestError(f"{path}: its noiseprofiles list no camera; give darktable's own file")
     make, model, profiles = cameras[_chosen(cameras, path, camera)]
@@ -140,11 +140,11 @@ def _chosen(cameras: dict[str, tuple[str, str, Any]], path: Path, camera: str | 
         raise RequestError(
             f"{path}: this file has {len(keys)} cameras; choose one, such as --camera {example!r}"
         )
-    wanted = [comparable(camera)]
+    wanted = [normalized_name(camera)]
     if built_in := built_in_name(camera):
         known = load_camera(built_in)
-        wanted.append(comparable(f"{known.make} {known.model}"))
-    models = {comparable(model): key for key, (_, model, _) in cameras.items()}
+        wanted.append(normalized_name(f"{known.make} {known.model}"))
+    models = {normalized_name(model): key for key, (_, model, _) in cameras.items()}
     for name in wanted:
         if name in cameras:
             return name

@@ -6,7 +6,7 @@ from typing import Any
 
 from clpipe.analysis.noise_models.model import Law, Levels, SensorModel
 from clpipe.base.errors import ImageError
-from clpipe.images.raw import read_exif, read_facts
+from clpipe.images.raw import read_exif, read_raw_info
 
 NOISE_PROFILE = "Tag 0xC761"  # exifread's name
 
@@ -18,7 +18,7 @@ def read_dng(path: Path) -> SensorModel:
         ImageError: the DNG cannot be read, is not a Bayer mosaic, or does not state its noise, ISO
             or levels.
     """
-    facts, exif = read_facts(path), read_exif(path)
+    facts, exif = read_raw_info(path), read_exif(path)
     tags = (tag for name, tag in exif.tags.items() if name.endswith(NOISE_PROFILE))
     tag = next(tags, None)
     if tag is None:

@@ -13,7 +13,7 @@ from clpipe.camera.profile import SRGB_TO_XYZ, Camera, Matrix, built_in_name, lo
 from clpipe.camera.text import profile_text
 
 # The middle of the ranges of Brooks et al. (CVPR 2019): red 1.9 to 2.4, blue 1.5 to 1.9.
-STAND_IN_GAINS = (2.15, 1.70)
+DEFAULT_GAINS = (2.15, 1.70)
 
 # ln(read noise in 14-bit DN) over ln(system gain): means of the laws of the five cameras of
 # Wei et al., CVPR 2020 (github.com/Vandermode/ELD).
@@ -142,7 +142,7 @@ class SensorModel:
             gains, matrix = known.white_balance_gains, known.xyz_to_camera
             source = matrix_source = f"not in the file; as the built-in {known.name} has it"
         else:
-            gains, matrix = self.gains or STAND_IN_GAINS, None
+            gains, matrix = self.gains or DEFAULT_GAINS, None
             source = "as the file has it, as shot"
             if not self.gains:
                 source = "not in the file; assumed: the middle of the range of Brooks et al. 2019"

@@ -11,7 +11,7 @@ from clpipe.stages.demosaic.median import EdgeDirectedMedian, Median
 from clpipe.stages.demosaic.menon2007 import Menon2007
 
 
-def _of_array(context: Context) -> Method | None:
+def _array_default(context: Context) -> Method | None:
     if not context.array:
         return None
     return Gray() if context.array.is_gray else LinearMmse()
@@ -26,5 +26,5 @@ STAGE = Stage(
         *(Bounded, EdgeDirectedMedian, EdgeDirected, Median, Bilinear, Malvar2004, Menon2007),
         *(LinearMmse, DirectionalMmse, Gray),
     ),
-    usual=_of_array,
+    default_method=_array_default,
 )

@@ -11,7 +11,7 @@ from clpipe.stages.demosaic.common import (
     HALF,
     QUARTER,
     mean_above_below,
-    mean_beside,
+    mean_left_right,
     red_and_blue,
     sum_of_corners,
 )
@@ -25,7 +25,7 @@ def bilinear(image: Floats, pattern: Pattern) -> Floats:
     >>> bilinear(np.float32([[4, 1], [3, 8]]), "RGGB")[0, 0].tolist()
     [4.0, 2.0, 8.0]
     """
-    in_row, in_column = mean_beside(image), mean_above_below(image)
+    in_row, in_column = mean_left_right(image), mean_above_below(image)
     cross = (in_row + in_column) * HALF
     across = sum_of_corners(image) * QUARTER
     red, blue = red_and_blue(pattern, image, in_row, in_column, across)
@@ -46,5 +46,5 @@ class Bilinear(Method):
     def arguments(self, context: Context) -> Arguments:
         return {"pattern": context.cfa}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return bilinear(image, given.context.pattern)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return bilinear(image, inputs.context.pattern)

@@ -23,7 +23,7 @@ from clpipe.stages.demosaic.common import (
     QUARTER,
     from_differences,
     mean_above_below,
-    mean_beside,
+    mean_left_right,
     red_and_blue,
     spread_differences,
 )
@@ -36,13 +36,13 @@ from clpipe.stages.denoise.strength import (
 
 # Both directions count as alike if the gradient, in roots of the signal, is below this value.
 # Chosen: a hundredth of white is less than the noise of most images, and is no edge.
-EVEN = np.float32(0.01**2)
+EQUAL_GRADIENT = np.float32(0.01**2)
 
 
-def between(values: Floats, *neighbours: Floats) -> Floats:
+def clamp_to_range(values: Floats, *neighbours: Floats) -> Floats:
     """Limit values to the range of their neighbours; all arrays have one shape.
 
-    >>> between(np.float32([0, 5, 9]), np.float32([1, 1, 1]), np.float32([6, 6, 6])).tolist()
+    >>> clamp_to_range(np.float32([0, 5, 9]), np.float32([1, 1, 1]), np.float32([6, 6, 6])).tolist()
     [1.0, 5.0, 6.0]
     """
     return np.clip(values, np.minimum.reduce(neighbours), np.maximum.reduce(neighbours))
@@ -60,15 +60,15 @@ def green_or_difference(roots: Floats, pattern: Pattern) -> Floats:
     west, east, north, south = neighbours.values()
     bend_x = np.float32(2) * roots - tap(roots, -2, 0) - tap(roots, 2, 0)
     bend_y = np.float32(2) * roots - tap(roots, 0, -2) - tap(roots, 0, 2)
-    green_x = between(mean_beside(roots) + bend_x * QUARTER, west, east)
-    green_y = between(mean_above_below(roots) + bend_y * QUARTER, north, south)
-    weight_y = np.square(abs(west - east) + abs(bend_x)) + EVEN
-    weight_x = np.square(abs(north - south) + abs(bend_y)) + EVEN
+    green_x = clamp_to_range(mean_left_right(roots) + bend_x * QUARTER, west, east)
+    green_y = clamp_to_range(mean_above_below(roots) + bend_y * QUARTER, north, south)
+    weight_y = np.square(abs(west - east) + abs(bend_x)) + EQUAL_GRADIENT
+    weight_x = np.square(abs(north - south) + abs(bend_y)) + EQUAL_GRADIENT
     green = (green_x * weight_x + green_y * weight_y) / (weight_x + weight_y)
     return by_site(roots.shape, pattern, roots - green, np.float32(0), roots - green)
 
 
-SETS = (
+NEIGHBOURS = (
     ((-1, 0), (1, 0)),  # in the row
     ((0, -1), (0, 1)),  # in the column
     ((-1, -1), (1, -1), (-1, 1), (1, 1)),  # at the corners
@@ -76,29 +76,29 @@ SETS = (
 
 
 def bounds(
-    roots: Floats, known: Floats, green: Floats, pattern: Pattern, doubt: np.float32
+    roots: Floats, differences: Floats, green: Floats, pattern: Pattern, noise_margin: np.float32
 ) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
     """Return the limits of red and blue, (red, blue) each, (height, width), in roots.
 
     The limits are those of the nearest samples of that colour, widened by the amount, minus
-    ``doubt``, by which green exceeds its own values at those samples. A line narrower than the
-    pattern is an extreme of green, and red and blue must follow it. At the edge of a colour, green
-    only rises or falls, and red and blue must not overshoot.
+    ``noise_margin``, by which green exceeds its own values at those samples. A line narrower than
+    the pattern is an extreme of green, and red and blue must follow it. At the edge of a colour,
+    green only rises or falls, and red and blue must not overshoot.
 
     Args:
         roots: the samples.
-        known: :func:`green_or_difference` of them.
+        differences: :func:`green_or_difference` of them.
         green: green at every pixel.
         pattern: the CFA pattern.
-        doubt: the change of green that noise alone may cause.
+        noise_margin: the change of green that noise alone may cause.
     """
-    there = roots - known  # green at red and blue sites
+    green_at_sites = roots - differences  # green at red and blue sites
     low, high = [], []
-    for steps in SETS:
+    for steps in NEIGHBOURS:
         samples = [tap(roots, *step) for step in steps]
-        greens = [tap(there, *step) for step in steps]
-        below = np.minimum(green - np.minimum.reduce(greens) + doubt, np.float32(0))
-        above = np.maximum(green - np.maximum.reduce(greens) - doubt, np.float32(0))
+        greens = [tap(green_at_sites, *step) for step in steps]
+        below = np.minimum(green - np.minimum.reduce(greens) + noise_margin, np.float32(0))
+        above = np.maximum(green - np.maximum.reduce(greens) - noise_margin, np.float32(0))
         low.append(np.minimum.reduce(samples) + below)
         high.append(np.maximum.reduce(samples) + above)
     return red_and_blue(pattern, roots, *low), red_and_blue(pattern, roots, *high)
@@ -133,7 +133,7 @@ class Bounded(Method):
         return self.with_defaults(noise=sqrt(green.at(MID_GREY)), offset=offset_of_roots(context))
 
     @property
-    def doubt(self) -> np.float32:
+    def noise_margin(self) -> np.float32:
         """The noise that green may have, in roots: three sigma plus an invisible difference."""
         assert self.noise is not None and self.offset is not None
         return float32(0.01 + 3 * noise_in_roots(self.noise, MID_GREY, self.offset))
@@ -162,19 +162,19 @@ class Bounded(Method):
     def arguments(self, context: Context) -> Arguments:
         return {
             "pattern": context.cfa,
-            "even": EVEN,
-            "noise": self.doubt,
+            "even": EQUAL_GRADIENT,
+            "noise": self.noise_margin,
             "offset": self.offset,
         }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        pattern, offset = given.context.pattern, np.float32(self.offset)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        pattern, offset = inputs.context.pattern, np.float32(self.offset)
         roots = root_of(image, offset)
         known = green_or_difference(roots, pattern)
         differences = spread_differences(known, pattern)
         red, green, blue = np.moveaxis(from_differences(roots, pattern, *differences), -1, 0)
         (red_low, blue_low), (red_high, blue_high) = bounds(
-            roots, known, green, pattern, self.doubt
+            roots, known, green, pattern, self.noise_margin
         )
         red, blue = np.clip(red, red_low, red_high), np.clip(blue, blue_low, blue_high)
         return from_root(in_steps(np.stack([red, green, blue], axis=-1)), offset)

@@ -12,10 +12,10 @@ from clpipe.reference.image import tap
 HALF, QUARTER, EIGHTH = np.float32(0.5), np.float32(0.25), np.float32(0.125)
 
 
-def mean_beside(image: Floats) -> Floats:
+def mean_left_right(image: Floats) -> Floats:
     """Return the mean of the pixels to the left and right of each pixel.
 
-    >>> mean_beside(np.float32([[1, 2, 5]])).tolist()
+    >>> mean_left_right(np.float32([[1, 2, 5]])).tolist()
     [[2.0, 3.0, 2.0]]
     """
     return (tap(image, -1, 0) + tap(image, 1, 0)) * HALF
@@ -33,13 +33,13 @@ def sum_of_corners(image: Floats) -> Floats:
 
 
 def red_and_blue(
-    pattern: Pattern, own: Floats, in_row: Floats, in_column: Floats, across: Floats
+    pattern: Pattern, at_site: Floats, in_row: Floats, in_column: Floats, across: Floats
 ) -> tuple[Floats, Floats]:
     """Return red and blue at every pixel, (height, width) each, chosen from four images by site.
 
     Args:
         pattern: the CFA pattern.
-        own: at red and blue sites, the value for the site's own colour.
+        at_site: at red and blue sites, the value for the site's own colour.
         in_row: at green sites, the value for the colour (red or blue) whose sites are in that row.
         in_column: at green sites, the value for the colour whose sites are in that column.
         across: at red sites the value for blue, at blue sites the value for red.
@@ -48,12 +48,12 @@ def red_and_blue(
     >>> [colour.tolist() for colour in red_and_blue("RGGB", *values)]
     [[[0.0, 1.0], [2.0, 3.0]], [[3.0, 2.0], [1.0, 0.0]]]
     """
-    red_row = (np.arange(own.shape[0])[:, None] & 1) == red_site(pattern)[1]
+    red_row = (np.arange(at_site.shape[0])[:, None] & 1) == red_site(pattern)[1]
     red_at_green = np.where(red_row, in_row, in_column)
     blue_at_green = np.where(red_row, in_column, in_row)
     return (
-        by_site(own.shape, pattern, own, red_at_green, across),
-        by_site(own.shape, pattern, across, blue_at_green, own),
+        by_site(at_site.shape, pattern, at_site, red_at_green, across),
+        by_site(at_site.shape, pattern, across, blue_at_green, at_site),
     )
 
 
@@ -63,7 +63,7 @@ def spread_differences(sparse: Floats, pattern: Pattern) -> tuple[Floats, Floats
     ``sparse`` is (height, width) and holds R-G at red sites and B-G at blue sites.
     """
     across = sum_of_corners(sparse) * QUARTER
-    return red_and_blue(pattern, sparse, mean_beside(sparse), mean_above_below(sparse), across)
+    return red_and_blue(pattern, sparse, mean_left_right(sparse), mean_above_below(sparse), across)
 
 
 def from_differences(

@@ -4,7 +4,7 @@ from functools import lru_cache
 from typing import ClassVar
 
 from clpipe.base.types import Floats
-from clpipe.reference.directional_mmse import MODELS, UNSEEN, directional_mmse, models
+from clpipe.reference.directional_mmse import ERROR_FLOOR, MODELS, directional_mmse, models
 from clpipe.reference.filter_array import FilterArray, kernel_table
 from clpipe.reference.linear_mmse import RADIUS
 from clpipe.stage import (
@@ -49,23 +49,23 @@ class DirectionalMmse(Method):
     any_array: ClassVar = True
 
     def passes(self) -> tuple[Pass, ...]:
-        foretold = (
+        error_passes = (
             Pass(name, Stencil(RADIUS), ("misses", *PERIOD), writes=name, kind=Kind.PAIR)
             for name in ERRORS
         )
         arguments = ("colours", *PERIOD, "unseen")
         blend = Pass("blend", Stencil(RADIUS), arguments, reads=("src", *ERRORS))
-        return (*foretold, blend)
+        return (*error_passes, blend)
 
     def arguments(self, context: Context) -> Arguments:
-        array = context.filters
+        array = context.filter_array
         colours, misses = tables(array)
         return {
             "colours": colours,
             "misses": misses,
-            "unseen": UNSEEN,
+            "unseen": ERROR_FLOOR,
             **period_of(array.period),
         }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return directional_mmse(image, given.context.filters)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return directional_mmse(image, inputs.context.filter_array)

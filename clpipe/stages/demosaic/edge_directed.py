@@ -24,7 +24,7 @@ from clpipe.stages.demosaic.common import (
     QUARTER,
     from_differences,
     mean_above_below,
-    mean_beside,
+    mean_left_right,
     spread_differences,
 )
 
@@ -52,7 +52,7 @@ def green_or_difference(image: Floats, pattern: Pattern, classifier: Classifier)
     change_y = abs(tap(image, 0, -1) - tap(image, 0, 1))
     bend_x = np.float32(2) * image - tap(image, -2, 0) - tap(image, 2, 0)
     bend_y = np.float32(2) * image - tap(image, 0, -2) - tap(image, 0, 2)
-    green_x, green_y = mean_beside(image), mean_above_below(image)
+    green_x, green_y = mean_left_right(image), mean_above_below(image)
     match classifier:
         case "hibbard":
             gradient_x, gradient_y = change_x, change_y
@@ -99,7 +99,7 @@ class EdgeDirected(Method):
     def arguments(self, context: Context) -> Arguments:
         return {"pattern": context.cfa, "classifier": CompileTime(self.classifier.upper())}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        pattern = given.context.pattern
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        pattern = inputs.context.pattern
         sparse = green_or_difference(image, pattern, self.classifier)
         return from_differences(image, pattern, *spread_differences(sparse, pattern))

@@ -47,11 +47,11 @@ class LinearMmse(Method):
         return (Pass("linear_mmse", Stencil(RADIUS), ("weights", *PERIOD)),)
 
     def arguments(self, context: Context) -> Arguments:
-        array = context.filters
+        array = context.filter_array
         return {"weights": weights_table(array), **period_of(array.period)}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return linear_mmse(image, given.context.filters)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return linear_mmse(image, inputs.context.filter_array)
 
 
 class Gray(Method):
@@ -76,15 +76,15 @@ class Gray(Method):
         Raises:
             RequestError: the sensor has several kinds of filters.
         """
-        if not context.filters.is_gray:
+        if not context.filter_array.is_gray:
             raise RequestError(
                 "demosaic.method=gray is for sensors of one channel, but the mosaic is "
-                f"{context.filters.name}; remove demosaic.method, or choose another method"
+                f"{context.filter_array.name}; remove demosaic.method, or choose another method"
             )
         return self
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("gray", Pointwise()),)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return np.repeat(image[..., None], 3, axis=-1)

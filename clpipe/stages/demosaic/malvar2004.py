@@ -50,5 +50,5 @@ class Malvar2004(Method):
     def arguments(self, context: Context) -> Arguments:
         return {"pattern": context.cfa}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return malvar2004(image, given.context.pattern)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return malvar2004(image, inputs.context.pattern)

@@ -58,8 +58,8 @@ class Median(Method):
     def arguments(self, context: Context) -> Arguments:
         return {"pattern": context.cfa, "size": CompileTime(str(self.size))}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        pattern = given.context.pattern
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        pattern = inputs.context.pattern
         red, green, blue = np.moveaxis(bilinear(image, pattern), -1, 0)
         differences = (median_filter(d, self.size) for d in (red - green, blue - green))
         return from_differences(image, pattern, *differences)
@@ -90,8 +90,8 @@ class EdgeDirectedMedian(Median, EdgeDirected):
     def arguments(self, context: Context) -> Arguments:
         return {**EdgeDirected.arguments(self, context), **Median.arguments(self, context)}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        pattern = given.context.pattern
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        pattern = inputs.context.pattern
         sparse = green_or_difference(image, pattern, self.classifier)
         differences = spread_differences(sparse, pattern)
         return from_differences(image, pattern, *(median_filter(d, self.size) for d in differences))

@@ -13,7 +13,13 @@ from clpipe.base.types import Floats, Mask
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
 from clpipe.stage import Arguments, Context, Kind, Method, Pass, ReferenceContext, Stencil
-from clpipe.stages.demosaic.common import HALF, QUARTER, mean_above_below, mean_beside, red_and_blue
+from clpipe.stages.demosaic.common import (
+    HALF,
+    QUARTER,
+    mean_above_below,
+    mean_left_right,
+    red_and_blue,
+)
 
 THIRD = np.float32(1 / 3)
 
@@ -29,7 +35,7 @@ def directional_differences(image: Floats, pattern: Pattern) -> tuple[Floats, Fl
     """
     bend_x = np.float32(2) * image - tap(image, -2, 0) - tap(image, 2, 0)
     bend_y = np.float32(2) * image - tap(image, 0, -2) - tap(image, 0, 2)
-    in_row = image - (mean_beside(image) + bend_x * QUARTER)
+    in_row = image - (mean_left_right(image) + bend_x * QUARTER)
     in_column = image - (mean_above_below(image) + bend_y * QUARTER)
     zero = np.float32(0)
     return (
@@ -51,7 +57,9 @@ def change(differences: Floats) -> Floats:
     return np.float32(3) * own + near + far
 
 
-def along(sparse: Floats, in_row: Mask) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+def neighbour_differences(
+    sparse: Floats, in_row: Mask
+) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
     """Return the differences at the two green neighbours, in the chosen direction of each site.
 
     Args:
@@ -62,11 +70,11 @@ def along(sparse: Floats, in_row: Mask) -> tuple[tuple[Floats, Floats], tuple[Fl
         Own minus green and own minus other, each for the left or upper and for the right or lower
         neighbour. The difference at a green site is the mean of those at its two adjacent sites.
     """
-    beside, above_below = mean_beside(sparse), mean_above_below(sparse)
+    left_right, above_below = mean_left_right(sparse), mean_above_below(sparse)
     own_green, own_other = [], []
     for step in (-1, 1):
-        own = np.where(in_row, tap(beside, step, 0), tap(above_below, 0, step))
-        other = np.where(in_row, tap(above_below, step, 0), tap(beside, 0, step))
+        own = np.where(in_row, tap(left_right, step, 0), tap(above_below, 0, step))
+        other = np.where(in_row, tap(above_below, step, 0), tap(left_right, 0, step))
         own_green.append(own)
         own_other.append(own - other)
     return (own_green[0], own_green[1]), (own_other[0], own_other[1])
@@ -82,19 +90,19 @@ def menon2007(image: Floats, pattern: Pattern) -> Floats:
     # Directional green, and the choice of the direction in which colour differences change less.
     by_row, by_column = directional_differences(image, pattern)
     in_row = change(by_row) <= change(by_column.T).T
-    chosen = np.where(in_row, by_row, by_column)
+    selected = np.where(in_row, by_row, by_column)
     # A first estimate of own minus other, which is refined after green.
-    (left, right), (left_other, right_other) = along(chosen, in_row)
+    (left, right), (left_other, right_other) = neighbour_differences(selected, in_row)
     own_other = (left_other + right_other) * HALF
     # Refine green: own minus green becomes the mean of three values along the direction.
-    refined = (left + chosen + right) * THIRD
-    refined = by_site(image.shape, pattern, refined, chosen, refined)
+    refined = (left + selected + right) * THIRD
+    refined = by_site(image.shape, pattern, refined, selected, refined)
     green = image - refined
     # Refine the other colour in the same way; red and blue at green sites are bilinear.
-    _, (left_other, right_other) = along(refined, in_row)
+    _, (left_other, right_other) = neighbour_differences(refined, in_row)
     other = image - (left_other + own_other + right_other) * THIRD
     red, blue = red_and_blue(
-        pattern, image, image + mean_beside(refined), image + mean_above_below(refined), other
+        pattern, image, image + mean_left_right(refined), image + mean_above_below(refined), other
     )
     return np.stack([red, green, blue], axis=-1)
 
@@ -109,16 +117,16 @@ class Menon2007(Method):
     )
 
     def passes(self) -> tuple[Pass, ...]:
-        given = ("pattern",)
+        names = ("pattern",)
         return (
-            Pass("directional_differences", Stencil(2), given, writes="both", kind=Kind.PAIR),
+            Pass("directional_differences", Stencil(2), names, writes="both", kind=Kind.PAIR),
             Pass("decide", Stencil(2), reads=("both",), writes="chosen", kind=Kind.PAIR),
-            Pass("refine", Stencil(2), given, ("chosen",), writes="refined", kind=Kind.PAIR),
-            Pass("interpolate", Stencil(2), given, ("src", "chosen", "refined")),
+            Pass("refine", Stencil(2), names, ("chosen",), writes="refined", kind=Kind.PAIR),
+            Pass("interpolate", Stencil(2), names, ("src", "chosen", "refined")),
         )
 
     def arguments(self, context: Context) -> Arguments:
         return {"pattern": context.cfa}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return menon2007(image, given.context.pattern)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return menon2007(image, inputs.context.pattern)

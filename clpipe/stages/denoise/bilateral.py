@@ -50,9 +50,9 @@ class Bilateral(WindowDenoiser):
             "chroma_scale": gaussian_scale(RANGE * chroma),
         }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         planes = rgb_to_ycbcr(image)
-        numbers = self.numbers(given.context)
+        numbers = self.numbers(inputs.context)
         luma, chroma = planes[..., :1], planes[..., 1:]
         near = numbers["spatial_scale"]
         luma = bilateral(luma, self.reaches[0], near, numbers["luma_scale"])

@@ -29,7 +29,7 @@ from clpipe.stages.denoise.strength import MID_GREY, Denoiser, offset_of_roots, 
 RANGE_LUMA, RANGE_CHROMA = 16.0, 2.5
 # The least noise that luma is filtered for, in roots: less than one level of 255. Found by
 # experiment: at 0.006, an image at ISO 100 is further from the ground truth than without denoising.
-LEAST_NOISE = 0.0025
+MIN_NOISE = 0.0025
 
 GRAIN = 0.35  # share of luma's noise that remains at strength 1, at low noise
 
@@ -144,7 +144,7 @@ class Biweight(Denoiser):
         """The differences of luma and of chroma that have the weight 0, in roots of the signal."""
         luma, chroma = self.roots
         ranges = (
-            RANGE_LUMA * self.luma_strength * hypot(luma, LEAST_NOISE),
+            RANGE_LUMA * self.luma_strength * hypot(luma, MIN_NOISE),
             RANGE_CHROMA * self.chroma_strength * chroma,
         )
         return max(ranges[0], 1e-6), max(ranges[1], 1e-6)
@@ -193,7 +193,7 @@ class Biweight(Denoiser):
             "offset": self.offset,
         }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         if self.is_off:
             return image
         luma_range, chroma_range = (np.float32(each) for each in self.ranges)

@@ -49,7 +49,7 @@ class BlendedFilter(WindowDenoiser):
         luma, chroma = self.amounts
         return {"luma_share": blend_share(luma), "chroma_share": blend_share(chroma)}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         planes = rgb_to_ycbcr(image)
         luma, chroma = (blend_share(amount) for amount in self.amounts)
         y, c = planes[..., :1], planes[..., 1:]

@@ -50,13 +50,13 @@ class NonLocalMeans(WindowDenoiser):
     )
     extra_reach: ClassVar = 1
     vectors_per_row: ClassVar = 4
-    enter: ClassVar = Pass(
+    first_pass: ClassVar = Pass(
         "to_noise_units",
         arguments=("luma_unit", "chroma_unit"),
         writes="planes",
         kind=Kind.YCBCR,
     )
-    leave: ClassVar = Pass(
+    last_pass: ClassVar = Pass(
         "from_noise_units", arguments=("luma_unit", "chroma_unit"), reads=("filtered",)
     )
 
@@ -89,8 +89,8 @@ class NonLocalMeans(WindowDenoiser):
             "chroma_scale": decay_of(FACTOR * self.chroma_strength),
         }
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        n = self.numbers(given.context)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        n = self.numbers(inputs.context)
         units = np.array([n["luma_unit"], n["chroma_unit"], n["chroma_unit"]], np.float32)
         planes = rgb_to_ycbcr(image) / units
         level = np.maximum(patch_sum(planes[..., 0]), np.float32(0))

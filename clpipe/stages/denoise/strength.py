@@ -63,8 +63,8 @@ def noise_of_colours(context: Context) -> tuple[Variance, Variance, Variance]:
     """
     a, b = context.noise_parameters()
     red, blue = context.applied_gains
-    one, two, three = (Variance(a * k, b * k * k) for k in (red, 1.0, blue))
-    return one, two, three
+    red_noise, green_noise, blue_noise = (Variance(a * k, b * k * k) for k in (red, 1.0, blue))
+    return red_noise, green_noise, blue_noise
 
 
 def noise_of_luma_and_chroma(context: Context) -> tuple[Variance, Variance]:
@@ -190,8 +190,8 @@ class WindowDenoiser(Denoiser):
     largest_size: ClassVar[int] = 15
     function: ClassVar[str]  # the stencil in the kernel file
     names: ClassVar[tuple[str, ...]]  # the stencil's run-time arguments, after the two reaches
-    enter: ClassVar[Pass] = Pass("to_luma_chroma", writes="planes", kind=Kind.YCBCR)
-    leave: ClassVar[Pass] = Pass("from_luma_chroma", reads=("filtered",))
+    first_pass: ClassVar[Pass] = Pass("to_luma_chroma", writes="planes", kind=Kind.YCBCR)
+    last_pass: ClassVar[Pass] = Pass("from_luma_chroma", reads=("filtered",))
     extra_reach: ClassVar[int] = 0  # px that the stencil reads outside its window
     vectors_per_row: ClassVar[int] = 0  # like in Stencil
 
@@ -200,7 +200,7 @@ class WindowDenoiser(Denoiser):
 
     @field_validator("luma_size", "chroma_size")
     @classmethod
-    def _odd(cls, size: int) -> int:
+    def _check_odd(cls, size: int) -> int:
         return odd_size(size, cls.largest_size)
 
     @property
@@ -214,7 +214,7 @@ class WindowDenoiser(Denoiser):
 
     def passes(self) -> tuple[Pass, ...]:
         return (
-            self.enter,
+            self.first_pass,
             Pass(
                 self.function,
                 Stencil(max(self.reaches) + self.extra_reach, self.vectors_per_row),
@@ -223,7 +223,7 @@ class WindowDenoiser(Denoiser):
                 writes="filtered",
                 kind=Kind.YCBCR,
             ),
-            self.leave,
+            self.last_pass,
         )
 
     def arguments(self, context: Context) -> Arguments:

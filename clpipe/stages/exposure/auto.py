@@ -121,7 +121,7 @@ class Auto(Gain):
     max_ev: float = parameter(20.0, "Highest result of metering, before ev.", "EV", ge=-20, le=20)
 
     @model_validator(mode="after")
-    def _ordered(self) -> Self:
+    def _check_order(self) -> Self:
         if self.min_ev > self.max_ev:
             raise ValueError(
                 f"max_ev must not be below min_ev; found {self.max_ev:g} and {self.min_ev:g}"
@@ -132,26 +132,26 @@ class Auto(Gain):
         return self.with_defaults(target=TARGETS[self.rule])
 
     def passes(self) -> tuple[Pass, ...]:
-        limits, found = ("target", "lowest", "highest", "offset"), ("metered_ev", "gain")
+        limits, estimates = ("target", "lowest", "highest", "offset"), ("metered_ev", "gain")
         circle = ("share", "inside", "outside")
         if self.rule == "percentile":
-            search = Pass(
+            metering = Pass(
                 "metered_bin",
                 Reduction(
                     "meter_percentile",
-                    found,
+                    estimates,
                     ("inside", "outside", "millionths", *limits),
                     bins=2 * BINS,
                 ),
                 ("share", "outside"),
             )
         else:
-            search = Pass(
+            metering = Pass(
                 "metered_log",
-                Reduction("meter_log_average", found, (*circle, "delta", *limits)),
+                Reduction("meter_log_average", estimates, (*circle, "delta", *limits)),
                 ("extent", *circle, "delta"),
             )
-        return search, Pass("exposure", arguments=("gain",))
+        return metering, Pass("exposure", arguments=("gain",))
 
     def arguments(self, context: Context) -> Arguments:
         assert self.target is not None
@@ -173,17 +173,17 @@ class Auto(Gain):
     def _millionths(self) -> int:
         return max(1, round(self.percentile * 10_000))
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        found = self._percentile(image) if self.rule == "percentile" else self._log_average(image)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        level = self._percentile(image) if self.rule == "percentile" else self._log_average(image)
         ev = 0
-        if found is not None:
+        if level is not None:
             assert self.target is not None
-            ev = round(np.log2(self.target) * STEPS) - found
+            ev = round(np.log2(self.target) * STEPS) - level
             ev = min(max(ev, round(self.min_ev * STEPS)), round(self.max_ev * STEPS))
         stops = np.array([ev / STEPS], np.float32)
         whole, rest = power_of_two(stops)
         (gain,) = (whole + whole * rest) * self.gain
-        given.estimates["metered_ev"], given.estimates["gain"] = float(stops[0]), float(gain)
+        inputs.estimates["metered_ev"], inputs.estimates["gain"] = float(stops[0]), float(gain)
         return image * gain
 
     def _circle(self, image: Floats) -> Mask:

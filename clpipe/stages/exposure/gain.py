@@ -38,7 +38,7 @@ class Gain(Method):
 
     def next_context(self, context: Context) -> Context:
         time = self.time(context.exposure_time)
-        return context.but(headroom=context.headroom + self.headroom, exposure_time=time)
+        return context.replace(headroom=context.headroom + self.headroom, exposure_time=time)
 
     def time(self, exposure_time: float | None) -> float | None:
         """The exposure time, s: EVs change it, like in a camera's bracket."""
@@ -59,5 +59,5 @@ class Gain(Method):
     def arguments(self, context: Context) -> Arguments:
         return {"gain": self.gain}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return image * self.gain

@@ -7,7 +7,7 @@ import numpy as np
 
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
-from clpipe.camera.optics import USUAL_TIME
+from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
 from clpipe.stage import Arguments, Context, ReferenceContext, parameter
 from clpipe.stages.exposure.gain import Gain
 
@@ -64,11 +64,13 @@ class Photometric(Gain):
     )
 
     def resolve(self, context: Context) -> Self:
-        return self.with_optics(context).with_defaults(f_number=8.0, exposure_time=USUAL_TIME)
+        return self.with_optics(context).with_defaults(
+            f_number=8.0, exposure_time=DEFAULT_EXPOSURE_TIME
+        )
 
     def next_context(self, context: Context) -> Context:
         headroom = context.headroom + self.headroom - math.log2(WHITE)
-        return context.but(headroom=headroom, exposure_time=self.time(self.exposure_time))
+        return context.replace(headroom=headroom, exposure_time=self.time(self.exposure_time))
 
     def factor(self, iso: float) -> np.float32:
         """Return the value of one unit of a render, over the sensor's full scale, at an ISO."""
@@ -82,5 +84,5 @@ class Photometric(Gain):
     def arguments(self, context: Context) -> Arguments:
         return {"gain": self.factor(context.iso)}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return image * self.factor(given.context.iso)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return image * self.factor(inputs.context.iso)

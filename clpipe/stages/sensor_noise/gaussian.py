@@ -37,10 +37,10 @@ class Gaussian(SensorNoise):
         names = ("a", "full_well", "read_noise", "shape", "scale")
         return (Pass(of_tukey, arguments=names, random=NoiseScope.IMAGE),)
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats | None:
         if self.tukey_lambda is None:  # here a negative signal lowers the variance below b
-            return np.maximum(self.own_variance(signal), np.float32(0)) + before
-        return super().variance(before, signal, context)
+            return np.maximum(self.added_variance(signal), np.float32(0)) + input_variance
+        return super().variance(input_variance, signal, context)
 
     def numbers(self) -> dict[str, np.float32]:
         full = float32(or_default(self.full_signal, NEVER_FULL))

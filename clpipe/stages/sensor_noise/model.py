@@ -112,7 +112,7 @@ class SensorNoise(SignalMethod):
     )
 
     @model_validator(mode="after")
-    def _one_way(self) -> Self:
+    def _check_parametrisation(self) -> Self:
         emva, paper = self._set_names(EMVA), self._set_names(PAPER)
         if emva and paper:
             raise ValueError(
@@ -159,23 +159,23 @@ class SensorNoise(SignalMethod):
         else:
             a, b = or_default(self.a, camera.a), or_default(self.b, camera.b)
             return camera if (a, b) == (camera.a, camera.b) else NoiseModel(a, b, unit)
-        for name, own, derived in (("a", self.a, model.a), ("b", self.b, model.b)):
-            if own is not None and not isclose(own, derived, rel_tol=1e-6):
+        for name, set_value, derived in (("a", self.a, model.a), ("b", self.b, model.b)):
+            if set_value is not None and not isclose(set_value, derived, rel_tol=1e-6):
                 raise RequestError(
-                    f"sensor_noise: set the noise in one parametrisation; {name} = {own:g} "
+                    f"sensor_noise: set the noise in one parametrisation; {name} = {set_value:g} "
                     f"contradicts {', '.join(names)}, which give {name} = {derived:g}"
                 )
         return model
 
     def resolve(self, context: Context) -> Self:
         model, camera = self.model(context), context.camera
-        filled = self.with_defaults(
+        resolved = self.with_defaults(
             a=model.a, b=model.b, tukey_lambda=camera.tukey_lambda_at(context.iso)
         )
-        return filled.with_defaults(full_well=camera.full_well)
+        return resolved.with_defaults(full_well=camera.full_well)
 
     def next_context(self, context: Context) -> Context:
-        return context.but(noise=self.model(context))
+        return context.replace(noise=self.model(context))
 
     def without_noise(self) -> Method | None:
         full = self.full_signal
@@ -186,11 +186,11 @@ class SensorNoise(SignalMethod):
         """The signal at which the well is full; None without a full well, or if a is 0."""
         return self.full_well * self.a if self.full_well and self.a else None
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats | None:
         """The variance a*y + b, with y clipped to 0..full well, without the cut of noise there."""
-        return self.own_variance(np.maximum(signal, np.float32(0))) + before
+        return self.added_variance(np.maximum(signal, np.float32(0))) + input_variance
 
-    def own_variance(self, signal: Floats) -> Floats:
+    def added_variance(self, signal: Floats) -> Floats:
         """The variance of this stage's noise, a*y + b, y at most the full well; signal squared."""
         y = np.minimum(signal, np.float32(or_default(self.full_signal, NEVER_FULL)))
         return y * np.float32(self.a) + np.float32(self.b)

@@ -46,8 +46,8 @@ class NoNoise(SignalMethod):
     def arguments(self, context: Context) -> Arguments:
         return {"full_signal": or_default(self.full_signal, NEVER_FULL)}
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        return before
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
+        return input_variance
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:

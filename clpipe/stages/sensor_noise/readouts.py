@@ -25,9 +25,12 @@ from clpipe.stage import (
 from clpipe.stages.sensor_noise.model import SensorNoise
 from clpipe.stages.sensor_noise.no_noise import NEVER_FULL, NoNoise, or_default
 
-RATIO = 16.0  # of a sensor whose profile has no ratio
-MOST = 4  # readouts
-ENDS, STEEP = np.float32(0.95), np.float32(10.0)  # of a transition, which begins at 0.85
+DEFAULT_RATIO = 16.0  # of a sensor whose profile has no ratio
+MAX_READOUTS = 4  # readouts
+HANDOVER_END, HANDOVER_SLOPE = (
+    np.float32(0.95),
+    np.float32(10.0),
+)  # of a transition, which begins at 0.85
 
 
 class Readout(NamedTuple):
@@ -84,11 +87,11 @@ class Readouts(SensorNoise):
         auto="merged",
         structural=True,
         ge=0,
-        le=MOST - 1,
+        le=MAX_READOUTS - 1,
     )
 
-    _range: float = PrivateAttr(1.0)  # of the camera, DN
-    _full: float | None = PrivateAttr(None)  # the signal that fills the well, without noise
+    _signal_range: float = PrivateAttr(1.0)  # of the camera, DN
+    _full_signal: float | None = PrivateAttr(None)  # the signal that fills the well, without noise
     _is_clean: bool = PrivateAttr(False)  # merges readouts that have no noise
 
     @property
@@ -103,21 +106,21 @@ class Readouts(SensorNoise):
 
     def with_camera(self, camera: Camera) -> Self:
         """Return a copy with the camera's values for everything that is not set."""
-        own = self.with_defaults(ratio=camera.readout_ratio, later_noise=camera.readout_noise)
-        return own.with_defaults(ratio=RATIO, later_noise=1.0)
+        filled = self.with_defaults(ratio=camera.readout_ratio, later_noise=camera.readout_noise)
+        return filled.with_defaults(ratio=DEFAULT_RATIO, later_noise=1.0)
 
     def resolve(self, context: Context) -> Self:
-        own = super().resolve(context).with_camera(context.camera)
-        last = len(own.readouts) - 1
-        if own.part is not None and own.part > last:
+        resolved = super().resolve(context).with_camera(context.camera)
+        last = len(resolved.readouts) - 1
+        if resolved.part is not None and resolved.part > last:
             raise RequestError(
-                f"sensor_noise.part: readout {own.part} does not exist; choose 0 to {last}"
+                f"sensor_noise.part: readout {resolved.part} does not exist; choose 0 to {last}"
             )
-        own._range = context.camera.signal_range
-        return own
+        resolved._signal_range = context.camera.signal_range
+        return resolved
 
     def next_context(self, context: Context) -> Context:
-        return super().next_context(context).but(full_scale=self.full_scale)
+        return super().next_context(context).replace(full_scale=self.full_scale)
 
     def passes(self) -> tuple[Pass, ...]:
         function, *further = self.function
@@ -132,7 +135,7 @@ class Readouts(SensorNoise):
         """The kernel function, and its arguments besides the readouts."""
         return ("readouts",)
 
-    def seen(self, image: Floats, photodiode: int) -> Floats:
+    def light_on(self, image: Floats, photodiode: int) -> Floats:
         """Return the light of one photodiode for an image, over the light of the first one."""
         return image
 
@@ -146,20 +149,20 @@ class Readouts(SensorNoise):
             return self
         if self.is_exact:
             return NoNoise(full_signal=self.full_scale)
-        own = self.model_copy(update={"a": 0.0, "b": 0.0, "tukey_lambda": None})
-        own._full, own._is_clean = self.full_signal, True
-        return own
+        clean = self.model_copy(update={"a": 0.0, "b": 0.0, "tukey_lambda": None})
+        clean._full_signal, clean._is_clean = self.full_signal, True
+        return clean
 
     @property
     def full_signal(self) -> float | None:
-        return self._full if self._is_clean else super().full_signal
+        return self._full_signal if self._is_clean else super().full_signal
 
     def numbers(self) -> dict[str, np.float32]:
         return {
             "a": float32(self.a),
             "full_well": float32(or_default(self.full_signal, NEVER_FULL)),
-            "range": float32(self._range),
-            "unit": float32(1 / self._range),
+            "range": float32(self._signal_range),
+            "unit": float32(1 / self._signal_range),
         }
 
     @property
@@ -173,39 +176,46 @@ class Readouts(SensorNoise):
         literals = {name: CompileTime(str(value)) for name, value in structure.items()}
         return {**self.numbers(), **literals, "table": self.table}
 
-    def own_variance(self, signal: Floats) -> Floats:
-        left, read = np.ones_like(signal), np.zeros_like(signal)
-        of_charges: dict[int, tuple[Floats, Floats]] = {}  # weight and shot noise by photodiode
+    def added_variance(self, signal: Floats) -> Floats:
+        remaining, read = np.ones_like(signal), np.zeros_like(signal)
+        by_photodiode: dict[int, tuple[Floats, Floats]] = {}  # weight and shot noise by photodiode
         readouts = self.readouts
         for i, (each, row) in enumerate(zip(readouts, self.table, strict=True)):
             if self.part is None:
                 is_last = i == len(readouts) - 1
-                own = left if is_last else left * self._weight(signal * row[1] * row[2])
-                left = left - own
+                weight_here = (
+                    remaining if is_last else remaining * self._weight(signal * row[1] * row[2])
+                )
+                remaining = remaining - weight_here
             else:
-                own = np.full_like(signal, i == self.part)
-            weight = of_charges.get(each.photodiode, (np.zeros_like(signal), left))[0] + own
+                weight_here = np.full_like(signal, i == self.part)
+            weight = (
+                by_photodiode.get(each.photodiode, (np.zeros_like(signal), remaining))[0]
+                + weight_here
+            )
             light, scale = signal * row[1], row[2] * row[3]
-            of_charges[each.photodiode] = weight, np.float32(self.a) * light * scale**2
-            read = read + own**2 * row[4] * row[3] ** 2
-        shot = sum(weight**2 * variance for weight, variance in of_charges.values())
+            by_photodiode[each.photodiode] = weight, np.float32(self.a) * light * scale**2
+            read = read + weight_here**2 * row[4] * row[3] ** 2
+        shot = sum(weight**2 * variance for weight, variance in by_photodiode.values())
         return np.asarray(shot + read, np.float32)
 
     @staticmethod
     def _weight(read: Floats) -> Floats:
         """Return the weight of a readout in the merged signal, from its own signal."""
-        return np.minimum(np.maximum((ENDS - read) * STEEP, np.float32(0)), np.float32(1))
+        return np.minimum(
+            np.maximum((HANDOVER_END - read) * HANDOVER_SLOPE, np.float32(0)), np.float32(1)
+        )
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         def normals(draw: int) -> Floats:
-            return normal_at(image.shape, draw, given.stream[NoiseScope.IMAGE])
+            return normal_at(image.shape, draw, inputs.stream[NoiseScope.IMAGE])
 
         n = self.numbers()
         values, weights = [], []
         photodiode, charge = -1, image
         for i, (number, share, gain, inverse, variance) in enumerate(self.table):
             if int(number) != photodiode:
-                photodiode, light = int(number), self.seen(image, int(number)) * share
+                photodiode, light = int(number), self.light_on(image, int(number)) * share
                 if not self._is_clean:
                     shot = square_root(np.maximum(n["a"] * light, np.float32(0)))
                     light = light + normals(photodiode) * shot
@@ -213,7 +223,7 @@ class Readouts(SensorNoise):
             read = charge * gain
             if not self._is_clean:
                 sigma = square_root(np.full(image.shape, variance, np.float32))
-                noise = normals(MOST + i) * sigma
+                noise = normals(MAX_READOUTS + i) * sigma
                 read = np.rint((read + noise) * n["range"]) * n["unit"]
             read = np.minimum(read, np.float32(1))
             values.append(read * inverse)

@@ -7,10 +7,10 @@ from clpipe.camera.profile import Camera
 from clpipe.stage import parameter
 from clpipe.stages.sensor_noise.readouts import Readout, Readouts
 
-LIGHT_RATIO = 100.0  # of a sensor whose profile has no ratio
+DEFAULT_LIGHT_RATIO = 100.0  # of a sensor whose profile has no ratio
 
 
-class Split(Readouts):
+class SplitPhotodiode(Readouts):
     """Pixels with a large and a small photodiode, side by side.
 
     A share ``crosstalk`` of the light under the large photodiode makes charge in the small one. The
@@ -29,11 +29,13 @@ class Split(Readouts):
     )
 
     def with_camera(self, camera: Camera) -> Self:
-        own = super().with_camera(camera)
-        return own.with_defaults(crosstalk=camera.photodiode_crosstalk).with_defaults(crosstalk=0.0)
+        filled = super().with_camera(camera)
+        return filled.with_defaults(crosstalk=camera.photodiode_crosstalk).with_defaults(
+            crosstalk=0.0
+        )
 
 
-class SplitPixel(Split):
+class SplitPixel(SplitPhotodiode):
     """Split pixels: a large and a small photodiode; the small one sees 1/``ratio`` of the light.
 
     >>> import numpy as np
@@ -53,7 +55,7 @@ class SplitPixel(Split):
         return Readout(0, 1, 1), Readout(1, 1 / self.ratio, 1, self.crosstalk or 0.0)
 
 
-class SplitDualGain(Split):
+class SplitDualGain(SplitPhotodiode):
     """Split pixels whose photodiodes are both read at two gains, ``ratio`` apart: four readouts.
 
     The least sensitive readout of the large photodiode must extend beyond the most sensitive one of
@@ -72,15 +74,15 @@ class SplitDualGain(Split):
     )
 
     def with_camera(self, camera: Camera) -> Self:
-        own = super().with_camera(camera).with_defaults(light_ratio=camera.photodiode_ratio)
-        own = own.with_defaults(light_ratio=LIGHT_RATIO)
-        assert own.light_ratio is not None and own.ratio is not None
-        if own.light_ratio <= own.ratio:
+        filled = super().with_camera(camera).with_defaults(light_ratio=camera.photodiode_ratio)
+        filled = filled.with_defaults(light_ratio=DEFAULT_LIGHT_RATIO)
+        assert filled.light_ratio is not None and filled.ratio is not None
+        if filled.light_ratio <= filled.ratio:
             raise RequestError(
-                f"sensor_noise.light_ratio must be above the ratio of the gains, {own.ratio:g}; "
-                f"it is {own.light_ratio:g}"
+                f"sensor_noise.light_ratio must be above the ratio of the gains, {filled.ratio:g}; "
+                f"it is {filled.light_ratio:g}"
             )
-        return own
+        return filled
 
     @property
     def readouts(self) -> tuple[Readout, ...]:

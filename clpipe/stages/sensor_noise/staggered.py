@@ -9,9 +9,9 @@ from pydantic import PrivateAttr
 from clpipe.base.types import Floats
 from clpipe.reference.filter_array import LANES
 from clpipe.stage import Arguments, Context, Span, parameter
-from clpipe.stages.sensor_noise.readouts import MOST, Readout, Readouts
+from clpipe.stages.sensor_noise.readouts import MAX_READOUTS, Readout, Readouts
 
-NOTHING = np.zeros((MOST - 1, 1, 1), np.float32)  # exists before there is an image
+NO_IMAGES = np.zeros((MAX_READOUTS - 1, 1, 1), np.float32)  # exists before there is an image
 
 
 class Staggered(Readouts):
@@ -26,11 +26,11 @@ class Staggered(Readouts):
     summary: ClassVar = "two to four exposures, each shorter than the one before, merged"
     other_examples: ClassVar = ({"count": 4},)
 
-    count: int = parameter(3, "Number of exposures.", structural=True, ge=2, le=MOST)
+    count: int = parameter(3, "Number of exposures.", structural=True, ge=2, le=MAX_READOUTS)
 
-    _is_apart: bool = PrivateAttr(False)  # each exposure sees different light
+    _light_changes: bool = PrivateAttr(False)  # each exposure sees different light
     # the light of all exposures but the first, of an image
-    _later: Floats | None = PrivateAttr(None)
+    _later_images: Floats | None = PrivateAttr(None)
 
     @property
     def readouts(self) -> tuple[Readout, ...]:
@@ -38,46 +38,52 @@ class Staggered(Readouts):
         return tuple(Readout(i, self.ratio**-i, 1) for i in range(self.count))
 
     def resolve(self, context: Context) -> Self:
-        own = super().resolve(context)
-        own._is_apart = context.light_changes
-        return own
+        resolved = super().resolve(context)
+        resolved._light_changes = context.light_changes
+        return resolved
 
     @property
     def spans(self) -> tuple[Span, ...]:
         """Return how many exposures the (resolved) method needs; 1 if all see the same light."""
         lengths = [each.share for each in self.readouts]
         starts = accumulate(lengths, initial=0.0)
-        is_open = self._is_apart and self._later is None
-        return tuple(map(Span, starts, lengths)) if is_open else (Span(),)
+        needs_images = self._light_changes and self._later_images is None
+        return tuple(map(Span, starts, lengths)) if needs_images else (Span(),)
 
-    def with_later(self, images: Floats) -> Self:
+    def with_later_images(self, images: Floats) -> Self:
         """Return the (resolved) method with the light of all exposures but the first.
 
         Args:
             images: of the method's kind, (exposure, height, width).
         """
         other = self.model_copy()
-        other._later = images
+        other._later_images = images
         return other
 
     @property
     def is_exact(self) -> bool:
-        return super().is_exact and not self._is_apart
+        return super().is_exact and not self._light_changes
 
     @property
     def function(self) -> tuple[str, ...]:
-        return ("exposures", "later", "columns", "rows") if self._is_apart else super().function
+        return (
+            ("exposures", "later", "columns", "rows") if self._light_changes else super().function
+        )
 
     def arguments(self, context: Context) -> Arguments:
-        if not self._is_apart:
+        if not self._light_changes:
             return super().arguments(context)
-        later = NOTHING if self._later is None else self._later
+        later = NO_IMAGES if self._later_images is None else self._later_images
         later = np.pad(later, ((0, 0), (0, 0), (0, LANES)))
         rows, columns = (np.int32(size) for size in later.shape[1:])
         return {**super().arguments(context), "later": later, "columns": columns, "rows": rows}
 
-    def seen(self, image: Floats, photodiode: int) -> Floats:
-        return image if self._later is None or not photodiode else self._later[photodiode - 1]
+    def light_on(self, image: Floats, photodiode: int) -> Floats:
+        return (
+            image
+            if self._later_images is None or not photodiode
+            else self._later_images[photodiode - 1]
+        )
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
-        return None if self._is_apart else super().variance(before, signal, context)
+    def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats | None:
+        return None if self._light_changes else super().variance(input_variance, signal, context)

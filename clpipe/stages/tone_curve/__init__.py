@@ -22,7 +22,7 @@ from clpipe.stage import (
 )
 from clpipe.stages.tone_curve.neutral import Neutral
 from clpipe.stages.tone_curve.standard import Standard
-from clpipe.stages.tone_curve.table import table_of
+from clpipe.stages.tone_curve.table import load_table
 
 CAMERA_RAW = str(resources.files("clpipe.stages.tone_curve") / "camera_raw.csv")
 
@@ -38,7 +38,7 @@ class CameraRaw(Curve):
     summary: ClassVar = "the default curve of Adobe Camera Raw (DNG SDK), on each channel"
 
     def table(self) -> Floats:
-        return table_of(CAMERA_RAW)
+        return load_table(CAMERA_RAW)
 
 
 class Linear(Method):
@@ -68,7 +68,7 @@ class Linear(Method):
     def arguments(self, context: Context) -> Arguments:
         return {"gain": self.gain}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return image * self.gain
 
 
@@ -78,7 +78,7 @@ class File(Curve):
     method: ClassVar = "file"
     summary: ClassVar = "a curve from a .csv (x,y; monotone cubic) or one-dimensional .cube file"
 
-    read: ClassVar = staticmethod(table_of)
+    read: ClassVar = staticmethod(load_table)
 
     path: str = parameter(
         CAMERA_RAW,
@@ -89,7 +89,7 @@ class File(Curve):
 
     @field_validator("path")
     @classmethod
-    def _readable(cls, path: str) -> str:
+    def _check_file(cls, path: str) -> str:
         cls.read(path)
         return path
 

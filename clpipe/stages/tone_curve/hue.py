@@ -7,10 +7,10 @@ import numpy as np
 from clpipe.base.types import Floats
 
 
-def inside_of(image: Floats) -> Floats:
+def clip_to_unit(image: Floats) -> Floats:
     """Return an image clipped to 0..1, of any shape; NaN becomes 0.
 
-    >>> inside_of(np.float32([-0.25, np.nan, 0.5, 2])).tolist()
+    >>> clip_to_unit(np.float32([-0.25, np.nan, 0.5, 2])).tolist()
     [0.0, 0.0, 0.5, 1.0]
     """
     return np.asarray(np.clip(np.nan_to_num(image), np.float32(0), np.float32(1)))
@@ -29,7 +29,7 @@ def keep_hue(image: Floats, curve: Callable[[Floats], Floats]) -> Floats:
     >>> keep_hue(np.float32([[[0.25, 0.5, 1]]]), np.sqrt).round(3).tolist()
     [[[0.5, 0.6669999957084656, 1.0]]]
     """
-    inside = inside_of(image)
+    inside = clip_to_unit(image)
     low, high = inside.min(-1, keepdims=True), inside.max(-1, keepdims=True)
     to_low, to_high = curve(low), curve(high)
     slope = (to_high - to_low) / np.maximum(high - low, np.float32(1e-6))

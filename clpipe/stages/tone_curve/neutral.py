@@ -55,5 +55,5 @@ class Neutral(Method):
     def arguments(self, context: Context) -> Arguments:
         return {"a": A, "b": B, "c": C, "d": D, "twist": A * D - B * C}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return keep_hue(image, neutral)

@@ -8,12 +8,14 @@ import numpy as np
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, parameter
-from clpipe.stages.tone_curve.hue import inside_of
+from clpipe.stages.tone_curve.hue import clip_to_unit
 
 # 18 % grey with one stop of headroom, and its result, which is nearly as bright as in sRGB.
 GREY, GREY_OUT = 0.09, 0.173
 NAMES = ("grey", "a", "b", "c", "d", "bright_a", "bright_b", "bright_c", "bright_d")
-WHITER = 0.5  # loss of colourfulness towards the brightest highlights, which turn white
+HIGHLIGHT_DESATURATION = (
+    0.5  # loss of colourfulness towards the brightest highlights, which turn white
+)
 
 
 @dataclass(frozen=True)
@@ -141,10 +143,13 @@ class Standard(Method):
 
     def colourfulness(self, high: Floats) -> Floats:
         """Return the share of the distance from grey that remains, by the largest colour."""
-        return np.asarray(np.float32(self.saturation) - np.float32(WHITER) * np.square(high * high))
+        return np.asarray(
+            np.float32(self.saturation)
+            - np.float32(HIGHLIGHT_DESATURATION) * np.square(high * high)
+        )
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        inside = inside_of(image)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        inside = clip_to_unit(image)
         high = inside.max(-1, keepdims=True)
         to_high = self.curve(high)
         part = self.colourfulness(high) * (to_high / np.maximum(high, np.float32(1e-9)))

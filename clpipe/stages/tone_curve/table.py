@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from clpipe.base.reading import read_text, read_when_changed
+from clpipe.base.reading import cached_by_mtime, read_text
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.curve import tabulate
 
@@ -153,7 +153,7 @@ FORMATS: dict[str, tuple[Callable[[str], Knots], Callable[[Knots, Doubles], Doub
 }
 
 
-def table_of(path: str) -> Floats:
+def load_table(path: str) -> Floats:
     """Return the table of a file's curve, see :mod:`clpipe.reference.curve`.
 
     A changed file is read again.
@@ -162,15 +162,15 @@ def table_of(path: str) -> Floats:
         ValueError: the file cannot be read, has an unknown format, or contains no curve.
     """
     try:
-        return _table_of(path)
+        return _load_table(path)
     except OSError as error:
         raise ValueError(f"cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise ValueError("not a text file") from None
 
 
-@read_when_changed
-def _table_of(path: str) -> Floats:
+@cached_by_mtime
+def _load_table(path: str) -> Floats:
     ending = Path(path).suffix.lower()
     if ending not in FORMATS:
         raise ValueError(f"expected a file with the extension {' or '.join(FORMATS)}")

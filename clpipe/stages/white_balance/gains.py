@@ -24,7 +24,7 @@ from clpipe.stage import (
     period_of,
 )
 
-ALIKE = parse_array("G")  # a filter array whose pixels all have the same level
+UNIFORM_ARRAY = parse_array("G")  # a filter array whose pixels all have the same level
 
 
 def apply_gains(image: Floats, context: Context, red: np.float32, blue: np.float32) -> Floats:
@@ -44,9 +44,9 @@ class EstimatedGains(Method):
     def next_context(self, context: Context) -> Context:
         # The estimates are known only when the image is processed; the as-shot gains replace them
         # here.
-        return context.but(applied_gains=context.gains, full_scale=1.0)
+        return context.replace(applied_gains=context.gains, full_scale=1.0)
 
-    def search(self) -> Pass:
+    def estimation_pass(self) -> Pass:
         """The pass that estimates "red_gain" and "blue_gain"."""
         raise NotImplementedError(type(self).__name__)
 
@@ -55,13 +55,13 @@ class EstimatedGains(Method):
         raise NotImplementedError(type(self).__name__)
 
     def passes(self) -> tuple[Pass, ...]:
-        search = self.search()
-        return search, APPLY
+        estimation_pass = self.estimation_pass()
+        return estimation_pass, APPLY
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        red, blue = self.gains(image, given.context.pattern)
-        given.estimates["red_gain"], given.estimates["blue_gain"] = float(red), float(blue)
-        return apply_gains(image, given.context, red, blue)
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        red, blue = self.gains(image, inputs.context.pattern)
+        inputs.estimates["red_gain"], inputs.estimates["blue_gain"] = float(red), float(blue)
+        return apply_gains(image, inputs.context, red, blue)
 
 
 def gain_parameter(colour: str, text: str = "Gain", auto: str = "from the camera") -> Any:
@@ -86,7 +86,7 @@ class CameraGains(Method):
         return self.red_gain, self.blue_gain
 
 
-class OfArray(CameraGains):
+class ArrayMethod(CameraGains):
     """Gains on a filter array that is no Bayer pattern: one for each of its channels."""
 
     kernel: ClassVar = "filter_array"
@@ -96,15 +96,15 @@ class OfArray(CameraGains):
     _array: FilterArray = PrivateAttr()
 
     @classmethod
-    def on(cls, array: FilterArray, own: CameraGains) -> Self:
+    def for_array(cls, array: FilterArray, gains: CameraGains) -> Self:
         """The (resolved) gains on a filter array."""
-        made = cls(**dict(own))
-        made._array = replace(array, gains=own.gains)
-        return made
+        method = cls(**dict(gains))
+        method._array = replace(array, gains=gains.gains)
+        return method
 
     def next_context(self, context: Context) -> Context:
         array = self._array.with_gains(self.gains, self.inverse)
-        return super().next_context(context).but(array=array)
+        return super().next_context(context).replace(array=array)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass(self.function, arguments=("factors", *PERIOD)),)
@@ -118,7 +118,7 @@ class OfArray(CameraGains):
         rows, columns = self._array.period
         return tiled(levels_table(self._array, self.inverse)[:rows, :columns], shape)
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return np.minimum(image * self.factors_at(image.shape), np.float32(1))
 
 
@@ -137,11 +137,11 @@ class Gains(CameraGains):
     any_array: ClassVar = True
 
     def resolve(self, context: Context) -> CameraGains:
-        own = super().resolve(context)
-        return ArrayGains.on(context.array, own) if context.array else own
+        resolved = super().resolve(context)
+        return ArrayGains.for_array(context.array, resolved) if context.array else resolved
 
     def next_context(self, context: Context) -> Context:
-        return context.but(applied_gains=self.gains, full_scale=1.0)
+        return context.replace(applied_gains=self.gains, full_scale=1.0)
 
     def passes(self) -> tuple[Pass, ...]:
         return (APPLY,)
@@ -150,11 +150,11 @@ class Gains(CameraGains):
         red, blue = map(float32, self.gains)
         return {"pattern": context.cfa, "red_gain": red, "blue_gain": blue}
 
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return apply_gains(image, given.context, *map(np.float32, self.gains))
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        return apply_gains(image, inputs.context, *map(np.float32, self.gains))
 
 
-class ArrayGains(OfArray, Gains):
+class ArrayGains(ArrayMethod, Gains):
     """Fixed gains on any filter array."""
 
 
@@ -169,19 +169,19 @@ class AsShot(Gains):
 
     def resolve(self, context: Context) -> CameraGains:
         red, blue = context.gains
-        own = self.with_defaults(red_gain=red, blue_gain=blue)
+        resolved = self.with_defaults(red_gain=red, blue_gain=blue)
         if context.array is None:
-            return own
-        is_white = context.array.is_balanced and own.gains == (1.0, 1.0)
-        return ArrayAsShot.on(ALIKE if is_white else context.array, own)
+            return resolved
+        is_white = context.array.is_balanced and resolved.gains == (1.0, 1.0)
+        return ArrayAsShot.for_array(UNIFORM_ARRAY if is_white else context.array, resolved)
 
 
-class ArrayAsShot(OfArray, AsShot):
+class ArrayAsShot(ArrayMethod, AsShot):
     """As-shot gains on any filter array; if white is 1 in the mosaic, no channel changes."""
 
     def next_context(self, context: Context) -> Context:
         after = super().next_context(context)
-        return after.but(array=context.array) if self._array == ALIKE else after
+        return after.replace(array=context.array) if self._array == UNIFORM_ARRAY else after
 
 
 class Unbalanced(Unchanged):

@@ -21,7 +21,7 @@ class GrayWorld(EstimatedGains):
     kernel: ClassVar = "gray_world"
     summary: ClassVar = "make the means of the three colours equal"
 
-    def search(self) -> Pass:
+    def estimation_pass(self) -> Pass:
         find = Reduction("gray_world", ("red_gain", "blue_gain"), ("pattern",))
         return Pass("gray_world_sample", find)
 

@@ -68,7 +68,7 @@ class WhitePatch(EstimatedGains):
     def _millionths(self) -> int:
         return max(1, round(self.percentile * 10_000))
 
-    def search(self) -> Pass:
+    def estimation_pass(self) -> Pass:
         return Pass(
             "white_patch_bin",
             Reduction("white_patch", ("red_gain", "blue_gain"), ("millionths",), bins=3 * STEPS),
