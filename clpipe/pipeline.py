@@ -12,9 +12,9 @@ from xxhash import xxh3_64_hexdigest
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
-from clpipe.base.text import one_of, several
+from clpipe.base.text import as_texts, unknown_name
 from clpipe.base.types import Array, plain
-from clpipe.base.validation import typed
+from clpipe.base.validation import check_argument_types
 from clpipe.chain.chain import Chain
 from clpipe.chain.depth import depth_of_array
 from clpipe.chain.entering import prepare_image
@@ -66,7 +66,7 @@ class Pipeline(ReadOnly):
         DeviceError: there is no usable device.
     """
 
-    @typed
+    @check_argument_types
     def __init__(
         self,
         config: str | Path | Sequence[str | Path] = "default",
@@ -77,12 +77,12 @@ class Pipeline(ReadOnly):
         until: str | None = None,
         **settings: "Unpack[Keywords]",
     ) -> None:
-        self._settings = overlay(load_settings(*several(config)), plain(settings))
+        self._settings = overlay(load_settings(*as_texts(config)), plain(settings))
         self._ends = start_at, until
         self._numbers = itertools.count()
         self._lock = threading.Lock()  # lets one thread use the device at a time
         chain = self._chain(self._settings)
-        kept = chain.select(several(keep))
+        kept = chain.select(as_texts(keep))
         encode = chain.result is Kind.DISPLAY
         on = open_device(None if device is None else str(device))
         self._runner = Runner(chain, on, kept, encode=encode, final=not encode)
@@ -227,7 +227,7 @@ class Pipeline(ReadOnly):
             RequestError: a name or value is not allowed.
         """
         if kind not in RESAMPLING:
-            raise RequestError(one_of("kind", str(kind), RESAMPLING))
+            raise RequestError(unknown_name("kind", str(kind), RESAMPLING))
         layer = as_array(layer, "layer")
         if layer.ndim not in (2, 3) or not layer.size:
             raise ImageError(f"found a layer of {layer.shape}; expected (height, width[, channel])")

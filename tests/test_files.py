@@ -11,7 +11,7 @@ import pytest
 
 from clpipe.base import files
 from clpipe.base.errors import ImageError, OutputError
-from clpipe.base.files import FileGroup, deferred_files, keep_names, write_whole
+from clpipe.base.files import FileGroup, deferred_files, sync_folder, write_atomic
 from clpipe.batch.outcome import DONE, Outcome
 from clpipe.batch.run_log import RunLog, read_log
 from clpipe.inputs.find import Job
@@ -28,34 +28,34 @@ def test_a_file_that_the_disk_does_not_hold_stays_as_it_was(tmp_path, size, befo
     if before:
         path.write_bytes(before)
     with file_limit(size), pytest.raises(ImageError, match=r"a\.bin: cannot be written: File too"):
-        write_whole(path, *PARTS)
+        write_atomic(path, *PARTS)
     assert [p.read_bytes() for p in tmp_path.iterdir()] == ([before] if before else [])
     with file_limit(len(WHOLE)):
-        assert write_whole(path, *PARTS).size == len(WHOLE)
+        assert write_atomic(path, *PARTS).size == len(WHOLE)
     assert path.read_bytes() == WHOLE
 
 
 def test_an_error_in_between_leaves_the_file_as_it_was(tmp_path):
-    write_whole(tmp_path / "a", b"before")
+    write_atomic(tmp_path / "a", b"before")
     with pytest.raises(TypeError):
-        write_whole(tmp_path / "a", b"after", "no bytes")
+        write_atomic(tmp_path / "a", b"after", "no bytes")
     assert [p.read_bytes() for p in tmp_path.iterdir()] == [b"before"]
 
 
 def test_deferred_files_are_on_the_disk_before_they_have_names(tmp_path, monkeypatch):
     done = []
-    monkeypatch.setattr(files, "file_to_disk", lambda path: done.append("disk"))
+    monkeypatch.setattr(files, "sync_file", lambda path: done.append("disk"))
     replace = Path.replace
     renamed = lambda path, to: done.append(to.name) or replace(path, to)  # noqa: E731
     monkeypatch.setattr(Path, "replace", renamed)
     groups = []
     for letter in "ab":
         with deferred_files() as group:
-            write_whole(tmp_path / f"{letter}.jpg", PARTS[0])
-            write_whole(tmp_path / f"{letter}.json", PARTS[1])
-            keep_names(tmp_path)
+            write_atomic(tmp_path / f"{letter}.jpg", PARTS[0])
+            write_atomic(tmp_path / f"{letter}.json", PARTS[1])
+            sync_folder(tmp_path)
         groups.append(group)
-    write_whole(tmp_path / "c", b"not deferred")
+    write_atomic(tmp_path / "c", b"not deferred")
     assert [p.name for p in tmp_path.iterdir() if p.name[0] != "."] == ["c"]
     done.clear()
     assert FileGroup.commit(groups) == [None, None]
@@ -70,8 +70,8 @@ def test_a_group_that_fails_leaves_nothing_and_the_others_are_whole(tmp_path):
     for letter in "abc":
         (tmp_path / letter).mkdir()
         with deferred_files() as group:
-            write_whole(tmp_path / letter / "picture", b"x")
-            write_whole(tmp_path / letter / "sidecar", b"y")
+            write_atomic(tmp_path / letter / "picture", b"x")
+            write_atomic(tmp_path / letter / "sidecar", b"y")
         groups.append(group)
     (tmp_path / "b/sidecar").mkdir()  # a folder, which no file can replace
     first, second, third = FileGroup.commit(groups)
@@ -88,13 +88,13 @@ def test_an_error_that_nobody_expected_leaves_no_part_of_a_group(tmp_path, monke
     groups = []
     for letter in "ab":
         with deferred_files() as group:
-            write_whole(tmp_path / letter, b"x")
+            write_atomic(tmp_path / letter, b"x")
         groups.append(group)
 
     def fail(path):
         raise MemoryError
 
-    monkeypatch.setattr(files, "file_to_disk", fail)
+    monkeypatch.setattr(files, "sync_file", fail)
     with pytest.raises(MemoryError):
         FileGroup.commit(groups)
     assert not list(tmp_path.iterdir())
@@ -102,19 +102,19 @@ def test_an_error_that_nobody_expected_leaves_no_part_of_a_group(tmp_path, monke
 
 def write_and_fail(path):
     with deferred_files():
-        write_whole(path, b"x")
+        write_atomic(path, b"x")
         raise TypeError
 
 
 WRITING_WHILE_IT_ENDS = """
 import os, sys, threading, time
 from pathlib import Path
-from clpipe.base.files import deferred_files, remove_temporary_files, write_whole
+from clpipe.base.files import deferred_files, remove_temporary_files, write_atomic
 
 def write(name):
     with deferred_files():
         for i in range(10**9):
-            write_whole(folder / f"{name}{i % 50}", bytes(4096))
+            write_atomic(folder / f"{name}{i % 50}", bytes(4096))
             if i == 50:
                 writing.wait()
 
@@ -138,20 +138,20 @@ def test_no_link_is_followed(tmp_path, monkeypatch):
     monkeypatch.setattr(files.secrets, "token_hex", lambda count: "00000000")
     (tmp_path / ".a.00000000.part.bin").symlink_to("victim")
     with pytest.raises(ImageError, match="File exists"):
-        write_whole(tmp_path / "a.bin", b"new")
+        write_atomic(tmp_path / "a.bin", b"new")
     monkeypatch.undo()
     (tmp_path / "a.bin").symlink_to("victim")
-    write_whole(tmp_path / "a.bin", b"new")  # the link is replaced, and not what it leads to
+    write_atomic(tmp_path / "a.bin", b"new")  # the link is replaced, and not what it leads to
     assert (tmp_path / "victim").read_text() == "keep"
     assert (tmp_path / "a.bin").read_bytes() == b"new"
 
 
 def test_the_longest_name_that_a_disk_takes(tmp_path):
     name = "é" * 125 + ".json"
-    write_whole(tmp_path / name, b"x")
+    write_atomic(tmp_path / name, b"x")
     assert [p.name for p in tmp_path.iterdir()] == [name]
     with pytest.raises(ImageError, match="File name too long"):
-        write_whole(tmp_path / f"x{name}", b"x")
+        write_atomic(tmp_path / f"x{name}", b"x")
 
 
 def outcome(number):

@@ -18,7 +18,7 @@ import pytest
 from clpipe.base.digests import digests
 from clpipe.base.errors import ClpipeError, ImageError, RequestError
 from clpipe.base.files import sha256_of
-from clpipe.base.reading import unchanged
+from clpipe.base.reading import check_unchanged
 from clpipe.batch.replay import replay_of
 from clpipe.batch.tars import Members, is_own
 from clpipe.camera.profile import load_camera
@@ -298,12 +298,12 @@ def test_a_link_to_a_file_is_a_file(tmp_path):
 def test_a_file_that_changes_while_it_is_read_is_refused(tmp_path):
     path = tmp_path / "a.exr"
     path.write_bytes(b"1234")
-    with unchanged(path):
+    with check_unchanged(path):
         path.read_bytes()
     for change in (lambda: path.write_bytes(b"12345"), path.unlink):
         with (
             pytest.raises(ImageError, match=r"a\.exr: the file changed while it was read"),
-            unchanged(path),
+            check_unchanged(path),
         ):
             change()
 

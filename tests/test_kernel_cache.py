@@ -13,7 +13,7 @@ import pytest
 
 from clpipe.base import process_folder, system
 from clpipe.base.errors import DeviceError
-from clpipe.base.memory import Left
+from clpipe.base.memory import FreeMemory
 from clpipe.engine import builders, cache_folder
 from clpipe.engine.builders import BinaryBuilder, PoclBuilder
 from clpipe.engine.store import Store
@@ -115,17 +115,17 @@ def test_a_packed_program_is_put_back(tmp_path):
     put(program / "program.bc", b"bytecode")
     put(program / "last_accessed")
     put(program / "f/8-1-1/f.so", b"library")
-    assert builders._programs_in(tmp_path / "one") == {"AB/CDEF"}
-    files = builders._files_of(program)
+    assert builders._list_programs(tmp_path / "one") == {"AB/CDEF"}
+    files = builders._list_files(program)
     assert files == {"program.bc", "f/8-1-1/f.so"}
-    builders._unpack(builders._packed(tmp_path / "one", "AB/CDEF", files), tmp_path / "two")
-    assert builders._files_of(tmp_path / "two/AB/CDEF") == files
+    builders._unpack(builders._pack(tmp_path / "one", "AB/CDEF", files), tmp_path / "two")
+    assert builders._list_files(tmp_path / "two/AB/CDEF") == files
     assert (tmp_path / "two/AB/CDEF/f/8-1-1/f.so").read_bytes() == b"library"
 
 
 def test_a_library_in_use_is_not_written_to(tmp_path):
     path = put(tmp_path / "one/AB/CDEF/f.so", b"library")
-    packed = builders._packed(tmp_path / "one", "AB/CDEF", frozenset({"f.so"}))
+    packed = builders._pack(tmp_path / "one", "AB/CDEF", frozenset({"f.so"}))
     path.write_bytes(b"running")
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
         builders._unpack(packed, tmp_path / "one")
@@ -144,16 +144,16 @@ def test_nothing_is_put_elsewhere(tmp_path):
 
 
 def test_without_room_to_compile_pocl_is_not_asked(tmp_path, monkeypatch):
-    monkeypatch.setattr(builders, "has_room", lambda _: False)
+    monkeypatch.setattr(builders, "has_free_space", lambda _: False)
     builder = PoclBuilder(None, Store(None), tmp_path / "pocl")
     with pytest.raises(DeviceError, match=r"needs 32 MiB of free space there .* TMPDIR"):
         builder.build(TEXT, [])
     monkeypatch.undo()
     with pytest.raises(DeviceError, match=r"removed while this process used it .* start again"):
         PoclBuilder(None, Store(None), tmp_path / "gone" / "pocl").build(TEXT, [])
-    monkeypatch.setattr(builders, "has_room", lambda _: True)
+    monkeypatch.setattr(builders, "has_free_space", lambda _: True)
     monkeypatch.setattr(PoclBuilder, "_has_compiled", False)
-    monkeypatch.setattr(builders, "memory_left", lambda: Left(50 << 20, "ulimit -v"))
+    monkeypatch.setattr(builders, "free_memory", lambda: FreeMemory(50 << 20, "ulimit -v"))
     with pytest.raises(DeviceError, match=r"needs about 112.0 MiB .* 50.0 MiB are left by ulimit"):
         builder.build(TEXT, [])
 
@@ -252,11 +252,11 @@ def test_a_new_folder_that_another_process_removes_is_made_again(tmp_path, monke
     def removed_once(**options):
         made.append(Path(make(**options)))
         if len(made) == 1:
-            process_folder._remove_if_left(made[0])
+            process_folder._remove_unlocked(made[0])
         return made[-1]
 
     monkeypatch.setattr(process_folder.tempfile, "mkdtemp", removed_once)
-    assert process_folder._folder_in(tmp_path) == made[1].resolve()
+    assert process_folder._create_folder(tmp_path) == made[1].resolve()
     assert made[1].is_dir() and not made[0].exists()
 
 
@@ -288,7 +288,7 @@ def test_a_parent_that_somebody_else_made_is_passed_over(tmp_path):
 
 def test_a_folder_needs_room_and_the_right_to_run_programs(tmp_path, monkeypatch):
     fresh = process_folder.process_folder.__wrapped__
-    monkeypatch.setattr(process_folder, "temporary_places", lambda: [tmp_path])
+    monkeypatch.setattr(process_folder, "temporary_folders", lambda: [tmp_path])
     with monkeypatch.context() as patch:
         patch.setattr(process_folder, "forbids_programs", lambda _: True)
         assert fresh() is None

@@ -11,7 +11,7 @@ import pytest
 
 from clpipe.base import memory
 from clpipe.base.errors import DeviceError, ImageError, RequestError
-from clpipe.base.memory import Left
+from clpipe.base.memory import FreeMemory
 from clpipe.batch import memory_budget
 from clpipe.batch.memory_budget import LEAST, STARTING, MemoryBudget, needed
 from clpipe.batch.threads import Batch
@@ -32,7 +32,7 @@ class SharingDevice:
         self.memory, self.bytes_held = limit, held
         self.limits = []
 
-    def limit(self, limit):
+    def limit_memory(self, limit):
         self.memory, self.bytes_held = limit, 0
         self.limits.append(limit)
 
@@ -40,7 +40,7 @@ class SharingDevice:
 def budget_of(free, *devices, size=None, drop=lambda: None):
     """A budget in which so many bytes are free, less what devices hold."""
     budget = MemoryBudget(
-        size, devices, drop, lambda: Left(free - sum(d.bytes_held for d in devices), "x")
+        size, devices, drop, lambda: FreeMemory(free - sum(d.bytes_held for d in devices), "x")
     )
     for _ in devices:
         budget.device_ready()
@@ -131,7 +131,7 @@ def test_for_a_large_image_devices_hold_little():
 def test_what_was_taken_before_may_be_freed_late(clock):
     freed = memory_budget.PATIENCE / 2  # s
     budget = MemoryBudget(
-        None, (), left=lambda: Left((60 if 0 < clock[0] < freed else 200) * MIB, "")
+        None, (), left=lambda: FreeMemory((60 if 0 < clock[0] < freed else 200) * MIB, "")
     )
     budget.acquire("a", 150 * MIB)
     budget.release("a")
@@ -141,7 +141,9 @@ def test_what_was_taken_before_may_be_freed_late(clock):
 
 
 def test_large_images_wait_for_the_compiler():
-    budget = MemoryBudget(None, (SharingDevice(0),), left=lambda: Left(STARTING + 100 * MIB, ""))
+    budget = MemoryBudget(
+        None, (SharingDevice(0),), left=lambda: FreeMemory(STARTING + 100 * MIB, "")
+    )
     budget.acquire("small", 10 * MIB)
     budget.release("small")
     large = Entering(budget, "large", 150 * MIB)
@@ -160,7 +162,7 @@ def test_nothing_is_let_in_at_the_end():
 
 def test_small_images_are_not_slowed_by_measuring(clock):
     count = []
-    budget = MemoryBudget(None, (), left=lambda: count.append(1) or Left(2**34, ""))
+    budget = MemoryBudget(None, (), left=lambda: count.append(1) or FreeMemory(2**34, ""))
     for number in range(100):
         budget.acquire(str(number), MIB)
     assert len(count) == 1
@@ -191,7 +193,7 @@ def test_one_that_is_too_large_costs_one_line(write_exr, clpipe, tmp_path, monke
     for i in range(3):
         write_exr(f"in/r{i}.exr", np.full((8, 12, 3), 0.2, np.float32))
     (tmp_path / "in" / "b.pfm").write_bytes(b"PF\n6000 4000\n-1.0\n")
-    monkeypatch.setattr(memory_budget, "memory_left", lambda: Left(300 * MIB, "a limit"))
+    monkeypatch.setattr(memory_budget, "free_memory", lambda: FreeMemory(300 * MIB, "a limit"))
     for _ in range(2):
         result = clpipe("run", "in", "-o", "out", "--device", "numpy", status=1)
         lines = [line for line in result.stderr.splitlines() if "b.pfm" in line]
@@ -211,15 +213,15 @@ def test_threads_that_cannot_be_started_are_one_line(monkeypatch):
 
 
 def test_address_space_counts(tmp_path, monkeypatch):
-    monkeypatch.setattr(memory, "address_space", lambda: 100 * 2**20)
+    monkeypatch.setattr(memory, "max_address_space", lambda: 100 * 2**20)
     (tmp_path / "proc/self").mkdir(parents=True)
     (tmp_path / "proc/self/status").write_text("VmPeak:  2 kB\nVmSize:\t 61440 kB\n")
-    left = memory.memory_left(tmp_path)
-    assert left == Left(40 * MIB, "ulimit -v, which is 100.0 MiB")
+    left = memory.free_memory(tmp_path)
+    assert left == FreeMemory(40 * MIB, "ulimit -v, which is 100.0 MiB")
 
 
 def test_no_runtime_is_loaded_where_addresses_are_too_few(monkeypatch):
-    monkeypatch.setattr(memory, "address_space", lambda: 2**20)
+    monkeypatch.setattr(memory, "max_address_space", lambda: 2**20)
     with pytest.raises(DeviceError, match=r"an OpenCL runtime needs .* left by ulimit -v, which"):
         find_devices()
 
@@ -253,7 +255,7 @@ WITHOUT_ROOM = """
 from pathlib import Path
 import resource
 import numpy as np
-from clpipe.base.memory import _listed
+from clpipe.base.memory import _proc_value
 from clpipe.chain.request import Request
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Runner
@@ -261,15 +263,15 @@ runner = Runner(Request().chain(), open_device(None))
 image = np.full((2000, 4400, 3), 0.2, np.float16)
 runner.compile()
 hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-least = _listed(Path("/proc/self/status"), "VmSize") + (100 << 20)
+least = _proc_value(Path("/proc/self/status"), "VmSize") + (100 << 20)
 resource.setrlimit(resource.RLIMIT_AS, (least, hard))
 tiled = runner.run(image, "a").encoded
 print(runner.device.bytes_held < 100 << 20)
 resource.setrlimit(resource.RLIMIT_AS, (hard, hard))
 print(np.array_equal(runner.run(image, "a").encoded, tiled), runner.device.bytes_held > 100 << 20)
-held = _listed(Path("/proc/self/status"), "VmSize")
-runner.device.limit(0)
-print(held - _listed(Path("/proc/self/status"), "VmSize") > 100 << 20)
+held = _proc_value(Path("/proc/self/status"), "VmSize")
+runner.device.limit_memory(0)
+print(held - _proc_value(Path("/proc/self/status"), "VmSize") > 100 << 20)
 """
 
 
@@ -284,19 +286,19 @@ def test_where_memory_ends_tiles_become_smaller(device):
 HEAPS = """
 import threading
 from pathlib import Path
-from clpipe.base.memory import _listed
-from clpipe.base.system import save_addresses
-save_addresses()
+from clpipe.base.memory import _proc_value
+from clpipe.base.system import use_single_heap
+use_single_heap()
 def work():
     held = [bytes(600) for _ in range(100)]
     barrier.wait()  # all hold memory
     barrier.wait()  # it was measured
 barrier = threading.Barrier(7)
-before = _listed(Path("/proc/self/status"), "VmSize")
+before = _proc_value(Path("/proc/self/status"), "VmSize")
 threads = [threading.Thread(target=work) for _ in range(6)]
 for thread in threads: thread.start()
 barrier.wait()
-print(_listed(Path("/proc/self/status"), "VmSize") - before)
+print(_proc_value(Path("/proc/self/status"), "VmSize") - before)
 barrier.wait()
 """
 

@@ -202,7 +202,7 @@ def test_no_buffer_is_replaced_while_an_image_is_on_the_device(device, monkeypat
         boxes = [Box(i, i, i + side // 2, i + side // 2) for i in range(patches)]
         images.append((np.full((side, side, 3), 0.2, np.float16), "k", RunOptions(boxes=boxes)))
     runner.run(*images[0])  # compiles
-    fresh.limit(fresh.memory)  # release all buffers
+    fresh.limit_memory(fresh.memory)  # release all buffers
     before, replaced = [], []
     make_way, reserve = Flow.reserve, Pool.reserve
 
@@ -270,7 +270,7 @@ def test_decoded_renders_are_kept_while_they_fit(renders, write_exr, monkeypatch
         made.__getitems__(order[:2])
         for i in order[2:]:
             made[i]
-        assert made._loader.renders.taken <= 2**20
+        assert made._loader.renders.used <= 2**20
         return "".join(name[1] for name in read)
 
     one = 48 * 64 * 6  # bytes, half

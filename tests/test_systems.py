@@ -141,7 +141,7 @@ class Windows:
 def test_shards_share_a_folder_by_the_locks_of_windows(tmp_path, monkeypatch):
     monkeypatch.setattr(system, "fcntl", None)
     monkeypatch.setattr(system, "msvcrt", Windows())
-    monkeypatch.setattr(output_folders, "HOLDABLE", 2**30)
+    monkeypatch.setattr(output_folders, "LOCKABLE_BYTES", 2**30)
     out = tmp_path / "out"
     with output_folder(out, Shard(1, 2)):
         for shard in (Shard(), Shard(1, 2), Shard(1, 3)):
@@ -197,7 +197,7 @@ def test_a_full_disk_is_noticed_before_an_encoder_meets_it(tmp_path, monkeypatch
 def test_files_for_encoders_are_gone_afterwards(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.delattr(os, "memfd_create")
-    with system.passing_file(10) as name:
+    with system.temporary_file(10) as name:
         Path(name).write_bytes(b"x")
         assert Path(name).is_relative_to(tmp_path)
     assert not list(tmp_path.iterdir())

@@ -77,7 +77,7 @@ class Flaky(MemoryFileSystem):
 def bucket(write_exr, clpipe, monkeypatch):
     """Seven renders in a bucket, and here."""
     monkeypatch.setattr(urls, "FIRST_WAIT", 0.0)
-    monkeypatch.setattr(urls, "TRIES", 30)
+    monkeypatch.setattr(urls, "MAX_TRIES", 30)
     fsspec.register_implementation("flaky", Flaky, clobber=True)
     system = fsspec.filesystem("flaky")
     Flaky.store.clear()
@@ -147,13 +147,13 @@ def test_files_globs_and_manifests_behind_urls(bucket, clpipe):
 
 
 def test_listings_are_urls(bucket):
-    assert urls.listed("flaky://b/renders/notes.txt") == ["flaky://b/renders/notes.txt"]
-    assert urls.listed("flaky://b/renders/x1/") == [
+    assert urls.list_urls("flaky://b/renders/notes.txt") == ["flaky://b/renders/notes.txt"]
+    assert urls.list_urls("flaky://b/renders/x1/") == [
         f"flaky://b/renders/x1/r{n}.exr" for n in (1, 3, 5)
     ]
-    assert urls.listed("flaky://*/renders/*/r0.exr") == ["flaky://b/renders/x0/r0.exr"]
-    assert urls.listed("flaky://b/r*") == []  # folders are no files
-    assert urls.listed("flaky://none/x") == []
+    assert urls.list_urls("flaky://*/renders/*/r0.exr") == ["flaky://b/renders/x0/r0.exr"]
+    assert urls.list_urls("flaky://b/r*") == []  # folders are no files
+    assert urls.list_urls("flaky://none/x") == []
 
 
 def test_tars_behind_urls_are_streamed(bucket, clpipe):
@@ -169,7 +169,7 @@ def test_tars_behind_urls_are_streamed(bucket, clpipe):
 
 
 def test_what_is_wrong_with_a_url_is_said(bucket, clpipe, monkeypatch):
-    monkeypatch.setattr(urls, "TRIES", 2)
+    monkeypatch.setattr(urls, "MAX_TRIES", 2)
 
     def told(*arguments, status):
         text = clpipe("run", *arguments, *RUN, status=status).stderr
@@ -223,7 +223,7 @@ def test_tars_behind_a_url_are_those_of_a_folder(bucket, clpipe, rate):
 @pytest.mark.slow
 def test_a_run_that_was_cut_off_goes_on(bucket, clpipe, monkeypatch):
     command = ("run", "in", "-o", "flaky://b/set", "--webdataset", 3, *RUN)
-    monkeypatch.setattr(urls, "TRIES", 1)
+    monkeypatch.setattr(urls, "MAX_TRIES", 1)
     Flaky.forbidden = "000001.tar"
     told = clpipe(*command, status=1).stderr
     assert "flaky://b/set/000001.tar: cannot be written: the token has expired" in told
@@ -278,7 +278,7 @@ def test_from_python(bucket, monkeypatch):
     assert sorted(tars(bucket)) == ["000000.tar", "000001.tar"]
     with pytest.raises(RequestError, match="add --webdataset N"):
         package.run("in", "flaky://b/set")
-    monkeypatch.setattr(urls, "TRIES", 1)
+    monkeypatch.setattr(urls, "MAX_TRIES", 1)
     Flaky.forbidden = "000000.index"
     with pytest.raises(OutputError, match="the token has expired"):
         list(package.run("in", "flaky://b/other", device="numpy", webdataset=4))
@@ -310,7 +310,7 @@ def test_manifests_behind_urls_do_not_lead_out_of_their_bucket(bucket, clpipe, t
 
 
 def test_a_listing_that_fails_is_no_empty_bucket(bucket, clpipe, monkeypatch):
-    monkeypatch.setattr(urls, "TRIES", 1)
+    monkeypatch.setattr(urls, "MAX_TRIES", 1)
     bucket.pipe_file("/b/set/000000.tar", b"somebody's")
 
     def refused(self, path, *arguments, **more):

@@ -284,7 +284,7 @@ def test_the_disk_is_full(clpipe, renders, when):
             return real(path, pixels, tags)
 
         if when == "tar":
-            patch.setattr(tar_sink, "whole_file", full)
+            patch.setattr(tar_sink, "atomic_file", full)
         else:
             patch.setattr(writer, "write_display", write)
         result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)

@@ -61,7 +61,7 @@ def choose_crops(texts: Sequence[str], picture: Floats) -> list[Crop]:
         RequestError: a text has another form, or its rectangle exceeds the picture.
 
     >>> choose_crops(["sky=10,20,30x40", "0,0,2x2"], np.zeros((99, 99, 3), np.float32))[0]
-    Place(name='sky', left=10, top=20, width=30, height=40)
+    Crop(name='sky', left=10, top=20, width=30, height=40)
     """
     height, width = picture.shape[:2]
     finder = _Finder(picture)

@@ -33,20 +33,27 @@ def full_version() -> str:
     from pathlib import Path
 
     root = Path(__file__).resolve().parents[2]
-    return _frozen(root) or _of_checkout(root) or _of_archive(_ARCHIVED) or _named("", "unknown", 0)
+    return (
+        _version_from_metadata(root)
+        or _version_from_git(root)
+        or _version_from_archive(_ARCHIVED)
+        or _format_version("", "unknown", 0)
+    )
 
 
-def _frozen(root: "Path") -> str:
+def _version_from_metadata(root: "Path") -> str:
     """Return the version in the metadata of an sdist or an installed wheel; "" if there is none."""
-    said = "Version: "
+    prefix = "Version: "
     for path in (root / "PKG-INFO", *root.glob("clpipe-*.dist-info/METADATA")):
         if path.is_file():
             lines = path.read_text("utf-8").splitlines()
-            return next((line.removeprefix(said) for line in lines if line.startswith(said)), "")
+            return next(
+                (line.removeprefix(prefix) for line in lines if line.startswith(prefix)), ""
+            )
     return ""
 
 
-def _of_checkout(root: "Path") -> str:
+def _version_from_git(root: "Path") -> str:
     """Return the version of a git checkout; "" if this is no checkout or git is missing."""
     import subprocess
 
@@ -54,32 +61,34 @@ def _of_checkout(root: "Path") -> str:
     # containers, root's git rejects another user's checkout, although its code runs here anyway.
     git = ["git", f"--git-dir={root / '.git'}", f"--work-tree={root}", "--no-optional-locks"]
 
-    def said(*arguments: str) -> str:
-        done = subprocess.run(  # noqa: S603
+    def git_output(*arguments: str) -> str:
+        process = subprocess.run(  # noqa: S603
             [*git, *arguments], check=True, capture_output=True, text=True, timeout=10, cwd=root
         )
-        return done.stdout.strip()
+        return process.stdout.strip()
 
     if not (root / ".git").exists():
         return ""
     try:
-        is_shallow, commit = said("rev-parse", "--is-shallow-repository", "--short", "HEAD").split()
-        count = 0 if is_shallow == "true" else int(said("rev-list", "--count", "HEAD"))
-        described = said("describe", "--tags", "--match", f"v{__version__}", "--always")
-        version = _named(described, f"g{commit}", count)
-        is_dirty = said("status", "--porcelain", "--", "clpipe", "kernels")
+        is_shallow, commit = git_output(
+            "rev-parse", "--is-shallow-repository", "--short", "HEAD"
+        ).split()
+        count = 0 if is_shallow == "true" else int(git_output("rev-list", "--count", "HEAD"))
+        described = git_output("describe", "--tags", "--match", f"v{__version__}", "--always")
+        version = _format_version(described, f"g{commit}", count)
+        is_dirty = git_output("status", "--porcelain", "--", "clpipe", "kernels")
     except (OSError, subprocess.SubprocessError, ValueError):
         return ""
     return version + ("." if "+" in version else "+") + "dirty" if is_dirty else version
 
 
-def _of_archive(filled: str) -> str:
+def _version_from_archive(text: str) -> str:
     """Return the version that ``git archive`` has filled in; "" if it has not."""
-    commit, _, described = filled.partition(" ")
-    return "" if commit.startswith("$") else _named(described, f"g{commit}", 0)
+    commit, _, described = text.partition(" ")
+    return "" if commit.startswith("$") else _format_version(described, f"g{commit}", 0)
 
 
-def _named(described: str, commit: str, count: int) -> str:
+def _format_version(described: str, commit: str, count: int) -> str:
     """Return the version of a commit.
 
     Args:

@@ -27,30 +27,30 @@ class Identity:
 
 
 class BoundedCache(Generic[V]):
-    """A cache that drops the least recently used values above a bound.
+    """A cache that drops the least recently used values above its capacity.
 
     Threads may share it. A pickled copy is empty.
 
     Args:
-        bound: the most values that it keeps or, with ``size``, the largest sum of their sizes.
+        capacity: the most values that it keeps or, with ``size``, the largest sum of their sizes.
         size: returns the size of a value.
 
     >>> squares = BoundedCache(2)
-    >>> [squares.get(n, lambda n=n: n * n) for n in (2, 3, 2, 4)], squares.taken
+    >>> [squares.get(n, lambda n=n: n * n) for n in (2, 3, 2, 4)], squares.used
     ([4, 9, 4, 16], 2)
     >>> [squares.get(n, lambda: 0) for n in (2, 3)], 4 in squares, len(squares)
     ([4, 0], False, 2)
     >>> texts = BoundedCache(5, size=len)
-    >>> [texts.get(n, lambda n=n: n * "x") for n in (2, 3, 6)], texts.taken, 6 in texts
+    >>> [texts.get(n, lambda n=n: n * "x") for n in (2, 3, 6)], texts.used, 6 in texts
     (['xx', 'xxx', 'xxxxxx'], 5, False)
     """
 
-    def __init__(self, bound: int, size: Callable[[V], int] | None = None) -> None:
-        self._bound = bound
+    def __init__(self, capacity: int, size: Callable[[V], int] | None = None) -> None:
+        self._capacity = capacity
         self._size = size
         self._lock = threading.Lock()  # guards the values and the sum of their sizes
         self._values: OrderedDict[Hashable, Any] = OrderedDict()
-        self.taken = 0  # the part of the bound in use
+        self.used = 0  # the part of the capacity in use
 
     def __contains__(self, key: Hashable) -> bool:
         return key in self._values
@@ -61,31 +61,31 @@ class BoundedCache(Generic[V]):
     def get(self, key: Hashable, make: Callable[[], V]) -> V:
         """Return the value of a key. If the cache has none, call ``make`` and keep its result.
 
-        A value larger than the bound is not kept. Exceptions of ``make`` are passed on.
+        A value larger than the capacity is not kept. Exceptions of ``make`` are passed on.
         """
         with self._lock:
-            known = self._values.get(key, self)
-            if known is not self:
+            cached = self._values.get(key, self)
+            if cached is not self:
                 self._values.move_to_end(key)
-                found: V = known
+                found: V = cached
                 return found
         value = make()
         with self._lock:
-            if key not in self._values and self._size_of(value) <= self._bound:
+            if key not in self._values and self._size_of(value) <= self._capacity:
                 self._values[key] = value
-                self.taken += self._size_of(value)
-                while self.taken > self._bound:
-                    self.taken -= self._size_of(self._values.popitem(last=False)[1])
+                self.used += self._size_of(value)
+                while self.used > self._capacity:
+                    self.used -= self._size_of(self._values.popitem(last=False)[1])
         return value
 
     def clear(self) -> None:
         """Forget all values."""
         with self._lock:
             self._values.clear()
-            self.taken = 0
+            self.used = 0
 
     def _size_of(self, value: V) -> int:
         return self._size(value) if self._size else 1
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return BoundedCache, (self._bound, self._size)
+        return BoundedCache, (self._capacity, self._size)

@@ -6,7 +6,7 @@ from typing import Any, Self
 
 from clpipe.base.text import one_line
 
-LONGEST = 4000  # characters of a message, because text quoted from a file can have any length
+MAX_LENGTH = 4000  # characters of a message, because text quoted from a file can have any length
 
 
 class ClpipeError(Exception):
@@ -24,8 +24,8 @@ class ClpipeError(Exception):
 
     def __str__(self) -> str:
         text = super().__str__()
-        half = LONGEST // 2
-        return text if len(text) <= LONGEST else f"{text[:half]} ... {text[-half:]}"
+        half = MAX_LENGTH // 2
+        return text if len(text) <= MAX_LENGTH else f"{text[:half]} ... {text[-half:]}"
 
 
 class RequestError(ClpipeError, ValueError):
@@ -102,8 +102,8 @@ class KindError(ImageError):
 
     def __init__(self, path: Path, attributes: Mapping[str, str]) -> None:
         stage = attributes.get("stage", "a stage that it does not name")
-        held = one_line(f"{attributes['kind']}, kept after {stage}")
-        super().__init__(f"{path}: holds {held}")
+        content = one_line(f"{attributes['kind']}, kept after {stage}")
+        super().__init__(f"{path}: holds {content}")
         self.attributes = attributes
 
 

@@ -21,15 +21,17 @@ def require(purpose: str, *modules: str) -> None:
     """
     missing = [name for name in modules if find_spec(name) is None]
     if missing:
-        raise RequestError(f"{purpose} needs {' and '.join(missing)}. Run: {installing(*missing)}")
+        raise RequestError(
+            f"{purpose} needs {' and '.join(missing)}. Run: {install_command(*missing)}"
+        )
 
 
-def installing(*packages: str) -> str:
+def install_command(*packages: str) -> str:
     """Return the command that installs packages.
 
     The command does not use clpipe's extras, because another project has this name on PyPI.
 
-    >>> installing("scipy", "matplotlib")
+    >>> install_command("scipy", "matplotlib")
     'pip install scipy matplotlib'
     """
     return f"pip install {' '.join(packages)}"

@@ -14,7 +14,7 @@ from typing import BinaryIO
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_regular
-from clpipe.base.system import begin_writing, bring_to_disk, file_to_disk
+from clpipe.base.system import start_writeback, sync_file, sync_folder_entries
 
 
 @CpuTimer("hash")
@@ -40,18 +40,18 @@ class Stored:
 _unfinished: set[Path] = set()  # temporary files of this process, for `remove_temporary_files`
 # Guards the creation of a temporary file together with its entry in _unfinished. It is reentrant,
 # because a signal handler may acquire it while its own thread holds it.
-_beginning = threading.RLock()
+_creation_lock = threading.RLock()
 
-LONGEST = 200  # bytes of a name that its temporary name repeats; file systems allow 255
+MAX_NAME_BYTES = 200  # bytes of a name that its temporary name repeats; file systems allow 255
 
 
-def shortened(name: str) -> str:
-    """Return the first :data:`LONGEST` bytes of a name, for a temporary name.
+def shorten_name(name: str) -> str:
+    """Return the first :data:`MAX_NAME_BYTES` bytes of a name, for a temporary name.
 
-    >>> shortened("render"), len(shortened("x" * 255))
+    >>> shorten_name("render"), len(shorten_name("x" * 255))
     ('render', 200)
     """
-    while len(os.fsencode(name)) > LONGEST:
+    while len(os.fsencode(name)) > MAX_NAME_BYTES:
         name = name[:-1]
     return name
 
@@ -67,12 +67,12 @@ class FileGroup:
 
     def __init__(self) -> None:
         self.paths: list[Path] = []
-        self._beside: list[Path] = []
+        self._temporary_paths: list[Path] = []
         self._folders: set[Path] = set()
 
-    def add(self, beside: Path, path: Path) -> None:
+    def add(self, temporary: Path, path: Path) -> None:
         """Add a written file, with its temporary and its final name."""
-        self._beside.append(beside)
+        self._temporary_paths.append(temporary)
         self.paths.append(path)
 
     def add_folder(self, folder: Path) -> None:
@@ -81,23 +81,25 @@ class FileGroup:
 
     def discard(self) -> None:
         """Remove the files."""
-        for beside in self._beside:
-            discard(beside)
-            _unfinished.discard(beside)
+        for temporary in self._temporary_paths:
+            discard(temporary)
+            _unfinished.discard(temporary)
 
-    def _bring_to_disk(self) -> None:
-        for beside, path in zip(self._beside, self.paths, strict=True):
-            with _named(path):
-                file_to_disk(beside)
+    def _sync(self) -> None:
+        for temporary, path in zip(self._temporary_paths, self.paths, strict=True):
+            with _write_errors(path):
+                sync_file(temporary)
 
     def _rename(self) -> None:
         last = len(self.paths) - 1
-        for number, (beside, path) in enumerate(zip(self._beside, self.paths, strict=True)):
-            with _named(path):
+        for number, (temporary, path) in enumerate(
+            zip(self._temporary_paths, self.paths, strict=True)
+        ):
+            with _write_errors(path):
                 if number == last:
-                    os.utime(beside)  # so that it is newer than the files that it describes
-                beside.replace(path)
-            _unfinished.discard(beside)
+                    os.utime(temporary)  # so that it is newer than the files that it describes
+                temporary.replace(path)
+            _unfinished.discard(temporary)
 
     @staticmethod
     @CpuTimer("write")
@@ -113,13 +115,13 @@ class FileGroup:
             have temporary names are removed.
         """
         for group in groups:
-            for beside in group._beside:
-                begin_writing(beside)
+            for temporary in group._temporary_paths:
+                start_writeback(temporary)
         errors: list[ImageError | None] = []
         folders: dict[Path, None] = {}
         for number, group in enumerate(groups):
             try:
-                group._bring_to_disk()
+                group._sync()
                 group._rename()
                 folders |= dict.fromkeys(group._folders)
                 errors.append(None)
@@ -127,11 +129,11 @@ class FileGroup:
                 group.discard()
                 errors.append(error)
             except BaseException:  # unexpected
-                for left in groups[number:]:
-                    left.discard()
+                for unfinished in groups[number:]:
+                    unfinished.discard()
                 raise
         for folder in folders:
-            keep_names(folder)
+            sync_folder(folder)
         return errors
 
 
@@ -145,7 +147,7 @@ def deferred_files() -> Iterator[FileGroup]:
     If the body raises, the files are removed.
     """
     group = FileGroup()
-    with _writing_to(group):
+    with _file_group(group):
         try:
             yield group
         except BaseException:
@@ -154,14 +156,14 @@ def deferred_files() -> Iterator[FileGroup]:
 
 
 @contextlib.contextmanager
-def passing_files() -> Iterator[None]:
+def unsynced_files() -> Iterator[None]:
     """Do not synchronise this thread's files to the disk: a power failure may lose them."""
-    with _writing_to(None):
+    with _file_group(None):
         yield
 
 
 @contextlib.contextmanager
-def _writing_to(group: FileGroup | None) -> Iterator[None]:
+def _file_group(group: FileGroup | None) -> Iterator[None]:
     before = vars(_thread).copy()
     _thread.group = group
     try:
@@ -172,7 +174,7 @@ def _writing_to(group: FileGroup | None) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _named(path: Path) -> Iterator[None]:
+def _write_errors(path: Path) -> Iterator[None]:
     """Convert an OSError to an ImageError about a file."""
     try:
         yield
@@ -180,46 +182,48 @@ def _named(path: Path) -> Iterator[None]:
         raise ImageError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
-def _begun(beside: Path) -> BinaryIO:
+def _create_temporary(temporary: Path) -> BinaryIO:
     """Create and open a temporary file."""
-    with _beginning:
-        _unfinished.add(beside)
-        return open(beside, "xb")
+    with _creation_lock:
+        _unfinished.add(temporary)
+        return open(temporary, "xb")
 
 
 @contextlib.contextmanager
-def whole_file(path: Path) -> Iterator[BinaryIO]:
+def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """Open a new file that replaces ``path`` when all of it is on the disk.
 
     Links are not followed. If the file cannot be written, or the body raises, ``path`` does not
-    change. See also :func:`passing_files` and :func:`deferred_files`.
+    change. See also :func:`unsynced_files` and :func:`deferred_files`.
 
     Raises:
         ImageError: the file cannot be written.
     """
-    beside = path.with_name(f".{shortened(path.stem)}.{secrets.token_hex(4)}.part{path.suffix}")
+    temporary = path.with_name(
+        f".{shorten_name(path.stem)}.{secrets.token_hex(4)}.part{path.suffix}"
+    )
     is_written = False
     try:
-        with _named(path):
-            with _begun(beside) as file:
+        with _write_errors(path):
+            with _create_temporary(temporary) as file:
                 yield file
                 file.flush()
                 if not hasattr(_thread, "group"):
                     os.fsync(file.fileno())  # else a power failure can leave an empty file
             if group := getattr(_thread, "group", None):
-                group.add(beside, path)
+                group.add(temporary, path)
             else:
-                beside.replace(path)
-                _unfinished.discard(beside)
+                temporary.replace(path)
+                _unfinished.discard(temporary)
         is_written = True
     finally:
         if not is_written:
-            discard(beside)
-            _unfinished.discard(beside)
+            discard(temporary)
+            _unfinished.discard(temporary)
 
 
 @CpuTimer("write")
-def write_whole(path: Path, *parts: bytes | memoryview) -> Stored:
+def write_atomic(path: Path, *parts: bytes | memoryview) -> Stored:
     """Write a file completely or not at all. An existing file is replaced.
 
     Args:
@@ -230,7 +234,7 @@ def write_whole(path: Path, *parts: bytes | memoryview) -> Stored:
         ImageError: the file cannot be written.
     """
     digest, size = hashlib.sha256(), 0
-    with whole_file(path) as file:
+    with atomic_file(path) as file:
         for part in parts:
             file.write(part)
             with CpuTimer("hash"):
@@ -245,15 +249,15 @@ def check_folder(folder: Path) -> None:
     Raises:
         RequestError: one is a file.
     """
-    if place := _file_among(folder):
-        raise RequestError(f"--output: {place} is a file. Name an output directory.")
+    if file := _file_in_path(folder):
+        raise RequestError(f"--output: {file} is a file. Name an output directory.")
 
 
-def _file_among(folder: Path) -> Path | None:
+def _file_in_path(folder: Path) -> Path | None:
     return next((place for place in (folder, *folder.parents) if os.path.isfile(place)), None)
 
 
-def make_folder_of(path: Path) -> None:
+def create_parents(path: Path) -> None:
     """Create the missing parent folders of a file.
 
     Raises:
@@ -262,19 +266,19 @@ def make_folder_of(path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        place = _file_among(path.parent)
-        reason = f"{place} is a file, not a folder" if place else error.strerror
+        file = _file_in_path(path.parent)
+        reason = f"{file} is a file, not a folder" if file else error.strerror
         raise ImageError(f"{path}: cannot be written: {reason}") from None
 
 
 def write_new(path: Path, data: bytes) -> Stored:
-    """Create the missing parent folders of a file, then write it with :func:`write_whole`.
+    """Create the missing parent folders of a file, then write it with :func:`write_atomic`.
 
     Raises:
         ImageError: the file cannot be written.
     """
-    make_folder_of(path)
-    return write_whole(path, data)
+    create_parents(path)
+    return write_atomic(path, data)
 
 
 def discard(path: Path) -> None:
@@ -286,19 +290,19 @@ def discard(path: Path) -> None:
             path.unlink()
 
 
-def keep_names(folder: Path, at_once: bool = False) -> None:
+def sync_folder(folder: Path, immediately: bool = False) -> None:
     """Synchronise the entries of a folder to the disk, if its file system can.
 
     Args:
         folder: the folder.
-        at_once: whether to do so now even if files are deferred, see :func:`deferred_files`.
+        immediately: whether to do so now even if files are deferred, see :func:`deferred_files`.
     """
-    if hasattr(_thread, "group") and not (_thread.group and at_once):
+    if hasattr(_thread, "group") and not (_thread.group and immediately):
         if _thread.group:
             _thread.group.add_folder(folder)
         return
     with contextlib.suppress(OSError):
-        bring_to_disk(folder)
+        sync_folder_entries(folder)
 
 
 def remove_temporary_files() -> None:
@@ -306,7 +310,7 @@ def remove_temporary_files() -> None:
 
     Afterwards, a thread that creates a temporary file blocks until the process ends.
     """
-    _beginning.acquire()
+    _creation_lock.acquire()
     for path in list(_unfinished):
         with contextlib.suppress(OSError):
             path.unlink(missing_ok=True)

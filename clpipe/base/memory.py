@@ -6,7 +6,7 @@ from pathlib import Path
 
 from clpipe.base.control_groups import group_folders
 from clpipe.base.errors import DeviceError, RequestError
-from clpipe.base.system import address_space
+from clpipe.base.system import max_address_space
 
 UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 NO_LIMIT = 2**60  # bytes; without a limit, groups of version 1 report the largest page count
@@ -28,10 +28,10 @@ def parse_size(text: str) -> int:
     return int(size)
 
 
-def in_words(size: float) -> str:
+def format_bytes(size: float) -> str:
     """Return a number of bytes as text, rounded to a tenth of a KiB, MiB or GiB.
 
-    >>> in_words(8.2 * 2**30), in_words(5_000_000), in_words(1000)
+    >>> format_bytes(8.2 * 2**30), format_bytes(5_000_000), format_bytes(1000)
     ('8.2 GiB', '4.8 MiB', '1.0 KiB')
     """
     for unit in ("GiB", "MiB"):
@@ -42,14 +42,14 @@ def in_words(size: float) -> str:
 
 
 @dataclass(frozen=True)
-class Left:
-    """How many bytes a process can still allocate, and the name of the limit, in words."""
+class FreeMemory:
+    """How many bytes a process can still allocate, and the limit, in words."""
 
     bytes: int
-    by: str
+    limit: str
 
 
-def memory_left(root: Path = Path("/")) -> Left | None:
+def free_memory(root: Path = Path("/")) -> FreeMemory | None:
     """Return the bytes that this process can still allocate, under its tightest limit.
 
     The limits are MemAvailable, control groups and ``ulimit -v``.
@@ -60,17 +60,17 @@ def memory_left(root: Path = Path("/")) -> Left | None:
     Returns:
         The bytes and the limit. None if there is no limit, for example outside Linux.
     """
-    limits = [_available(root), *_left_in_groups(root), _left_of_addresses(root)]
-    return min(filter(None, limits), key=lambda left: left.bytes, default=None)
+    limits = [_free_in_machine(root), *_free_in_groups(root), _free_addresses(root)]
+    return min(filter(None, limits), key=lambda free: free.bytes, default=None)
 
 
 def available_memory(root: Path = Path("/")) -> int | None:
-    """Return the bytes of :func:`memory_left`."""
-    left = memory_left(root)
-    return left.bytes if left else None
+    """Return the bytes of :func:`free_memory`."""
+    free = free_memory(root)
+    return free.bytes if free else None
 
 
-def check_addresses(needed: int, what: str) -> None:
+def check_address_space(needed: int, what: str) -> None:
     """Check that ``ulimit -v`` leaves enough address space. Libraries crash without it.
 
     Args:
@@ -80,11 +80,11 @@ def check_addresses(needed: int, what: str) -> None:
     Raises:
         DeviceError: too little address space is left.
     """
-    left = _left_of_addresses(Path("/"))
-    if left and left.bytes < needed:
+    free = _free_addresses(Path("/"))
+    if free and free.bytes < needed:
         raise DeviceError(
-            f"{what} needs about {in_words(needed)} of address space, but {in_words(left.bytes)} "
-            f"are left by {left.by}. Raise the limit."
+            f"{what} needs about {format_bytes(needed)} of address space, but "
+            f"{format_bytes(free.bytes)} are left by {free.limit}. Raise the limit."
         )
 
 
@@ -93,23 +93,23 @@ def peak_memory(root: Path = Path("/")) -> int | None:
 
     The system's ru_maxrss is not used, because it includes the peak of the parent process.
     """
-    return _listed(root / "proc/self/status", "VmHWM")
+    return _proc_value(root / "proc/self/status", "VmHWM")
 
 
-def _available(root: Path) -> Left | None:
-    size = _listed(root / "proc/meminfo", "MemAvailable")
-    return None if size is None else Left(size, "this machine's memory")
+def _free_in_machine(root: Path) -> FreeMemory | None:
+    size = _proc_value(root / "proc/meminfo", "MemAvailable")
+    return None if size is None else FreeMemory(size, "this machine's memory")
 
 
-def _left_of_addresses(root: Path) -> Left | None:
+def _free_addresses(root: Path) -> FreeMemory | None:
     """Return the address space left under ``ulimit -v``, which also counts reserved memory."""
-    limit, used = address_space(), _listed(root / "proc/self/status", "VmSize")
+    limit, used = max_address_space(), _proc_value(root / "proc/self/status", "VmSize")
     if limit is None or used is None:
         return None
-    return Left(max(limit - used, 0), f"ulimit -v, which is {in_words(limit)}")
+    return FreeMemory(max(limit - used, 0), f"ulimit -v, which is {format_bytes(limit)}")
 
 
-def _listed(path: Path, name: str) -> int | None:
+def _proc_value(path: Path, name: str) -> int | None:
     """Return the bytes of an entry in a file of /proc, whose values are in KiB."""
     try:
         match = re.search(rf"^{name}:\s+(\d+) kB", path.read_text("utf-8"), re.MULTILINE)
@@ -118,30 +118,34 @@ def _listed(path: Path, name: str) -> int | None:
     return int(match[1]) * 1024 if match else None
 
 
-def _left_in_groups(root: Path) -> list[Left | None]:
+def _free_in_groups(root: Path) -> list[FreeMemory | None]:
     """Return the memory left in each control group of this process and in the groups' parents."""
     first = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_{}_file", "total_mapped_file")
     second = ("memory.max", "memory.current", "{}_file", "file_mapped")
     return [
-        _left_in_group(folder, *(first if is_first_version else second))
+        _free_in_group(folder, *(first if is_first_version else second))
         for folder, is_first_version in group_folders("memory", root)
     ]
 
 
-def _left_in_group(folder: Path, limit: str, used: str, cached: str, mapped: str) -> Left | None:
+def _free_in_group(
+    folder: Path, limit: str, used: str, cached: str, mapped: str
+) -> FreeMemory | None:
     """Return the memory left in one group; None without a limit.
 
     Cached files count as free, because the system can drop them, unless they are mapped.
     """
     try:
-        most = int((folder / limit).read_text("utf-8"))
-        if most >= NO_LIMIT:
+        maximum = int((folder / limit).read_text("utf-8"))
+        if maximum >= NO_LIMIT:
             return None
-        rest = most - int((folder / used).read_text("utf-8"))
+        remaining = maximum - int((folder / used).read_text("utf-8"))
         lines = (folder / "memory.stat").read_text("utf-8").splitlines()
     except (OSError, ValueError):  # missing, or "max": no limit
         return None
     values = {name: int(value) for name, _, value in (line.partition(" ") for line in lines)}
     both = (values.get(cached.format(state), 0) for state in ("active", "inactive"))
     files = max(sum(both) - values.get(mapped, 0), 0)
-    return Left(max(rest + files, 0), f"its control group's limit, which is {in_words(most)}")
+    return FreeMemory(
+        max(remaining + files, 0), f"its control group's limit, which is {format_bytes(maximum)}"
+    )

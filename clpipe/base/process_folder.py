@@ -16,9 +16,9 @@ from functools import cache
 from pathlib import Path
 
 from clpipe.base.files import discard
-from clpipe.base.system import fcntl, forbids_programs, use, writable_by_others
+from clpipe.base.system import fcntl, forbids_programs, lock_file, writable_by_others
 
-ROOM = 32 * 2**20  # bytes; with less, PoCL's compiler may end the process
+MIN_FREE_SPACE = 32 * 2**20  # bytes; with less, PoCL's compiler may end the process
 NAME = re.compile(r"clpipe-\d+-\w+")  # of a process's folder: its number, and random characters
 
 
@@ -27,13 +27,13 @@ def process_folder() -> Path | None:
     """Return this process's folder. The first call creates it.
 
     Returns:
-        A folder with :data:`ROOM` bytes free, in which programs may run. None if no folder for
-        temporary files allows that.
+        A folder with :data:`MIN_FREE_SPACE` bytes free, in which programs may run. None if no
+        folder for temporary files allows that.
     """
-    for place in temporary_places():
+    for place in temporary_folders():
         with suppress(OSError):
-            if has_room(place) and not forbids_programs(place):
-                return _folder_in(place)
+            if has_free_space(place) and not forbids_programs(place):
+                return _create_folder(place)
     return None
 
 
@@ -41,61 +41,61 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=process_folder.cache_clear)  # a child creates its own
 
 
-def temporary_places() -> Iterator[Path]:
+def temporary_folders() -> Iterator[Path]:
     """Yield the folders for temporary files, the usual one first."""
     with suppress(FileNotFoundError):
         yield Path(tempfile.gettempdir())
     yield from (place for place in (Path("/var/tmp"), Path("/dev/shm")) if place.is_dir())  # noqa: S108
 
 
-def has_room(folder: Path) -> bool:
-    """Return whether :data:`ROOM` bytes are free in a folder.
+def has_free_space(folder: Path) -> bool:
+    """Return whether :data:`MIN_FREE_SPACE` bytes are free in a folder.
 
     Raises:
         OSError: the folder is missing or cannot be read.
     """
-    return shutil.disk_usage(folder).free >= ROOM
+    return shutil.disk_usage(folder).free >= MIN_FREE_SPACE
 
 
-def _folder_in(place: Path) -> Path:
+def _create_folder(temporary: Path) -> Path:
     """Create a locked folder below a temporary one, and remove the folders of killed processes.
 
     Raises:
         OSError: the folder cannot be created.
     """
-    ours = place / f"clpipe-processes-{os.getuid() if hasattr(os, 'getuid') else 'kernels'}"
+    parent = temporary / f"clpipe-processes-{os.getuid() if hasattr(os, 'getuid') else 'kernels'}"
     with suppress(OSError):
-        ours.mkdir(mode=0o700)
-    if ours.is_symlink() or not ours.is_dir() or writable_by_others(ours):
-        ours = place  # another user has created it
+        parent.mkdir(mode=0o700)
+    if parent.is_symlink() or not parent.is_dir() or writable_by_others(parent):
+        parent = temporary  # another user has created it
     elif fcntl:
-        for folder in ours.iterdir():
+        for folder in parent.iterdir():
             if NAME.fullmatch(folder.name) and not folder.is_symlink():
-                _remove_if_left(folder)
+                _remove_unlocked(folder)
     while True:
-        folder = Path(tempfile.mkdtemp(prefix=f"clpipe-{os.getpid()}-", dir=ours)).resolve()
-        if not fcntl or _locked(folder):
+        folder = Path(tempfile.mkdtemp(prefix=f"clpipe-{os.getpid()}-", dir=parent)).resolve()
+        if not fcntl or _lock_folder(folder):
             atexit.register(_remove, folder, os.getpid())
             return folder
 
 
-def _locked(folder: Path) -> bool:
+def _lock_folder(folder: Path) -> bool:
     """Lock a new folder until this process ends; False if another process has just removed it."""
     with suppress(FileNotFoundError):
         lock = os.open(folder, os.O_RDONLY)
-        use(lock, alone=True)
+        lock_file(lock, exclusive=True)
         if folder.exists():
             return True
         os.close(lock)
     return False
 
 
-def _remove_if_left(folder: Path) -> None:
+def _remove_unlocked(folder: Path) -> None:
     """Remove a folder unless a process holds its lock."""
     with suppress(OSError):
         lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
-            if use(lock, alone=True, wait=False):
+            if lock_file(lock, exclusive=True, wait=False):
                 discard(folder)
         finally:
             os.close(lock)

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from clpipe.base.errors import ImageError, MissingError, RequestError
-from clpipe.base.memory import in_words
-from clpipe.base.text import alike
+from clpipe.base.memory import format_bytes
+from clpipe.base.text import similar_names
 
 T = TypeVar("T")
 
@@ -27,9 +27,9 @@ TEXT_BYTES = 16 * 2**20  # the limit for configurations, curves and sidecars, no
 
 KEY_PARTS = 32  # limit for dotted keys, because tomllib's memory grows with the square of the parts
 
-SEARCHED = 20_000  # the most names of a folder to search for a similar one
+MAX_SEARCHED = 20_000  # the most names of a folder to search for a similar one
 
-KINDS = {
+FILE_TYPES = {
     stat.S_IFDIR: "a folder",
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
@@ -53,24 +53,24 @@ def check_regular(path: Path) -> os.stat_result:
         raise OSError(errno.EINVAL, "no file can have this name") from None
     kind = stat.S_IFMT(status.st_mode)
     if kind != stat.S_IFREG:
-        raise OSError(errno.EINVAL, f"it is {KINDS.get(kind, 'something else')}, not a file")
+        raise OSError(errno.EINVAL, f"it is {FILE_TYPES.get(kind, 'something else')}, not a file")
     return status
 
 
-def read_when_changed(read: Callable[[str], T]) -> Callable[[str], T]:
+def cached_by_mtime(read: Callable[[str], T]) -> Callable[[str], T]:
     """Decorate a function that reads a file, so that it reads again only if the file has changed.
 
     The function raises an OSError if the path is not a regular file.
     """
 
     @lru_cache(maxsize=16)
-    def kept(path: str, time: int, size: int) -> T:
+    def cached(path: str, time: int, size: int) -> T:
         return read(path)
 
     @wraps(read)
     def current(path: str) -> T:
         status = check_regular(Path(path))
-        return kept(path, status.st_mtime_ns, status.st_size)
+        return cached(path, status.st_mtime_ns, status.st_size)
 
     return current
 
@@ -92,8 +92,8 @@ def check_exists(path: Path) -> None:
     place, rest = path, Path()
     while not os.path.exists(place.parent) and place != place.parent:
         place, rest = place.parent, place.name / rest
-    near = _similar(place)
-    hint = f". Did you mean {near / rest}?" if near else ""
+    similar = _similar(place)
+    hint = f". Did you mean {similar / rest}?" if similar else ""
     raise MissingError(str(path), f"{path}: there is no such file or folder{hint}")
 
 
@@ -116,18 +116,18 @@ def _similar(path: Path) -> Path | None:
     """Return a file with a similar name in a missing file's folder, preferably of its extension."""
     try:
         with os.scandir(path.parent) as entries:
-            names = [entry.name for entry in islice(entries, SEARCHED)]
+            names = [entry.name for entry in islice(entries, MAX_SEARCHED)]
     except OSError:
         return None
     by_stem: dict[str, str] = {}
     for name in sorted(names, key=lambda name: (Path(name).suffix != path.suffix, name)):
         by_stem.setdefault(Path(name).stem, name)
-    near = alike(path.stem, by_stem, cutoff=0.7)
-    return path.with_name(by_stem[near[0]]) if near else None
+    similar = similar_names(path.stem, by_stem, cutoff=0.7)
+    return path.with_name(by_stem[similar[0]]) if similar else None
 
 
 @contextmanager
-def unchanged(path: Path) -> Iterator[None]:
+def check_unchanged(path: Path) -> Iterator[None]:
     """Check that a file does not change in the ``with`` block, so that its digest fits its pixels.
 
     Raises:
@@ -147,31 +147,31 @@ def _state(path: Path) -> tuple[int, ...]:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
-def read_bytes(path: Path, most: int = TEXT_BYTES) -> bytes:
-    """Return the contents of a regular file of at most ``most`` bytes.
+def read_bytes(path: Path, max_bytes: int = TEXT_BYTES) -> bytes:
+    """Return the contents of a regular file of at most ``max_bytes`` bytes.
 
     Raises:
         OSError: the file cannot be read, is not a regular file, or is larger.
     """
     size = check_regular(path).st_size
     with path.open("rb") as file:
-        data = b"" if size > most else file.read(size + 1)
+        data = b"" if size > max_bytes else file.read(size + 1)
         if len(data) > size:  # it has grown
-            data += file.read(most + 1 - len(data))
-    if max(size, len(data)) > most:
-        found = in_words(max(size, len(data)))
-        raise OSError(errno.EFBIG, f"it has {found}, but the limit is {in_words(most)}")
+            data += file.read(max_bytes + 1 - len(data))
+    if max(size, len(data)) > max_bytes:
+        found = format_bytes(max(size, len(data)))
+        raise OSError(errno.EFBIG, f"it has {found}, but the limit is {format_bytes(max_bytes)}")
     return data
 
 
-def read_named(option: str, path: Path, most: int) -> bytes:
-    """Return the contents of a file that an option names, of at most ``most`` bytes.
+def read_named(option: str, path: Path, max_bytes: int) -> bytes:
+    """Return the contents of a file that an option names, of at most ``max_bytes`` bytes.
 
     Raises:
         RequestError: the file cannot be read, is not a regular file, or is larger.
     """
     try:
-        return read_bytes(path, most)
+        return read_bytes(path, max_bytes)
     except OSError as error:
         raise RequestError(f"{option} {path}: cannot be read: {error.strerror}") from None
 

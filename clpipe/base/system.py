@@ -31,13 +31,13 @@ def _optional(name: str) -> Any:
 fcntl, msvcrt, resource = (_optional(name) for name in ("fcntl", "msvcrt", "resource"))
 
 # Bytes of a file that can be locked, also beyond its end. Windows's C runtime counts with 31 bits.
-HOLDABLE = 2**40 if fcntl else 2**30
+LOCKABLE_BYTES = 2**40 if fcntl else 2**30
 
 _ARENA_MAX = -8  # of glibc's mallopt: the most heaps
 _SYNC_FILE_RANGE_WRITE = 2  # Linux: start to write all dirty pages that are not being written
 
 # Without O_BINARY, Windows writes "\r\n" for "\n".
-_PLAIN = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
+_OPEN_FLAGS = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
 
 
 def open_plain(path: Path, flags: int) -> int:
@@ -51,10 +51,10 @@ def open_plain(path: Path, flags: int) -> int:
     """
     if not hasattr(os, "O_NOFOLLOW") and path.is_symlink():
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
-    return os.open(path, flags | _PLAIN, 0o666)
+    return os.open(path, flags | _OPEN_FLAGS, 0o666)
 
 
-def hold(file: int, first: int, length: int) -> bool:
+def lock_range(file: int, first: int, length: int) -> bool:
     """Lock a range of a file's bytes against other processes, until the file is closed.
 
     The system also releases the lock whenever the process ends.
@@ -62,7 +62,7 @@ def hold(file: int, first: int, length: int) -> bool:
     Args:
         file: a descriptor, open for writing.
         first: the first byte.
-        length: the number of bytes. The range must end within :data:`HOLDABLE` bytes.
+        length: the number of bytes. The range must end within :data:`LOCKABLE_BYTES` bytes.
 
     Returns:
         False if another process has locked a part of the range.
@@ -85,14 +85,15 @@ def hold(file: int, first: int, length: int) -> bool:
     return True
 
 
-def use(file: int, alone: bool = False, wait: bool = True) -> bool:
+def lock_file(file: int, exclusive: bool = False, wait: bool = True) -> bool:
     """Lock a whole file, shared or exclusively, until the file is closed.
 
-    The system also releases the lock when the process ends. Locks of :func:`hold` do not affect it.
+    The system also releases the lock when the process ends. Locks of :func:`lock_range` do not
+    affect it.
 
     Args:
         file: a descriptor.
-        alone: whether the lock is exclusive.
+        exclusive: whether the lock is exclusive.
         wait: whether to wait until other processes release their locks.
 
     Returns:
@@ -102,8 +103,8 @@ def use(file: int, alone: bool = False, wait: bool = True) -> bool:
     if not fcntl:
         return True
     try:
-        how = fcntl.LOCK_EX if alone else fcntl.LOCK_SH
-        fcntl.flock(file, how if wait else how | fcntl.LOCK_NB)
+        operation = fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH
+        fcntl.flock(file, operation if wait else operation | fcntl.LOCK_NB)
     except OSError:
         return False
     return True
@@ -124,17 +125,17 @@ def writable_by_others(folder: Path) -> str:
     return f"others may write to it (mode {mode:04o})" if mode & 0o022 else ""
 
 
-def let_go(path: Path, file: int, first: int, length: int) -> None:
+def close_and_remove(path: Path, file: int, first: int, length: int) -> None:
     """Close a file with a range that this process has locked, and remove it if no other has locks.
 
     Args:
         path: the file.
         file: its descriptor.
-        first, length: the range, as for :func:`hold`.
+        first, length: the range, as for :func:`lock_range`.
     """
     with contextlib.suppress(OSError):
         if fcntl:
-            if hold(file, 0, HOLDABLE):
+            if lock_range(file, 0, LOCKABLE_BYTES):
                 path.unlink()
         elif msvcrt:
             os.lseek(file, first, os.SEEK_SET)
@@ -154,10 +155,10 @@ def reserve(file: BinaryIO, size: int) -> None:
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(file.fileno(), 0, size)
     else:
-        _check_room(file.name, size)
+        _check_free_space(file.name, size)
 
 
-def _check_room(path: str, size: int) -> None:
+def _check_free_space(path: str, size: int) -> None:
     """Check that the disk of a path has a number of bytes free.
 
     Raises:
@@ -182,7 +183,7 @@ def forbids_programs(folder: Path) -> bool:
 
 
 @contextlib.contextmanager
-def passing_file(size: int) -> Iterator[str]:
+def temporary_file(size: int) -> Iterator[str]:
     """Yield the path of a temporary file for a library to write. It is removed afterwards.
 
     The file is in memory if the system supports that, else in the folder for temporary files.
@@ -201,16 +202,16 @@ def passing_file(size: int) -> Iterator[str]:
             os.close(memory)
         return
     with tempfile.TemporaryDirectory(prefix="clpipe-", ignore_cleanup_errors=True) as folder:
-        _check_room(folder, size)
+        _check_free_space(folder, size)
         yield os.path.join(folder, "passing")
 
 
-def largest_file() -> int | None:
+def max_file_size() -> int | None:
     """Return the file size limit of this process in bytes (``ulimit -f``); None without a limit."""
     return _limit("RLIMIT_FSIZE")
 
 
-def address_space() -> int | None:
+def max_address_space() -> int | None:
     """Return the address space limit of this process in bytes (``ulimit -v``); None without one."""
     return _limit("RLIMIT_AS")
 
@@ -223,7 +224,7 @@ def _limit(name: str) -> int | None:
     return None if limit == resource.RLIM_INFINITY else limit
 
 
-def save_addresses() -> None:
+def use_single_heap() -> None:
     """Make all threads of this process and of its children share one heap.
 
     Otherwise glibc reserves 64 MiB of address space for each thread's heap and uses little of it.
@@ -233,7 +234,7 @@ def save_addresses() -> None:
         _libc().mallopt(_ARENA_MAX, 1)
 
 
-def give_back_memory() -> None:
+def trim_memory() -> None:
     """Return freed memory that the C library keeps for later to the system."""
     with contextlib.suppress(OSError, TypeError, AttributeError):  # another C library
         _libc().malloc_trim(0)
@@ -257,7 +258,7 @@ def blocked_signals(numbers: Collection[int]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def kept_signals() -> Iterator[None]:
+def preserve_signal_handlers() -> Iterator[None]:
     """Restore this process's signal handlers after the ``with`` block.
 
     LLVM, which compiles for PoCL in this process, installs its own handlers at its first use, to
@@ -275,7 +276,7 @@ def kept_signals() -> Iterator[None]:
                     signal.signal(number, handler)
 
 
-def bring_to_disk(folder: Path) -> None:
+def sync_folder_entries(folder: Path) -> None:
     """Synchronise a folder's entries to the disk. Windows cannot open folders, so it skips this.
 
     Raises:
@@ -300,7 +301,7 @@ def _libc() -> ctypes.CDLL:
     return ctypes.CDLL(None)
 
 
-def file_to_disk(path: Path) -> None:
+def sync_file(path: Path) -> None:
     """Synchronise a file's bytes to the disk.
 
     Raises:
@@ -310,16 +311,16 @@ def file_to_disk(path: Path) -> None:
         os.fsync(file.fileno())
 
 
-def begin_writing(path: Path) -> None:
+def start_writeback(path: Path) -> None:
     """Start to write a file's bytes to the disk without waiting, if the system supports that.
 
     The disk can then combine the writes of several files.
     """
     with contextlib.suppress(OSError, TypeError, AttributeError):  # another C library
-        begin = _libc().sync_file_range
+        sync_file_range = _libc().sync_file_range
         with open(path, "r+b", buffering=0) as file:
             whole = ctypes.c_int64(0), ctypes.c_int64(0)
-            begin(file.fileno(), *whole, _SYNC_FILE_RANGE_WRITE)
+            sync_file_range(file.fileno(), *whole, _SYNC_FILE_RANGE_WRITE)
 
 
 def processors() -> int:
@@ -334,7 +335,7 @@ def processor_numbers() -> list[int]:
     return []
 
 
-def stay_on(numbers: Collection[int]) -> None:
+def bind_to_processors(numbers: Collection[int]) -> None:
     """Bind the threads that this process starts from now on to some processors.
 
     This does nothing if the system cannot do it, or if one of the processors is not available.

@@ -5,10 +5,10 @@ from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
-LONG = 4  # the fewest letters of a word that can match a misspelt name
+MIN_WORD_LENGTH = 4  # the fewest letters of a word that can match a misspelt name
 
 
-def alike(text: str, names: Iterable[str], cutoff: float = 0.55) -> list[str]:
+def similar_names(text: str, names: Iterable[str], cutoff: float = 0.55) -> list[str]:
     """Return the names that a shortened or misspelt name may mean, in their order.
 
     These are the names that contain all of its words. If there are none, the function returns the
@@ -19,26 +19,28 @@ def alike(text: str, names: Iterable[str], cutoff: float = 0.55) -> list[str]:
         names: the existing names.
         cutoff: the least similarity, from 0 to 1.
 
-    >>> alike("canon 5d", ["canon-5d2", "canon-6d", "canon-5d3"])
+    >>> similar_names("canon 5d", ["canon-5d2", "canon-6d", "canon-5d3"])
     ['canon-5d2', 'canon-5d3']
-    >>> alike("Demosiac", ["mosaic", "demosaic"])
+    >>> similar_names("Demosiac", ["mosaic", "demosaic"])
     ['demosaic']
-    >>> alike("noize", ["normalize", "row_noise", "column_noise"])
+    >>> similar_names("noize", ["normalize", "row_noise", "column_noise"])
     ['row_noise', 'column_noise']
     """
     by_lower = {name.lower(): name for name in names}
-    near = with_words(text, by_lower)
-    if not near:
-        words = {word for name in by_lower for word in _words(name) if len(word) >= LONG}
+    similar = names_with_words(text, by_lower)
+    if not similar:
+        words = {word for name in by_lower for word in _words(name) if len(word) >= MIN_WORD_LENGTH}
         best = get_close_matches(text.lower(), [*by_lower, *sorted(words)], 1, cutoff)
-        near = best if best and best[0] in by_lower else with_words("".join(best), by_lower)
-    return [by_lower[name] for name in near]
+        similar = (
+            best if best and best[0] in by_lower else names_with_words("".join(best), by_lower)
+        )
+    return [by_lower[name] for name in similar]
 
 
-def with_words(text: str, names: Iterable[str]) -> list[str]:
+def names_with_words(text: str, names: Iterable[str]) -> list[str]:
     """Return the names that contain all words of a text, in their order.
 
-    >>> with_words("noise", ["sensor_noise", "denoise", "row_noise"])
+    >>> names_with_words("noise", ["sensor_noise", "denoise", "row_noise"])
     ['sensor_noise', 'row_noise']
     """
     words = _words(text)
@@ -49,17 +51,17 @@ def _words(text: str) -> set[str]:
     return set(re.findall(r"[^\W\d_]+|\d+", text.lower()))
 
 
-def either(names: Iterable[str]) -> str:
+def quote_alternatives(names: Iterable[str]) -> str:
     """Return names as alternatives, in quotes.
 
-    >>> either(["a", "b", "c"])
+    >>> quote_alternatives(["a", "b", "c"])
     "'a', 'b' or 'c'"
     """
     *others, last = (f"'{name}'" for name in names)
     return f"{', '.join(others)} or {last}" if others else last
 
 
-def one_of(what: str, found: str, allowed: Iterable[str], nearest: str | None = None) -> str:
+def unknown_name(what: str, found: str, allowed: Iterable[str], nearest: str | None = None) -> str:
     """Return a message about an unknown name, with a suggestion.
 
     Args:
@@ -68,12 +70,12 @@ def one_of(what: str, found: str, allowed: Iterable[str], nearest: str | None = 
         allowed: the existing names.
         nearest: the name to suggest. None suggests the most similar of the allowed names.
 
-    >>> one_of("stage", "demosiac", ["mosaic", "demosaic"])
+    >>> unknown_name("stage", "demosiac", ["mosaic", "demosaic"])
     "unknown stage 'demosiac' (did you mean 'demosaic'?); allowed: mosaic, demosaic"
     """
     names = list(map(one_line, allowed))
-    near = [nearest] if nearest else alike(found, names)
-    hint = f" (did you mean {either(near)}?)" if near else ""
+    similar = [nearest] if nearest else similar_names(found, names)
+    hint = f" (did you mean {quote_alternatives(similar)}?)" if similar else ""
     return f"unknown {what} '{one_line(found)}'{hint}; allowed: {', '.join(names) or 'none'}"
 
 
@@ -100,7 +102,7 @@ def printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else "?" for letter in line)
 
 
-MOST_DIGITS = 18  # of a whole number; int() raises ValueError for more than 4300
+MAX_DIGITS = 18  # of a whole number; int() raises ValueError for more than 4300
 
 
 def whole_number(text: str) -> int:
@@ -112,13 +114,13 @@ def whole_number(text: str) -> int:
     >>> whole_number("42"), whole_number("-3"), whole_number("9" * 5000)
     (42, -1, -1)
     """
-    return int(text) if text.isdecimal() and len(text) <= MOST_DIGITS else -1
+    return int(text) if text.isdecimal() and len(text) <= MAX_DIGITS else -1
 
 
-def duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Return a length of time as text.
 
-    >>> duration(5.21), duration(83), duration(7265)
+    >>> format_duration(5.21), format_duration(83), format_duration(7265)
     ('5.2 s', '1 min 23 s', '2 h 01 min')
     """
     if seconds < 60:
@@ -129,10 +131,10 @@ def duration(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60:02} min"
 
 
-def several(values: str | int | Path | Sequence[str | int | Path] | None) -> tuple[str, ...]:
+def as_texts(values: str | int | Path | Sequence[str | int | Path] | None) -> tuple[str, ...]:
     """Return one value or several as a tuple of texts; an empty tuple for None.
 
-    >>> several("a"), several((0, Path("b"))), several(None)
+    >>> as_texts("a"), as_texts((0, Path("b"))), as_texts(None)
     (('a',), ('0', 'b'), ())
     """
     return tuple(map(str, [values] if isinstance(values, str | int | Path) else values or ()))

@@ -36,7 +36,7 @@ INFIX: dict[Callable[..., Any], str] = {
     operator.ne: "!=",
 }
 UFUNCS = {np.add: operator.add, np.subtract: operator.sub, np.multiply: operator.mul}
-PLAIN = float, int, np.number
+NUMBER_TYPES = float, int, np.number
 
 
 class NotTraceableError(Exception):
@@ -64,7 +64,7 @@ class Traced:
 
     def __float__(self) -> float:
         self.trace.guard(operator.eq, self, self.value)
-        self.trace.pinned = True
+        self.trace.value_used = True
         return float(self.value)
 
     def __len__(self) -> int:
@@ -85,7 +85,7 @@ class Traced:
         return repr(float(self))
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
-        scalars = all(isinstance(each, (Traced, *PLAIN)) for each in inputs)
+        scalars = all(isinstance(each, (Traced, *NUMBER_TYPES)) for each in inputs)
         if scalars and method == "__call__" and ufunc.nout == 1 and not options:
             return call(UFUNCS.get(ufunc, ufunc), *inputs)
         plain = [float(each) if isinstance(each, Traced) else each for each in inputs]
@@ -96,7 +96,7 @@ def _calculation(function: Callable[..., Any], swapped: bool = False) -> Callabl
     """Return a method of :class:`Traced` for an operator; swapped, for the reflected operator."""
 
     def calculated(self: Traced, *others: Any) -> Any:
-        if not all(isinstance(other, (Traced, *PLAIN)) for other in others):
+        if not all(isinstance(other, (Traced, *NUMBER_TYPES)) for other in others):
             return NotImplemented
         return call(function, *others, self) if swapped else call(function, self, *others)
 
@@ -105,7 +105,7 @@ def _calculation(function: Callable[..., Any], swapped: bool = False) -> Callabl
 
 def _comparison(function: Callable[..., Any]) -> Callable[..., Any]:
     def compared(self: Traced, other: Any) -> Any:
-        if not isinstance(other, (Traced, *PLAIN)):
+        if not isinstance(other, (Traced, *NUMBER_TYPES)):
             return NotImplemented
         return self.trace.guard(function, self, other)
 
@@ -180,55 +180,58 @@ class Trace:
 
     def __init__(self, values: Sequence[Any]) -> None:
         self.inputs = [Traced(self, f"x{n}", value) for n, value in enumerate(values)]
-        self.pinned = False  # whether code took the value of a number
+        self.value_used = False  # whether code has used the value of a number as a constant
         self._lines: list[str] = []
-        self._places: dict[str, int] = {}  # expression -> number of its line, if not removed
-        self._constants: dict[str, Any] = {"altered": altered, "with_attributes": with_attributes}
+        self._line_numbers: dict[str, int] = {}  # expression -> number of its line, if not removed
+        self._constants: dict[str, Any] = {
+            "with_changes": with_changes,
+            "with_attributes": with_attributes,
+        }
         self._names: dict[int, str] = {}  # id of a constant -> its name
 
     def number(self, function: Callable[..., Any], arguments: Sequence[Any], result: Any) -> Traced:
         """Return the result of a function of numbers, traced."""
         text = self._text(function, arguments)
-        place = self._places.get(text, len(self._lines))
-        line = f"v{place} = {text}"
-        if self._lines[place : place + 1] != [line]:  # else it has been computed before
-            place = self._places[text] = len(self._lines)
-            self._lines.append(f"v{place} = {text}")
-        return Traced(self, f"v{place}", result)
+        index = self._line_numbers.get(text, len(self._lines))
+        line = f"v{index} = {text}"
+        if self._lines[index : index + 1] != [line]:  # else it has been computed before
+            index = self._line_numbers[text] = len(self._lines)
+            self._lines.append(f"v{index} = {text}")
+        return Traced(self, f"v{index}", result)
 
     def guard(self, function: Callable[..., Any], *arguments: Any) -> bool:
         """Return the outcome of a comparison. The computation is valid only for this outcome."""
         outcome = bool(function(*map(value_of, arguments)))
-        holds = self._text(function, arguments)
-        line = f"if {'not ' if outcome else ''}({holds}): return None"
-        place = self._places.get(line, len(self._lines))
-        if self._lines[place : place + 1] != [line]:
-            self._places[line] = len(self._lines)
+        condition = self._text(function, arguments)
+        line = f"if {'not ' if outcome else ''}({condition}): return None"
+        index = self._line_numbers.get(line, len(self._lines))
+        if self._lines[index : index + 1] != [line]:
+            self._line_numbers[line] = len(self._lines)
             self._lines.append(line)
         return outcome
 
     @contextmanager
     def attempt(self) -> Iterator[None]:
-        """Trace an optional part: its lines are removed if it fails or takes a number's value.
+        """Trace an optional part: its lines are removed if it fails or uses a number's value.
 
         Raises:
-            NotTraceableError: the part failed, or took a number's value.
+            NotTraceableError: the part failed, or used a number's value.
         """
-        before, count, self.pinned = self.pinned, len(self._lines), False
+        before, count, self.value_used = self.value_used, len(self._lines), False
         try:
             yield
-            if self.pinned:
+            if self.value_used:
                 raise NotTraceableError
         except Exception:
             del self._lines[count:]
             raise NotTraceableError from None
         finally:
-            self.pinned = before
+            self.value_used = before
 
-    def holds(self, value: Any) -> bool:
+    def contains_traced(self, value: Any) -> bool:
         """Return whether an object contains traced numbers."""
         count = len(self._lines)
-        text = _Copies(self).text(value)
+        text = _CopyWriter(self).text(value)
         del self._lines[count:]
         return text is not None
 
@@ -245,7 +248,7 @@ class Trace:
         Raises:
             NotTraceableError: the result contains traced numbers in other places.
         """
-        text = _Copies(self).text(result) or self._constant(result)
+        text = _CopyWriter(self).text(result) or self._constant(result)
         inputs = "".join(f"{each.name}, " for each in self.inputs)
         body = [f"{inputs}= values" if inputs else "pass"]
         body += needed_lines([*self._lines, f"return {text}"])
@@ -273,17 +276,17 @@ def needed_lines(lines: Sequence[str]) -> list[str]:
     >>> needed_lines(["v0 = x0 + k0", "v1 = x0 * x0", "return v0"])
     ['v0 = x0 + k0', 'return v0']
     """
-    taken: set[str] = set()
+    needed: set[str] = set()
     kept = []
     for line in reversed(lines):
         result, *used = re.findall(r"\w+", line)
-        if result in taken or result in ("if", "return"):
+        if result in needed or result in ("if", "return"):
             kept.append(line)
-            taken.update(used)
+            needed.update(used)
     return kept[::-1]
 
 
-def altered(template: T, attributes: Mapping[str, Any]) -> T:
+def with_changes(template: T, attributes: Mapping[str, Any]) -> T:
     """Return a copy of an object with some attributes replaced, without validation."""
     other = with_attributes(type(template), {**vars(template), **attributes})
     if isinstance(template, BaseModel):
@@ -299,7 +302,7 @@ def with_attributes(kind: type[T], attributes: dict[str, Any]) -> T:
     return other
 
 
-class _Copies:
+class _CopyWriter:
     """Writes the lines that copy a result with new numbers. See :meth:`Trace.repeat`."""
 
     def __init__(self, trace: Trace) -> None:
@@ -315,7 +318,7 @@ class _Copies:
         """
         if isinstance(value, Traced):
             return value.name
-        if isinstance(value, (str, type, type(None), *PLAIN)):
+        if isinstance(value, (str, type, type(None), *NUMBER_TYPES)):
             return None
         key = id(value)
         if key in self._open:  # it refers to itself
@@ -339,7 +342,7 @@ class _Copies:
             return self._text_of_container(value)
         attributes = getattr(value, "__dict__", None) or {}
         texts = {name: self.text(part) for name, part in attributes.items()}
-        if any(map(self.text, _hidden(value))):
+        if any(map(self.text, _referenced(value))):
             raise NotTraceableError(f"{type(value).__name__} holds traced numbers")
         if not any(texts.values()):
             return None
@@ -348,7 +351,7 @@ class _Copies:
         known = constant({n: None if text else attributes[n] for n, text in texts.items()})
         changes = ", ".join(f"{name!r}: {text}" for name, text in texts.items() if text)
         if isinstance(value, BaseModel):
-            return f"altered({constant(value)}, {{**{known}, {changes}}})"
+            return f"with_changes({constant(value)}, {{**{known}, {changes}}})"
         return f"with_attributes({constant(type(value))}, {{**{known}, {changes}}})"
 
     def _text_of_container(self, value: Any) -> str | None:
@@ -367,7 +370,7 @@ class _Copies:
         return f"{constant(type(value))}({listed})"  # a named tuple
 
 
-def _hidden(value: Any) -> list[Any]:
+def _referenced(value: Any) -> list[Any]:
     """Return the objects that an object refers to, apart from its attributes."""
     match value:
         case BaseModel():

@@ -2,7 +2,8 @@
 
 The rest of clpipe handles paths only. A URL is represented by a path in this process's folder for
 temporary files, which contains :data:`SPOOL` and then the URL's parts. :func:`path_of` makes that
-path, :func:`url_of` reads the URL from it, in any process, and :func:`fetched` puts the file there.
+path, :func:`url_of` reads the URL from it, in any process, and :func:`fetched_files` puts the file
+there.
 
 fsspec finds the credentials, in the environment and in its own configuration.
 """
@@ -22,7 +23,7 @@ from typing import Any, TypeVar
 
 from clpipe.base.errors import ClpipeError, ImageError, OutputError, RequestError
 from clpipe.base.extras import require
-from clpipe.base.process_folder import ROOM, process_folder
+from clpipe.base.process_folder import MIN_FREE_SPACE, process_folder
 from clpipe.base.text import one_line
 
 T = TypeVar("T")
@@ -31,15 +32,15 @@ SPOOL = "clpipe-spool"
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://(.+)")
 
-TRIES = 6
+MAX_TRIES = 6
 FIRST_WAIT = 0.25  # s; doubled each time
 
 # The names of a file's checksum or modification time in file systems, in order of preference.
-CHANGES = ["ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime"]
-CHANGES += ["updated", "modified", "created"]
+CHANGE_KEYS = ["ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime"]
+CHANGE_KEYS += ["updated", "modified", "created"]
 
 # Errors that are not retried.
-FINAL = (FileNotFoundError, PermissionError, IsADirectoryError, NotImplementedError)
+PERMANENT_ERRORS = (FileNotFoundError, PermissionError, IsADirectoryError, NotImplementedError)
 
 
 def is_url(text: str) -> bool:
@@ -69,10 +70,10 @@ def path_of(text: str) -> Path:
     folder = process_folder()
     if folder is None:
         raise RequestError(
-            f"{text}: no folder for temporary files has {ROOM >> 20} MiB free and allows programs "
-            "to run. Set TMPDIR to such a folder."
+            f"{text}: no folder for temporary files has {MIN_FREE_SPACE >> 20} MiB free and allows "
+            "programs to run. Set TMPDIR to such a folder."
         )
-    return _place(text, folder)
+    return _spool_path(text, folder)
 
 
 def url_of(path: Path) -> str | None:
@@ -88,7 +89,7 @@ def url_of(path: Path) -> str | None:
     return f"{scheme}://{'/'.join(rest)}" if rest and ".." not in rest else None
 
 
-def joined(folder: Path, text: str) -> Path:
+def join_url(folder: Path, text: str) -> Path:
     """Return the path that a text names: a URL, or a path relative to a folder.
 
     Raises:
@@ -106,7 +107,7 @@ def joined(folder: Path, text: str) -> Path:
     return path_of(f"{scheme}://{inside}")
 
 
-def listed(url: str) -> list[str]:
+def list_urls(url: str) -> list[str]:
     """Return the URLs of all files below one, at any depth, or of those that a glob matches.
 
     The URL of a file returns itself. fsspec remembers the listing, so that stamps cost nothing.
@@ -117,11 +118,11 @@ def listed(url: str) -> list[str]:
     Raises:
         RequestError: the URL cannot be listed.
     """
-    fixed = re.split(r"[*[]", url)[0].rpartition("/")[0] if is_glob(url) else url.rstrip("/")
+    prefix = re.split(r"[*[]", url)[0].rpartition("/")[0] if is_glob(url) else url.rstrip("/")
 
     def work(system: Any, path: str) -> list[str]:
         system.invalidate_cache()
-        root = path.removesuffix(url[len(fixed) :]).rstrip("/")
+        root = path.removesuffix(url[len(prefix) :]).rstrip("/")
         found: Iterable[str] = ()
         with contextlib.suppress(FileNotFoundError):
             if is_glob(url):
@@ -130,20 +131,22 @@ def listed(url: str) -> list[str]:
             else:
                 found = system.find(path)
         # The scheme stays that of the URL, because a file system may have several.
-        return sorted(f"{fixed}{name[len(root) :]}" for name in found)
+        return sorted(f"{prefix}{name[len(root) :]}" for name in found)
 
-    return _retried(url, work, RequestError, "listed")
+    return _with_retries(url, work, RequestError, "listed")
 
 
 def stamp_of_url(url: str) -> tuple[int, int]:
     """Return a file's size in bytes, and a number that changes with it; zeros if it is missing."""
     with contextlib.suppress(ClpipeError):
-        return _retried(url, lambda system, path: _stamp(system.info(path)), ImageError, "read")
+        return _with_retries(
+            url, lambda system, path: _stamp(system.info(path)), ImageError, "read"
+        )
     return 0, 0
 
 
 @contextlib.contextmanager
-def fetched(paths: Iterable[Path]) -> Iterator[list[Path]]:
+def fetched_files(paths: Iterable[Path]) -> Iterator[list[Path]]:
     """Fetch the files of paths that represent URLs, each into a separate folder.
 
     Yields:
@@ -160,7 +163,7 @@ def fetched(paths: Iterable[Path]) -> Iterator[list[Path]]:
                 folder = tempfile.TemporaryDirectory(
                     prefix="fetched-", dir=process_folder(), ignore_cleanup_errors=True
                 )
-                found[-1] = _place(url, Path(stack.enter_context(folder)))
+                found[-1] = _spool_path(url, Path(stack.enter_context(folder)))
                 _fetch(url, found[-1], ImageError)
         yield found
 
@@ -192,7 +195,7 @@ def upload(path: Path, url: str) -> None:
         if (size := system.info(remote).get("size")) != path.stat().st_size:
             raise OSError(f"only {size} of {path.stat().st_size} bytes were written")
 
-    _retried(url, work, OutputError, "written")
+    _with_retries(url, work, OutputError, "written")
 
 
 def read_url(url: str) -> bytes | None:
@@ -207,7 +210,7 @@ def read_url(url: str) -> bytes | None:
             return bytes(system.cat_file(path))
         return None
 
-    return _retried(url, work, OutputError, "read")
+    return _with_retries(url, work, OutputError, "read")
 
 
 def _check_scheme(url: str) -> None:
@@ -225,13 +228,13 @@ def _check_scheme(url: str) -> None:
         raise RequestError(f"{url}: {one_line(str(error))}") from None
 
 
-def _place(url: str, folder: Path) -> Path:
+def _spool_path(url: str, folder: Path) -> Path:
     """Return the path that represents a URL, below a folder for temporary files.
 
     Raises:
         RequestError: no path can.
 
-    >>> str(_place("s3://bucket/a/b.exr", Path("/tmp/x")))
+    >>> str(_spool_path("s3://bucket/a/b.exr", Path("/tmp/x")))
     '/tmp/x/clpipe-spool/s3/bucket/a/b.exr'
     """
     scheme, _, rest = url.partition("://")
@@ -242,7 +245,7 @@ def _place(url: str, folder: Path) -> Path:
     return folder / SPOOL / scheme / rest
 
 
-def _fetch(url: str, path: Path, fails: type[ClpipeError]) -> None:
+def _fetch(url: str, path: Path, error_type: type[ClpipeError]) -> None:
     """Copy a file to this machine, whole or not at all, with its stamp as size and time of change.
 
     Raises:
@@ -261,38 +264,40 @@ def _fetch(url: str, path: Path, fails: type[ClpipeError]) -> None:
         part.replace(path)
 
     try:
-        _retried(url, work, fails, "read")
+        _with_retries(url, work, error_type, "read")
     finally:
         part.unlink(missing_ok=True)
 
 
 def _stamp(info: Mapping[str, Any]) -> tuple[int, int]:
     """Return a file's size in bytes, and a number that changes when the file does."""
-    said = next((str(v) for name in CHANGES if (v := info.get(name)) is not None), "")
-    number = int.from_bytes(hashlib.sha256(said.encode()).digest()[:7]) if said else 0
+    version = next((str(v) for name in CHANGE_KEYS if (v := info.get(name)) is not None), "")
+    number = int.from_bytes(hashlib.sha256(version.encode()).digest()[:7]) if version else 0
     return int(info.get("size") or 0), number // 100 * 100  # NTFS stores times in units of 100 ns
 
 
-def _retried(url: str, work: Callable[[Any, str], T], fails: type[ClpipeError], what: str) -> T:
+def _with_retries(
+    url: str, work: Callable[[Any, str], T], error_type: type[ClpipeError], what: str
+) -> T:
     """Return the result of a function for a URL's file system and the path in it.
 
     The function is retried after errors that may be temporary.
 
     Raises:
         RequestError: as for :func:`_check_scheme`.
-        ClpipeError: all tries failed. The error has the type ``fails``.
+        ClpipeError: all tries failed. The error has the type ``error_type``.
     """
     _check_scheme(url)
     from fsspec.core import url_to_fs
 
     wait = FIRST_WAIT
-    for left in reversed(range(TRIES)):
+    for tries_left in reversed(range(MAX_TRIES)):
         try:
             return work(*url_to_fs(url))
         except Exception as error:
-            if not left or isinstance(error, FINAL):
+            if not tries_left or isinstance(error, PERMANENT_ERRORS):
                 reason = one_line(str(error) or type(error).__name__)
-                raise fails(f"{url}: cannot be {what}: {reason}") from None
+                raise error_type(f"{url}: cannot be {what}: {reason}") from None
             time.sleep(wait * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
             wait *= 2
     raise AssertionError

@@ -72,10 +72,10 @@ def first_fault(error: ValidationError) -> Fault:
     return Fault(path, "invalid", f"found {first['input']!r}: {reason}" if shown else reason)
 
 
-def typed(function: Callable[P, R]) -> Callable[P, R]:
+def check_argument_types(function: Callable[P, R]) -> Callable[P, R]:
     """Decorate a function, so that it rejects arguments of other types than annotated.
 
-    >>> @typed
+    >>> @check_argument_types
     ... def keep(names: str, truth: bool = False) -> None: ...
     >>> keep("normalize", truth="mosaic")
     Traceback (most recent call last):
@@ -102,40 +102,42 @@ def typed(function: Callable[P, R]) -> Callable[P, R]:
             try:
                 TypeAdapter(annotations[name], config=strict).validate_python(value)
             except ValidationError:
-                expected = in_words(annotations[name])
+                expected = describe_type(annotations[name])
                 raise RequestError(f"found {name} {value!r}; expected {expected}") from None
         return function(*args, **kwargs)
 
     return checked
 
 
-def in_words(annotation: Any) -> str:
+def describe_type(annotation: Any) -> str:
     """Return the values that a type allows, in words.
 
-    >>> in_words(bool | Literal["clean", "noisy"] | None), in_words(str | Sequence[str | Path])
-    ("true or false, 'clean', 'noisy' or None", 'a text or a list of texts or paths')
+    >>> describe_type(bool | Literal["clean", "noisy"] | None)
+    "true or false, 'clean', 'noisy' or None"
+    >>> describe_type(str | Sequence[str | Path])
+    'a text or a list of texts or paths'
     """
-    *others, last = dict.fromkeys(_allowed(annotation))
+    *others, last = dict.fromkeys(_describe_parts(annotation))
     return f"{', '.join(others)} or {last}" if others else last
 
 
-def _allowed(annotation: Any) -> Iterator[str]:
+def _describe_parts(annotation: Any) -> Iterator[str]:
     origin, parts = get_origin(annotation), get_args(annotation)
     if origin is Literal:
         yield from map(repr, parts)
     elif origin in (Union, UnionType):
         for part in parts:
-            yield from _allowed(part)
+            yield from _describe_parts(part)
     elif origin is Sequence:
-        plural = (each.split(" ", 1)[-1] + "s" for each in _allowed(parts[0]))
+        plural = (each.split(" ", 1)[-1] + "s" for each in _describe_parts(parts[0]))
         yield f"a list of {' or '.join(plural)}"
     elif origin is Mapping:
         yield "a table"
     else:
-        yield WORDS.get(annotation, getattr(annotation, "__name__", str(annotation)))
+        yield TYPE_NAMES.get(annotation, getattr(annotation, "__name__", str(annotation)))
 
 
-WORDS: dict[Any, str] = {
+TYPE_NAMES: dict[Any, str] = {
     str: "a text",
     Path: "a path",
     int: "a whole number",

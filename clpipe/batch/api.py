@@ -7,10 +7,10 @@ from typing import Any
 
 from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
-from clpipe.base.text import several
+from clpipe.base.text import as_texts
 from clpipe.base.types import plain
 from clpipe.base.urls import path_of
-from clpipe.base.validation import typed
+from clpipe.base.validation import check_argument_types
 from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
 from clpipe.chain.formats import format_named
@@ -39,7 +39,7 @@ FIELDS = {"format": "formats", "webdataset": "per_tar", "device": "devices", "jo
 Texts = str | Path | Sequence[str | Path]  # one, or several
 
 
-@typed
+@check_argument_types
 def run(
     inputs: Texts,
     output: str | Path,
@@ -205,7 +205,7 @@ def run_of(
     own = {name: given.pop(name) for name in ("camera", "iso") if name in given}
     series, values = split_series(plain({**settings, **own}))
     for name, value in given.items():
-        listed = several(value) if OPTIONS[name].type_ is list else value
+        listed = as_texts(value) if OPTIONS[name].type_ is list else value
         given[name] = CONVERT[name](listed) if name in CONVERT else listed
         check_option(name, given[name])
     if "patch" in given:

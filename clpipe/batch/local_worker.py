@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 from clpipe.base.errors import ClpipeError
 from clpipe.base.files import discard, remove_temporary_files
 from clpipe.base.process_folder import process_folder
-from clpipe.base.system import stay_on
+from clpipe.base.system import bind_to_processors
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.spec import RunSpec
 from clpipe.batch.threads import Batch, Jobs
@@ -55,7 +55,7 @@ def main(file: int) -> None:
     gc.freeze()  # imported modules stay, so the collector need not visit them
     spec, seat = pipe.receive()
     if seat.processors:
-        stay_on(seat.processors)
+        bind_to_processors(seat.processors)
     logger = logging.getLogger("clpipe")
     logger.setLevel(seat.level)
     logger.addHandler(_Forwarder(pipe))

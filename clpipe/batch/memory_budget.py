@@ -7,8 +7,8 @@ from dataclasses import replace
 from math import prod
 
 from clpipe.base.errors import ImageError
-from clpipe.base.memory import Left, available_memory, in_words, memory_left
-from clpipe.base.system import give_back_memory
+from clpipe.base.memory import FreeMemory, available_memory, format_bytes, free_memory
+from clpipe.base.system import trim_memory
 from clpipe.chain.chain import Chain
 from clpipe.chain.formats import DNG, FORMATS
 from clpipe.engine.device import Device
@@ -92,7 +92,7 @@ class MemoryBudget:
         size: int | None,
         devices: Sequence[Device | None] = (),
         drop: Callable[[], None] = lambda: None,
-        left: Callable[[], Left | None] | None = None,
+        left: Callable[[], FreeMemory | None] | None = None,
     ) -> None:
         self._size = size
         self._sharing = [each for each in devices if each and each.info.zero_copy]
@@ -100,10 +100,10 @@ class MemoryBudget:
         self._aside = size or 0 if has_staged else 0  # for staging buffers of GPUs
         self._starting = len(devices)
         self._drop = drop
-        self._left = left or memory_left
+        self._left = left or free_memory
         self._limits: dict[Device, int] = {}  # of devices that were given less for one image
         self._most = 0  # the most bytes that were ever free for one image and the devices
-        self._measured: tuple[float, Left | None] = 0.0, Left(0, "")
+        self._measured: tuple[float, FreeMemory | None] = 0.0, FreeMemory(0, "")
         self._taken: dict[str, int] = {}  # bytes, by the stem of an image
         self._queue = threading.Lock()  # lets one image wait at a time, so none overtakes it
         self._changed = threading.Condition()  # guards all of the above; notified when they change
@@ -159,7 +159,7 @@ class MemoryBudget:
         free = self._free(size)
         return free is None or needed(size) <= free.bytes
 
-    def _free(self, size: int) -> Left | None:
+    def _free(self, size: int) -> FreeMemory | None:
         """Return the memory for one more image. Small images may use a recent measurement."""
         when, free = self._measured
         now = time.monotonic()
@@ -181,7 +181,7 @@ class MemoryBudget:
             ImageError: there is not enough.
         """
         self._drop()
-        give_back_memory()
+        trim_memory()
         free = self._free(size)
         least = min(LEAST, 4 * size + ASIDE // 2)  # the planes of a small image are no larger
         there = self._most - sum(min(each.memory, least) for each in self._sharing)
@@ -198,11 +198,11 @@ class MemoryBudget:
             free = self._free(size)
             there = free.bytes if free else 0
             self._restore()
-        left = in_words(max(there, 0))
+        left = format_bytes(max(there, 0))
         raise ImageError(
-            f"it takes about {in_words(needed(size))} of memory; {left} are left by "
-            f"{free.by if free else 'this machine'}; allow more, or ask for less (--jobs 1, fewer "
-            "pictures of each image)"
+            f"it takes about {format_bytes(needed(size))} of memory; {left} are left by "
+            f"{free.limit if free else 'this machine'}; allow more, or ask for less (--jobs 1, "
+            "fewer pictures of each image)"
         )
 
     def _restore(self) -> None:

@@ -17,8 +17,8 @@ from typing import Any
 from clpipe.base.about import full_version
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.files import discard, sha256_of, write_whole
-from clpipe.base.urls import fetched, listed, read_url, upload, url_of
+from clpipe.base.files import discard, sha256_of, write_atomic
+from clpipe.base.urls import fetched_files, list_urls, read_url, upload, url_of
 from clpipe.batch.outcome import FAILED, SKIPPED, Outcome
 from clpipe.batch.sinks import Executor
 from clpipe.batch.tar_sink import Packer, Tars
@@ -48,7 +48,7 @@ class RemoteTars(Tars):
         self._request = json.dumps(writer.request.record(), sort_keys=True, default=str)
         url = url_of(tars[0].folder)
         assert url
-        below = [each.removeprefix(f"{url}/") for each in listed(url)]
+        below = [each.removeprefix(f"{url}/") for each in list_urls(url)]
         self._there = {name for name in below if "/" not in name}
         self._keys = {tar.name: self._key(tar) for tar in tars}  # of the present inputs
         for name in sorted(self._there):
@@ -164,7 +164,7 @@ class RemoteTars(Tars):
         }
         record |= {"key": self._keys[tar.name], "samples": [job.stem for job in tar.jobs], **more}
         path = tar.path.with_name(f"{_stem(tar)}{INDEX}")
-        write_whole(path, json.dumps(record).encode())
+        write_atomic(path, json.dumps(record).encode())
         url = url_of(path)
         assert url
         upload(path, url)
@@ -189,7 +189,7 @@ def _stem(tar: Tar) -> str:
 def _is_whole(tar: Tar, index: Mapping[str, Any]) -> bool:
     """Return whether a tar's bytes have the SHA-256 of its index."""
     try:
-        with fetched([tar.path]) as (path,):
+        with fetched_files([tar.path]) as (path,):
             return sha256_of(path)[0] == index.get("sha256")
     except (ImageError, OSError):
         return False

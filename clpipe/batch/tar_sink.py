@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.base.errors import ImageError, OutputError
-from clpipe.base.files import Stored, keep_names, passing_files, whole_file
+from clpipe.base.files import Stored, atomic_file, sync_folder, unsynced_files
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, Outcome
 from clpipe.batch.sinks import Executor, Folder
 from clpipe.batch.tars import OF_PATCHES, STAGING, Members, Tar, prepare
@@ -47,7 +47,7 @@ class StagedWriter(OutputWriter):
 
     def write(self, *arguments: Any) -> dict[Path, Stored]:
         """Write the images of one rendition. They go into the tar, so they need no fsync."""
-        with passing_files():
+        with unsynced_files():
             return super().write(*arguments)
 
 
@@ -178,7 +178,7 @@ class Packer:
 
     def _write(self, members: Sequence[tuple[str, Source]]) -> None:
         with (
-            whole_file(self.tar.path) as file,
+            atomic_file(self.tar.path) as file,
             tarfile.TarFile(
                 fileobj=file,
                 mode="w",
@@ -200,7 +200,7 @@ class Packer:
                         start, info.size = source
                         data.seek(start)
                     tar.addfile(info, data)
-        keep_names(self.tar.folder)  # before its pictures are removed
+        sync_folder(self.tar.folder)  # before its pictures are removed
 
 
 class Tars(Folder):

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from clpipe.base.errors import RequestError
-from clpipe.base.files import make_folder_of, whole_file
+from clpipe.base.files import atomic_file, create_parents
 from clpipe.base.reading import check_regular
 from clpipe.batch.outcome import STEPS, Outcome
 
@@ -61,8 +61,8 @@ class Trace:
         Raises:
             ImageError: it cannot be written.
         """
-        make_folder_of(self._path)
-        self._file = self._stack.enter_context(whole_file(self._path))
+        create_parents(self._path)
+        self._file = self._stack.enter_context(atomic_file(self._path))
         self._file.write(BEGINNING + b": [")
         return self
 

@@ -11,7 +11,7 @@ from clpipe.base.digests import stamp_of
 from clpipe.base.errors import DeviceError, ImageError, NoPictureError, OutputError, RequestError
 from clpipe.base.files import FileGroup, deferred_files
 from clpipe.base.types import Array
-from clpipe.base.urls import fetched
+from clpipe.base.urls import fetched_files
 from clpipe.batch.job_state import JobState
 from clpipe.batch.memory_budget import host_bytes
 from clpipe.batch.outcome import LEFT_OUT, SKIPPED, Span
@@ -135,7 +135,7 @@ class ImageWorker:
                 renditions = self._missing(state)
                 if renditions:
                     state.loader = self.loader.for_job(job)
-                    with fetched(job.paths) as (first, *others):
+                    with fetched_files(job.paths) as (first, *others):
                         if first != job.path:
                             here = replace(job, path=first, subframes=tuple(others))
                         admit(here)

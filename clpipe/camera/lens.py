@@ -11,11 +11,11 @@ from typing import Any
 from xml.etree import ElementTree
 
 from clpipe.base.errors import KeyedError, RequestError
-from clpipe.base.extras import installing
+from clpipe.base.extras import install_command
 from clpipe.base.text import one_line
 from clpipe.camera.profile import Camera
 
-INSTALL = installing("lensfunpy")
+INSTALL = install_command("lensfunpy")
 INFINITY_DISTANCE = 1000.0  # m, for lensfun's calibrations at infinity
 MAX_EXTRA_WORDS = 2  # words of a lens's name, besides the maker, that you may omit
 RECTILINEAR = "RECTILINEAR"  # lensfun's type of the lenses that clpipe supports

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import check_exists, parse_toml, read_text
-from clpipe.base.text import alike, one_line, one_of, with_words
+from clpipe.base.text import names_with_words, one_line, similar_names, unknown_name
 from clpipe.base.types import Doubles
 from clpipe.base.validation import first_fault
 from clpipe.camera.gain_stage import GainStage, NotNegative, Offsets, Positive, TukeyLambda
@@ -299,13 +299,13 @@ def cameras_matching(name: str) -> list[str]:
     ([], ['canon-5d2', 'canon-5d3', 'canon-5d4'])
     """
     names = _full_names()
-    return list(dict.fromkeys(names[each] for each in with_words(name, names)))
+    return list(dict.fromkeys(names[each] for each in names_with_words(name, names)))
 
 
 def similar_cameras(name: str) -> list[str]:
     """Return the built-in cameras that a shortened or misspelt name may mean."""
     by_name = camera_names()
-    near = (by_name[found] for found in alike(normalized_name(name), by_name))
+    near = (by_name[found] for found in similar_names(normalized_name(name), by_name))
     return cameras_matching(name) or list(dict.fromkeys(near))
 
 
@@ -395,7 +395,9 @@ def _reason(error: ValidationError) -> str:
     fault = first_fault(error)
     if fault.problem == "unknown":
         model = GainStage if "." in fault.key else Camera
-        return fault.key.removesuffix(fault.name) + one_of("key", fault.name, model.model_fields)
+        return fault.key.removesuffix(fault.name) + unknown_name(
+            "key", fault.name, model.model_fields
+        )
     if fault.problem == "missing":
         return f"{fault.key}: missing; every profile needs this key"
     return f"{fault.key}: {fault.text}" if fault.path else fault.text

@@ -4,7 +4,7 @@ import re
 from typing import Any
 
 from clpipe.base.errors import RequestError
-from clpipe.base.text import alike, either
+from clpipe.base.text import quote_alternatives, similar_names
 from clpipe.chain.keys import CODE, KEYS
 from clpipe.chain.methods import parameter_names
 from clpipe.chain.registry import all_stages
@@ -48,7 +48,7 @@ def _suggestion(text: str) -> str:
         meant = [key for key in known if key.endswith(f".{name}")]
         if not meant:
             parameters = {key.partition(".")[2]: key for key in reversed(known)}
-            meant = [parameters[each] for each in alike(name, parameters, cutoff=0.7)]
+            meant = [parameters[each] for each in similar_names(name, parameters, cutoff=0.7)]
     if not equals or not meant:
         return "; 'clpipe stages' lists the stages, and 'clpipe stages NAME' the parameters of one"
-    return f"; did you mean {either(f'{key}={value}' for key in meant)}?"
+    return f"; did you mean {quote_alternatives(f'{key}={value}' for key in meant)}?"

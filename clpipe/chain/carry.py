@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import cast, get_args
 
 from clpipe.base.errors import RequestError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.images.kinds import kind_from_name
 from clpipe.reference.carried import LayerKind
 
@@ -51,7 +51,7 @@ def parse_carry(texts: Sequence[str]) -> tuple[AovSpec, ...]:
         name, colon, kind = layer.rpartition(":")
         name, kind = (name, kind) if colon else (layer, "")
         if colon and kind not in kinds:
-            raise RequestError(f"--carry {text}: {one_of('kind', kind, kinds)}")
+            raise RequestError(f"--carry {text}: {unknown_name('kind', kind, kinds)}")
         if not name or not name.isprintable() or "/" in name or name.lower() == VALID:
             raise RequestError(
                 f"--carry {text!r}: found the layer name {name!r}; expected a name such as Depth, "

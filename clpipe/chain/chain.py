@@ -6,8 +6,8 @@ from functools import cached_property, wraps
 from typing import Any, TypeVar
 
 from clpipe.base.errors import RequestError
-from clpipe.base.text import one_of
-from clpipe.base.tracing import NotTraceableError, Trace, altered
+from clpipe.base.text import unknown_name
+from clpipe.base.tracing import NotTraceableError, Trace, with_changes
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.optics import Optics
 from clpipe.camera.profile import Camera
@@ -242,13 +242,13 @@ class Chain:
 
     def with_settings(self, settings: Settings) -> "Chain":
         """Return the chain with other settings, which resolve to the same steps."""
-        return altered(self, {"settings": settings})
+        return with_changes(self, {"settings": settings})
 
     def traced(self, trace: Trace) -> "Chain":
         """Return the chain with all properties computed, as far as they can be traced."""
         is_complete = True
         for step in self.steps:
-            is_complete &= not trace.holds(step.passes)
+            is_complete &= not trace.contains_traced(step.passes)
             _ = step.adds_noise
             try:
                 with trace.attempt():
@@ -259,7 +259,7 @@ class Chain:
         for name in (*COMPUTED, *STRUCTURAL):
             getattr(self, name)
         _ = is_complete and self.arguments
-        return altered(self, {"structure": {} if is_complete else None})
+        return with_changes(self, {"structure": {} if is_complete else None})
 
     def equals(self, other: "Chain") -> bool:
         """Return whether another chain has the same steps with the same numbers."""
@@ -357,7 +357,7 @@ class Chain:
         for step in self.steps:
             if step.name == name:
                 return step
-        raise RequestError(one_of("stage in this chain", name, [s.name for s in self.steps]))
+        raise RequestError(unknown_name("stage in this chain", name, [s.name for s in self.steps]))
 
 
 def cached_by_structure(function: Callable[[Chain], T]) -> Callable[[Chain], T]:

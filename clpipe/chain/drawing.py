@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from clpipe.base.errors import KeyedError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.chain.draws import Choice, Draw, Limits, parse_draw
 from clpipe.chain.keys import KEYS
 from clpipe.reference.random import philox_rounds, stream_of
@@ -61,7 +61,7 @@ def draw_order(draws: Mapping[str, Draw], constants: Mapping[str, Any]) -> list[
                 )
         if leader and leader not in constants:
             names = sorted({*constants, *draws} - {path[-1]})
-            unknown = one_of("value", leader, names).replace("allowed", "set or drawn are")
+            unknown = unknown_name("value", leader, names).replace("allowed", "set or drawn are")
             raise KeyedError(path[-1], f"{path[-1]}: {unknown}")
         return len(path)
 

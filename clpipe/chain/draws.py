@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from clpipe.base.errors import KeyedError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.base.validation import first_fault
 
 SMALLEST_FLOAT = math.ulp(0.0)  # the least number above 0
@@ -361,7 +361,7 @@ def parse_draw(key: str, table: Mapping[str, Any]) -> Draw:
     """
     names = [distribution for distribution in DISTRIBUTIONS if distribution in table]
     if len(names) != 1:
-        problem = one_of("draw", next((str(k) for k in table), ""), DISTRIBUTIONS)
+        problem = unknown_name("draw", next((str(k) for k in table), ""), DISTRIBUTIONS)
         if names:
             problem = f"a draw has one distribution, but these are {' and '.join(names)}; use one"
         raise KeyedError(key, f"{key}: found {dict(table)!r}: {problem}")
@@ -373,7 +373,7 @@ def parse_draw(key: str, table: Mapping[str, Any]) -> Draw:
         field = str(fault.path[0]) if fault.path else names[0]
         reason = fault.text
         if fault.problem == "unknown":
-            reason = one_of(f"key of {names[0]}", field, distribution.model_fields)
+            reason = unknown_name(f"key of {names[0]}", field, distribution.model_fields)
         elif fault.problem == "missing":
             reason = f"the draw {names[0]} needs this key; add it"
         raise KeyedError(key, f"{key}: {field}: {reason}") from None

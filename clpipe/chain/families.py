@@ -14,7 +14,7 @@ from typing import Any
 
 from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.digests import stamp_of
-from clpipe.base.tracing import Trace, altered, with_attributes
+from clpipe.base.tracing import Trace, with_attributes, with_changes
 from clpipe.camera.profile import Camera
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.registry import all_stages
@@ -208,7 +208,7 @@ def with_numbers(settings: Settings, numbers: Numbers) -> Settings:
         table = settings.parameters[step]
         floats = {name: next(remaining) for name in table if type(getattr(method, name)) is float}
         parameters[step] = {**table, **floats}
-        validated[step] = parameters[step], altered(method, floats) if floats else method
+        validated[step] = parameters[step], with_changes(method, floats) if floats else method
     return replace(settings, iso=iso, parameters=parameters, validated=validated)
 
 

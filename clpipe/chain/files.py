@@ -10,7 +10,7 @@ from typing import Any
 
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.reading import check_exists, parse_toml, read_text
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.keys import CODE, KEYS, LENS, TABLES, string_list
 from clpipe.chain.looks import override_settings
@@ -87,7 +87,7 @@ def load_config(name: str) -> Config:
     built_in = built_in_configs()
     path = built_in.get(name, Path(name))
     if path.suffix != ".toml" and not os.path.isfile(path):
-        raise RequestError(one_of("configuration", name, built_in) + ", or a .toml file")
+        raise RequestError(unknown_name("configuration", name, built_in) + ", or a .toml file")
     check_exists(path)
     try:
         text = read_text(path)

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 
 from clpipe.base.errors import KeyedError, RequestError
-from clpipe.base.text import one_of
-from clpipe.base.tracing import Traced, altered
+from clpipe.base.text import unknown_name
+from clpipe.base.tracing import Traced, with_changes
 from clpipe.camera.lens import calibration_of
 from clpipe.camera.optics import IN_PIXELS, Optics
 from clpipe.camera.profile import Camera, load_camera
@@ -62,7 +62,7 @@ def make_chain(
         return _build_chain(settings, camera, *ends)
 
     chain = chain_of_family(settings, camera, ends, build)
-    return altered(chain, {"draws": draws}) if draws else chain
+    return with_changes(chain, {"draws": draws}) if draws else chain
 
 
 def _build_chain(
@@ -77,11 +77,11 @@ def _build_chain(
     names = [step.name for step in steps]
     for name in settings.parameters:
         if name not in names and name not in all_stages():
-            raise KeyedError(name, one_of("stage in this chain", name, names))
+            raise KeyedError(name, unknown_name("stage in this chain", name, names))
     first, last = 0, len(steps)
     for name in (n for n in (start_at, until) if n is not None):
         if name not in names:
-            raise RequestError(one_of("stage in this chain", name, names))
+            raise RequestError(unknown_name("stage in this chain", name, names))
     if start_at is not None:
         first = names.index(start_at)
     if until is not None:

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from clpipe.base.errors import KeyedError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.base.validation import first_fault
 from clpipe.chain.keys import OUTPUT, RENDER
 from clpipe.chain.registry import all_stages
@@ -60,7 +60,7 @@ def stage_named(key: str, name: str) -> Stage:
             stage = base_name(name)
             message = f"{name}: this names a repeated stage; to repeat it, list {stage} again"
             raise KeyedError(key, f"{message}. The second is then called {stage}_2")
-        raise KeyedError(key, one_of("stage", name, all_stages()))
+        raise KeyedError(key, unknown_name("stage", name, all_stages()))
     return all_stages()[name]
 
 
@@ -135,7 +135,7 @@ def method_named(stage: Stage, name: str, chosen: Any) -> type[Method]:
         KeyedError: the stage has no such method.
     """
     if not isinstance(chosen, str) or chosen not in stage.by_name:
-        message = one_of("method", str(chosen), stage.by_name)
+        message = unknown_name("method", str(chosen), stage.by_name)
         raise KeyedError(f"{name}.method", f"{name}.method: {message}")
     return stage.by_name[chosen]
 
@@ -170,9 +170,9 @@ def unknown_parameter(step: str, model: type[BaseModel], parameter: str) -> Keye
     """Return the error for a parameter that a step, or another table, does not have."""
     key = f"{step}.{parameter}"
     if not issubclass(model, Method):
-        return KeyedError(key, one_of(f"key of {step}", parameter, model.model_fields))
+        return KeyedError(key, unknown_name(f"key of {step}", parameter, model.model_fields))
     what = f"parameter of {step} ({model.method})"
-    message = one_of(what, parameter, ["method", *model.model_fields])
+    message = unknown_name(what, parameter, ["method", *model.model_fields])
     stage = all_stages()[base_name(step)]
     others = [m for m, other in stage.by_name.items() if parameter in other.model_fields]
     if others:

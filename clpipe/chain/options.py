@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from clpipe.base.errors import RequestError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.chain.files import built_in_configs
 from clpipe.chain.formats import ALL_FORMATS
 from clpipe.chain.identity import MAX_FRAMES
@@ -258,4 +258,4 @@ def check_option(name: str, value: Any) -> None:
         raise RequestError(f"found {name} {value}; expected {key.allowed}")
     for each in value if key.choices and key.type_ is list else ():
         if each not in key.choices:
-            raise RequestError(one_of(name, each, key.choices))
+            raise RequestError(unknown_name(name, each, key.choices))

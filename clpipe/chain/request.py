@@ -12,8 +12,8 @@ from pydantic import Field, TypeAdapter, ValidationError
 from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
-from clpipe.base.text import one_of, several
-from clpipe.base.tracing import altered
+from clpipe.base.text import as_texts, unknown_name
+from clpipe.base.tracing import with_changes
 from clpipe.base.validation import first_fault
 from clpipe.chain.carry import AovSpec, parse_carry
 from clpipe.chain.chain import Chain
@@ -119,7 +119,7 @@ class Request(RecordedRequest):
         """
         for file in stage_files:
             load_stage_file(Path(file))
-        configuration = load_configs(several(config)) if config else None
+        configuration = load_configs(as_texts(config)) if config else None
         code = (*(configuration.stage_files if configuration else ()), *map(Path, stage_files))
         request = cls(
             config=configuration.values if configuration else None,
@@ -166,7 +166,7 @@ class Request(RecordedRequest):
 
     def for_image(self, name: str, values: Mapping[str, Any]) -> Self:
         """Return the request for one image: with its name, and values that only it has."""
-        return altered(self, {"image_name": name, "image": values})
+        return with_changes(self, {"image_name": name, "image": values})
 
     def with_outputs(self, chain: Chain) -> "ResolvedRequest":
         """Return the request with every output named, for a chain.
@@ -234,7 +234,7 @@ class Request(RecordedRequest):
         for step, value in self.options.items():
             is_table = isinstance(value, Mapping) and step not in KEYS  # there it is a draw
             if is_table and step not in known:
-                raise RequestError(one_of("stage in this chain", step, chain.names))
+                raise RequestError(unknown_name("stage in this chain", step, chain.names))
         return chain
 
     def record(self) -> dict[str, Any]:

@@ -14,8 +14,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from clpipe.base.errors import KeyedError, RequestError
-from clpipe.base.text import either, one_of
-from clpipe.base.tracing import altered
+from clpipe.base.text import quote_alternatives, unknown_name
+from clpipe.base.tracing import with_changes
 from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_name, load_camera
 from clpipe.chain.drawing import draw_extremes, draw_values, parse_drawn
 from clpipe.chain.draws import SMALLEST_FLOAT, Choice, Draw, Limits, field_limits
@@ -126,7 +126,7 @@ class Settings:
                 values[name] = value
         pushed = "iso" in self.draws and "camera" not in self.draws
         drawn = overlay(self, values)
-        return altered(drawn, {"pushed": True}) if pushed else drawn
+        return with_changes(drawn, {"pushed": True}) if pushed else drawn
 
     def constants(self) -> dict[str, Any]:
         """Return the values that are set and not drawn, by dotted name."""
@@ -278,7 +278,7 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
         if not step_draws:
             validated[step] = constants, make_model(step, constants)
     tables_now = {"parameters": parameters, "validated": validated, "draws": draws}
-    changed = altered(settings, {**plain, **tables_now})
+    changed = with_changes(settings, {**plain, **tables_now})
     if draws:
         _check_draws(changed, values)
     return changed
@@ -308,8 +308,8 @@ def _check_plain_values(settings: Settings, plain: Mapping[str, Any]) -> dict[st
             raise KeyedError(key, f"{key}: set it in a configuration file, or use --stage-file")
         if key not in KEYS:
             similar = [each for each in parameter_names() if each.endswith(f".{key}")]
-            hint = f"; did you mean {either(similar)}?" if similar else ""
-            raise KeyedError(key, one_of("key", key, (*KEYS, *TABLES, *all_stages())) + hint)
+            hint = f"; did you mean {quote_alternatives(similar)}?" if similar else ""
+            raise KeyedError(key, unknown_name("key", key, (*KEYS, *TABLES, *all_stages())) + hint)
         check_type(key, value)
     for key in ("stages", "skip"):
         if key in plain:
@@ -339,7 +339,7 @@ def _check_step(key: str, name: str) -> None:
     if key == "stages":
         stage_named(key, name)
     elif name != NOISE and base_name(name) not in all_stages():
-        raise KeyedError(key, f"skip: {one_of('stage', name, (NOISE, *all_stages()))}")
+        raise KeyedError(key, f"skip: {unknown_name('stage', name, (NOISE, *all_stages()))}")
 
 
 def _merge_table(settings: Settings, step: str, table: Mapping[str, Any]) -> dict[str, Any]:

@@ -17,9 +17,9 @@ from click.shell_completion import CompletionItem
 
 from clpipe.base.about import full_version
 from clpipe.base.errors import ClpipeError, DeviceError, OutputError, RequestError
-from clpipe.base.memory import check_addresses
-from clpipe.base.system import address_space, processors, save_addresses
-from clpipe.base.text import alike, either, one_line
+from clpipe.base.memory import check_address_space
+from clpipe.base.system import max_address_space, processors, use_single_heap
+from clpipe.base.text import one_line, quote_alternatives, similar_names
 from clpipe.commands.notices import NOTICES
 
 # Commands by the headings of the help. Each is a module here that defines a function of its name.
@@ -117,19 +117,21 @@ def meant(text: str) -> str:
     if camera := built_in_name(text):
         return f" It is a camera; to see its noise, use 'clpipe cameras {camera}'."
     stages = (f"stages {name}" for name in all_stages())
-    near = alike(text, (*COMMANDS, "cameras import", "--version"), 0.62) or alike(text, stages)
+    near = similar_names(text, (*COMMANDS, "cameras import", "--version"), 0.62) or similar_names(
+        text, stages
+    )
     if not near:
         return f" The commands are {', '.join(COMMANDS)}."
-    return f" Did you mean {either(f'clpipe {name}' for name in near)}?"
+    return f" Did you mean {quote_alternatives(f'clpipe {name}' for name in near)}?"
 
 
 def prepare_memory() -> None:
     """Save address space if it is limited, and check that the libraries fit into it."""
-    if address_space() is None:
+    if max_address_space() is None:
         return
-    save_addresses()
+    use_single_heap()
     try:
-        check_addresses(LIBRARIES + OF_THREAD * processors(), "loading clpipe's libraries")
+        check_address_space(LIBRARIES + OF_THREAD * processors(), "loading clpipe's libraries")
     except DeviceError as error:
         fail(error)
 

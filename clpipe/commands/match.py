@@ -14,7 +14,7 @@ from clpipe.analysis.matching.result import Match, Row, write_configuration
 from clpipe.analysis.matching.scenes import Scenes
 from clpipe.analysis.matching.search import Candidate, StoppedError, Watch
 from clpipe.base.extras import require
-from clpipe.base.text import duration
+from clpipe.base.text import format_duration
 from clpipe.batch.interrupt import INTERRUPTED, interruptible
 from clpipe.chain.keys import KEYS
 from clpipe.chain.settings import Settings
@@ -81,7 +81,7 @@ class Follower(Watch):
         now = time.perf_counter()
         text = f"{share:.0%}; {residuals}"
         if share:
-            text += f"; about {duration((now - self._began) * (1 / share - 1))} left"
+            text += f"; about {format_duration((now - self._began) * (1 / share - 1))} left"
         if self._bar:
             self._bar.update(self._task, completed=share, description=text)
         elif now - self._said >= EVERY:

@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from clpipe.base.errors import RequestError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.chain.files import toml_text
 from clpipe.chain.options import OPTIONS
 from clpipe.commands.chain_options import chain_options, option, request_of
@@ -73,7 +73,7 @@ def launch_named(plan: Plan, wanted: str) -> AnyLaunch:
         if wanted in (str(number), launch.name):
             return launch
     names = (f"{number} {launch.name}" for number, launch in enumerate(plan.launches, 1))
-    raise RequestError(f"--source: {one_of('launch', wanted, names)}")
+    raise RequestError(f"--source: {unknown_name('launch', wanted, names)}")
 
 
 def plan_rows(plan: Plan) -> list[tuple[str, ...]]:

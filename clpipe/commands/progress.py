@@ -14,7 +14,7 @@ import click
 from rich.console import Console
 from rich.text import Text
 
-from clpipe.base.text import duration, one_line
+from clpipe.base.text import format_duration, one_line
 from clpipe.base.urls import url_of
 from clpipe.batch.interrupt import interruptible
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
@@ -161,7 +161,7 @@ class Reporter:
         if not with_count:
             return "  ".join(parts)
         left = summary.total - summary.finished
-        remaining = duration(summary.elapsed * left / summary.finished)
+        remaining = format_duration(summary.elapsed * left / summary.finished)
         count = f"{summary.finished} of {summary.total} images"
         return "; ".join([count, *parts, f"about {remaining} left"])
 

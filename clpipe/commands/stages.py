@@ -8,7 +8,7 @@ import click
 from pydantic import ValidationError
 
 from clpipe.base.errors import ClpipeError, RequestError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.chain.keys import CODE, KEYS
 from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages, load_stage_file
@@ -41,7 +41,7 @@ def stages(
     for file in stage_files:
         load_stage_file(file)
     if name is not None and name not in all_stages():
-        raise RequestError(one_of("stage", name, all_stages()))
+        raise RequestError(unknown_name("stage", name, all_stages()))
     settings = overlay(DEFAULTS, settings_in(values))
     chosen = [all_stages()[name]] if name else list(all_stages().values())
     if as_json:

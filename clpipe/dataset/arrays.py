@@ -6,7 +6,7 @@ from typing import Any, Literal
 import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.base.types import Array
 from clpipe.reference.cfa import sites
 from clpipe.stage import Kind
@@ -30,7 +30,7 @@ def dtype_named(dtype: Any) -> str | None:
     except TypeError:
         name = str(dtype)
     if name not in DTYPES:
-        raise RequestError(one_of("dtype", name, DTYPES))
+        raise RequestError(unknown_name("dtype", name, DTYPES))
     return name
 
 

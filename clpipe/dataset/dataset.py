@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Literal, Self, Unpack
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.processors import available_processors
 from clpipe.base.readonly import ReadOnly
-from clpipe.base.text import several
+from clpipe.base.text import as_texts
 from clpipe.base.types import plain
-from clpipe.base.validation import typed
+from clpipe.base.validation import check_argument_types
 from clpipe.chain.rendition import DEVELOPMENT
 from clpipe.chain.request import Request
 from clpipe.dataset.ahead import PATCHES, Size, begun_ahead
@@ -121,7 +121,7 @@ class Dataset(ReadOnly):
             raw or variance that is requested, or if a type cannot hold the values.
     """
 
-    @typed
+    @check_argument_types
     def __init__(
         self,
         inputs: str | Path | Sequence[str | Path],
@@ -160,11 +160,11 @@ class Dataset(ReadOnly):
             until=until,
             layer=layer,
             transfer=transfer,
-            carry=several(carry),
+            carry=as_texts(carry),
         )
         loader = ImageLoader(request)
         self._skips = on_error == "skip"
-        self._jobs = jobs_of(loader, several(inputs), several(exclude), self._skips)
+        self._jobs = jobs_of(loader, as_texts(inputs), as_texts(exclude), self._skips)
         chain = loader.first_chain(self._jobs)
         if truth is None and patch and any(step.adds_noise for step in chain.steps):
             truth = "clean"
@@ -173,7 +173,7 @@ class Dataset(ReadOnly):
         self._draws_by_patch = is_drawn and (draws == "patch" if draws else at_random)
         spec = SampleSpec(
             arrays=ArrayFormat(dtype_named(dtype), channels_first, raw),
-            keep=chain.select(several(keep)),
+            keep=chain.select(as_texts(keep)),
             truth=DEVELOPMENT if truth is True else truth or None,
             variance=variance,
         )

@@ -10,7 +10,7 @@ import numpy as np
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.types import Array
-from clpipe.base.validation import typed
+from clpipe.base.validation import check_argument_types
 from clpipe.dataset.arrays import packed, unpacked
 from clpipe.images.arrays import as_array
 from clpipe.pipeline import Pipeline
@@ -50,7 +50,7 @@ class RawNoise(ReadOnly):
         RequestError: a name or value is not allowed.
     """
 
-    @typed
+    @check_argument_types
     def __init__(
         self,
         camera: str | Path,

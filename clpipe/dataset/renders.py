@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.files import passing_files, whole_file
+from clpipe.base.files import atomic_file, unsynced_files
 from clpipe.engine.runner import is_planar
 from clpipe.images.read import SourceImage
 
@@ -36,7 +36,7 @@ class SharedRenders:
 
     >>> image = SourceImage(np.ones((2, 3, 3), np.float16), "", "", (), {})
     >>> renders = SharedRenders(100)
-    >>> [renders.get(key, lambda: image).pixels.shape for key in "aabc"], renders.taken
+    >>> [renders.get(key, lambda: image).pixels.shape for key in "aabc"], renders.used
     ([(2, 3, 3), (2, 3, 3), (2, 3, 3), (2, 3, 3)], 72)
     """
 
@@ -58,7 +58,7 @@ class SharedRenders:
         return _shared, (self._size, self._folder)
 
     @property
-    def taken(self) -> int:
+    def used(self) -> int:
         """The bytes of all pixels in the cache."""
         # Names with a leading dot are unfinished files.
         files = list(self._folder.glob("[!.]*.npy")) if self._folder else []
@@ -79,7 +79,7 @@ class SharedRenders:
         place = self._folder / name
         if (mapped := _mapped(place)) is None:
             source = decode()
-            if self.taken + source.pixels.nbytes > self._size or not _keep(place, source):
+            if self.used + source.pixels.nbytes > self._size or not _keep(place, source):
                 return source
             mapped = _mapped(place) or source
         if len(self._opened) >= OPEN:
@@ -107,10 +107,10 @@ def _keep(place: Path, source: SourceImage) -> bool:
     planar, pixels = is_planar(source.pixels), source.pixels
     rest = replace(source, pixels=np.broadcast_to(pixels[:1, :1], (1, 1, *pixels.shape[2:])))
     try:
-        with passing_files():
-            with whole_file(place.with_suffix(".npy")) as file:
+        with unsynced_files():
+            with atomic_file(place.with_suffix(".npy")) as file:
                 np.save(file, pixels.transpose(2, 0, 1) if planar else pixels)
-            with whole_file(
+            with atomic_file(
                 place.with_suffix(".pickle")
             ) as file:  # last, so the other file is complete
                 pickle.dump((rest, planar), file)

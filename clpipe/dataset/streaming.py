@@ -11,8 +11,8 @@ from typing import Any
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
-from clpipe.base.text import several
-from clpipe.base.urls import fetched, is_glob, is_url, listed, path_of
+from clpipe.base.text import as_texts
+from clpipe.base.urls import fetched_files, is_glob, is_url, list_urls, path_of
 from clpipe.dataset.dataset import Dataset
 from clpipe.dataset.developer import Sample
 from clpipe.torch.iterable import IterableDataset, worker
@@ -58,7 +58,7 @@ class StreamingDataset(ReadOnly, IterableDataset):
             )
         self._epoch: int = options.pop("epoch", 0)
         self._options = options
-        self._tars = [found for name in several(tars) for found in _found(name)]
+        self._tars = [found for name in as_texts(tars) for found in _found(name)]
 
     def __repr__(self) -> str:
         return f"StreamingDataset({len(self._tars)} tars)"
@@ -101,7 +101,7 @@ def _found(name: str) -> list[str]:
         RequestError: there is no such tar.
     """
     if is_url(name):
-        tars = listed(name) if is_glob(name) else [name]
+        tars = list_urls(name) if is_glob(name) else [name]
     else:
         tars = sorted(glob.glob(name)) if glob.has_magic(name) else [name] * Path(name).is_file()
     if not tars:
@@ -118,7 +118,7 @@ def _unpack(tar: str, folder: Path) -> None:
     folder.mkdir()
     into = folder / PurePosixPath(tar).name.removesuffix(".tar")
     try:
-        with fetched([path_of(tar)]) as (path,), tarfile.open(path) as file:
+        with fetched_files([path_of(tar)]) as (path,), tarfile.open(path) as file:
             for member in file:
                 inside = PurePosixPath(member.name)
                 if not member.isfile() or inside.is_absolute() or ".." in inside.parts:

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError, ImageError
-from clpipe.base.files import passing_files, write_new
-from clpipe.base.memory import in_words, memory_left
-from clpipe.base.process_folder import ROOM, has_room
+from clpipe.base.files import unsynced_files, write_new
+from clpipe.base.memory import format_bytes, free_memory
+from clpipe.base.process_folder import MIN_FREE_SPACE, has_free_space
 from clpipe.engine.store import Store
 
 COMPILER_MEMORY = 112 << 20  # bytes of memory; measured: 86 to 105 MiB for the default chain
@@ -115,7 +115,7 @@ class PoclBuilder:
             DeviceError: there is too little disk space or memory, or the folder was removed.
         """
         try:
-            has_space = has_room(self._folder.parent)
+            has_space = has_free_space(self._folder.parent)
         except OSError as error:
             raise DeviceError(
                 f"{self._folder.parent}: PoCL's folder was removed while this process used it "
@@ -123,14 +123,15 @@ class PoclBuilder:
             ) from None
         if not has_space:
             raise DeviceError(
-                f"{self._folder}: PoCL needs {ROOM >> 20} MiB of free space there to compile. Free "
-                "some space, or set TMPDIR to another folder for temporary files."
+                f"{self._folder}: PoCL needs {MIN_FREE_SPACE >> 20} MiB of free space there to "
+                "compile. Free some space, or set TMPDIR to another folder for temporary files."
             )
-        left = None if self._has_compiled else memory_left()
-        if left and left.bytes < COMPILER_MEMORY:
+        free = None if self._has_compiled else free_memory()
+        if free and free.bytes < COMPILER_MEMORY:
             raise DeviceError(
-                f"PoCL's compiler needs about {in_words(COMPILER_MEMORY)} of memory, but "
-                f"{in_words(left.bytes)} are left by {left.by}. Allow more for the first run."
+                f"PoCL's compiler needs about {format_bytes(COMPILER_MEMORY)} of memory, but "
+                f"{format_bytes(free.bytes)} are left by {free.limit}. "
+                "Allow more for the first run."
             )
         PoclBuilder._has_compiled = True
 
@@ -192,7 +193,7 @@ def _unpack(data: bytes, folder: Path) -> None:
     """
     with (
         suppress(ImageError, zipfile.BadZipFile),
-        passing_files(),
+        unsynced_files(),
         zipfile.ZipFile(io.BytesIO(data)) as archive,
     ):
         for name, content in _valid_files(archive):

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import platformdirs
 
-from clpipe.base.process_folder import ROOM, process_folder
+from clpipe.base.process_folder import MIN_FREE_SPACE, process_folder
 from clpipe.base.system import writable_by_others
 
 VARIABLE = "CLPIPE_CACHE_DIR"  # names another folder
@@ -106,6 +106,6 @@ def pocl_problem() -> str:
     if process_folder():
         return ""
     return (
-        f"PoCL needs a writable folder for temporary files with {ROOM >> 20} MiB of free space, "
-        "mounted without 'noexec'. Set TMPDIR to such a folder"
+        f"PoCL needs a writable folder for temporary files with {MIN_FREE_SPACE >> 20} MiB of free "
+        "space, mounted without 'noexec'. Set TMPDIR to such a folder"
     )

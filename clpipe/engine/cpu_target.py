@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 
 VARIABLE = "CLPIPE_CPU_TARGET"  # forces a target, for tests and support
 DRIVER_CHOICE = "driver"  # the value that keeps the driver's choice
@@ -192,7 +192,7 @@ def forced_target() -> str | None:
     """
     name = os.environ.get(VARIABLE) or None
     if name and name not in (*TARGETS, DRIVER_CHOICE):
-        raise DeviceError(f"{VARIABLE}: {one_of('target', name, (*TARGETS, DRIVER_CHOICE))}")
+        raise DeviceError(f"{VARIABLE}: {unknown_name('target', name, (*TARGETS, DRIVER_CHOICE))}")
     return name
 
 

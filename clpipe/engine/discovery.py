@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from clpipe.base.errors import DeviceError
-from clpipe.base.extras import installing
-from clpipe.base.memory import available_memory, check_addresses
+from clpipe.base.extras import install_command
+from clpipe.base.memory import available_memory, check_address_space
 from clpipe.base.system import processors
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.engine.cache_folder import pocl_problem
 from clpipe.engine.cpu_target import VARIABLE as TARGET_VARIABLE
 from clpipe.engine.cpu_target import Target, candidates, compile_for, forced_target
@@ -89,7 +89,9 @@ def find_devices(retest: bool = False) -> list[DeviceInfo]:
             "this process was forked from one that had used OpenCL, so OpenCL would hang here. "
             'Use multiprocessing\'s "spawn" or "forkserver", or fork before OpenCL is used.'
         )
-    check_addresses(POCL_ADDRESS_SPACE + THREAD_ADDRESS_SPACE * processors(), "an OpenCL runtime")
+    check_address_space(
+        POCL_ADDRESS_SPACE + THREAD_ADDRESS_SPACE * processors(), "an OpenCL runtime"
+    )
     _process = os.getpid()
     forced_target()
     known = verdicts(retest)
@@ -180,7 +182,7 @@ def runtime_advice() -> str:
     x86 = this_system.machine() in ("x86_64", "AMD64")
     ways = [
         "your GPU's driver",
-        *([installing("intel-opencl-rt", "intel-cmplr-lib-rt")] if linux and x86 else []),
+        *([install_command("intel-opencl-rt", "intel-cmplr-lib-rt")] if linux and x86 else []),
         *(["apt-get install pocl-opencl-icd (Debian, Ubuntu)"] if linux else []),
     ]
     if name := forced_target():
@@ -214,7 +216,7 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
         ]
         if not matching:
             names = [f"{d.index}: {d.label}" for d in devices]
-            raise DeviceError(one_of("device", selector, [*names, "numpy"]))
+            raise DeviceError(unknown_name("device", selector, [*names, "numpy"]))
         usable = [d for d in matching if not d.problem]
         if not usable:
             raise DeviceError(

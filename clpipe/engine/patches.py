@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from clpipe.base.errors import ImageError
-from clpipe.base.memory import in_words
+from clpipe.base.memory import format_bytes
 from clpipe.engine.extents import Box, enclosing
 from clpipe.engine.ir import Plan
 from clpipe.engine.tiles import Tiling, buffer_sizes, cutter_of, phases_of
@@ -55,6 +55,6 @@ def check_memory(sizes: Mapping[str, int], memory: int) -> None:
     """
     if sum(sizes.values()) > memory:
         raise ImageError(
-            f"a patch needs {in_words(sum(sizes.values()))} of device memory, but the limit is "
-            f"{in_words(memory)}. Raise the memory limit, or use smaller patches."
+            f"a patch needs {format_bytes(sum(sizes.values()))} of device memory, but the limit is "
+            f"{format_bytes(memory)}. Raise the memory limit, or use smaller patches."
         )

@@ -15,7 +15,7 @@ from typing import Any
 
 from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import DeviceError, RequestError
-from clpipe.base.system import kept_signals
+from clpipe.base.system import preserve_signal_handlers
 from clpipe.engine.builders import BinaryBuilder, PoclBuilder
 from clpipe.engine.cache_folder import cache_folder, cache_notice, pocl_folder
 from clpipe.engine.discovery import DeviceInfo
@@ -50,7 +50,7 @@ class Programs:
 
         self._cl = cl
         try:
-            with kept_signals():
+            with preserve_signal_handlers():
                 self.context = cl.Context([info.handle])
         except cl.Error as error:
             raise DeviceError(

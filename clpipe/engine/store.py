@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from clpipe.base.errors import ImageError
-from clpipe.base.files import discard, passing_files, write_new
+from clpipe.base.files import discard, unsynced_files, write_new
 
 DIGEST = hashlib.sha256().digest_size  # bytes at the beginning of a file
 
@@ -54,5 +54,5 @@ class Store:
         """Store bytes under a key, in place of earlier ones. Errors are ignored."""
         path = self.path(*key)
         if path is not None:
-            with suppress(ImageError), passing_files():
+            with suppress(ImageError), unsynced_files():
                 write_new(path, hashlib.sha256(data).digest() + data)

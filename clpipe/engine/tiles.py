@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from clpipe.base.errors import ImageError
-from clpipe.base.memory import in_words
+from clpipe.base.memory import format_bytes
 from clpipe.engine.bindings import slot_buffer, step_buffer
 from clpipe.engine.extents import Box, Extent, Extents, whole_image
 from clpipe.engine.ir import AnyLaunch, Finalize, Histogram, Launch, Lines, Plan, Reduce, reads_of
@@ -329,10 +329,11 @@ def tiling_of(
         smallest = cutter.largest_tile(column_step, 4)
         least, full = (buffer_sizes(plan, extents, depth) for extents in (smallest, whole))
         raise ImageError(
-            f"{width}x{height} pixels need {in_words(sum(full.values()))} of device memory, or "
-            f"{in_words(sum(least.values()))} in the smallest tiles, with a buffer of "
-            f"{in_words(max(least.values()))}. The limit is {in_words(memory)}, with buffers of at "
-            f"most {in_words(largest)}. Raise the memory limit, or use another device."
+            f"{width}x{height} pixels need {format_bytes(sum(full.values()))} of device memory, or "
+            f"{format_bytes(sum(least.values()))} in the smallest tiles, with a buffer of "
+            f"{format_bytes(max(least.values()))}. The limit is {format_bytes(memory)}, with "
+            f"buffers of at most {format_bytes(largest)}. Raise the memory limit, or use another "
+            "device."
         )
     _, columns, rows = best
     tiles = tuple(

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError
-from clpipe.base.extras import installing
+from clpipe.base.extras import install_command
 from clpipe.base.process_folder import process_folder
 from clpipe.engine.cache_folder import prepare_environment
 
@@ -58,7 +58,7 @@ def load_pyopencl() -> Any:
     try:
         import pyopencl as cl
     except (ImportError, OSError) as error:
-        way = f"Use --device numpy, or run: {installing('--force-reinstall', 'pyopencl')}"
+        way = f"Use --device numpy, or run: {install_command('--force-reinstall', 'pyopencl')}"
         raise DeviceError(f"pyopencl cannot be loaded: {error}. {way}") from None
     return cl
 

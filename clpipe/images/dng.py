@@ -13,7 +13,7 @@ import numpy as np
 
 from clpipe.base.about import __version__
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.files import Stored, write_whole
+from clpipe.base.files import Stored, write_atomic
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.profile import SRGB_TO_XYZ
@@ -309,4 +309,4 @@ def write_dng(
         head += tiff.directory_bytes(directory, offset)
     head += thumbnail.tobytes().ljust(dn_offset - thumbnail_offset, b"\0")
 
-    return write_whole(path, head, np.ascontiguousarray(dn).data.cast("B"))
+    return write_atomic(path, head, np.ascontiguousarray(dn).data.cast("B"))

@@ -10,7 +10,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_regular
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.base.types import Array, Floats
 from clpipe.images.pixels import DEFAULT_MAX_PIXELS, check_size
 
@@ -90,7 +90,7 @@ def parse_dump(text: str) -> Dump:
         )
     width, height, type_ = int(match[1]), int(match[2]), match[3]
     if type_ not in TYPES:
-        raise RequestError(f"dump: {one_of('type', type_, list(TYPES))}")
+        raise RequestError(f"dump: {unknown_name('type', type_, list(TYPES))}")
     if not (2 <= width <= MAX_SIDE and 2 <= height <= MAX_SIDE):
         raise RequestError(
             f"dump: found {text!r}; width and height must be from 2 to {MAX_SIDE} pixels"

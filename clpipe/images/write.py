@@ -16,8 +16,8 @@ from PIL import ImageCms
 from clpipe.base.about import __version__
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.errors import ImageError
-from clpipe.base.files import Stored, write_whole
-from clpipe.base.system import largest_file, passing_file
+from clpipe.base.files import Stored, write_atomic
+from clpipe.base.system import max_file_size, temporary_file
 from clpipe.base.types import Array, Floats
 from clpipe.images.attributes import PREFIX
 from clpipe.images.encoding import Encoding
@@ -129,7 +129,7 @@ def write_npy(path: Path, array: Array) -> Stored:
     prefix_size = len(np.lib.format.MAGIC_PREFIX) + 4  # the version, and the length of the header
     padded = text + " " * (-(prefix_size + len(text) + 1) % 64) + "\n"
     header = np.lib.format.magic(1, 0) + len(padded).to_bytes(2, "little") + padded.encode()
-    return write_whole(path, header, array.data.cast("B"))
+    return write_atomic(path, header, array.data.cast("B"))
 
 
 def write_planes(path: Path, planes: Mapping[str, Array], attributes: Mapping[str, str]) -> Stored:
@@ -186,14 +186,14 @@ def _stored(path: Path, size: int, encode: Callable[[str], None]) -> Stored:
     # therefore write to memory, or to a disk with enough space.
     try:
         _check_file_limit(2 * size)
-        with passing_file(2 * size) as to:
+        with temporary_file(2 * size) as to:
             encode(to)
             with (
                 open(to, "rb", buffering=0) as file,
                 mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as encoded,
                 memoryview(encoded) as data,
             ):
-                return write_whole(path, data)
+                return write_atomic(path, data)
     except OSError as error:
         raise ImageError(f"{path}: cannot be written: {error.strerror or error}") from None
 
@@ -204,7 +204,7 @@ def _check_file_limit(size: int) -> None:
     Raises:
         OSError: it may not.
     """
-    limit = largest_file()
+    limit = max_file_size()
     if limit is not None and size > limit:
         raise OSError(errno.EFBIG, f"{os.strerror(errno.EFBIG)} (ulimit -f)")
 

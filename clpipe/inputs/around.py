@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.reading import unchanged
+from clpipe.base.reading import check_unchanged
 from clpipe.base.types import Array
 from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import Settings
@@ -172,7 +172,7 @@ def read_around(job: Job, read: Callable[[Path], SourceImage], wide: WideAngle) 
     """
     sources: list[SourceImage] = []
     for path in job.paths:
-        with unchanged(path):
+        with check_unchanged(path):
             sources.append(read(path))
     first = sources[0]
     for path, other in zip(job.paths, sources, strict=True):

@@ -10,7 +10,7 @@ import numpy as np
 
 from clpipe.base.digests import digests, stamp_of
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.reading import unchanged
+from clpipe.base.reading import check_unchanged
 from clpipe.base.types import Array
 from clpipe.chain.carry import AovSpec
 from clpipe.chain.chain import Chain
@@ -140,7 +140,7 @@ def read_found(
     Raises:
         ImageError: the layer is damaged, or differs from the image in size.
     """
-    with unchanged(layer.file):
+    with check_unchanged(layer.file):
         pixels, place, own = read_layer(layer.file, layer.location, max_pixels)
     if own != size:
         raise ImageError(

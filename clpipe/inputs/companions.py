@@ -9,7 +9,7 @@ from pathlib import Path
 
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError
-from clpipe.base.text import alike, either, one_line
+from clpipe.base.text import one_line, quote_alternatives, similar_names
 from clpipe.chain.carry import AovSpec
 from clpipe.images.kinds import MIN_CHANNELS, flow_vectors, kind_from_name
 from clpipe.images.passes import LayerLocation, find_layers, layer_kind
@@ -105,8 +105,8 @@ class Finder:
                 return [self._found(asked, file, each) for each in named]
         layers = [each.without_rank for file in self.layers for each in self._of(file)]
         names = dict.fromkeys(layer.rpartition(".")[2] for layer in layers if layer)
-        near = alike(asked.name, names)
-        hint = f" (did you mean {either(near)}?)" if near else ""
+        near = similar_names(asked.name, names)
+        hint = f" (did you mean {quote_alternatives(near)}?)" if near else ""
         files = [file.name for file in self.layers if file != self.path]
         where = f"the file and {', '.join(files)} have" if files else "the file has"
         expected = f"{self.path.stem}_{one_line(asked.name)}.exr"

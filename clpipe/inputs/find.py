@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_input
 from clpipe.base.text import printable, whole_number
-from clpipe.base.urls import is_glob, is_url, listed, path_of, url_of
+from clpipe.base.urls import is_glob, is_url, list_urls, path_of, url_of
 from clpipe.chain.rendition import Rendition
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import PICTURE_SUFFIXES, RENDER_SUFFIXES
@@ -220,7 +220,7 @@ def _jobs_behind(url: str, endings: Sequence[str], excluded: Exclusion) -> list[
         return [Job(path_of(url), url.rpartition("/")[2])]
     root = url.rstrip("/")
     jobs = []
-    for each in listed(url):
+    for each in list_urls(url):
         is_below = each.startswith(f"{root}/") and not is_pattern
         key = each.removeprefix(f"{root}/") if is_below else each.rpartition("/")[2]
         hidden = any(part.startswith(".") for part in key.split("/"))
@@ -268,13 +268,13 @@ def images_in(
     ranked = sorted(others.items(), key=lambda item: (-item[1], item[0]))
     kinds = [f"{count} {suffix}" for suffix, count in ranked[:5]]
     kinds += ["others"] * (len(others) > len(kinds))
-    listed = printable(", ".join(kinds))
+    kinds_text = printable(", ".join(kinds))
     if not images:
         left = " that are not excluded" if excluded else ""
         looked = ", ".join(e for e in endings if e not in RAW_SUFFIXES)
         raws = " and camera raws" if set(RAW_SUFFIXES) & set(endings) else ""
         text = f"{folder}: this folder has no images{left}; clpipe looked for {looked}{raws}"
-        text += f", and the folder has {listed}" if listed else ""
+        text += f", and the folder has {kinds_text}" if kinds_text else ""
         if others.keys() & set(PICTURE_SUFFIXES):
             text += f". {FINISHED}"
         raise RequestError(text)
@@ -282,7 +282,9 @@ def images_in(
         is_one = others.total() == 1
         not_images = "file is not an image" if is_one else "files are not images"
         were = "was" if is_one else "were"
-        log.info("%s: %d %s and %s skipped: %s", folder, others.total(), not_images, were, listed)
+        log.info(
+            "%s: %d %s and %s skipped: %s", folder, others.total(), not_images, were, kinds_text
+        )
     return sorted(images)
 
 

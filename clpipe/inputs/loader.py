@@ -10,7 +10,7 @@ import numpy as np
 
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, KindError, NoPictureError, RequestError
-from clpipe.base.reading import unchanged
+from clpipe.base.reading import check_unchanged
 from clpipe.chain.chain import Chain
 from clpipe.chain.entering import prepare_image
 from clpipe.chain.exposures import exposures_of
@@ -228,7 +228,7 @@ class ImageLoader:
             spans = exposures.spans if exposures else (Span(),)
             source = average(job, self._read, known, spans)
         else:
-            with unchanged(job.path):
+            with check_unchanged(job.path):
                 source = self._read(job.path)
         if source.envmap == CUBE_MAP:
             raise ImageError(

@@ -10,8 +10,8 @@ from typing import Any, Protocol
 
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import check_exists, read_bytes
-from clpipe.base.text import one_of
-from clpipe.base.urls import fetch, is_url, joined
+from clpipe.base.text import unknown_name
+from clpipe.base.urls import fetch, is_url, join_url
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import TABLES, check_type
 from clpipe.chain.methods import TABLE_MODELS, base_name
@@ -186,7 +186,7 @@ def check_rows(
                     check_cameras(own)
                     for step in others:
                         if step not in (*PLAIN, *TABLES, *steps):
-                            raise RequestError(one_of("stage in this chain", step, steps))
+                            raise RequestError(unknown_name("stage in this chain", step, steps))
                 known[alike] = own
             for key, value in alone.items():
                 check_type(key, value)
@@ -234,15 +234,15 @@ def _check_column(name: str) -> None:
             raise RequestError(
                 f"{name} is not a column, but each of its parameters is; use {name}.PARAMETER"
             )
-        raise RequestError(one_of("column", name, (*OWN, *PLAIN)) + ", or stage.parameter")
+        raise RequestError(unknown_name("column", name, (*OWN, *PLAIN)) + ", or stage.parameter")
     if dot and step not in TABLES:
         if stage is None:
-            raise RequestError(f"{name}: {one_of('stage', step, (*all_stages(), *TABLES))}")
+            raise RequestError(f"{name}: {unknown_name('stage', step, (*all_stages(), *TABLES))}")
         names = dict.fromkeys(n for method in stage.methods for n in method.model_fields)
         if parameter not in ("method", *names):
-            raise RequestError(one_of(f"parameter of {step}", parameter, ("method", *names)))
+            raise RequestError(unknown_name(f"parameter of {step}", parameter, ("method", *names)))
     elif dot and parameter not in (fields := TABLE_MODELS[step].model_fields):
-        raise RequestError(one_of(f"key of {step}", parameter, fields))
+        raise RequestError(unknown_name(f"key of {step}", parameter, fields))
 
 
 def _row(
@@ -276,7 +276,7 @@ def _row(
             values[column] = value.split()
         elif column in PLAIN:
             values[column] = value
-    own = joined(folder, path)
+    own = join_url(folder, path)
     key = name or (own.name if is_url(path) else key_of(folder, own))
     values = resolve_paths(folder, values)
     return Row(own, key, name, alike.setdefault(repr(values), values), frames, place)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import RequestError
-from clpipe.base.text import several
+from clpipe.base.text import as_texts
 from clpipe.camera.profile import load_camera
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.settings import Settings, overlay
@@ -83,8 +83,8 @@ class Series:
     def _members(self) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield the folders, each with the settings of its pictures."""
         cameras: list[tuple[str, dict[str, Any]]] = [("", {})]
-        several = 0 if self.always else 1
-        if len(self.cameras) > several:
+        as_texts = 0 if self.always else 1
+        if len(self.cameras) > as_texts:
             names = [load_camera(camera).name for camera in self.cameras]
             for name in names:
                 if names.count(name) > 1:
@@ -93,7 +93,7 @@ class Series:
                 (f"{name}/", {"camera": camera})
                 for name, camera in zip(names, self.cameras, strict=True)
             ]
-        named = self.isos if len(self.isos) > several else ()
+        named = self.isos if len(self.isos) > as_texts else ()
         isos = [(f"iso{iso:g}", {"iso": iso}) for iso in named]
         for folder, camera in cameras:
             for name, iso in isos or [("", {})]:
@@ -122,7 +122,7 @@ def split_series(
         if key in settings and not isinstance(settings[key], Mapping)
     }
     isos = check_isos(own["iso"]) if "iso" in own else ()
-    series = Series(several(own.get("camera")), isos, always)
+    series = Series(as_texts(own.get("camera")), isos, always)
     others = {key: value for key, value in settings.items() if key not in own}
     return series, others | series.common
 

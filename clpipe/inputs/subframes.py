@@ -10,7 +10,7 @@ import numpy as np
 
 from clpipe.base.digests import joint_digest
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.reading import unchanged
+from clpipe.base.reading import check_unchanged
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import Settings
@@ -93,7 +93,7 @@ def average(
     totals: Floats = np.empty(0, np.float32)
     weights: list[tuple[Doubles, Doubles]] = []  # of a frame, and in addition of its light layer
     for number, path in enumerate(job.paths):
-        with unchanged(path):
+        with check_unchanged(path):
             source = read(path, None)
             light = read(path, shutter.light_layer) if shutter.light_layer else None
         pixels = source.pixels

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import RequestError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.chain.keys import CODE, KEYS
 from clpipe.chain.toml import toml_value
 
@@ -73,7 +73,7 @@ def _check_header(place: str, columns: Sequence[str], check_column: Callable[[st
             raise RequestError(f"{place}: there are two columns '{column}'; remove one of them")
     if "path" not in columns:
         commas = "" if len(columns) > 1 else "; columns are separated by commas"
-        message = one_of("column", "path", columns).replace("unknown", "there is no")
+        message = unknown_name("column", "path", columns).replace("unknown", "there is no")
         raise RequestError(f"{place}: {message.replace('; allowed:', '; found:')}{commas}")
     for column in columns:
         try:

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from clpipe.base.errors import ImageError
-from clpipe.base.files import keep_names, make_folder_of, write_whole
+from clpipe.base.files import create_parents, sync_folder, write_atomic
 from clpipe.base.reading import read_bytes
 from clpipe.outputs.existing import is_marked
 from clpipe.outputs.photographs import MODELS, Photograph, photographs
@@ -90,9 +90,9 @@ def write_camera_files(folder: Path, splits: Mapping[str, str] = MappingProxyTyp
     for name in (name for name in FILES if name not in taken):
         path = folder / name
         if name in texts:
-            make_folder_of(path)
-            write_whole(path, texts[name].encode())
-            keep_names(path.parent)
+            create_parents(path)
+            write_atomic(path, texts[name].encode())
+            sync_folder(path.parent)
         elif texts:
             path.unlink(missing_ok=True)  # its pictures have been removed
     reasons = tuple(

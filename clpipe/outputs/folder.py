@@ -9,9 +9,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from clpipe.base.errors import RequestError
-from clpipe.base.files import shortened
-from clpipe.base.memory import in_words
-from clpipe.base.system import HOLDABLE, hold, let_go, open_plain, reserve
+from clpipe.base.files import shorten_name
+from clpipe.base.memory import format_bytes
+from clpipe.base.system import LOCKABLE_BYTES, close_and_remove, lock_range, open_plain, reserve
 from clpipe.inputs.find import Job, Shard
 from clpipe.outputs.patches import without_patch
 
@@ -22,7 +22,9 @@ LEAST_FREE = 8 * 2**20  # bytes; a disk with less free space counts as full
 
 LOCK = ".clpipe.lock"
 
-UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # names that whole_file gives
+UNFINISHED = re.compile(
+    r"\.(.+)\.[0-9a-f]{8}\.part\.\w+"
+)  # names of temporary files by atomic_file
 
 # Locks of this process: the file, its descriptor, and the first byte and length of the locked part.
 _held: set[tuple[Path, int, int, int]] = set()
@@ -39,7 +41,7 @@ def write_problem(folder: Path, with_space: bool = True) -> str:
             if with_space:
                 reserve(file, LEAST_FREE)
     except OSError as error:
-        needed = f" ({in_words(LEAST_FREE)} are needed)" if error.errno == errno.ENOSPC else ""
+        needed = f" ({format_bytes(LEAST_FREE)} are needed)" if error.errno == errno.ENOSPC else ""
         return f"cannot write to this directory: {error.strerror}{needed}"
     finally:
         with contextlib.suppress(OSError):
@@ -66,15 +68,15 @@ def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
     if reason := write_problem(folder, with_space=False):
         raise RequestError(f"{folder}: {reason}")
     # Each shard locks its part of a file that stays empty.
-    first = HOLDABLE * (shard.number - 1) // shard.of
-    share = HOLDABLE * shard.number // shard.of - first
+    first = LOCKABLE_BYTES * (shard.number - 1) // shard.of
+    share = LOCKABLE_BYTES * shard.number // shard.of - first
     held = folder / LOCK, _locked(folder / LOCK, share, first), first, share
     _held.add(held)
     try:
         yield
     finally:
         _held.discard(held)
-        let_go(*held)
+        close_and_remove(*held)
 
 
 def release_folders() -> None:
@@ -85,7 +87,7 @@ def release_folders() -> None:
     """
     while _held:
         with contextlib.suppress(OSError):
-            let_go(*_held.pop())
+            close_and_remove(*_held.pop())
 
 
 def _locked(path: Path, length: int, first: int) -> int:
@@ -100,7 +102,7 @@ def _locked(path: Path, length: int, first: int) -> int:
         except OSError as error:
             raise RequestError(f"{path}: this file cannot be locked: {error.strerror}") from None
         try:
-            is_ours = hold(lock, first, length)
+            is_ours = lock_range(lock, first, length)
         except OSError:
             return lock  # a file system without locks
         if not is_ours:
@@ -118,7 +120,7 @@ def _locked(path: Path, length: int, first: int) -> int:
 def remove_unfinished(folder: Path, jobs: Iterable[Job], patches: bool = False) -> None:
     """Remove the unfinished files of these jobs, or of their patches, that a killed run left."""
     named = (os.path.split(job.stem) for job in jobs)
-    stems = {os.path.join(folder, shortened(name)) for folder, name in named}
+    stems = {os.path.join(folder, shorten_name(name)) for folder, name in named}
 
     def is_ours(stem: str) -> bool:
         return stem in stems or (patches and without_patch(stem) in stems)

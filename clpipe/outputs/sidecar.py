@@ -16,7 +16,7 @@ from typing import Any
 from pydantic_core import from_json
 
 from clpipe.base.errors import ImageError
-from clpipe.base.files import keep_names, write_whole
+from clpipe.base.files import sync_folder, write_atomic
 from clpipe.base.reading import parse_json, read_bytes
 
 SIDECAR = "json"  # its extension
@@ -144,8 +144,8 @@ def write_sidecar(path: Path, record: Mapping[str, Any]) -> None:
     Raises:
         ImageError: it cannot be written.
     """
-    write_whole(path, sealed(record))
-    keep_names(path.parent)
+    write_atomic(path, sealed(record))
+    sync_folder(path.parent)
 
 
 def remove_sidecar(path: Path) -> None:
@@ -156,7 +156,7 @@ def remove_sidecar(path: Path) -> None:
     """
     try:
         path.unlink()
-        keep_names(path.parent, at_once=True)
+        sync_folder(path.parent, immediately=True)
     except FileNotFoundError:
         pass
     except OSError as error:

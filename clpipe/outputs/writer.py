@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from clpipe.base.errors import ImageError, OutputError
-from clpipe.base.files import Stored, keep_names
+from clpipe.base.files import Stored, sync_folder
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.formats import DNG, FORMATS, NPY, Format, extension_of
@@ -190,7 +190,7 @@ class OutputWriter(OutputPlan):
                 return
             folder.mkdir(parents=True, exist_ok=True)
             for place in folder.relative_to(self.folder).parents:
-                keep_names(self.folder / place)
+                sync_folder(self.folder / place)
         except OSError as error:
             raise ImageError(f"{folder}: this folder cannot be created: {error.strerror}") from None
 

@@ -10,7 +10,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from clpipe.base.errors import RequestError
-from clpipe.base.text import one_of
+from clpipe.base.text import unknown_name
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.reference.cfa import PATTERNS, Pattern
 
@@ -212,7 +212,9 @@ def parse_array(text: str, gains: tuple[float, float] = (1.0, 1.0)) -> FilterArr
     """
     rows = tuple(NAMED.get(text, text).split("/"))
     if "/" not in text and text not in NAMED and not set(text) <= {*LETTERS}:
-        raise RequestError(f"{one_of('filter array', text, NAMED)}; or use rows, for example RG/GB")
+        raise RequestError(
+            f"{unknown_name('filter array', text, NAMED)}; or use rows, for example RG/GB"
+        )
     unknown = sorted(set("".join(rows)) - {*LETTERS})
     if unknown:
         raise RequestError(f"{text!r} contains {unknown[0]!r}; a channel is one of {LETTERS}")

@@ -8,8 +8,8 @@ from datetime import datetime
 from functools import cached_property
 from typing import Any
 
-from clpipe.base.memory import in_words
-from clpipe.base.text import duration, one_line
+from clpipe.base.memory import format_bytes
+from clpipe.base.text import format_duration, one_line
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS
 from clpipe.engine.clipping import WARNING_SHARE
 from clpipe.reports.run import Made, Run
@@ -153,11 +153,11 @@ def totals(run: Run, found: Sequence[Session]) -> list[tuple[str, str]]:
         left_out = last.count(LEFT_OUT)
         rows += [("Left out", f"{left_out:,}")] if left_out else []
         if last.seconds > 0:
-            rows.append(("Time of the last run", duration(last.seconds)))
+            rows.append(("Time of the last run", format_duration(last.seconds)))
         if last.speed:
             rows.append(("Speed of the last run", f"{last.speed:.3g} MP/s"))
         if peak := number(last.end.get("peak_memory")):
-            rows.append(("Peak memory", in_words(peak)))
+            rows.append(("Peak memory", format_bytes(peak)))
     return rows
 
 

@@ -12,7 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from clpipe.analysis.svg import PAGE_FILES, bars_svg, histogram_svg, lines_svg, shares_svg
 from clpipe.base.about import __version__
-from clpipe.base.text import duration, one_line
+from clpipe.base.text import format_duration, one_line
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, STEPS
 from clpipe.reports import figures
 from clpipe.reports.figures import Parameter, Session, Step, text_of
@@ -221,7 +221,7 @@ def session_row(session: Session) -> Mapping[str, str]:
         "done": f"{session.count(DONE):,}",
         "skipped": f"{session.count(SKIPPED):,}",
         "failed": f"{session.count(FAILED):,}",
-        "time": duration(session.seconds),
+        "time": format_duration(session.seconds),
         "speed": f"{session.speed:.3g} MP/s" if session.speed else "-",
     }
 

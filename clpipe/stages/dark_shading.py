@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import field_validator
 
 from clpipe.base.errors import ImageError
-from clpipe.base.reading import read_when_changed
+from clpipe.base.reading import cached_by_mtime
 from clpipe.base.tracing import float32
 from clpipe.base.types import Array, Floats
 from clpipe.reference.random import Stream, normal_of, philox
@@ -177,7 +177,7 @@ def read_map(path: str) -> Floats:
         raise ValueError(str(error)) from None
 
 
-@read_when_changed
+@cached_by_mtime
 def _read_map(path: str) -> Floats:
     from clpipe.images.read import read_image  # this import is slow and rarely needed
 

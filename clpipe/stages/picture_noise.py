@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from clpipe.base.errors import RequestError
-from clpipe.base.reading import parse_json, read_bytes, read_when_changed
+from clpipe.base.reading import cached_by_mtime, parse_json, read_bytes
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.correlated import correlated_normals, mixing
@@ -314,7 +314,7 @@ def measured_noise(path: str) -> Mapping[float | None, Mapping[str, MeasuredNois
         raise ValueError(f"cannot be read: {error.strerror}") from None
 
 
-@read_when_changed
+@cached_by_mtime
 def _measured_noise(path: str) -> Mapping[float | None, Mapping[str, MeasuredNoise]]:
     try:
         report = parse_json(read_bytes(Path(path)))

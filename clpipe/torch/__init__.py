@@ -5,7 +5,7 @@ It uses only PyTorch: no OpenCL, files or processes. It needs the package ``torc
 
 from typing import TYPE_CHECKING, Any
 
-from clpipe.base.extras import installing
+from clpipe.base.extras import install_command
 
 if TYPE_CHECKING:
     from clpipe.torch.raw_noise import RawNoise
@@ -26,5 +26,5 @@ def __getattr__(name: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
-        raise ImportError(f"clpipe.torch needs torch; {installing('torch')}") from None
+        raise ImportError(f"clpipe.torch needs torch; {install_command('torch')}") from None
     return getattr(raw_noise, name)

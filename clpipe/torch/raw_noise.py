@@ -12,9 +12,9 @@ from torch.nn import functional
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
-from clpipe.base.text import several
+from clpipe.base.text import as_texts
 from clpipe.base.types import plain
-from clpipe.base.validation import typed
+from clpipe.base.validation import check_argument_types
 from clpipe.chain.chain import Chain
 from clpipe.chain.files import load_settings
 from clpipe.chain.making import make_chain
@@ -59,7 +59,7 @@ class RawNoise(ReadOnly):
     (torch.Size([8, 4, 32, 32]), True)
     """
 
-    @typed
+    @check_argument_types
     def __init__(
         self,
         camera: str | Path | Mapping[str, Any],
@@ -71,7 +71,7 @@ class RawNoise(ReadOnly):
     ) -> None:
         own = camera if isinstance(camera, Mapping) else str(camera)
         given = {**settings, "camera": own, "iso": iso, "seed": seed or 0}
-        self._settings = overlay(load_settings(*several(config)), plain(given))
+        self._settings = overlay(load_settings(*as_texts(config)), plain(given))
         self._random = torch.Generator()
         if seed is None:
             self._random.seed()

@@ -15,7 +15,7 @@ from clpipe.analysis.calibration.profile import calibrated_profile
 from clpipe.analysis.calibration.result import Calibration
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.extras import require
-from clpipe.base.files import whole_file, write_new
+from clpipe.base.files import atomic_file, write_new
 from clpipe.camera.profile import load_camera
 
 
@@ -82,7 +82,7 @@ def write_with_picture(path: Path, text: str, png: bytes) -> Path:
     picture = path.with_suffix(".png")
     write_new(picture, png)
     try:
-        with whole_file(path) as file:
+        with atomic_file(path) as file:
             file.write(text.encode())
             file.flush()
             load_camera(file.name)  # raises RequestError for an invalid profile

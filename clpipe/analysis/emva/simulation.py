@@ -10,7 +10,7 @@ import numpy as np
 from clpipe.analysis.emva.sensor import noisiest_light
 from clpipe.analysis.emva.series import NAME, NS, PAIR, Exposure, Series, series_text
 from clpipe.base.errors import RequestError
-from clpipe.base.files import check_folder, make_folder_of, write_new
+from clpipe.base.files import check_folder, create_parents, write_new
 from clpipe.camera.profile import Camera, load_camera
 from clpipe.chain.identity import image_key, noise_key
 from clpipe.chain.making import make_chain
@@ -92,7 +92,7 @@ def simulate(
         light = np.full((size.height, size.width), photon * exposure.photons, np.float32)
         for frame in exposure.frames:
             key = noise_key(settings, image_key(frame.relative_to(folder).as_posix(), ""))
-            make_folder_of(frame)
+            create_parents(frame)
             write_grey_png(frame, runner.run(light, key).image.astype(samples))
             done += 1
             watch(done, total)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from clpipe.base.reading import read_text, read_when_changed
+from clpipe.base.reading import cached_by_mtime, read_text
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.curve import tabulate
 
@@ -169,7 +169,7 @@ def load_table(path: str) -> Floats:
         raise ValueError("not a text file") from None
 
 
-@read_when_changed
+@cached_by_mtime
 def _load_table(path: str) -> Floats:
     ending = Path(path).suffix.lower()
     if ending not in FORMATS:
