@@ -329,17 +329,17 @@ def test_buffers_that_cannot_be_made(device, monkeypatch):
     image = example(Kind.RGB, (150, 203), half=True)
     whole = runner.run(image, "k")
     pool = device.flow.pool
-    make, sizes = pool._make, []
+    allocate, sizes = pool._allocate, []
 
     def scarce(size):
         sizes.append(size)
         if size > 40_000:
             raise cl.MemoryError("CL_MEM_OBJECT_ALLOCATION_FAILURE")
-        return make(size)
+        return allocate(size)
 
     pool.release()
     with monkeypatch.context() as patch:
-        patch.setattr(pool, "_make", scarce)
+        patch.setattr(pool, "_allocate", scarce)
         same(whole, runner.run(image, "k"))
     assert max(sizes) > 100_000
     assert max(b.size for b in pool.buffers.values()) <= 40_000

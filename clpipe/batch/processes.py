@@ -64,7 +64,7 @@ def default_processes(images: int, claim: MemoryClaim, processors: int) -> int:
         claim: the size of the first image.
         processors: the number of available processors.
 
-    >>> small, large = Claim(512, 512, 0, 0), Claim(6000, 4000, 0, 0)
+    >>> small, large = MemoryClaim(512, 512, 0, 0), MemoryClaim(6000, 4000, 0, 0)
     >>> [default_processes(100_000, small, n) for n in (1, 2, 4)]
     [1, 2, 4]
     >>> default_processes(200, small, 4), default_processes(10_000, large, 64)
