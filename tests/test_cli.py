@@ -224,10 +224,12 @@ def test_a_jpeg_has_its_limit(clpipe, write_exr):
 
 def test_plan(clpipe):
     result = clpipe("plan", "--set", "white_balance.method=gray_world")
-    assert "10 launches, 6 slots" in result.stdout
+    assert "Launches: 5. Slots: 1. Memory" in result.stdout
+    assert "Launch 2 runs in bands of 8 rows" in result.stdout
     record = json.loads(clpipe("plan", "--json", "--keep", "sensor_noise").stdout)
     assert record["kept"] == ["sensor_noise"]
-    assert len(record["launches"]) == 8
+    numbers = [launch["number"] for launch in record["launches"]]
+    assert numbers == ["1", "2", "2.1", "2.2", "3", *(f"3.{i}" for i in range(1, 6))]
 
 
 def test_stages(clpipe):
@@ -365,20 +367,22 @@ def test_a_plan_says_what_opens_a_launch(clpipe):
     assert "denoise: stencil, radius 2" in opened
     assert "white_balance: histogram" in opened_by("--set", "white_balance.method=white_patch")
     text = clpipe("plan", *options).stdout
-    assert "sensor_noise is kept" in text and "slots" in text and "bytes a pixel" in text
+    assert "sensor_noise is kept" in text and "Slots: " in text and "bytes per pixel" in text
 
 
 def test_a_plan_prints_the_source_of_a_launch(clpipe):
     by_number, by_name = (
-        clpipe("plan", "--source", launch).stdout for launch in (4, "demosaic.bounded_green")
+        clpipe("plan", "--source", launch).stdout for launch in (2.3, "demosaic.bounded_green")
     )
     assert by_number == by_name and "#define LANES 8" in by_number
     assert re.search(r"__kernel .*\nvoid launch_[0-9a-f]{16}\(", by_number)
-    for unknown in ("0", "8", "denoise"):
+    in_bands = clpipe("plan", "--source", 2).stdout
+    assert "bounded_green(" in in_bands and "for (int band = " in in_bands
+    for unknown in ("0", "3", "denoise"):
         stderr = clpipe("plan", "--source", unknown, status=2).stderr
         assert (
             f"unknown launch '{unknown}'" in stderr
-            and "1 lines, 2 inverse_color_matrix, 3" in stderr
+            and "1 lines, 2 inverse_color_matrix..gamma, 2.1 inverse_color_matrix, 2.2" in stderr
         )
     assert "use only one" in clpipe("plan", "--source", 4, "--json", status=2).stderr
 

@@ -19,7 +19,7 @@ from clpipe.base.errors import DeviceError, ImageError, RequestError
 from clpipe.dataset import prefetch
 from clpipe.dataset.render_cache import RenderCache
 from clpipe.dataset.samples import SampleLoader
-from clpipe.engine.runner import is_planar
+from clpipe.engine.buffers import is_planar
 from clpipe.images.read import SourceImage
 from clpipe.inputs.loader import ImageLoader
 from tests.conftest import same_samples as same

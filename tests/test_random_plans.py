@@ -19,7 +19,7 @@ from clpipe.chain.chain import Chain, Step
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.engine.check import example
-from clpipe.engine.ir import Finalize, Histogram, Launch, Lines, Plan, Reduce, reads_of
+from clpipe.engine.ir import Cpu, Finalize, Histogram, Launch, Lines, Plan, Reduce, reads_of
 from clpipe.engine.ops import Op
 from clpipe.engine.plan import make_plan
 from clpipe.engine.runner import Runner
@@ -229,9 +229,15 @@ class Execution:
         self.sums, self.reduced, self.given = {}, {}, {}
         self.encoded = None
         for launch in plan.launches:
-            self.launch(launch)
+            self.rings = {}  # of images between the launches of a band
+            for each in (
+                launch.bands.parts if isinstance(launch, Launch) and launch.bands else [launch]
+            ):
+                self.launch(each)
 
     def stored(self, image):
+        if image.number in self.rings:
+            return self.rings[image.number]
         held = {self.slots[slot] for slot in self.plan.slots[image.number]}
         ((number, symbol),) = held
         assert number == image.number
@@ -283,6 +289,8 @@ class Execution:
             for slot in self.plan.slots[launch.writes.number]:
                 assert slot not in read
                 self.slots[slot] = launch.writes.number, symbol
+            if not self.plan.slots[launch.writes.number]:
+                self.rings[launch.writes.number] = symbol
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -293,7 +301,8 @@ def test_what_a_plan_makes_is_what_the_passes_say(seed):
         keep = [name for name in chain.names if random.random() < 0.25]
         encode, final = random.random() < 0.5 or not keep, random.random() < 0.5
         half, fold, incremental = (random.random() < share for share in (0.5, 0.8, 0.3))
-        plan = make_plan(chain, half, keep, encode, final, fold, False, incremental)
+        cpu = random.choice([None, Cpu(2, 1 << 18)])
+        plan = make_plan(chain, half, keep, encode, final, fold, False, incremental, cpu)
         expected, last = results_of_passes(chain, symbols), chain.names[-1]
         done = Execution(plan, symbols)
         assert not done.sums and not done.reduced
@@ -313,7 +322,7 @@ def check_sizes(plan: Plan, chain: Chain) -> None:
     passes = [each for step in chain.steps for each in step.method.passes()]
     resamplers = [p.access.resampler for p in passes if isinstance(p.access, Resample)]
     assert list(plan.resamplings) == resamplers[: len(plan.resamplings)]
-    for launch in plan.launches:
+    for launch in plan.alone:
         above = [read.image.level for read in reads_of(launch)]
         is_resampled = isinstance(launch, Launch) and launch.opener and not launch.stencil
         assert all(level == launch.level - bool(is_resampled) for level in above)

@@ -11,11 +11,12 @@ from clpipe.batch.threads import Batch
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine import stack
+from clpipe.engine.buffers import crop_patches
 from clpipe.engine.check import check_stack, example
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.options import DEFAULTS, RunOptions
-from clpipe.engine.runner import Result, Runner, crop_patches, submit_batch
+from clpipe.engine.runner import Result, Runner, submit_batch
 from clpipe.stage import Kind
 from tests.conftest import worker_of
 

@@ -11,11 +11,12 @@ from clpipe.base.errors import DeviceFailedError
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine import programs
+from clpipe.engine.buffers import crop_patches
 from clpipe.engine.check import example
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.options import RunOptions, Timing
-from clpipe.engine.runner import Runner, crop_patches
+from clpipe.engine.runner import Runner
 from clpipe.stage import Kind
 from tests.conftest import fail_launches
 

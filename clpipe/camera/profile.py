@@ -210,10 +210,8 @@ class Camera(BaseModel):
         stage = self.gain_stage(iso)
         if not stage.color_bias:
             return 0.0, 0.0, 0.0, 0.0
-        one, two, three, four = (
-            stage.interpolate(iso, of) / self.signal_range
-            for of in zip(*stage.color_bias, strict=True)
-        )
+        offsets = (stage.interpolate(iso, row) for row in zip(*stage.color_bias, strict=True))
+        one, two, three, four = (offset / self.signal_range for offset in offsets)
         return one, two, three, four
 
     def black_level_error(self, iso: float) -> float:
@@ -357,9 +355,9 @@ def load_camera(name: str) -> Camera:
         similar = similar_cameras(name)
         hint = f" (most similar: {', '.join(similar)})" if similar else ""
         raise RequestError(
-            f"unknown camera '{one_line(name)}': it is not built in{hint}. 'clpipe cameras' "
-            "lists those that are. For another camera, make a profile with 'clpipe cameras "
-            "import' or 'clpipe calibrate', and name its .toml file"
+            f"unknown camera '{one_line(name)}': it is not built in{hint}. 'clpipe cameras' lists "
+            "those that are. For another camera, make a profile with 'clpipe cameras import' or "
+            "'clpipe calibrate', and name its .toml file"
         )
     check_exists(path)
     try:
@@ -394,10 +392,8 @@ def _reason(error: ValidationError) -> str:
     """Return the first problem of a profile: its key, its value and what is allowed."""
     fault = first_fault(error)
     if fault.problem == "unknown":
-        model = GainStage if "." in fault.key else Camera
-        return fault.key.removesuffix(fault.name) + unknown_name(
-            "key", fault.name, model.model_fields
-        )
+        fields = (GainStage if "." in fault.key else Camera).model_fields
+        return fault.key.removesuffix(fault.name) + unknown_name("key", fault.name, fields)
     if fault.problem == "missing":
         return f"{fault.key}: missing; every profile needs this key"
     return f"{fault.key}: {fault.text}" if fault.path else fault.text

@@ -14,7 +14,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import atomic_file, unsynced_files
-from clpipe.engine.runner import is_planar
+from clpipe.engine.buffers import is_planar
 from clpipe.images.read import SourceImage
 
 MAX_OPEN = 4096  # files that a process maps

@@ -29,6 +29,12 @@ class ExtentNumber(NamedTuple):
     of_input: bool = False
 
 
+class StripNumber(NamedTuple):
+    """The "columns" or "rows" of a strip; see :mod:`clpipe.engine.bands`."""
+
+    name: str
+
+
 class TileNumber(NamedTuple):
     """The number of this tile, from 0."""
 
@@ -67,7 +73,7 @@ Value = ArgumentValue | StreamWord | EncodedCurves | ResamplingValue
 Bind = Callable[[Sequence[Value]], list[Any]]  # returns NumPy scalars and arrays
 
 
-Binding = Buffer | ExtentNumber | TileNumber | Value
+Binding = Buffer | ExtentNumber | TileNumber | StripNumber | Value
 
 
 class Parameter(NamedTuple):
@@ -78,6 +84,9 @@ class Parameter(NamedTuple):
 
     declaration: str
     binding: Binding
+
+
+RINGS = "rings"  # the buffer of the rows between launches that run in bands
 
 
 def slot_buffer(number: int) -> str:

@@ -113,6 +113,22 @@ def copy_plane(extent: Extent, plane: Array, target: Array, channel: int) -> Non
     image[:] = rows[top : top + core.height, left : left + core.width]
 
 
+def is_planar(image: Array) -> bool:
+    """Return whether the channels of an image are stored as consecutive planes.
+
+    >>> is_planar(np.zeros((3, 4, 5)).transpose(1, 2, 0)), is_planar(np.zeros((4, 5, 3)))
+    (True, False)
+    """
+    if image.ndim != 3 or image.flags.c_contiguous:
+        return False
+    return image.transpose(2, 0, 1).flags.c_contiguous
+
+
+def crop_patches(image: Array, boxes: Sequence[Box]) -> Array:
+    """Return parts of an image, all of one size, as (patch, height, width[, channel])."""
+    return np.stack([image[box.top : box.bottom, box.left : box.right] for box in boxes])
+
+
 class Pool:
     """Device buffers by name, which later images reuse if they are large enough."""
 

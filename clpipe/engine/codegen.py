@@ -10,11 +10,13 @@ plans with the same launch therefore share its program.
 """
 
 import hashlib
-from collections.abc import Sequence
 
-from clpipe.engine.bindings import step_buffer
+from clpipe.engine.bands import BAND, margin_of, schedule_of
+from clpipe.engine.bindings import RINGS, step_buffer
+from clpipe.engine.blocks import block_code, call, kernels_of, tap_function
 from clpipe.engine.ir import (
     AnyLaunch,
+    Bands,
     Border,
     Finalize,
     Histogram,
@@ -22,25 +24,28 @@ from clpipe.engine.ir import (
     Launch,
     Lines,
     Plan,
-    Read,
     Reduce,
 )
 from clpipe.engine.kernel_builder import KernelBuilder, kernel_opening, sort_parameters
-from clpipe.engine.ops import Op
 from clpipe.engine.sources import LIBRARY, files_text
-from clpipe.engine.work_items import PARTIALS, RUN, columns_of, local_size, summed_together
+from clpipe.engine.work_items import (
+    PARTIALS,
+    RUN,
+    columns_of,
+    group_size,
+    local_size,
+    round_up,
+    summed_together,
+)
 from clpipe.reference.filter_array import MIRRORED
-from clpipe.stage import Kind, LineTable, TableLookup
+from clpipe.stage import LineTable
 
 # The compiler knows that the origin is a whole number of blocks. Therefore it also knows which rows
 # share a Philox call, and the phase of a Bayer pattern.
-EXTENT = "{width, height, pitch, left * LANES, top * 4, columns, rows, border}"
+EXTENT = "{width, height, pitch, left * LANES, top * 4, columns, rows, border, 0}"
+ITEM_SUMS = "(int4)(fold_columns(even_rows, first), fold_columns(odd_rows, first))"
+STORE_SUMS = f"store_sums({ITEM_SUMS}, sums, first, e);"
 PLACEHOLDER_NAME = "kernel_without_a_name_yet"
-
-
-def call(op: Op, arguments: Sequence[str]) -> str:
-    """Return the call of a pass's function."""
-    return f"{op.pass_.function}({', '.join(arguments)})"
 
 
 def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
@@ -53,12 +58,12 @@ def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
     text += f"#define RUN {RUN}\n"
     text += files_text([f"lib/{part}.h" for part in LIBRARY], seen)
     match launch:
+        case Launch(bands=bands) if bands:
+            body = _bands(builder, launch, bands)
+            text += _functions_of_bands(builder, bands, seen)
         case Launch():
-            body = _pixels(builder, launch)
-            # The tap function calls the stages of its prologue, and the stencil calls it.
-            text += files_text(kernels_of([op for r in launch.reads for op in r.prologue]), seen)
-            text += _source_image(builder, launch)
-            text += files_text(kernels_of([*launch.ops, launch.sums]), seen)
+            body = _whole_image(builder, launch)
+            text += _functions(builder, launch, seen)
         case Lines():
             body = _lines(builder, launch)
             text += files_text(kernels_of(launch.ops), seen)
@@ -84,7 +89,7 @@ def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
     parameters = sort_parameters(builder.parameters)
     declared, table_reads = kernel_opening(parameters)
     signature = ",\n    ".join(declared)
-    size = 1 if isinstance(launch, Finalize) else local_size(lanes)
+    size = group_size(launch, lanes)
     setup = "".join(f"    {line}\n" for line in builder.setup)
     opening_lines = "".join(f"    {line}\n" for line in table_reads)
     # The hint prevents Intel's compiler from vectorising our vectors, up to nine times slower.
@@ -99,211 +104,133 @@ def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
     return Kernel(name, source, tuple(parameters.values()), launch, tuple(sorted(seen)))
 
 
-def kernels_of(ops: Sequence[Op | None]) -> list[str]:
-    """Return the kernel files of these passes."""
-    return [op.kernel for op in ops if op]
-
-
-def _prologue(builder: KernelBuilder, read: Read) -> list[tuple[Op, list[str], list[str]]]:
-    """Return the passes recomputed at a tap, with their arguments and their run-time arguments."""
-    calls = []
-    for op in read.prologue:
-        arguments = builder.arguments(op)
-        literals = dict(op.literals).values()
-        calls.append((op, arguments, [a for a in arguments if a not in literals]))
-    return calls
-
-
-def _source_image(builder: KernelBuilder, launch: Launch) -> str:
-    """Return the type and tap function of a stencil's ``src``, which recomputes passes at taps."""
-    if not launch.stencil:
-        return ""
-    reads = dict(zip(launch.ops[0].pass_.reads, launch.reads, strict=True))
-    read = reads.get("src")
-    if not read or not read.prologue:
-        kind = read.image.kind if read else launch.ops[0].source
-        return (
-            "typedef image src_image;\n"
-            f"INLINE {kind.c_type} src_tap(src_image src, int dx, int dy) "
-            f"{{ return tap_{kind.c_name}(src, dx, dy); }}\n"
-        )
-    fields = ""
-    value = f"tap_{read.image.kind.c_name}(src.stored, dx, dy)"
-    for op, arguments, values in _prologue(builder, read):
-        fields += "".join(f"float {v}; " for v in values)
-        value = call(op, [value, "at", *(f"src.{a}" if a in values else a for a in arguments)])
-    return (
-        f"typedef struct {{ image stored; {fields}}} src_image;\n"
-        f"INLINE {read.prologue[-1].kind.c_type} src_tap(src_image src, int dx, int dy) {{\n"
-        f"    const site at = shifted(src.stored.at, dx, dy);\n    return {value};\n}}\n"
-    )
-
-
-def _load(builder: KernelBuilder, launch: Launch) -> tuple[list[str], list[str], Kind]:
-    """Return the lines that compute ``v0`` from the source, a stored image or a stencil.
-
-    Returns:
-        The lines per work item (for a stencil that computes a whole block), the lines per row, and
-        the kind of ``v0``.
-    """
-    plan, op = builder.plan, launch.opener
-    if not launch.reads:
-        kind, dtype = plan.source, "half" if plan.half else "float"
-        builder.buffer("src", dtype, "src")
-        source = f"source_{kind.c_name}_{dtype}{'_planes' if plan.planar else ''}"
-        return [], [f"const {kind.c_type} v0 = {source}(src, at, e);"], kind
-    fills_block = launch.stencil and launch.stencil.vectors_per_row
-    images = [
-        f"image_at({', '.join(builder.planes(read))}, e, first, {'0' if fills_block else 'ROW'})"
-        for read in launch.reads
+def _bands(builder: KernelBuilder, launch: Launch, bands: Bands) -> str:
+    """Return the body of a kernel that runs launches in bands: each work item computes a strip."""
+    schedule, lanes = schedule_of(bands), builder.lanes
+    builder.rings = schedule.rings
+    columns, rows = builder.strip("columns"), builder.strip("rows")
+    buffer = builder.buffer("strips", "float", RINGS, written=True)
+    margin = margin_of(bands, lanes)
+    lines = [
+        f"const int strip_left = left * LANES + (uint)get_global_id(0) * {columns};",
+        f"const int strip_top = top * 4 + (uint)get_global_id(1) * {rows};",
+        "const int right = left * LANES + columns, bottom = top * 4 + rows;",
+        f"const int strip_right = int_min(strip_left + (int){columns}, right);",
+        f"const int strip_bottom = int_min(strip_top + (int){rows}, bottom);",
+        "if (strip_left >= strip_right || strip_top >= strip_bottom) return;",
+        f"const size_t ring_pitch = {columns} + {2 * margin};",
+        f"const uint strips_across = (columns + {columns} - 1) / {columns};",
+        "const size_t strip = get_global_id(1) * strips_across + get_global_id(0);",
+        f"{buffer} += strip * ring_pitch * {schedule.rows} + {margin} - strip_left;",
     ]
-    if not op:
-        kind = launch.reads[0].image.kind
-        return [], [f"const {kind.c_type} v0 = tap_{kind.c_name}({images[0]}, 0, 0);"], kind
-    if not launch.stencil:
-        larger = builder.input_extent()
-        planes = [f"image_origin({p}, {larger})" for p in builder.planes(launch.reads[0])]
-        expression = call(
-            op,
-            [
-                "at",
-                *planes,
-                larger,
-                *builder.resampling_arguments(launch.level - 1),
-                *builder.arguments(op),
-            ],
-        )
-        return [], [f"const {op.kind.c_type} v0 = {expression};"], op.kind
-    lines = []
-    for name, read, stored in zip(op.pass_.reads, launch.reads, images, strict=True):
-        values = [v for _, _, tap_values in _prologue(builder, read) for v in tap_values]
-        type_ = "src_image" if name == "src" else "image"
-        expression = f"{{{', '.join([stored, *values])}}}" if values else stored
-        lines.append(f"const {type_} {name} = {expression};")
-    kind, arguments = op.kind, [*op.pass_.reads, *builder.arguments(op)]
-    if not fills_block:
-        return [], [*lines, f"const {kind.c_type} v0 = {call(op, ['at', *arguments])};"], kind
-    lines.append(f"{call(op, ['first', *arguments, 'block'])};")
-    size = launch.rows * columns_of(launch, builder.lanes)
-    per_item = [f"{kind.c_type} block[{size}];", "{", *(f"    {x}" for x in lines), "}"]
-    index = "ROW" if builder.lanes == 1 else "row * COLUMNS + column"
-    return per_item, [f"const {kind.c_type} v0 = block[{index}];"], kind
+    for ring in schedule.rings.values():
+        shape = f"(uint)ring_pitch, 0, 0, width, height, {ring.border}, {ring.rows}"
+        lines.append(f"const extent {builder.extent(ring.image)} = {{width, height, {shape}}};")
+        for channel, plane in enumerate(builder.planes_of(ring.image, written=True)):
+            offset = ring.offset + channel * ring.rows
+            lines.append(f"__global float *const {plane} = {buffer} + {offset} * ring_pitch;")
+    # Launches that are ahead need rows from before the strip, so the first bands are partial.
+    before = round_up(2 * max(schedule.leads), BAND)
+    lines.append(f"for (int band = strip_top - {before}; band < strip_bottom; band += {BAND}) {{")
+    for number, part in enumerate(bands.parts):
+        lead, overlap = schedule.leads[number], schedule.overlaps[number]
+        vectors, high = columns_of(part, lanes), part.rows
+        wide = lanes * vectors
+        code = in_part(block_code(builder, part), number).replace("COLUMNS", str(vectors))
+        lines += [
+            f"{{ // {part.name}",
+            f"const int low = int_max(strip_top - {lead}, (int)top * 4);",
+            f"const int high = int_min(strip_bottom + {lead}, bottom);",
+            f"const int begin = int_clamp(band + {lead}, low, high) + {high - 1};",
+            f"const int end = int_clamp(band + {lead + BAND}, low, high) + {high - 1};",
+            f"const int from_x = int_max(strip_left - {overlap}, (int)left * LANES);",
+            f"const int to_x = int_min(strip_right + {overlap}, right);",
+            # Positions are multiples of a block's size, so that the compiler knows their parity.
+            f"for (uint j = begin / {high}; j < end / {high}; ++j) {{",
+            f"for (uint i = from_x / {wide}; i * {wide} < to_x; ++i) {{",
+            f"const uint x = i * {wide}, y = j * {high};",
+            code,
+            *([STORE_SUMS] if part.sums else []),
+            "}}}",
+        ]
+    return "\n".join([*lines, "}"]) + "\n"
 
 
-def _encode(builder: KernelBuilder, value: str, kind: Kind, curves: Sequence[Op]) -> str:
-    """Return the line that writes eight-bit pixels, through one table if curves come last."""
-    builder.buffer("dst", "uchar", "dst", written=True)
-    if not curves:
-        return f"encode_{'mosaic' if kind.c_type == 'vf' else 'rgb'}({value}, dst, at, e);"
-    return f"encode_rgb_by_table({value}, {builder.table8(curves)}, dst, at, e);"
+def _functions(builder: KernelBuilder, launch: Launch, seen: set[str]) -> str:
+    """Return the functions that a launch calls.
+
+    The stencil calls the tap function, and this calls the passes that it recomputes.
+    """
+    text = files_text(kernels_of([op for r in launch.reads for op in r.prologue]), seen)
+    text += tap_function(builder, launch)
+    return text + files_text(kernels_of([*launch.ops, launch.sums]), seen)
 
 
-def _pixels(builder: KernelBuilder, launch: Launch) -> str:
-    """Return the body of a kernel over the image: it loads, calls the stages and stores."""
-    plan = builder.plan
-    per_item, lines, kind = _load(builder, launch)
-    ops = list(launch.ops[1:] if launch.opener else launch.ops)
-    curves: list[Op] = []
-    if launch.encodes and not launch.writes:
-        while ops and isinstance(ops[-1].pass_.access, TableLookup):
-            curves.insert(0, ops.pop())
-    for i, op in enumerate(ops):
-        kind = op.kind
-        expression = call(op, [f"v{i}", "at", *builder.arguments(op)])
-        lines.append(f"const {kind.c_type} v{i + 1} = {expression};")
-    value = f"v{len(ops)}"
-    if launch.sums:
-        builder.buffer("sums", "int4", step_buffer("sums", launch.sums.step), written=True)
-        sample = call(launch.sums, [value, "at", *builder.arguments(launch.sums)])
-        lines.append(f"const vi sample = only_inside({sample}, at, {builder.core()});")
-        lines.append("if (ROW & 1) odd_rows += sample; else even_rows += sample;")
-        per_item.append("vi even_rows = (vi)(0), odd_rows = (vi)(0);")
-    wide = launch.stencil and launch.stencil.vectors_per_row and builder.lanes > 1
-    if not wide:
-        # Compute all rows before the first store. The compiler can then share work between rows,
-        # because no store can change their inputs.
-        per_item.append(
-            f"{kind.c_type} {', '.join(f'values_{row}' for row in range(launch.rows))};"
-        )
-        lines.append(f"values_ROW = {value};")
-        value = "values_ROW"
-    writes, encodes = [], []
-    if launch.writes:
-        slots = [builder.slot(n, True) for n in plan.slots[launch.writes.number]]
-        writes.append(f"store_{kind.c_name}({', '.join([value, *slots])}, at, e);")
-    if launch.encodes:
-        encodes.append(_encode(builder, value, kind, curves))
-    if wide:
-        body = _block_loop([*lines, *writes, *encodes], launch)
-    else:
-        body = _unrolled_rows(lines, launch.rows) + _store(writes, kind, launch.rows)
-        body += _unrolled_rows(encodes, launch.rows)
+def _functions_of_bands(builder: KernelBuilder, bands: Bands, seen: set[str]) -> str:
+    """Return the functions that launches in bands call.
+
+    Each launch has a tap function with its own name. The file of a stencil is compiled for the taps
+    and the columns of the launch that it opens, even if an earlier launch needs another function of
+    the file.
+    """
+    texts: list[str] = []
+    with_taps: set[int] = set()
+    openers: dict[str, int] = {}
+    for number, part in enumerate(bands.parts):
+        if part.stencil:
+            openers.setdefault(part.ops[0].kernel, number)
+
+    def include(file: str) -> None:
+        if file in seen:
+            return
+        if (number := openers.get(file)) is None:
+            texts.append(files_text([file], seen))
+            return
+        add_taps(number)
+        columns = columns_of(bands.parts[number], builder.lanes)
+        texts.append(f"#undef COLUMNS\n#define COLUMNS {columns}\n")
+        texts.append(f"#define src_image src_image{number}\n#define src_tap src_tap{number}\n")
+        texts.append(files_text([file], seen) + "#undef src_image\n#undef src_tap\n")
+
+    def add_taps(number: int) -> None:
+        if number not in with_taps:
+            with_taps.add(number)
+            for read in bands.parts[number].reads:
+                for op in read.prologue:
+                    include(op.kernel)
+            texts.append(in_part(tap_function(builder, bands.parts[number]), number))
+
+    for number, part in enumerate(bands.parts):
+        add_taps(number)
+        for file in kernels_of([*part.ops, part.sums]):
+            include(file)
+    return "".join(texts)
+
+
+def in_part(code: str, number: int) -> str:
+    """Return the code of a launch with its own names for the image and the taps of a stencil."""
+    return code.replace("src_image", f"src_image{number}").replace("src_tap", f"src_tap{number}")
+
+
+def _whole_image(builder: KernelBuilder, launch: Launch) -> str:
+    """Return the body of a kernel over the image, with one block for each work item."""
     position = (
         f"    const uint x = left * LANES + (uint)get_global_id(0) * (COLUMNS * LANES);\n"
         f"    const uint y = top * 4 + (uint)get_global_id(1) * {launch.rows};\n"
     )
-    rows = "".join(f"    {line}\n" for line in [*per_item, *body])
-    rows = f"    const site first = site_at(x, y);\n{rows}"
+    rows = block_code(builder, launch)
     inside = "x - e.left < columns && y - e.top < rows"  # members of a stack may differ in size
     outside = "x - e.left >= columns || y - e.top >= rows"
     if not launch.sums:
         return f"{position}    if ({outside}) return;\n{rows}"
-    item_sums = "(int4)(fold_columns(even_rows, first), fold_columns(odd_rows, first))"
-    if (group_size := summed_together(builder.lanes)) == 1:
-        store = f"    store_sums({item_sums}, sums, e);\n"
-        return f"{position}    if ({outside}) return;\n{rows}{store}"
+    if (together := summed_together(builder.lanes)) == 1:
+        return f"{position}    if ({outside}) return;\n{rows}    {STORE_SUMS}\n"
     # No work item may return before a barrier.
     return (
-        f"    __local int4 group[{group_size}];\n{position}    int4 own = (int4)(0);\n"
-        f"    if ({inside}) {{\n{rows}    own = {item_sums};\n    }}\n"
+        f"    __local int4 group[{together}];\n{position}    int4 own = (int4)(0);\n"
+        f"    if ({inside}) {{\n{rows}    own = {ITEM_SUMS};\n    }}\n"
         "    store_group_sums(own, group, sums);\n"
     )
-
-
-def _block_loop(lines: Sequence[str], launch: Launch) -> list[str]:
-    """Return loops over the vectors of a stencil's block. It is in memory, so they stay rolled."""
-    return [
-        "#pragma unroll 1",
-        f"for (uint row = 0; row < {launch.rows}; ++row) {{",
-        "    for (uint column = 0; column < COLUMNS; ++column) {",
-        "        if (x - e.left + column * LANES >= columns) break;",
-        "        const site at = site_at(x + column * LANES, y + row);",
-        *(f"        {line}" for line in lines),
-        "    }",
-        "}",
-    ]
-
-
-def _unrolled_rows(lines: Sequence[str], rows: int) -> list[str]:
-    """Return the lines for each row of a work item, unrolled, with the row's number for ROW.
-
-    Loops are not possible: Mesa's compiler mixes up an array that one loop fills and another reads.
-    """
-    if not lines:
-        return []
-    site = "const site at = shifted(first, 0, ROW);"
-    scope = ["{", *(f"    {line}" for line in [site, *lines]), "}"]
-    return [line.replace("ROW", str(row)) for row in range(rows) for line in scope]
-
-
-def _store(writes: Sequence[str], kind: Kind, rows: int) -> list[str]:
-    """Return the stores of all rows of a work item, with a separate, slower loop near edges."""
-    if not writes:
-        return []
-    inside = [line.replace("(", "_inside(", 1) for line in writes]
-    selection = "".join(f"row == {row} ? values_{row} : " for row in range(rows - 1))
-    return [
-        f"if (near_edge(first, {rows}, e)) {{",
-        "#pragma unroll 1",
-        f"    for (uint row = 0; row < {rows}; ++row) {{",
-        "        const site at = shifted(first, 0, row);",
-        f"        const {kind.c_type} value = {selection}values_{rows - 1};",
-        *(f"        {line.replace('values_ROW', 'value')}" for line in writes),
-        "    }",
-        "} else {",
-        *(f"    {line}" for line in _unrolled_rows(inside, rows)),
-        "}",
-    ]
 
 
 def _lines(builder: KernelBuilder, launch: Lines) -> str:

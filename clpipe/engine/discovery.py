@@ -14,7 +14,8 @@ from clpipe.base.text import unknown_name
 from clpipe.engine.cache_folder import pocl_problem
 from clpipe.engine.cpu_target import VARIABLE as TARGET_VARIABLE
 from clpipe.engine.cpu_target import Target, candidates, compile_for, forced_target
-from clpipe.engine.hardware import Hardware, hardware_of
+from clpipe.engine.hardware import Hardware, hardware_of, private_cache
+from clpipe.engine.ir import Cpu
 from clpipe.engine.runtimes import (
     attempt,
     device_problem,
@@ -62,6 +63,11 @@ class DeviceInfo:
     def zero_copy(self) -> bool:
         """Whether kernels use the host's memory directly and at full speed."""
         return self.type == "CPU" and bool(self.handle.host_unified_memory)
+
+    @property
+    def cpu(self) -> Cpu | None:
+        """The CPU on which launches run in bands; None for a device without vector lanes."""
+        return Cpu(self.compute_units, private_cache()) if self.lanes > 1 else None
 
     @property
     def alignment(self) -> int:

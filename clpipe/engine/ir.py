@@ -5,6 +5,7 @@ Images of one size form a level. The source is on level 0. Each resampling leads
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from itertools import chain
 
 from clpipe.engine.bindings import Parameter
 from clpipe.engine.ops import Op
@@ -49,6 +50,8 @@ class Launch:
         rows: the rows of a work item's block.
         columns: the vectors of a work item's block; with one lane, always one.
         level: the level of the result.
+        bands: the launches that this one runs in bands, if any. ``ops`` and ``reads`` are all of
+            theirs; the other attributes are those of the last.
     """
 
     name: str
@@ -60,6 +63,7 @@ class Launch:
     rows: int = 2
     columns: int = 1
     level: int = 0
+    bands: "Bands | None" = None
 
     @property
     def opener(self) -> Op | None:
@@ -73,10 +77,43 @@ class Launch:
         return self.writes is not None and self.writes.period is not None
 
     @property
+    def radius(self) -> int:
+        """The largest distance at which the launch reads stored images, in pixels."""
+        return self.stencil.radius if self.stencil else 0
+
+    @property
+    def src(self) -> Read | None:
+        """The read of the image that the opener calls ``src``, or None."""
+        if not self.opener:
+            return None
+        return dict(zip(self.opener.pass_.reads, self.reads, strict=False)).get("src")
+
+    @property
     def stencil(self) -> Stencil | None:
         """The access of the opener if it is a stencil, else None."""
         access = self.opener.pass_.access if self.opener else None
         return access if isinstance(access, Stencil) else None
+
+
+@dataclass(frozen=True)
+class Cpu:
+    """The parts of a CPU that matter to a plan.
+
+    Attributes:
+        cores: the number of cores.
+        cache: the bytes of the largest cache that each core has for itself.
+    """
+
+    cores: int
+    cache: int
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Launches that one kernel runs band by band on a CPU; see :mod:`clpipe.engine.bands`."""
+
+    parts: tuple[Launch, ...]
+    cpu: Cpu
 
 
 @dataclass(frozen=True)
@@ -195,6 +232,14 @@ class Plan:
         return replace(self, launches=launches, resamplings=())
 
     @cached_property
+    def alone(self) -> tuple[AnyLaunch, ...]:
+        """The launches, with those that run in bands as separate launches."""
+        parts = (
+            x.bands.parts if isinstance(x, Launch) and x.bands else (x,) for x in self.launches
+        )
+        return tuple(chain.from_iterable(parts))
+
+    @cached_property
     def estimates(self) -> dict[str, tuple[str, ...]]:
         """The names of the numbers that each step estimates from the image."""
         found = [launch.op for launch in self.launches if isinstance(launch, Finalize)]
@@ -203,6 +248,13 @@ class Plan:
     def sizes(self, width: int, height: int) -> tuple[tuple[int, int], ...]:
         """Return the width and height of each level's images, from those of the source."""
         return sizes(self.resamplings, width, height)
+
+    def is_tiny(self, width: int, height: int) -> bool:
+        """Return whether some image is so small that a pixel has several mirror images.
+
+        Launches that read such an image cannot run in bands.
+        """
+        return min(map(min, self.sizes(width, height))) <= 2 * self.border + 1
 
     def check_resamplings(self, width: int, height: int) -> None:
         """Check that an image of this size can be resampled.

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
+from clpipe.engine.bands import Ring
 from clpipe.engine.bindings import (
     ArgumentValue,
     Binding,
@@ -11,17 +12,18 @@ from clpipe.engine.bindings import (
     Parameter,
     ResamplingValue,
     StreamWord,
+    StripNumber,
     TileNumber,
     slot_buffer,
     step_buffer,
 )
-from clpipe.engine.ir import Plan, Read
+from clpipe.engine.ir import Image, Plan, Read
 from clpipe.engine.ops import Op
 from clpipe.stage import NoiseScope
 
 INPUT_EXTENT = (
     "{from_width, from_height, from_pitch, from_left * LANES, from_top * 4, from_columns, "
-    "from_rows, border}"
+    "from_rows, border, 0}"
 )
 
 # A kernel processes a stack of images. The third dimension of the index space counts the images.
@@ -42,6 +44,7 @@ class KernelBuilder:
         self.setup: list[str] = []
         self._steps: list[str] = []
         self._slots: list[int] = []
+        self.rings: dict[int, Ring] = {}  # by the image's number
 
     def name(self, step: str, item: str) -> str:
         """Return the canonical name of a step's item, such as ``step0_gain``."""
@@ -98,10 +101,29 @@ class KernelBuilder:
             f"plane{self._slots.index(number)}", "float", slot_buffer(number), written
         )
 
+    def planes_of(self, image: Image, written: bool) -> list[str]:
+        """Return the planes of an image: parameters, or variables for the planes of a ring."""
+        if image.number in self.rings:
+            return [f"ring{image.number}_{c}" for c in range(len(image.kind.channels))]
+        return [self.slot(n, written) for n in self.plan.slots[image.number]]
+
     def planes(self, read: Read) -> list[str]:
-        """Return three plane parameters for an image; the last one is repeated if it has fewer."""
-        slots = [self.slot(n, False) for n in self.plan.slots[read.image.number]]
-        return (slots + [slots[-1]] * 2)[:3]
+        """Return three planes of an image; the last one is repeated if it has fewer."""
+        planes = self.planes_of(read.image, False)
+        return (planes + [planes[-1]] * 2)[:3]
+
+    def extent(self, image: Image) -> str:
+        """Return the variable with the extent of an image."""
+        return f"e{image.number}" if image.number in self.rings else "e"
+
+    def image(self, read: Read, row: str) -> str:
+        """Return an expression for an image at a row of the work item's block."""
+        at = "ring_at" if read.image.number in self.rings else "image_at"
+        return f"{at}({', '.join(self.planes(read))}, {self.extent(read.image)}, first, {row})"
+
+    def strip(self, name: str) -> str:
+        """Return the parameter for the "columns" or "rows" of a strip."""
+        return self.parameter(f"strip_{name}", "uint", StripNumber(name))
 
     def lines(self, step: str, item: str, written: bool) -> str:
         """Return the parameter for one of a step's line tables."""
@@ -162,7 +184,7 @@ def sort_parameters(parameters: Mapping[str, Parameter]) -> dict[str, Parameter]
     def group(parameter: Parameter) -> int:
         if isinstance(parameter.binding, ExtentNumber):
             return int(parameter.binding.of_input)
-        if element_type(parameter) or isinstance(parameter.binding, TileNumber):
+        if element_type(parameter) or isinstance(parameter.binding, TileNumber | StripNumber):
             return 2
         return 3 + list(AS_TYPE).index(parameter.declaration.split()[0])
 

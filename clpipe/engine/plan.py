@@ -10,8 +10,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from clpipe.chain.chain import Chain
+from clpipe.engine.bands import in_bands
 from clpipe.engine.ir import (
     AnyLaunch,
+    Cpu,
     Finalize,
     Histogram,
     Image,
@@ -181,6 +183,7 @@ def make_plan(
     fold: bool = True,
     planar: bool = False,
     incremental: bool = False,
+    cpu: Cpu | None = None,
 ) -> Plan:
     """Return the plan of a chain.
 
@@ -196,6 +199,7 @@ def make_plan(
         planar: whether the source is stored as consecutive planes, not interleaved.
         incremental: whether images share no slots, so that a launch can be skipped if its results
             are still on the device.
+        cpu: the CPU on whose cores launches run in bands. None runs each over the whole image.
 
     Raises:
         RequestError: the chain lacks a step to keep.
@@ -227,6 +231,8 @@ def make_plan(
     launches[:0] = [Lines(tuple(ops), level=level) for level, ops in planner.lines.items()]
     results = [*kept.values(), final_image] if final_image else kept.values()
     pinned = {image.number for image in (planner.images if incremental else results)}
+    if cpu and not incremental:
+        launches = in_bands(launches, pinned, cpu)
     slots, count = assign_slots(launches, planner.images, pinned)
     border = max((op.radius for x in launches if isinstance(x, Launch) for op in x.ops), default=0)
     return Plan(

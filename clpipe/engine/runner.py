@@ -12,7 +12,7 @@ from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, cached_by_structure
 from clpipe.chain.exposures import exposures_of
 from clpipe.chain.registry import user_code_errors
-from clpipe.engine.buffers import HostImages, allocate_results
+from clpipe.engine.buffers import HostImages, allocate_results, crop_patches, is_planar
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.ir import Plan
@@ -72,22 +72,6 @@ class Result:
         return None if self.final is None and self.encoded is None else png_bytes(self.image)
 
 
-def is_planar(image: Array) -> bool:
-    """Return whether the channels of an image are stored as consecutive planes.
-
-    >>> is_planar(np.zeros((3, 4, 5)).transpose(1, 2, 0)), is_planar(np.zeros((4, 5, 3)))
-    (True, False)
-    """
-    if image.ndim != 3 or image.flags.c_contiguous:
-        return False
-    return image.transpose(2, 0, 1).flags.c_contiguous
-
-
-def crop_patches(image: Array, boxes: Sequence[Box]) -> Array:
-    """Return parts of an image, all of one size, as (patch, height, width[, channel])."""
-    return np.stack([image[box.top : box.bottom, box.left : box.right] for box in boxes])
-
-
 @cached_by_structure
 def has_size_estimates(chain: Chain) -> bool:
     """Return whether a stage derives numbers from the size of the image."""
@@ -122,6 +106,7 @@ class Runner:
         incremental: whether the device keeps all intermediate images. If an image that is processed
             whole is run again, only the last launch and those affected by a change run again. The
             results are the same; this needs less time and more memory.
+        bands: whether launches run in bands on a CPU. The results are the same.
     """
 
     def __init__(
@@ -132,6 +117,7 @@ class Runner:
         encode: bool = True,
         final: bool = False,
         incremental: bool = False,
+        bands: bool = True,
     ) -> None:
         self.chain = chain
         self.device = device
@@ -139,6 +125,7 @@ class Runner:
         self.encode = encode
         self.final = final
         self.incremental = incremental
+        self.bands = bands
         self._arguments = chain.arguments
         self._exposures = exposures_of(chain)
         # Shared with the runners of other chains, by a chain's structure.
@@ -150,7 +137,8 @@ class Runner:
 
         A chain that differs only in run-time values is neither planned nor compiled again.
         """
-        other = Runner(chain, self.device, self.keep, self.encode, self.final, self.incremental)
+        results = self.keep, self.encode, self.final
+        other = Runner(chain, self.device, *results, self.incremental, self.bands)
         other._plans, other._tables = self._plans, self._tables
         return other
 
@@ -163,15 +151,22 @@ class Runner:
             runner._plans = self._plans
         return runners
 
-    def plan(self, half: bool = True, fold: bool = True, planar: bool = False) -> Plan:
-        """Return the plan for a float16 or float32 source, interleaved or in planes."""
-        chain, key = self.chain, (half, fold, planar)
+    def plan(
+        self, half: bool = True, fold: bool = True, planar: bool = False, bands: bool = True
+    ) -> Plan:
+        """Return the plan for a float16 or float32 source, interleaved or in planes.
+
+        On a CPU, launches run in bands unless ``bands`` is false.
+        """
+        bands &= self.bands and not self.incremental
+        cpu = self.device.info.cpu if self.device and bands else None
+        chain, key = self.chain, (half, fold, planar, cpu)
 
         def plan() -> Plan:
             ops = chain_ops(chain, self._arguments)
             structure = (*key, chain.source, chain.result, ops)
             results = self.keep, self.encode, self.final
-            options = chain, half, *results, fold, planar, self.incremental
+            options = chain, half, *results, fold, planar, self.incremental, cpu
             return self._plans.get(structure, lambda: make_plan(*options))
 
         return self._plans.get(
@@ -180,8 +175,10 @@ class Runner:
 
     def plan_for(self, image: Array) -> Plan:
         """Return the plan for an image."""
-        size = self.chain.size(*image.shape[1::-1])
-        return self.plan(image.dtype == np.float16, min(size) > 1, is_planar(image))
+        size = image.shape[1::-1]
+        options = image.dtype == np.float16, min(self.chain.size(*size)) > 1, is_planar(image)
+        plan = self.plan(*options)
+        return self.plan(*options, bands=False) if plan.is_tiny(*size) else plan
 
     def compile(self, half: bool = True) -> None:
         """Compile all kernels, so that the first image does not wait for the compiler.

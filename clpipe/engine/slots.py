@@ -36,4 +36,4 @@ def assign_slots(
         for read in {read.image.number for read in reads_of(launch)}:
             if last_use[read] == i and read not in pinned:
                 free.extend(slots[read])
-    return tuple(slots[image.number] for image in images), count
+    return tuple(slots.get(image.number, ()) for image in images), count

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.types import Array
+from clpipe.engine.bands import strip_of, strips_of
 from clpipe.engine.bindings import (
     ArgumentValue,
     Buffer,
@@ -22,6 +23,7 @@ from clpipe.engine.bindings import (
     ExtentNumber,
     ResamplingValue,
     StreamWord,
+    StripNumber,
     TileNumber,
     Value,
 )
@@ -70,6 +72,7 @@ class Call:
             type_: [] for type_ in SCALAR_TYPES
         }  # indices into values
         self._tile: int | None = None
+        self._strips: dict[str, int] = {}
         for column, parameter in enumerate(kernel.parameters):
             element = element_type(parameter)
             match parameter.binding:
@@ -82,6 +85,8 @@ class Call:
                     self._numbers[of_input].append(name)
                 case TileNumber():
                     self._tile = column
+                case StripNumber(name):
+                    self._strips[name] = column
                 case ArgumentValue() | StreamWord() | EncodedCurves() | ResamplingValue() as value:
                     if element:
                         self._pointers.append((column, len(self.values)))
@@ -117,6 +122,12 @@ class Call:
         rows = self._extent_table(stack)
         if self._tile is not None:
             rows[:, self._tile] = stack.tile
+        if self._strips:
+            largest = enclosing([member.extents for member in stack.members])
+            launch = self.kernel.launch
+            assert isinstance(launch, Launch) and launch.bands
+            size = strip_of(launch.bands, largest[launch.level])
+            rows[:, self._strips["columns"]], rows[:, self._strips["rows"]] = size
         end = rows.shape[1]
         for type_, numbers in reversed(self._scalars.items()):  # they are the last columns
             if numbers:
@@ -210,6 +221,8 @@ def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[
     """Return the global and the local size of a kernel for one member, in work items."""
     lanes, local = extent.lanes, local_size(extent.lanes)
     match kernel.launch:
+        case Launch(bands=bands) if bands:
+            return strips_of(bands, extent), (1, 1)
         case Launch(rows=rows) as launch:
             wide = lanes * columns_of(launch, lanes)
             blocks = round_up(-(-extent.padded_width // wide), local)

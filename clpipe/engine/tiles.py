@@ -18,7 +18,8 @@ from functools import lru_cache
 
 from clpipe.base.errors import ImageError
 from clpipe.base.memory import format_bytes
-from clpipe.engine.bindings import slot_buffer, step_buffer
+from clpipe.engine.bands import ring_bytes
+from clpipe.engine.bindings import RINGS, slot_buffer, step_buffer
 from clpipe.engine.extents import Box, Extent, Extents, whole_image
 from clpipe.engine.ir import AnyLaunch, Finalize, Histogram, Launch, Lines, Plan, Reduce, reads_of
 from clpipe.engine.ops import Op
@@ -56,7 +57,11 @@ def buffer_sizes(plan: Plan, extents: Extents, depth: int = 1) -> dict[str, int]
                 # Line tables cover the image, not the tile: whole blocks of rows, and one vector.
                 longest = round_up(max(image.width, image.height), max(lanes, 4)) + 2 * lanes
                 sizes |= {step_buffer(op.pass_.writes, op.step): longest * 4 for op in ops}
-            case Launch(sums=sums, level=level) if sums:
+            case Launch(bands=bands, sums=sums, level=level):
+                if bands:
+                    sizes[RINGS] = max(ring_bytes(bands, extents[level]), sizes.get(RINGS, 0))
+                if not sums:
+                    continue
                 sizes[step_buffer("sums", sums.step)] = extents[level].blocks * 16
                 sizes[step_buffer("partials", sums.step)] = PARTIALS * 32
             case Histogram(op=op):
@@ -152,7 +157,7 @@ def halos_of(plan: Plan) -> tuple[int, ...]:
     """Return the halo of each level: the radius of all its stencils in a row, in pixels."""
     reach: dict[int, int] = {}  # of each stored image
     halos = [0] * (len(plan.resamplings) + 1)
-    for launch in reversed(plan.launches):
+    for launch in reversed(plan.alone):
         halo = 0
         if isinstance(launch, Launch):
             halo = reach.get(launch.writes.number, 0) if launch.writes else 0

@@ -1,6 +1,6 @@
 """The sizes of work-groups, blocks and reductions, by the lanes of a device. Pure."""
 
-from clpipe.engine.ir import AnyLaunch, Border, Launch
+from clpipe.engine.ir import AnyLaunch, Border, Finalize, Launch
 
 PARTIALS = 256  # the number of partial sums or partial histograms of a reduction
 RUN = 64  # the number of consecutive histogram bins whose sum is also stored
@@ -14,6 +14,12 @@ def round_up(value: int, step: int) -> int:
 def local_size(lanes: int) -> int:
     """Return the work items per work-group. On a GPU, 64 would not fill a multiprocessor."""
     return 128 if lanes == 1 else 64
+
+
+def group_size(launch: AnyLaunch | Border, lanes: int) -> int:
+    """Return the work items per work-group of a launch. A strip of bands is a group by itself."""
+    is_one = isinstance(launch, Finalize) or (isinstance(launch, Launch) and launch.bands)
+    return 1 if is_one else local_size(lanes)
 
 
 def summed_together(lanes: int) -> int:

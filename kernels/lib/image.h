@@ -21,6 +21,7 @@ typedef struct {
     uint left, top;      // of the planes, in the image; in whole blocks
     uint columns, rows;  // of the planes
     uint border;         // around the planes, in pixels: as wide as the plan's widest stencil
+    uint ring;           // if not 0, planes store only this many rows: row y in place of row y - ring
 } extent;
 
 // The pixels of a tile without its halo.
@@ -38,6 +39,7 @@ typedef struct {
     uint pitch;
     int row;
     site at;
+    uint ring;
 } image;
 
 INLINE site site_at(uint x, uint y) {
@@ -63,6 +65,13 @@ INLINE size_t plane_offset(site at, extent e) {
     return (size_t)(at.y - e.top + e.border) * e.pitch + border_left(e) + (at.x - e.left);
 }
 
+INLINE int int_min(int a, int b) { return a < b ? a : b; }
+INLINE int int_max(int a, int b) { return a > b ? a : b; }
+INLINE int int_clamp(int a, int low, int high) { return int_min(int_max(a, low), high); }
+
+// Rows from the start of a plane to a row of the image. Rows of the border are negative.
+INLINE long ring_row(int y, uint ring) { return (long)((uint)(y + (int)ring) % ring); }
+
 // The address that the image's first pixel would have. Positions in the image start from it.
 INLINE __global const float *image_origin(__global const float *plane, extent e) {
     return plane + ((long)e.border - (long)e.top) * (long)e.pitch + (long)border_left(e) -
@@ -73,11 +82,19 @@ INLINE image image_at(__global const float *p0, __global const float *p1, __glob
                       extent e, site first, uint row) {
     const size_t offset = plane_offset(first, e);
     const site at = {first.x, first.y + row, first.odd};
-    const image i = {p0 + offset, p1 + offset, p2 + offset, e.pitch, (int)row, at};
+    const image i = {p0 + offset, p1 + offset, p2 + offset, e.pitch, (int)row, at, 0};
+    return i;
+}
+
+INLINE image ring_at(__global const float *p0, __global const float *p1, __global const float *p2,
+                     extent e, site first, uint row) {
+    const site at = {first.x, first.y + row, first.odd};
+    const image i = {p0 + first.x, p1 + first.x, p2 + first.x, e.pitch, (int)row, at, e.ring};
     return i;
 }
 
 INLINE vf tap_plane(__global const float *plane, image i, int dx, int dy) {
+    if (i.ring) return load(plane + ring_row((int)i.at.y + dy, i.ring) * (long)i.pitch + dx);
     return load(plane + (long)(i.row + dy) * (long)i.pitch + dx);
 }
 #define TAP(plane) tap_plane(i.plane, i, dx, dy)
@@ -105,9 +122,11 @@ INLINE int mirror_image(int place, int n, int border) {
 // `x` and `y` start where the planes begin.
 INLINE void store_at_edge(vf v, __global float *dst, int x, int y, extent e) {
     const int border = (int)e.border, columns = (int)e.columns;
-    __global float *origin = dst + (size_t)border * e.pitch + border_left(e);
-    __global float *row = origin + (long)y * (long)e.pitch;
-    __global float *image_row = origin + (long)mirror_image(y, (int)e.rows, border) * (long)e.pitch;
+    const int image_y = mirror_image(y, (int)e.rows, border);
+    __global float *origin = e.ring ? dst : dst + (size_t)border * e.pitch + border_left(e);
+    __global float *row = origin + (e.ring ? ring_row(y, e.ring) : (long)y) * (long)e.pitch;
+    __global float *image_row =
+        origin + (e.ring ? ring_row(image_y, e.ring) : (long)image_y) * (long)e.pitch;
     if (LANES > 1 && x > border && x + LANES + border < columns) {
         store(v, row + x);
         store(v, image_row + x);
@@ -157,7 +176,8 @@ INLINE bool near_edge(site at, uint rows, extent e) {
 
 // A pixel of a block that is not near an edge.
 INLINE void store_plane_inside(vf v, __global float *dst, site at, extent e) {
-    store(v, dst + plane_offset(at, e));
+    if (e.ring) store(v, dst + ring_row((int)at.y, e.ring) * (long)e.pitch + at.x);
+    else store(v, dst + plane_offset(at, e));
 }
 
 // Any pixel, with its mirror images.

@@ -36,8 +36,9 @@ INLINE void store_group_sums(int4 own, __local int4 *group, __global int4 *sums)
     if (i == 0) sums[get_group_id(1) * get_num_groups(0) + get_group_id(0)] = group[0];
 }
 #else
-INLINE void store_sums(int4 own, __global int4 *sums, extent e) {
-    sums[get_global_id(1) * ((e.columns + LANES - 1) / LANES) + get_global_id(0)] = own;
+INLINE void store_sums(int4 own, __global int4 *sums, site first, extent e) {
+    const uint across = (e.columns + LANES - 1) / LANES;
+    sums[(size_t)((first.y - e.top) / 4) * across + (first.x - e.left) / LANES] = own;
 }
 #endif
 

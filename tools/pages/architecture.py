@@ -4,7 +4,6 @@ Run this again after packages or launches have changed. A test compares the pict
 """
 
 import ast
-import json
 import re
 import textwrap
 import tomllib
@@ -13,9 +12,11 @@ from html import escape
 from itertools import chain
 
 import grimp
-from click.testing import CliRunner
 
-from clpipe.commands.main import main as command
+from clpipe.chain.making import make_chain
+from clpipe.chain.settings import Settings
+from clpipe.commands.plan import plan_record
+from clpipe.engine.plan import make_plan
 from tools import ROOT
 
 DOCS = ROOT / "docs"
@@ -130,8 +131,7 @@ def lifetimes(launches: Sequence[dict[str, str]]) -> Iterator[tuple[str, int, in
 
 def launches_picture() -> str:
     """Draw the launches of the default chain, and the lifetime of each slot's images."""
-    printed = CliRunner().invoke(command, ["plan", "--json"], catch_exceptions=False)
-    plan = json.loads(printed.output)
+    plan = plan_record(make_plan(make_chain(Settings())))
     launches, slots = plan["launches"], plan["slots"]
     left, top, step = 476, 62, 46
     width = left + slots * step + 14

@@ -1,0 +1,166 @@
+"""Launches in bands: the same bits as over whole images, in a few rows of memory."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clpipe.chain.making import make_chain
+from clpipe.chain.settings import settings_from
+from clpipe.engine.bands import BAND, ring_bytes, schedule_of, strip_of, strips_of
+from clpipe.engine.check import example
+from clpipe.engine.extents import Box, Extent, whole_image
+from clpipe.engine.hardware import USUAL_CACHE, private_cache
+from clpipe.engine.ir import Cpu, Launch, Plan
+from clpipe.engine.options import RunOptions
+from clpipe.engine.plan import make_plan
+from clpipe.engine.runner import Runner
+from clpipe.engine.tiles import buffer_sizes
+from clpipe.stage import Kind
+from tests.test_tiles import same
+
+CPU = Cpu(cores=2, cache=1 << 19)
+WARPED = {
+    "distortion": {"method": "brown_conrady", "fx": 200.0, "k1": -0.1},
+    "resize": {"scale": 0.6},
+}
+CHAINS = {
+    "default": {},
+    "sums": {"white_balance": {"method": "gray_world"}},
+    "histogram": {"exposure": {"method": "auto"}},
+    "resampled": WARPED,
+    "paper": {"demosaic": {"method": "edge_directed_median"}, "denoise": {"method": "bilateral"}},
+    "means": {"demosaic": {"method": "menon2007"}, "denoise": {"method": "mean"}},
+    "blocks": {"denoise": {"method": "non_local_means"}},
+    "quad": {
+        "mosaic": {"method": "array", "array": "quad-RGGB"},
+        "demosaic": {"method": "linear_mmse"},
+    },
+}
+
+
+def plan_of(cpu: Cpu | None = CPU, **chain) -> Plan:
+    return make_plan(make_chain(settings_from({"iso": 3200, **chain})), cpu=cpu)
+
+
+def banded(plan: Plan) -> list[Launch]:
+    return [x for x in plan.launches if isinstance(x, Launch) and x.bands]
+
+
+def narrow(device, monkeypatch, cores: int = 3, cache: int = 1) -> None:
+    """Let the device have strips as narrow as can be."""
+    monkeypatch.setattr("clpipe.engine.bands.SMALLEST", 256)
+    monkeypatch.setattr("clpipe.engine.bands.SMALLEST_CACHE", 1)
+    monkeypatch.setattr("clpipe.engine.discovery.private_cache", lambda: cache)
+    monkeypatch.setattr(device, "info", replace(device.info, compute_units=cores))
+
+
+@pytest.mark.parametrize("chain", CHAINS)
+def test_bands_give_the_same_bits(device, monkeypatch, chain):
+    narrow(device, monkeypatch)
+    chain = make_chain(settings_from({"iso": 3200, **CHAINS[chain]}))
+    one, two = (Runner(chain, device, final=True, bands=on) for on in (True, False))
+    for size in ((61, 203), (150, 64), (40, 41)):
+        image = example(Kind.RGB, size, half=True)
+        assert banded(one.plan_for(image)) and not banded(two.plan_for(image))
+        same(two.run(image, "k"), one.run(image, "k"))
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+@pytest.mark.parametrize("height", range(48, 52))
+def test_bands_give_the_same_bits_for_all_patterns(device, monkeypatch, pattern, height):
+    narrow(device, monkeypatch)
+    chain = make_chain(settings_from({"iso": 3200, "mosaic": {"pattern": pattern}}))
+    image = example(Kind.RGB, (height, 131))
+    one, two = (Runner(chain, device, bands=on).run(image, "k") for on in (True, False))
+    same(two, one)
+
+
+@pytest.mark.parametrize("size", [(1, 40), (40, 1), (3, 3), (8, 200), (9, 9)])
+def test_images_hardly_larger_than_a_border_run_launch_by_launch(device, size):
+    runner = Runner(make_chain(settings_from({})), device)
+    image = example(Kind.RGB, size)
+    plan = runner.plan_for(image)
+    assert plan.border == 3
+    assert bool(banded(plan)) == (min(size) > 7)
+    same(Runner(runner.chain, device, bands=False).run(image, "k"), runner.run(image, "k"))
+
+
+def test_tiles_patches_and_stacks_run_in_bands(device, monkeypatch):
+    narrow(device, monkeypatch, cache=1 << 16)
+    runner = Runner(make_chain(settings_from({"iso": 3200})), device)
+    image = example(Kind.RGB, (301, 203), half=True)
+    whole = Runner(runner.chain, device, bands=False).run(image, "k")
+    boxes = boxes_of(whole.image.shape)
+    patches = runner.submit(image, "k", RunOptions(boxes=boxes))()
+    for box, patch in zip(boxes, patches.image, strict=True):
+        assert np.array_equal(patch, whole.image[box.top : box.bottom, box.left : box.right])
+
+
+def boxes_of(shape):
+
+    height, width = shape[:2]
+    return [
+        Box(x, y, x + 40, y + 33)
+        for y in range(0, height - 33, 67)
+        for x in range(0, width - 40, 41)
+    ]
+
+
+def test_what_ends_a_run_of_bands():
+    names = [[part.name for part in launch.bands.parts] for launch in banded(plan_of())]
+    assert [len(each) for each in names] == [6]
+    sums = plan_of(white_balance={"method": "gray_world"})
+    assert [len(launch.bands.parts) for launch in banded(sums)] == [2, 5]
+    assert banded(sums)[0].bands.parts[-1].sums
+    kept = make_plan(make_chain(settings_from({})), keep=["normalize"], cpu=CPU)
+    assert all(kept.slots[image.number] for _, image in kept.kept)
+    assert not banded(make_plan(make_chain(settings_from({})), incremental=True, cpu=CPU))
+    assert not banded(plan_of(cpu=None))
+
+
+def test_only_the_source_and_the_result_are_stored_whole():
+    plan = plan_of()
+    sizes = buffer_sizes(plan, whole_image(plan, 6000, 4000, 8))
+    assert sum(sizes.values()) < 0.25e9  # 33 bytes a pixel without bands, 0.8 GB
+    assert sum(sizes.values()) - sizes["rings"] < 9.1 * 24e6
+
+
+@given(st.integers(1, 9000), st.integers(1, 9000), st.sampled_from([8, 16]), st.integers(1, 64))
+@settings(max_examples=200, deadline=None)
+def test_strips_cover_the_image_and_fit_into_the_cache(width, height, lanes, cores):
+    (launch,) = banded(plan_of(Cpu(cores, 1 << 20)))
+    extent = Extent.whole(width, height, lanes, 3)
+    columns, rows = strip_of(launch.bands, extent)
+    across, down = strips_of(launch.bands, extent)
+    assert (across - 1) * columns < width <= across * columns
+    assert (down - 1) * rows < height <= down * rows
+    assert columns % (2 * lanes) == 0 and rows % BAND == 0
+    assert ring_bytes(launch.bands, extent) <= across * down << 20
+
+
+def test_rings_hold_what_readers_need():
+    (launch,) = banded(plan_of())
+    schedule, parts = schedule_of(launch.bands), launch.bands.parts
+    assert schedule.leads[-1] == schedule.overlaps[-1] == 0
+    for number, part in enumerate(parts[:-1]):
+        ring = schedule.rings[part.writes.number]
+        for reader, other in enumerate(parts):
+            if any(read.image == part.writes for read in other.reads):
+                ahead = schedule.leads[number] - schedule.leads[reader]
+                assert ahead >= other.radius and ring.border >= other.radius
+                assert ring.rows >= BAND + ahead + other.radius + 2 * ring.border
+                assert schedule.overlaps[number] >= schedule.overlaps[reader] + other.radius
+
+
+def test_the_cache_of_a_core_is_read_from_linux(tmp_path):
+    assert private_cache(tmp_path) == USUAL_CACHE
+    for number, (level, size) in enumerate([("1", "32K"), ("2", "1280K"), ("3", "20480K")]):
+        (tmp_path / f"index{number}").mkdir()
+        (tmp_path / f"index{number}" / "level").write_text(level + "\n")
+        (tmp_path / f"index{number}" / "size").write_text(size + "\n")
+    private_cache.cache_clear()
+    assert private_cache(tmp_path) == 1280 << 10
+    private_cache.cache_clear()
