@@ -98,16 +98,21 @@ def _load(builder: KernelBuilder, launch: Launch) -> tuple[list[str], list[str],
     lines.append(f"{call(op, ['first', *arguments, 'block'])};")
     size = launch.rows * columns_of(launch, builder.lanes)
     per_item = [f"{kind.c_type} block[{size}];", "{", *(f"    {x}" for x in lines), "}"]
-    index = "ROW" if builder.lanes == 1 else "row * COLUMNS + column"
+    index = "row * COLUMNS + column" if columns_of(launch, builder.lanes) > 1 else "ROW"
     return per_item, [f"const {kind.c_type} v0 = block[{index}];"], kind
 
 
-def _encode(builder: KernelBuilder, value: str, kind: Kind, curves: Sequence[Op]) -> str:
-    """Return the line that writes eight-bit pixels, through one table if curves come last."""
+def _encode(builder: KernelBuilder, value: str, kind: Kind, curves: Sequence[Op]) -> list[str]:
+    """Return the lines that compute eight-bit pixels, through one table if curves come last.
+
+    All but the last line need only the value. The last line stores.
+    """
     builder.buffer("dst", "uchar", "dst", written=True)
-    if not curves:
-        return f"encode_{'mosaic' if kind.c_type == 'vf' else 'rgb'}({value}, dst, at, e);"
-    return f"encode_rgb_by_table({value}, {builder.table8(curves)}, dst, at, e);"
+    if kind.c_type == "vf":
+        return [f"encode_mosaic({value}, dst, at, e);"]
+    table = f"{builder.table8(curves)}, true" if curves else "0, false"
+    codes = f"codes[ROW] = {'indices' if curves else 'levels'}_of({value});"
+    return [codes, f"store_levels(codes + ROW, {table}, dst, at, e);"]
 
 
 def block_code(builder: KernelBuilder, launch: Launch) -> str:
@@ -133,7 +138,7 @@ def block_code(builder: KernelBuilder, launch: Launch) -> str:
         lines.append(f"const vi sample = only_inside({sample}, at, {builder.core()});")
         lines.append("if (ROW & 1) odd_rows += sample; else even_rows += sample;")
         per_item.append("vi even_rows = (vi)(0), odd_rows = (vi)(0);")
-    wide = launch.stencil and launch.stencil.vectors_per_row and builder.lanes > 1
+    wide = columns_of(launch, builder.lanes) > 1
     if not wide:
         # Compute all rows before the first store. The compiler can then share work between rows,
         # because no store can change their inputs.
@@ -142,19 +147,24 @@ def block_code(builder: KernelBuilder, launch: Launch) -> str:
         )
         lines.append(f"values_ROW = {value};")
         value = "values_ROW"
-    writes, encodes = [], []
+    writes, encodes = [], list[str]()
     if launch.writes:
         extent = builder.extent(launch.writes)
         planes = builder.planes_of(launch.writes, True)
         writes.append(f"store_{kind.c_name}({', '.join([value, *planes])}, at, {extent});")
     if launch.encodes:
-        encodes.append(_encode(builder, value, kind, curves))
+        encodes = _encode(builder, value, kind, curves)
+        if len(encodes) > 1:
+            per_item.append(f"levels codes[{launch.rows}];")
     if wide:
+        encodes = [line.replace("ROW", "row") for line in encodes]
         body = _block_loop([*lines, *writes, *encodes], launch)
     else:
         extent = builder.extent(launch.writes) if launch.writes else "e"
         body = _unrolled_rows(lines, launch.rows) + _store(writes, kind, launch.rows, extent)
-        body += _unrolled_rows(encodes, launch.rows)
+        body += _unrolled_rows(encodes[:-1], launch.rows)
+        unrolled = builder.lanes == 1 or len(encodes) == 1
+        body += _row_loop(encodes[-1:], launch.rows, unrolled)
     rows = "".join(f"    {line}\n" for line in [*per_item, *body])
     return f"    const site first = site_at(x, y);\n{rows}"
 
@@ -169,6 +179,19 @@ def _block_loop(lines: Sequence[str], launch: Launch) -> list[str]:
         "        const site at = site_at(x + column * LANES, y + row);",
         *(f"        {line}" for line in lines),
         "    }",
+        "}",
+    ]
+
+
+def _row_loop(lines: Sequence[str], rows: int, unrolled: bool) -> list[str]:
+    """Return the lines for each row of a work item, in a loop unless ``unrolled``."""
+    if unrolled or not lines:
+        return _unrolled_rows(lines, rows)
+    return [
+        "#pragma unroll 1",
+        f"for (uint row = 0; row < {rows}; ++row) {{",
+        "    const site at = shifted(first, 0, row);",
+        *(f"    {line.replace('ROW', 'row')}" for line in lines),
         "}",
     ]
 
