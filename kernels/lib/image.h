@@ -69,6 +69,9 @@ INLINE int int_min(int a, int b) { return a < b ? a : b; }
 INLINE int int_max(int a, int b) { return a > b ? a : b; }
 INLINE int int_clamp(int a, int low, int high) { return int_min(int_max(a, low), high); }
 
+// A GPU, with its single lane, has no rings.
+#define IN_RING(planes) (LANES > 1 && (planes).ring)
+
 // Rows from the start of a plane to a row of the image. Rows of the border are negative.
 INLINE long ring_row(int y, uint ring) { return (long)((uint)(y + (int)ring) % ring); }
 
@@ -94,7 +97,7 @@ INLINE image ring_at(__global const float *p0, __global const float *p1, __globa
 }
 
 INLINE vf tap_plane(__global const float *plane, image i, int dx, int dy) {
-    if (i.ring) return load(plane + ring_row((int)i.at.y + dy, i.ring) * (long)i.pitch + dx);
+    if (IN_RING(i)) return load(plane + ring_row((int)i.at.y + dy, i.ring) * (long)i.pitch + dx);
     return load(plane + (long)(i.row + dy) * (long)i.pitch + dx);
 }
 #define TAP(plane) tap_plane(i.plane, i, dx, dy)
@@ -123,10 +126,10 @@ INLINE int mirror_image(int place, int n, int border) {
 INLINE void store_at_edge(vf v, __global float *dst, int x, int y, extent e) {
     const int border = (int)e.border, columns = (int)e.columns;
     const int image_y = mirror_image(y, (int)e.rows, border);
-    __global float *origin = e.ring ? dst : dst + (size_t)border * e.pitch + border_left(e);
-    __global float *row = origin + (e.ring ? ring_row(y, e.ring) : (long)y) * (long)e.pitch;
+    __global float *origin = IN_RING(e) ? dst : dst + (size_t)border * e.pitch + border_left(e);
+    __global float *row = origin + (IN_RING(e) ? ring_row(y, e.ring) : (long)y) * (long)e.pitch;
     __global float *image_row =
-        origin + (e.ring ? ring_row(image_y, e.ring) : (long)image_y) * (long)e.pitch;
+        origin + (IN_RING(e) ? ring_row(image_y, e.ring) : (long)image_y) * (long)e.pitch;
     if (LANES > 1 && x > border && x + LANES + border < columns) {
         store(v, row + x);
         store(v, image_row + x);
@@ -176,7 +179,7 @@ INLINE bool near_edge(site at, uint rows, extent e) {
 
 // A pixel of a block that is not near an edge.
 INLINE void store_plane_inside(vf v, __global float *dst, site at, extent e) {
-    if (e.ring) store(v, dst + ring_row((int)at.y, e.ring) * (long)e.pitch + at.x);
+    if (IN_RING(e)) store(v, dst + ring_row((int)at.y, e.ring) * (long)e.pitch + at.x);
     else store(v, dst + plane_offset(at, e));
 }
 
