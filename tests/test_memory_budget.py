@@ -259,7 +259,7 @@ from clpipe.base.memory import _proc_value
 from clpipe.chain.request import Request
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Runner
-runner = Runner(Request().chain(), open_device(None))
+runner = Runner(Request().chain(), open_device(None), bands=False)
 image = np.full((2000, 4400, 3), 0.2, np.float16)
 runner.compile()
 hard = resource.getrlimit(resource.RLIMIT_AS)[1]

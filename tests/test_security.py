@@ -148,4 +148,4 @@ def test_faults_of_all_kinds_in_small():
     """Run a few faults of tools/stress/faults.py; all of them take an hour."""
     options = ("--images", 8, "--repeats", 1, "--device", "numpy")
     done = run_python("-m", "tools.stress.faults", *options, "full", "power")
-    assert done.stdout.count("1 times") == 2
+    assert done.stdout.count("1 trials") == 2

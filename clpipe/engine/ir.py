@@ -115,6 +115,14 @@ class Bands:
     parts: tuple[Launch, ...]
     cpu: Cpu
 
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        # Cached, because each launch looks its strips up.
+        return hash((self.parts, self.cpu))
+
 
 @dataclass(frozen=True)
 class Lines:

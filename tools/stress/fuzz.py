@@ -112,7 +112,7 @@ def readers(suffix: str) -> tuple[Callable[[Path], object], ...]:
 
     def members(path: Path) -> object:
         tar = Members(path)
-        return [tar.sidecar(name) for name in tar.places], is_clpipe_tar(path)
+        return [tar.sidecar(name) for name in tar.locations], is_clpipe_tar(path)
 
     def layers(path: Path) -> object:
         return [read_layer(path, layer, MAX_PIXELS) for layer in find_layers(path)[:8]]
