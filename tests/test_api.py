@@ -107,7 +107,7 @@ def test_what_a_user_may_write(render):
     [
         (
             np.zeros((4, 4, 3), np.uint8),
-            "samples of type uint8, but the chain starts on rgb in floats",
+            "samples of type uint8, but the chain expects rgb as floats",
         ),
         ([[1.0]], "a list, but an array is expected"),
         (np.zeros((4, 4), np.float32), "shape .4, 4., but .height, width, 3. is expected"),

@@ -46,7 +46,7 @@ def test_torch_tensors_are_taken():
     ("image", "message"),
     [
         ((IMAGE * 255).astype(np.uint8), "type uint8, .* pass image / np.float32.WHITE."),
-        (IMAGE > 0.5, "type bool, but the chain starts on rgb in floats"),
+        (IMAGE > 0.5, "type bool, but the chain expects rgb as floats"),
         (IMAGE.tolist(), "a list, but an array is expected. Pass numpy.asarray"),
         (
             np.dstack([IMAGE, IMAGE[..., :1]]),

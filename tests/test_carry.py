@@ -330,7 +330,7 @@ def test_a_pipeline_moves_arrays():
             ("--carry", "small:depth"),
             "its layer small has 3x2 pixels, but the picture in/a.exr has 14x9",
         ),
-        (("--carry", "two"), "has no layer called two, but several others (b, c). Name one of"),
+        (("--carry", "two"), "has no layer 'two'. It has the layers b, c; name one of"),
         (("--carry", "Depth", "--carry", "View.Depth"), "both contain the channel View.Depth.Z"),
         (("--carry", "seg={name}_no.exr"), "its companion in/a_no.exr does not exist"),
         (("--carry", "broken"), "a_broken.exr: cannot be read as an image"),

@@ -257,7 +257,10 @@ def test_syb3r():
         ("iso = { choice = 3 }", "iso: choice: found 3: should be a valid list"),
         ("iso = { choice = [100, 'x'] }", "iso: found 'x', but expected a number"),
         ("iso = { choice = [[100]] }", r"iso: found \[100\], but expected a number"),
-        ("iso = { choice = [{ uniform = [1, 2] }] }", "list plain values only"),
+        (
+            "iso = { choice = [{ uniform = [1, 2] }] }",
+            "null and tables are not allowed; list plain values",
+        ),
         (
             "iso = { uniform = [1, 2], choice = [3] }",
             "one distribution, but these are choice and uniform",
@@ -316,7 +319,7 @@ def test_syb3r():
         (
             "[sensor_noise]\na = { normal = [0.01, 0.01] }\n"
             "b = { log_normal_of = 'sensor_noise.a', slope = 1, intercept = 0, sigma = 1 }",
-            "sensor_noise.b: found .*sensor_noise.a, which it follows, must be above 0",
+            "sensor_noise.b: found .*sensor_noise.a, which must be above 0",
         ),
         (
             "[quantize]\nblack_level = { uniform = [0, 600] }\nwhite_level = 500.0",

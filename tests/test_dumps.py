@@ -73,7 +73,7 @@ def test_a_dump_of_another_size_is_told_what_would_fit(tmp_path):
         in output
     )
     output = clpipe("run", tmp_path / "a.raw", "-o", tmp_path, status=1)
-    assert "not a raw that LibRaw knows" in output or "--dump" in output
+    assert "LibRaw does not support it" in output or "--dump" in output
 
 
 @pytest.mark.parametrize(

@@ -196,7 +196,7 @@ def test_an_exposure_of_a_bracket_is_replayed(clpipe, write_exr, tmp_path, scene
         (["--bracket", "-2,x"], "--bracket: found '-2,x'; expected EVs, such as -2,0,2"),
         (["--bracket", "nan"], "expected EVs"),
         (["--bracket", "1e-9,0"], "expected EVs"),
-        (["--bracket", "1,1.0"], "found '1,1.0', with +1 EV twice; give it once"),
+        (["--bracket", "1,1.0"], "found '1,1.0', which repeats +1 EV; list each EV once"),
         (
             ["--bracket", "0,30"],
             "+30 EV added to exposure.ev=0 is not allowed; exposure.ev: found 30",

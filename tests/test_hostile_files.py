@@ -355,7 +355,9 @@ def test_a_pipe_in_the_output_folder_does_not_make_a_run_wait(clpipe, write_exr)
     assert (
         "did not write this tar" in clpipe(*run, "-o", "tars", "--webdataset", 1, status=2).output
     )
-    assert "exists and is no trace" in clpipe(*run, "-o", "x", "--trace", "t.json", status=2).output
+    assert (
+        "exists and is not a trace" in clpipe(*run, "-o", "x", "--trace", "t.json", status=2).output
+    )
 
 
 def test_an_image_of_very_many_parts_is_refused(tmp_path, monkeypatch):

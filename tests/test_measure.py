@@ -391,7 +391,7 @@ def test_settings_that_cannot_be_used(write_exr, clpipe, tmp_path):
     out.write_image(pixels)
     out.close()
     result = clpipe("measure", "bad.exr", "bad.exr", status=1)
-    assert "bad.exr: its settings cannot be used: unknown camera 'box'" in result.stderr
+    assert "bad.exr: the settings in this file are invalid: unknown camera 'box'" in result.stderr
 
 
 def test_odd_and_tiny_mosaics():

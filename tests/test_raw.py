@@ -285,11 +285,11 @@ XTRANS = "GGRGGBGGBGGRBRGRBGGGBGGRGGRGGBRBGBRG"
     ("change", "message"),
     [
         ("linear", "this file has all colours at each pixel"),
-        ("half", "it is damaged, or not a raw that LibRaw knows"),
+        ("half", "the file is damaged, or LibRaw does not support it"),
         ("no pixels", "this raw has only metadata and no pixels"),
         ("empty", "the file is empty"),
         ("jpeg", "this is a JPEG, not a camera raw"),
-        ("text", "it is damaged, or not a raw that LibRaw knows"),
+        ("text", "the file is damaged, or LibRaw does not support it"),
     ],
 )
 def test_what_only_looks_like_a_raw(tmp_path, change, message):

@@ -18,9 +18,9 @@ DUMP = ("--dump", "256x256:uint16le", "--set", "normalize.black_level=600")
 DUMP += ("--set", "normalize.white_level=16383")
 # Files of ../shared/data/raw, and the size of the picture or the message.
 ADDITIONAL = {
-    "bep_truncated.cr2": "it is damaged, or not a raw that LibRaw knows",
+    "bep_truncated.cr2": "the file is damaged, or LibRaw does not support it",
     "exiftool_DNG.dng": "this raw has only metadata and no pixels",
-    "exiftool_Nikon.nef": "it is damaged, or not a raw that LibRaw knows",
+    "exiftool_Nikon.nef": "the file is damaged, or LibRaw does not support it",
     "magicknet_DSC8695.dng": "this file has all colours at each pixel",
     "magicknet_RAW_KODAK_DC50.KDC": (512, 768, 3),
     "mei_issue247-1.nef": "this is a JPEG, not a camera raw",

@@ -162,7 +162,7 @@ KNOTS = "[[0,0],[4096,1024],[16383,4095]]"
     ("options", "message"),
     [
         (("quantize.method=pwl", "quantize.knots=[[0,0]]"), "knots: found .*expected pairs"),
-        (("quantize.method=pwl", "quantize.knots=[[0,0],[9,9],[5,10]]"), "rising in both"),
+        (("quantize.method=pwl", "quantize.knots=[[0,0],[9,9],[5,10]]"), "increase in both"),
         (("quantize.method=pwl", "quantize.knots=[[0,0],[16383,5000]]"), "does not fit in 12 bits"),
         (
             ("quantize.method=pwl", "quantize.knots=[[0,0],[99,50]]"),

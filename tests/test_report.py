@@ -177,7 +177,7 @@ def test_files_that_are_gone_or_changed_are_named(out):
     (out / "b.normalize.exr").write_bytes(b"short")
     page = report(out)
     assert "a.jpg: is missing" in page.shown_text
-    assert "b.jpg: was changed since; its SHA-256" in page.shown_text
+    assert "b.jpg: has changed since the run; its SHA-256" in page.shown_text
     assert "b.normalize.exr: has 5 bytes, not the " in page.shown_text
     by_name = {entry["name"]: entry for entry in page.data["sheet-data"]}
     assert not by_name["a"]["image"] and not by_name["b"]["image"] and by_name[SHOWN]["image"]

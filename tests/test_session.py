@@ -57,7 +57,7 @@ def test_what_cannot_be_is_refused_at_once(renders):
         ({"memory": 0}, "--memory: '0' is not a size"),
         ({"format": "gif"}, "unknown format 'gif'"),
         ({"transfer": "x"}, "found transfer 'x'; expected 'srgb', 'linear' or None"),
-        ({"bracket": [1, 1]}, r"--bracket: found \[1, 1\], with \+1 EV twice"),
+        ({"bracket": [1, 1]}, r"--bracket: found \[1, 1\], which repeats \+1 EV"),
         ({"bracket": [float("nan")]}, r"--bracket: found \[nan\]; expected EVs"),
         ({"redo": "some"}, "found redo 'some'"),
         ({"frames": "2"}, "found frames '2'; expected a whole number or None"),

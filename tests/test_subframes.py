@@ -137,7 +137,7 @@ def test_a_frame_of_another_size_fails_alone(frames, clpipe, write_exr):
     write_exr("in/f03.exr", np.zeros((24, 39, 3), np.float16))
     options = ("--set", "shutter.subframes=4", "--device", "numpy")
     stderr = clpipe("run", "in", "-o", "o", *options, status=1).stderr
-    assert "this frame is 39x24, but that of in/f00.exr, in the same exposure, is 40x24" in stderr
+    assert "this frame is 39x24, but in/f00.exr, in the same exposure, has 40x24" in stderr
     with Image.open("o/f04.jpg") as picture:
         assert picture.size == (40, 24)
 

@@ -54,7 +54,7 @@ class Comparison:
     labels: tuple[str, ...]
     places: tuple[Crop, ...]
     rows: tuple[Row, ...]
-    noise: tuple[Noise, ...]  # of each picture; empty if not known
+    noise: tuple[Noise, ...]  # noise of each picture; empty if not known
     notes: tuple[str, ...]
 
     def record(self) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from clpipe.reference.curve import to_8_bit
 log = logging.getLogger(__name__)
 
 DPI = 300
-MAX_PIXELS = 1 << 26  # pixels of a figure, 256 MB while it is drawn
+MAX_PIXELS = 1 << 26  # largest figure; drawing it takes 256 MB
 GAP = 12  # px, between crops and as the outer margin
 SIZE, SMALL = 7, 6  # points
 # In px, for text in DejaVu Sans of one point: the height of a line, and the width of a digit.
@@ -44,7 +44,7 @@ METADATA = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 
 
 def check_name(path: Path, pictures: Sequence[Path]) -> None:
-    """Check that a figure can have this name, which is not that of a picture.
+    """Check that a figure can have this name and that no picture has it.
 
     Raises:
         RequestError: its extension is unknown, or a picture has that name.

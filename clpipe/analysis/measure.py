@@ -83,7 +83,7 @@ def measure_against(
 ) -> tuple[Floats, float, Floats, Mask]:
     """Return the clean image, its share of degrees of freedom, the noise, and clipped samples.
 
-    The arguments and errors are those of :func:`measure`.
+    For the arguments and errors, see :func:`measure`.
     """
     check_partners(images, truth)
     frames = np.stack([image.pixels for image in images])

@@ -25,7 +25,7 @@ class Exposure:
     """The exposure of a frame in EV.
 
     ``metered`` is the result of ``exposure.method=auto`` for this frame only. ``ev`` is smoothed
-    over time, and includes the compensation. ``headroom`` is that of the frame's chain.
+    over time, and includes the compensation. ``headroom`` comes from the frame's chain.
     """
 
     job: Job

@@ -33,9 +33,9 @@ class Picture:
     pattern: str = "RGGB"  # Bayer's, or rows of letters
     black: float | None = None
     white: float | None = None
-    balance: str = ""  # of a kept mosaic, as text: the white balance gains removed and applied
+    balance: str = ""  # white balance gains removed and applied, as text, of a kept mosaic
     iso: float | None = None  # None if the file does not state it
-    step: float = 0.0  # of a finished picture: the step to which samples are rounded
+    step: float = 0.0  # rounding step of a finished picture
 
     @property
     def what(self) -> str:
@@ -65,7 +65,7 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
     stays in the unit of the file, and gets ``pattern``.
 
     Raises:
-        ImageError: the file cannot be read, is a camera raw, or its settings cannot be used.
+        ImageError: the file cannot be read, is a camera raw, or its settings are invalid.
     """
     if path.suffix.lower() in RAW_SUFFIXES:  # some also contain a small picture
         raise ImageError(
@@ -85,7 +85,7 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
         settings = embedded_settings(source.attributes)
         context = context_after(settings, source.attributes.get("stage")) if settings else None
     except RequestError as error:
-        raise ImageError(f"{path}: its settings cannot be used: {error}") from None
+        raise ImageError(f"{path}: the settings in this file are invalid: {error}") from None
     iso = context.iso if context else None
     if not mosaic:
         if kind == Kind.DISPLAY.label:

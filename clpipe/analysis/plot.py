@@ -100,7 +100,7 @@ def draw_intensity(axes: Axes, report: NoiseReport) -> None:
 
 
 def draw_tails(axes: Axes, report: NoiseReport) -> None:
-    """Draw the share of standardised noise beyond each value, and that of a Gaussian."""
+    """Draw the share of standardised noise beyond each value, for the image and for a Gaussian."""
     beyond = [gaussian_beyond(abs(z)) / 2 for z in HISTOGRAM]
     axes.fill_between(HISTOGRAM, beyond, 1e-12, color="0.85", label="Gaussian")
     for one in report.channels:

@@ -96,8 +96,9 @@ def reject_other_scenes(images: Sequence[Picture], noise: Floats) -> None:
         others = "the others" if frames > 2 else images[1 - worst].path
         raise RequestError(
             f"{images[worst].path} does not show the same scene as {others}. Averaged over "
-            f"{BLOCK}x{BLOCK} pixels, {remaining[worst] / energy:.0%} of the difference remains; "
-            f"noise leaves less than {SCENE_SHARE:.0%}. Give repeats of one scene, or --truth."
+            f"{BLOCK}x{BLOCK} pixels, {remaining[worst] / energy:.0%} of the difference "
+            f"remains, but noise would leave less than {SCENE_SHARE:.0%}. Give repeats of "
+            "one scene, or add --truth."
         )
 
 

@@ -28,15 +28,15 @@ class NoiseReport:
     truth: str | None  # None: the mean of the images
     width: int
     height: int
-    share: float  # of valid pixels, or of valid samples in a mosaic
-    edges: Doubles  # of the intensity bins
+    share: float  # share of valid pixels, or of valid samples in a mosaic
+    edges: Doubles  # edges of the intensity bins
     channels: tuple[Channel, ...]
     correlations: Mapping[tuple[str, str], float]
-    covariances: Mapping[str, Doubles]  # of red, green and blue, (3, 3), by area; {} for mosaics
+    covariances: Mapping[str, Doubles]  # RGB covariance matrices, (3, 3), by area; {} for mosaics
     notes: tuple[str, ...]
     iso: float | None = None  # None if the images do not state it
     bursts: int = 1  # number of bursts whose noise is pooled
-    at_edges: float = math.nan  # of pictures: rms of luma's noise at edges over that in flat areas
+    at_edges: float = math.nan  # rms of luma noise at edges over flat areas; only for pictures
     rounding: float = 0.0  # the variance that rounding in files adds to each channel
 
     def record(self) -> dict[str, Any]:

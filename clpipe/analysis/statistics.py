@@ -42,13 +42,13 @@ class Channel:
     autocorrelation: Doubles  # (17, 17), down and right from -8 to 8; [8, 8] is 1
     energy_left: float  # share, after averaging 2x2 pixels
     tails: Tails
-    whole_sigma: float = math.nan  # of all pixels, including invalid ones
-    whole_curve: NoiseCurve | None = None  # of all pixels
+    whole_sigma: float = math.nan  # sigma of all pixels, including invalid ones
+    whole_curve: NoiseCurve | None = None  # noise curve of all pixels
     size: int = 0  # number of samples, including invalid ones
 
     @property
     def right(self) -> float:
-        """The correlation of noise with that of the pixel to the right."""
+        """The correlation between the noise of a pixel and of the pixel to the right."""
         middle = len(self.autocorrelation) // 2
         return float(self.autocorrelation[middle, middle + 1])
 

@@ -98,7 +98,7 @@ class NoPictureError(ImageError):
 
 
 class KindError(ImageError):
-    """A kept image lacks the required channels. ``attributes`` are those of the file."""
+    """A kept image lacks the required channels. ``attributes`` come from the file."""
 
     def __init__(self, path: Path, attributes: Mapping[str, str]) -> None:
         stage = attributes.get("stage", "a stage that it does not name")

@@ -142,9 +142,9 @@ _thread = threading.local()  # "group": the group of deferred files, or None for
 
 @contextlib.contextmanager
 def deferred_files() -> Iterator[FileGroup]:
-    """Defer this thread's files: they get their final names when the group is committed.
+    """Write this thread's files under temporary names until the group is committed.
 
-    If the body raises, the files are removed.
+    If the body raises an error, the files are removed.
     """
     group = FileGroup()
     with _file_group(group):

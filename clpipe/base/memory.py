@@ -13,7 +13,7 @@ NO_LIMIT = 2**60  # bytes; without a limit, groups of version 1 report the large
 
 
 def parse_size(text: str) -> int:
-    """Return the bytes of a number with a unit: K, M, G or T, in powers of 1024.
+    """Convert a size such as 4G to bytes. The units K, M, G and T are powers of 1024.
 
     >>> parse_size("512M"), parse_size("1.5 GiB"), parse_size("4096")
     (536870912, 1610612736, 4096)
@@ -84,7 +84,7 @@ def check_address_space(needed: int, what: str) -> None:
     if free and free.bytes < needed:
         raise DeviceError(
             f"{what} needs about {format_bytes(needed)} of address space, but "
-            f"{format_bytes(free.bytes)} are left by {free.limit}. Raise the limit."
+            f"only {format_bytes(free.bytes)} is available ({free.limit}). Raise the limit."
         )
 
 

@@ -19,7 +19,7 @@ from clpipe.base.files import discard
 from clpipe.base.system import fcntl, forbids_programs, lock_file, writable_by_others
 
 MIN_FREE_SPACE = 32 * 2**20  # bytes; with less, PoCL's compiler may end the process
-NAME = re.compile(r"clpipe-\d+-\w+")  # of a process's folder: its number, and random characters
+NAME = re.compile(r"clpipe-\d+-\w+")  # folder of a process: its id and random characters
 
 
 @cache

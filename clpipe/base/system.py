@@ -33,7 +33,7 @@ fcntl, msvcrt, resource = (_optional(name) for name in ("fcntl", "msvcrt", "reso
 # Bytes of a file that can be locked, also beyond its end. Windows's C runtime counts with 31 bits.
 LOCKABLE_BYTES = 2**40 if fcntl else 2**30
 
-_ARENA_MAX = -8  # of glibc's mallopt: the most heaps
+_ARENA_MAX = -8  # mallopt's parameter for the largest number of heaps in glibc
 _SYNC_FILE_RANGE_WRITE = 2  # Linux: start to write all dirty pages that are not being written
 
 # Without O_BINARY, Windows writes "\r\n" for "\n".

@@ -102,7 +102,7 @@ def printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else "?" for letter in line)
 
 
-MAX_DIGITS = 18  # of a whole number; int() raises ValueError for more than 4300
+MAX_DIGITS = 18  # digits of a whole number; int() raises ValueError for more than 4300
 
 
 def whole_number(text: str) -> int:

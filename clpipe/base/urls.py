@@ -130,7 +130,7 @@ def list_urls(url: str) -> list[str]:
                 found = [name for name, info in infos.items() if info["type"] != "directory"]
             else:
                 found = system.find(path)
-        # The scheme stays that of the URL, because a file system may have several.
+        # The URL keeps its scheme, because a file system may have several.
         return sorted(f"{prefix}{name[len(root) :]}" for name in found)
 
     return _with_retries(url, work, RequestError, "listed")

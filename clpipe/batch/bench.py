@@ -94,7 +94,7 @@ def bench_batch(device: Device, request: Request, workload: Workload) -> BatchSp
     """Time one workload from half-float EXR to JPEG, with the CPU time of each step.
 
     Thread clocks measure the time of a step. On a CPU, the driver's threads run kernels and
-    transfers. Their time is the process's time minus that of our threads. It is divided between
+    transfers. Their time is the process's time minus our threads' time. It is divided between
     kernels, which use all compute units, and transfers, which use one. "Python" is the time of our
     threads outside all steps.
 

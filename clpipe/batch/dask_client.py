@@ -40,7 +40,7 @@ CONNECT_TIMEOUT = 10.0  # s, for the scheduler to answer and for its first worke
 
 WORKER_TIMEOUT = 60.0  # s without any worker; nannies and job queues start new ones
 
-RETRIES = 2  # of a chunk that ended with an unexpected error
+RETRIES = 2  # retries of a chunk that ended with an unexpected error
 
 FIRST_CHUNK, MAX_CHUNK = 4, 64  # images in a chunk
 
@@ -67,7 +67,7 @@ def connected(address: str, spec: DaskSpec) -> Iterator["Cluster"]:
     except (OSError, ValueError) as error:
         raise RequestError(
             f"--dask: no Dask scheduler answers at {address!r} within {CONNECT_TIMEOUT:g} s"
-            f"{f' ({error})' * bool(str(error))}; expected its tcp://HOST:PORT"
+            f"{f' ({error})' * bool(str(error))}; expected tcp://HOST:PORT of a running scheduler"
         ) from None
     try:
         with contextlib.suppress(TimeoutError):

@@ -110,7 +110,7 @@ def _devices(
 
 
 def share_on_machine(worker: str, workers: Collection[str]) -> tuple[int, int]:
-    """Return a worker's number among those of its machine, from 0, and how many these are.
+    """Return a worker's number on its machine, from 0, and the number of workers there.
 
     >>> share_on_machine("tcp://b:2", ["tcp://b:1", "tcp://a:1", "tcp://b:3", "tcp://b:2"])
     (1, 3)

@@ -103,7 +103,9 @@ class MemoryBudget:
         self._compiling = len(devices)
         self._drop = drop
         self._left = left or free_memory
-        self._limits: dict[Device, int] = {}  # of devices that were given less for one image
+        self._limits: dict[
+            Device, int
+        ] = {}  # usual memory limits of devices while one image uses less
         self._max_free = 0  # the most bytes that were ever free for one image and the devices
         self._measured: tuple[float, FreeMemory | None] = 0.0, FreeMemory(0, "")
         self._taken: dict[str, int] = {}  # bytes, by the stem of an image
@@ -204,9 +206,9 @@ class MemoryBudget:
             self._restore()
         left = format_bytes(max(possible, 0))
         raise ImageError(
-            f"it takes about {format_bytes(needed(size))} of memory; {left} are left by "
-            f"{free.limit if free else 'this machine'}; allow more memory, or use less with "
-            "--jobs 1 or fewer pictures per image"
+            f"it takes about {format_bytes(needed(size))} of memory, but only {left} "
+            f"is available ({free.limit if free else 'this machine'}); allow more memory, "
+            "or use less with --jobs 1 or fewer pictures per image"
         )
 
     def _restore(self) -> None:

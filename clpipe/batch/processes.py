@@ -35,8 +35,8 @@ from clpipe.outputs.folder import remove_unfinished
 
 log = logging.getLogger(__name__)
 
-# The model of an image's CPU time from which the number of processes follows
-# (docs/performance.md): ms under the interpreter's lock, ms in all, and ms for each megapixel.
+# A model of an image's CPU time, which determines the number of processes (docs/performance.md):
+# ms under the interpreter's lock, ms in total, and further ms for each megapixel.
 LOCKED_MS, IMAGE_MS, MEGAPIXEL_MS = 2.0, 3.0, 25.0
 MAX_LOCK_SHARE = 0.5  # threads wait for the lock if it is held for more of a process's time
 MIN_WORK_MS = 1200  # ms of work that justify a process; starting one takes 600
@@ -53,7 +53,10 @@ PROGRAM = (
     "import json, sys; sys.path[:] = json.loads({path!r}); {start}"
 )
 START = "from clpipe.batch.local_worker import main; main(int(sys.argv[1]))"
-THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")  # up to PoCL 3.1, and from 4 on
+THREADS = (
+    "POCL_MAX_PTHREAD_COUNT",
+    "POCL_CPU_MAX_CU_COUNT",
+)  # the name up to PoCL 3.1, and the name since PoCL 4
 
 
 def default_processes(images: int, claim: MemoryClaim, processors: int) -> int:
@@ -61,7 +64,7 @@ def default_processes(images: int, claim: MemoryClaim, processors: int) -> int:
 
     Args:
         images: the number of images.
-        claim: the size of the first image.
+        claim: size and memory of the first image.
         processors: the number of available processors.
 
     >>> small, large = MemoryClaim(512, 512, 0, 0), MemoryClaim(6000, 4000, 0, 0)
@@ -120,7 +123,7 @@ class Processes:
         self._processes: list[_Process] = []
         self._remaining: deque[Job] = deque()
         self._suspects: deque[Job] = deque()  # held by a process that died; tried alone at the end
-        self._deaths: Counter[str] = Counter()  # of processes that held a job, by its stem
+        self._deaths: Counter[str] = Counter()  # deaths of processes that held a job, by its stem
         self._is_compiled = False  # whether one has compiled the kernels, which are cached
         self._early_deaths = 0  # processes in a row that died before they were ready
         self._fruitless_deaths = 0  # processes that died since the last outcome

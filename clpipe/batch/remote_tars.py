@@ -50,7 +50,7 @@ class RemoteTars(Tars):
         assert url
         below = [each.removeprefix(f"{url}/") for each in list_urls(url)]
         self._there = {name for name in below if "/" not in name}
-        self._keys = {tar.name: self._key(tar) for tar in tars}  # of the present inputs
+        self._keys = {tar.name: self._key(tar) for tar in tars}  # digests of the current inputs
         for name in sorted(self._there):
             match = NUMBERED.fullmatch(name)
             if match and int(match[2]) >= tars[0].of:

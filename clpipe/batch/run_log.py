@@ -112,7 +112,7 @@ def _line(event: str, at: float, values: Mapping[str, Any]) -> bytes:
 
 
 class RunLog:
-    """Writes the log of a run after those of earlier runs. It begins with the first image.
+    """Writes the log of a run after the logs of earlier runs. It begins with the first image.
 
     Args:
         path: the file.

@@ -59,7 +59,7 @@ class Packer:
         self._writer = writer
         self._lock = threading.Lock()  # lets one thread read the old tar's index, once
         self._reused: dict[str, list[str]] = {}  # files of the old tar that stay, by their sidecar
-        self.statuses: dict[str, str] = {}  # of jobs, by stem
+        self.statuses: dict[str, str] = {}  # status of each job, by its stem
 
     @cached_property
     def _old(self) -> Members:

@@ -74,8 +74,8 @@ def split_into_tars(jobs: Sequence[Job], count: int, folder: Path) -> list[Tar]:
             )
         if HIDDEN_BY_READERS.match(name):
             raise RequestError(
-                f"{job.label}: would be the sample {name}, but WebDataset takes a folder "
-                "__NAME__ for its own and skips it; give it another name"
+                f"{job.label}: its sample would be called {name}, but WebDataset skips "
+                "folders called __NAME__; give the image another name"
             )
         job_by_sample[name] = job
     samples = [replace(job, name=name) for name, job in job_by_sample.items()]

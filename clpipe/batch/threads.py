@@ -97,7 +97,7 @@ class Batch:
                 an error that it raises ends the run.
 
         Raises:
-            OutputError: nothing more can be written. Images in flight are reported first.
+            OutputError: nothing more can be written. The outcomes of images in flight come first.
             DeviceError: no device is usable any more. If one fails, the others take over its work.
         """
         developers = self._developers
@@ -201,7 +201,7 @@ class Batch:
                     or not self._developers.is_small(decoded[-1])
                 ):
                     self._make(decoded)
-        except BaseException as error:  # of the run, not of one image
+        except BaseException as error:  # an error of the run, not of one image
             self._fail(error)
             self._budget.close()
         finally:
@@ -283,7 +283,7 @@ class Batch:
                 self._commit(made)
                 for state, _ in made:
                     self._outcomes.put(state.outcome())
-        except BaseException as error:  # of the run, not of one image
+        except BaseException as error:  # an error of the run, not of one image
             self._fail(error)
             while ended < self.in_flight:
                 if left := self._made.get():

@@ -20,7 +20,7 @@ def check_trace(path: Path) -> None:
     """Check that a trace may be written to a file.
 
     Raises:
-        RequestError: the name does not end in .json, or the file exists and is no trace.
+        RequestError: the name does not end in .json, or the file exists and is not a trace.
     """
     if path.suffix != ".json":
         raise RequestError(f"--trace: found {path}; expected a name that ends in .json")
@@ -33,7 +33,7 @@ def check_trace(path: Path) -> None:
     except OSError:
         own = False
     if not own:
-        raise RequestError(f"--trace: {path} exists and is no trace; choose another name")
+        raise RequestError(f"--trace: {path} exists and is not a trace; choose another name")
 
 
 class Trace:

@@ -52,7 +52,7 @@ class GainStage(BaseModel):
         """Return the value in DN of one of this stage's tables at an ISO.
 
         The table is converted to electrons and interpolated linearly in log ISO. Outside the table,
-        the value in electrons is that of the nearest end.
+        the nearest value in electrons is used.
         """
         electrons = self.interpolate(iso, _ratios(values, self.system_gain))
         return electrons * self.gain_at(iso)

@@ -20,7 +20,7 @@ INFINITY_DISTANCE = 1000.0  # m, for lensfun's calibrations at infinity
 MAX_EXTRA_WORDS = 2  # words of a lens's name, besides the maker, that you may omit
 RECTILINEAR = "RECTILINEAR"  # lensfun's type of the lenses that clpipe supports
 SAME_CROP = 1.01  # ratio of crop factors that count as equal
-ASPECT = 1.5  # of the images that a lens was calibrated with, if the database does not contain it
+ASPECT = 1.5  # assumed aspect ratio of the calibration images if the database lacks it
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def calibration_of(
         name: the model, or a part of it that belongs to no other model.
         camera: if lensfun knows it, the image has its sensor's size. Else the sensor is that of the
             camera on which the lens was calibrated.
-        focal_length: in mm; None is that of a prime lens.
+        focal_length: in mm; None for a prime lens.
         aperture: the f-number; without it there is no vignetting.
         focus_distance: in m; None is far away.
 
@@ -292,7 +292,7 @@ def _aspects() -> dict[tuple[str, str, float], float]:
 
     aspects = {}
     for path in Path(lensfunpy.__file__).parent.glob("db_files/*.xml"):
-        for lens in ElementTree.parse(path).iter("lens"):  # noqa: S314 - a file of the package
+        for lens in ElementTree.parse(path).iter("lens"):  # noqa: S314 - the file is part of lensfunpy
             if text := lens.findtext("aspect-ratio"):
                 width, _, height = text.partition(":")
                 key = lens.findtext("maker", ""), lens.findtext("model", "")

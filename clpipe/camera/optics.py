@@ -13,10 +13,10 @@ from typing import Any
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.camera.lens import LensCalibration
 
-LENGTH_TOLERANCE = 0.01  # of a length or an f-number; those of lenses are nominal
-PIXEL_TOLERANCE = 1e-4  # of lengths in px
+LENGTH_TOLERANCE = 0.01  # relative, for lengths and f-numbers; lenses state nominal values
+PIXEL_TOLERANCE = 1e-4  # relative, for lengths in px
 
-FOCAL_TOLERANCE = 0.1  # of a lens's focal length on a sensor; makers round, and image shapes differ
+FOCAL_TOLERANCE = 0.1  # relative, for a lens's focal length; makers round, and aspect ratios differ
 FILM_WIDTH, FILM_DIAGONAL = 36.0, math.hypot(36, 24)  # mm, of 35 mm film
 
 DEFAULT_EXPOSURE_TIME = 0.01  # s, default exposure time
@@ -38,7 +38,7 @@ class Optics:
         f_number: of the aperture.
         focus_distance: in m.
         exposure_time: in s.
-        calibration: that of the lens with the given name.
+        calibration: the calibration of the lens with the stated name.
         has_lens_sensor: whether the sensor's width is not stated and is that of the lens's
             camera, for a 3:2 image; see :meth:`for_image`.
         places: where each of them is stated.
@@ -104,7 +104,7 @@ class Optics:
         The sensor of a named lens has the diagonal from lensfun, whatever the shape of the image.
 
         Raises:
-            RequestError: the stated focal length in px is not that of the lens for this image.
+            RequestError: the stated focal length in px does not fit the lens and this image.
         """
         known, lens = self.known, self.calibration
         if lens is None:

@@ -72,21 +72,21 @@ class Camera(BaseModel):
     column_noise_ratio: NotNegative = 0.0
     quantum_efficiency: Annotated[float, Field(gt=0, le=1)] | None = None  # electrons per photon
     full_well: Positive | None = None  # e-; None: the ADC clips first
-    tukey_lambda: TukeyLambda | None = None  # of read noise at every ISO; None: Gaussian
+    tukey_lambda: TukeyLambda | None = None  # distribution of read noise; None: Gaussian
     prnu: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # standard deviation over mean
-    crosstalk: Share = 0.0  # of a pixel's charge, to each side
+    crosstalk: Share = 0.0  # share of a pixel's charge that leaks to each side
     dsnu: NotNegative = 0.0  # e-
     hot_pixel_share: Share = 0.0
     hot_pixel_level: NotNegative = 0.0  # e-, the smallest extra charge of a hot pixel
     dead_pixel_share: Share = 0.0
-    rts_share: Share = 0.0  # of pixels with random telegraph noise
+    rts_share: Share = 0.0  # share of pixels with random telegraph noise
     rts_amplitude: NotNegative = 0.0  # e-, the mean distance of their two levels
     dark_current: NotNegative = 0.0  # e-/s
     dark_current_temperature: Temperature = 20.0  # at which dark_current was measured
     dark_current_doubling: Positive | None = None  # K; None: the same at every temperature
     dark_current_spread: Fraction = 0.0  # variation between pixels, standard deviation over mean
     dark_shading_slope: NotNegative = 0.0  # DN per ISO, standard deviation over the sensor
-    # DN, likewise for the part that does not depend on the ISO
+    # DN, standard deviation over the sensor of the part that does not depend on the ISO
     dark_shading_offset: NotNegative = 0.0
     dark_shading_length: Positive = 500.0  # px, over which both change
     banding_amplitude: NotNegative = 0.0  # e-, of a wave along the columns
@@ -160,7 +160,7 @@ class Camera(BaseModel):
     def noise(self, iso: float) -> NoiseModel:
         """Return shot and read noise at an ISO: a = K / range, b = (read noise / range)^2.
 
-        The formulas are those of EMVA 1288, with K the system gain. Between the ISOs of a gain
+        The formulas come from EMVA 1288, with K the system gain. Between the ISOs of a gain
         stage, K / ISO is interpolated. Read noise is interpolated in electrons, linearly in log
         ISO. A gain stage is valid until the next one begins. Above the last measured ISO, K stays
         proportional to the ISO, and read noise is constant in electrons.

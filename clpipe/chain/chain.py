@@ -52,7 +52,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Step:
-    """A stage at its place in a chain: its resolved method, and the context that it reads."""
+    """A stage in a chain: its resolved method, and the context in which it runs."""
 
     name: str
     stage: Stage
@@ -100,9 +100,9 @@ class Chain:
     source: Kind
     camera: Camera
     settings: Settings
-    names: tuple[str, ...]  # of all steps, including those before start_at and after until
+    names: tuple[str, ...]  # all steps, including those before start_at and after until
     draws: Mapping[str, Draw] = field(default_factory=dict)  # the settings are an example of them
-    margins: Margins = NO_MARGINS  # the overscan of the image that enters
+    margins: Margins = NO_MARGINS  # the overscan of the chain's input
     # Results that all chains of this structure share, see of_structure(); None if not shared.
     structure: dict[Any, Any] | None = field(default=None, init=False)
 

@@ -142,7 +142,10 @@ class Choice(Draw):
     def _check_plain(self) -> "Choice":
         for item in self.choice:
             if item is None or isinstance(item, Mapping):
-                raise ValueError(f"found {item!r} in the list; list plain values only")
+                raise ValueError(
+                    f"found {item!r} in the list, but null and tables are not allowed; list plain "
+                    "values"
+                )
         return self
 
     def extremes(self, limits: Limits | None, followed: Sequence[Any]) -> Sequence[Any]:
@@ -327,7 +330,7 @@ class LogNormalOf(NumberDraw):
         for one in followed:
             if isinstance(one, bool) or not isinstance(one, int | float) or not one > 0:
                 raise ValueError(
-                    f"{self.follows}, which it follows, must be above 0, but can be {one!r}"
+                    f"this draw follows {self.follows}, which must be above 0, but can be {one!r}"
                 )
         extremes = [
             limits.nearest(self._value_at(z, one))

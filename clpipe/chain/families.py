@@ -77,7 +77,7 @@ class Family:
     def _is_equal(self, chain: Chain, numbers: Numbers) -> bool:
         try:
             return chain.equals(self._make(numbers))
-        except Exception:  # the arguments' error is reported when they are needed
+        except Exception:  # the error is raised again where the chain itself is built
             return False
 
     def derive(self, make: Callable[[Chain], Chain], chain: Chain, numbers: Numbers) -> Chain:

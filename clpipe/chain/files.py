@@ -43,7 +43,7 @@ class Config:
 def load_settings(*names: str) -> Settings:
     """Return the settings of configurations; the defaults if none is named.
 
-    Errors are those of :func:`load_configs`.
+    Raises the errors of :func:`load_configs`.
     """
     return load_configs(names).settings if names else Settings()
 

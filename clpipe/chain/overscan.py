@@ -27,7 +27,7 @@ def overscan_step_count(chain: Chain) -> int:
 def with_overscan(chain: Chain, margins: Margins) -> Chain:
     """Return the chain for an image with overscan, which the chain must be able to use.
 
-    Plans and kernels differ from those of ``chain`` only in numbers.
+    Plans and kernels differ from the ones for ``chain`` only in numbers.
     """
     count = overscan_step_count(chain)
     steps = tuple(

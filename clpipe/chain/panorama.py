@@ -11,7 +11,7 @@ from clpipe.stages.projection import WideAngle
 def with_panorama(chain: Chain, panorama: Panorama) -> Chain:
     """Return the chain for an image that is the atlas of a panorama.
 
-    Plans and kernels differ from those of ``chain`` only in numbers.
+    Plans and kernels differ from the ones for ``chain`` only in numbers.
     """
     steps = tuple(
         replace(step, method=step.method.with_panorama(panorama))

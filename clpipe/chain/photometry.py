@@ -20,7 +20,9 @@ METERED = "metered_ev"  # among the estimates of exposure
 Estimates = Mapping[str, Mapping[str, float]]
 Tables = dict[str, list[float]]
 
-RESPONSES: BoundedCache[Tables] = BoundedCache(64)  # by methods; images of a run share them
+RESPONSES: BoundedCache[Tables] = BoundedCache(
+    64
+)  # tables by methods, shared by the images of a run
 
 
 @dataclass(frozen=True)

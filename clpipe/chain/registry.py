@@ -1,4 +1,4 @@
-"""The registry of stages: built-in ones, those of installed packages, and those of stage files."""
+"""The registry of stages: built in, from installed packages, and from stage files."""
 
 import os
 import re

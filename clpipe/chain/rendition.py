@@ -21,18 +21,18 @@ NOISY, *_ = ROLES = get_args(Role)
 DEVELOPMENT, CLEAN, MOSAIC, VARIANCE = TRUTHS = ROLES[1:5]
 IID, INTENSITY = BASELINES = ROLES[5:]
 
-# Truths that are the same picture without noise, and truths that are always float mosaics.
+# Truths that look like the noisy picture, and truths that are always float mosaics.
 PICTURES, FLOAT_MOSAICS = TRUTHS[:2], TRUTHS[2:]
 
 
 @dataclass(frozen=True)
 class Rendition:
-    """One of the pictures that are made of an image.
+    """One of the pictures that clpipe makes from an image.
 
     Args:
-        role: the noisy picture, one of :data:`TRUTHS` or one of :data:`BASELINES`.
+        role: :data:`NOISY`, one of :data:`TRUTHS`, or one of :data:`BASELINES`.
         ev: its relative exposure in a bracket, in EV; None without a bracket.
-        frame: the number of the noisy picture in its burst; None if it is no frame.
+        frame: the number of the noisy picture in its burst; None without a burst.
         frames: the number of frames of the burst; None without a burst.
     """
 
@@ -115,5 +115,7 @@ def parse_bracket(evs: str | Sequence[float]) -> tuple[float, ...]:
         raise RequestError(f"--bracket: found {evs!r}; expected EVs, such as -2,0,2")
     for ev in bracket:
         if bracket.count(ev) > 1:
-            raise RequestError(f"--bracket: found {evs!r}, with {ev:+g} EV twice; give it once")
+            raise RequestError(
+                f"--bracket: found {evs!r}, which repeats {ev:+g} EV; list each EV once"
+            )
     return bracket

@@ -41,7 +41,7 @@ class RecordedRequest:
 
     Args:
         config: the values of a configuration, nested as in its file; None if none is named.
-        options: values that override those of the configuration.
+        options: values that override the configuration.
         image: values of one image that override both, from its row in a manifest.
         stage_files: Python files that define further stages; :meth:`Request.settings` loads them.
         image_name: the image that draws belong to; "" if it is no particular image.

@@ -76,8 +76,9 @@ def signal_and_noise(chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
 def variance_of(noise: Sequence[Step], signal: Floats) -> Floats:
     """Return the variance of the noise in each pixel of a mosaic, in signal squared.
 
-    The noisy mosaic varies about the clean one by this much, over images and over cameras. The
-    clean mosaic is that of an ideal sensor, so fixed patterns (PRNU, DSNU, columns) are noise too.
+    This is the expected squared difference between the noisy and the clean mosaic, over images and
+    cameras. The clean mosaic is from an ideal sensor, so fixed patterns (PRNU, DSNU, columns) count
+    as noise.
 
     Derivation: a stage reads x + n, where x is the clean image and n has the mean 0 and the
     variance v. It draws its own noise independently of n. By the law of total variance, the

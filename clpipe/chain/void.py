@@ -16,11 +16,11 @@ MAX_OVERSCAN = 0.5  # the largest overscan that a warning proposes, relative to 
 
 
 def black_area_warning(chain: Chain, width: int, height: int) -> str:
-    """Return a warning if part of a picture is black because its lens shows too much; else "".
+    """Return a warning if the lens sees past the render, which leaves black areas; else "".
 
     Args:
         chain: the chain of the picture.
-        width, height: the size in px of the image that enters, with its overscan.
+        width, height: the size of the input in px, with its overscan.
 
     Raises:
         ImageError: the distortion folds the image over.
@@ -33,7 +33,7 @@ def black_area_warning(chain: Chain, width: int, height: int) -> str:
         lens = chain.optics.calibration
         if lens and lens.is_of_smaller_sensor:
             raise ImageError(
-                f"{lens.name} was calibrated on a smaller sensor than that of {chain.camera.name}, "
+                f"{lens.name} was calibrated on a smaller sensor than {chain.camera.name}'s, "
                 "so its distortion is undefined in the corners; choose another lens, or a camera "
                 "with a smaller sensor"
             ) from None

@@ -240,7 +240,7 @@ def figures(iso: float, *values: float) -> tuple[str, ...]:
 
 
 def noise_at(camera: Camera, iso: float) -> dict[str, Any]:
-    """Return the noise at an ISO in all three forms, and that of dark frames in DN.
+    """Return the noise at an ISO in all three forms, and the noise of dark frames in DN.
 
     Raises:
         RequestError: the ISO is outside the camera's range.

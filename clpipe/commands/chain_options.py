@@ -57,7 +57,7 @@ def option(key: Key, parameter: str = "", **others: Any) -> Callable[[F], F]:
     """Return a decorator that adds the option for a key to a command.
 
     Args:
-        key: the key, from which type, range, choices and help follow.
+        key: the key, which defines the option's type, range, choices and help.
         parameter: the parameter of the command's function, if it is not the key's name.
         **others: arguments of :func:`click.option` that replace those from the key.
     """

@@ -83,7 +83,7 @@ def parameters(context: click.Context, option: click.Parameter, text: str) -> li
 
 
 def _stages(context: click.Context) -> list[str]:
-    """Return the names of all stages, including those of ``--stage-file`` if they can be loaded."""
+    """Return the names of all stages, also from each ``--stage-file`` that can be loaded."""
     from clpipe.chain.registry import all_stages, load_stage_file
 
     try:

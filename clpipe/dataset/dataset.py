@@ -107,8 +107,8 @@ class Dataset(ReadOnly):
         on_error: "raise" the error of an image that cannot be read or developed, or "skip" the
             image with a warning. An index of a skipped image returns a sample of the next one.
             Headers are read at once. Files without a valid header are rejected, or skipped.
-        cache: the bytes of decoded renders to keep for further patches and epochs, also as text,
-            such as "4G". Workers share them as memory-mapped files in the temporary directory
+        cache: the bytes of decoded renders to cache for more patches and epochs, as a number or as
+            text such as "4G". Workers share them as memory-mapped files in the temporary directory
             (``TMPDIR``). 0 keeps none.
         epoch: the number of the first epoch.
         epochs: the number of epochs. None is endless.
@@ -309,7 +309,7 @@ class Dataset(ReadOnly):
             waiting, read, size, is_full = [], [], BatchSize(side), False
 
     def _develop(self, epoch: int, image: int, numbers: Sequence[int]) -> list[Sample]:
-        """Return samples of an image. If it fails and may be skipped, use the next valid image.
+        """Return samples of an image. If it fails and errors are skipped, use the next valid image.
 
         Raises:
             ImageError: the image, or every image, cannot be read or processed.

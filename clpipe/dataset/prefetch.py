@@ -20,8 +20,8 @@ Pending = tuple[SampleBatch, Callable[[], list[Sample]]]
 PATCHES_TOGETHER = 16  # patches with their own draws in one batch
 # Samples are developed together until either limit is reached. In a shuffled dataset, every sample
 # may have its own render. Larger groups only take more memory.
-MAX_BYTES = 2**27  # of renders
-MAX_PIXELS = 2**21  # of samples
+MAX_BYTES = 2**27  # bytes of renders
+MAX_PIXELS = 2**21  # pixels of samples
 
 
 class BatchSize:

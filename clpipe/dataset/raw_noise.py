@@ -33,7 +33,7 @@ class RawNoise(ReadOnly):
 
     It runs the default chain from ``crosstalk`` to ``normalize``: sensor noise, row, column and
     pixel defects, clipping and rounding to DN. Noise depends on the mosaic, the ISO, the seed and
-    the key. With a ``noise_key``, the result is that of the whole chain with this key.
+    the key. With a ``noise_key``, the result equals the whole chain's result with this key.
 
     The process that first calls it opens the device. OpenCL does not survive a fork, so workers of
     a process that has used it must be spawned.

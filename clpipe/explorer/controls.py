@@ -75,7 +75,7 @@ def key_controls() -> dict[str, Any]:
 
 
 def camera_controls(others: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the built-in cameras and those of given files, with their ISO ranges.
+    """Return the built-in cameras and the cameras of the files, with their ISO ranges.
 
     Raises:
         RequestError: a file is not a camera profile.

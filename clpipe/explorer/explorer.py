@@ -38,7 +38,7 @@ from clpipe.stage import Kind
 
 MAX_SOURCES = 2  # decoded images in memory
 MIN_RESULTS = 3  # results that are always kept
-MAX_RESULT_BYTES = 1 << 28  # bytes; more results are kept up to this size
+MAX_RESULT_BYTES = 1 << 28  # bytes; up to this size, more than MIN_RESULTS are kept
 ALWAYS_RECORDED = ("camera", "iso", "seed", "stages", "skip")  # always in Settings.record()
 
 
@@ -215,7 +215,7 @@ class Explorer:
         sample = self.sample(number)
         height, width = sample.image.shape[:2]
         if not (0 <= y < height and 0 <= x < width):
-            raise RequestError(f"there is no pixel {x}, {y} in {width}x{height}")
+            raise RequestError(f"found pixel {x}, {y}, but the image has {width}x{height} pixels")
         found = np.atleast_1d(sample.image[y, x])
         return {"values": [float(value) for value in found], "unit": sample.unit}
 

@@ -11,7 +11,7 @@ from clpipe.chain.registry import all_stages
 
 
 def files_in(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield the file names in nested values, each with its dotted key. Includes those of draws.
+    """Yield the file names in nested values and in draws, each with its dotted key.
 
     >>> list(files_in({"camera": "a.toml", "iso": 100, "tone_curve": {"path": "b.cube"}}))
     [('camera', 'a.toml'), ('tone_curve.path', 'b.cube')]

@@ -60,8 +60,8 @@ def as_image(value: Any, kind: Kind) -> Array:
             "For a finished picture, use Pipeline('unprocess')"
         )
         raise ImageError(
-            f"the image has samples of type {image.dtype}, but the chain starts on {kind.label} in "
-            f"floats. {advice}"
+            f"the image has samples of type {image.dtype}, but the chain expects "
+            f"{kind.label} as floats. {advice}"
         )
     if image.dtype not in (np.float16, np.float32):
         image = image.astype(np.float32)

@@ -10,7 +10,7 @@ from clpipe.images.openimageio import open_image
 from clpipe.images.tags import DATE, FLIPS, sensor_width, shot_to_attributes
 
 SHOT_OF_TAGS = {"exposure_time": "exposure", "focal_length": "focal_length"}
-PREFIX = "clpipe:"  # of the names of clpipe's own attributes
+PREFIX = "clpipe:"  # prefix of clpipe's attribute names
 
 
 def clpipe_attributes(spec: Any) -> dict[str, str]:
@@ -32,7 +32,7 @@ def read_attributes(path: Path) -> dict[str, str]:
 def shot_attributes(spec: Any) -> dict[str, float]:
     """Return the shot from OpenEXR's standard attributes, without impossible values.
 
-    The names are those of a render's camera (``[render]``): exposure_time in s, focal_length
+    The names come from a render's camera (``[render]``): exposure_time in s, focal_length
     and sensor_width in mm.
     """
     size = spec.getattribute("sensorOverallDimensions")

@@ -1,4 +1,4 @@
-"""The size that a file claims, and the memory to read it, found without reading pixels."""
+"""Reads the image size from a file's header, and estimates the memory to read its pixels."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ FLOAT = 4  # bytes
 
 @dataclass(frozen=True)
 class MemoryClaim:
-    """The size that a file claims in px, and the bytes of memory for its image and to read it.
+    """The size in a file's header, and estimates of the memory for its image and to read it.
 
     The model follows :mod:`clpipe.images.read`. This table compares it with measurements at 24 MP,
     in bytes per pixel:

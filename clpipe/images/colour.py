@@ -10,7 +10,7 @@ from clpipe.base.types import Array, Floats
 # x and y of red, green, blue and white: ITU-R BT.709-6 (2015), which sRGB shares.
 SRGB = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 MAX_CHROMATICITY = (
-    100.0  # the largest absolute x or y; those of wide colour spaces are within -1 to 2
+    100.0  # the largest absolute x or y; wide colour spaces have values within -1 to 2
 )
 CIE_XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
 

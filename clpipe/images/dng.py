@@ -143,7 +143,7 @@ def preview(dn: Array, negative: Negative) -> Array:
     """Return a small sRGB picture of a mosaic, (height, width, 3) uint8, at most 512 px per side.
 
     A pixel is the mean of each channel in one period of the mosaic. It has the tone curve, because
-    RawTherapee matches the histogram of its own picture to that of the preview.
+    RawTherapee matches the histogram of its own picture to the preview's histogram.
     """
     array = negative.array
     down, across = array.period
@@ -215,7 +215,7 @@ def main_directory(
         271: tiff.text(tags.make),  # Make
         # Model. It differs from the real camera's name, for which RawTherapee crops optically black
         # columns and sets its own white level. LibRaw uses its own matrix even if a name only
-        # begins with that of a real camera.
+        # begins with the name of a real camera.
         272: tiff.text(SIMULATED + tags.model),
         274: tiff.short(orientation),  # Orientation
         305: tiff.text(f"clpipe {__version__}"),  # Software

@@ -20,7 +20,7 @@ TYPES: dict[int, np.dtype[Any]] = {
     1: np.dtype(np.float16),
     2: np.dtype(np.float32),
 }
-CHUNK_ROWS = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)  # of a chunk, by the number of the compression
+CHUNK_ROWS = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)  # rows per chunk, by compression number
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class ExrHeader:
 
     Args:
         channels: the type of each channel, by name.
-        columns: the width of a chunk in px; 0 if it is that of the image.
+        columns: the width of a chunk in px; 0 if it equals the width of the image.
         rows: the height of a chunk in px.
         end: the header's length in bytes, after which the table of chunk offsets begins.
     """

@@ -49,7 +49,7 @@ class PictureLocation:
         channels: the numbers of R, G and B, of X, Y and Z, or of a single channel.
         xyz: whether the channels are X, Y and Z.
         view: the number of the view in a stereo picture.
-        name: the name of the layer without that of the view.
+        name: the name of the layer, without the view's name.
     """
 
     part: int
@@ -69,7 +69,7 @@ class PictureLocation:
 
     @property
     def is_aov(self) -> bool:
-        """Whether its name is that of an AOV."""
+        """Whether its name is the name of an AOV."""
         if not self.name:
             return False
         *above, last = self.name.split(".")

@@ -20,7 +20,7 @@ from clpipe.reference.carried import LayerKind
 
 CRYPTOMATTE = "cryptomatte/"  # prefix of attributes that map Cryptomatte's numbers to names
 
-CHANNEL_ORDER = "RGBAXYZWUV"  # of channels within a layer
+CHANNEL_ORDER = "RGBAXYZWUV"  # order of the channels of a layer
 
 FLOAT_TYPES = {oiio.HALF: oiio.HALF, oiio.FLOAT: oiio.FLOAT, oiio.DOUBLE: oiio.FLOAT}
 

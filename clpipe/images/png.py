@@ -8,7 +8,7 @@ from pathlib import Path
 MAGIC = b"\x89PNG\r\n\x1a\n"
 MAX_CHUNKS = 1000  # before the first chunk of samples
 
-# ITU-T H.273 (2024), tables 2 and 3: x and y of red, green, blue and white; names of curves.
+# Codes of ITU-T H.273 (2024). Table 2: x and y of red, green, blue and white. Table 3: curves.
 PRIMARIES = {
     1: (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290),
     9: (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290),

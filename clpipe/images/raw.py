@@ -32,10 +32,11 @@ RAW_SUFFIXES = (
     *(".srf", ".srw", ".x3f"),
 )
 
-MIN_BITS = 0.25  # of a pixel; assumed to be less than any compressed raw has
-MAX_GAIN = 8.0  # of white balance; the smallest is its inverse. No light source needs more.
+MIN_BITS = 0.25  # bits per pixel; every compressed raw is assumed to have more
+MAX_GAIN = 8.0  # largest white balance gain; the smallest is its inverse
 
-# EXIF's orientation by LibRaw's flip (1: left to right, 2: upside down, 4: then transposed).
+# Converts LibRaw's flip to EXIF's orientation. The flip is a sum of 1 (mirror horizontally),
+# 2 (mirror vertically) and 4 (then transpose).
 ORIENTATIONS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
 
 # The bytes before the EXIF in files that are not TIFF: in a CR3's boxes, in a RAF's JPEG.
@@ -61,14 +62,14 @@ class RawInfo:
     model: str
     iso: float | None
     exposure: float | None  # s
-    visible_area: tuple[int, int, int, int]  # of the sensor, px: left, top, width, height
-    pattern: str  # of the visible area: a Bayer pattern, or rows of letters with / between them
-    black_levels: tuple[int, int, int, int]  # of the pattern's four sites, row by row
+    visible_area: tuple[int, int, int, int]  # left, top, width, height in sensor px
+    pattern: str  # CFA of the visible area: a Bayer pattern, or rows separated by /
+    black_levels: tuple[int, int, int, int]  # of the four sites of the pattern, row by row
     white_level: int
     as_shot: tuple[float, float, float]  # white balance multipliers of red, green, blue
     gains: tuple[float, float] | None  # red, blue, as shot
     xyz_to_camera: Matrix | None
-    camera_to_srgb: Matrix | None  # of white-balanced RGB, linear
+    camera_to_srgb: Matrix | None  # for linear, white-balanced RGB
     orientation: int  # EXIF's: 1 is upright
     aperture: float | None
     focal_length: float | None  # mm
@@ -104,7 +105,7 @@ def read_raw_info(path: Path, max_pixels: int = DEFAULT_MAX_PIXELS) -> RawInfo:
         first, second, third, fourth = (int(by_colour[c]) for c in cell)
         red, green, blue = map(float, raw.camera_whitebalance[:3])
         matrix = _matrix(raw.rgb_xyz_matrix[:3])
-        # rawpy's color_matrix is that of the file, or LibRaw's if the file has none.
+        # rawpy's color_matrix comes from the file, or from LibRaw if the file has none.
         to_srgb = _matrix(raw.color_matrix[:, :3])
         if to_srgb is None and matrix is not None:
             to_camera = np.array(matrix) @ SRGB_TO_XYZ
@@ -215,7 +216,7 @@ def _open_raw(path: Path, max_pixels: int) -> Iterator[Any]:
         reason = error.args[0].decode() if isinstance(error.args[0], bytes) else str(error)
         hint = f"; {DUMP_HINT}" if path.suffix.lower() == ".raw" else ""
         raise ImageError(
-            f"{path}: it is damaged, or not a raw that LibRaw knows: {reason}{hint}"
+            f"{path}: the file is damaged, or LibRaw does not support it: {reason}{hint}"
         ) from None
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror or error}") from None

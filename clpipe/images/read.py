@@ -304,7 +304,7 @@ def _decode(
 ) -> tuple[SourceImage, Statements]:
     """Return the unconverted picture of a file that OpenImageIO reads, and the file's statements.
 
-    The arguments and errors are those of :func:`read_image`.
+    For the arguments and errors, see :func:`read_image`.
 
     Raises:
         SubsampledError: the channels differ in size.

@@ -19,7 +19,7 @@ from clpipe.images.pixels import DEFAULT_MAX_PIXELS, check_size, display_window
 from clpipe.reference.geometry import Margins
 
 LARGE_FILE = 4 << 20  # bytes; for smaller files, starting a thread takes longer than the SHA-256
-MAX_CHANNEL_SPAN = 8  # channels; those of a picture may be hundreds apart
+MAX_CHANNEL_SPAN = 8  # channels; the channels of a picture may be hundreds apart
 
 
 def read_samples(path: Path, file: Any, part: int, channels: Sequence[int], type_: Any) -> Array:

@@ -113,7 +113,7 @@ def exposed_attributes(attributes: Mapping[str, str], tags: Tags) -> dict[str, s
 def from_attributes(attributes: Mapping[str, str], default: Tags) -> tuple[Tags, int]:
     """Return the tags and the orientation in an image's attributes.
 
-    Missing tags are those of ``default``. A missing orientation is upright.
+    Missing tags are taken from ``default``. A missing orientation is upright.
 
     Raises:
         ImageError: the attributes are damaged.

@@ -23,9 +23,9 @@ from clpipe.inputs.annotations import (
 POSES, INFOS, CAMERAS = "scene_gt.json", "scene_gt_info.json", "scene_camera.json"
 MASKS = ("mask", "mask_visib")
 BOXES = ("bbox_obj", "bbox_visib")
-DIGITS = 6  # of an image's number in file names
-MAX_IMAGE_NUMBER = 10**9 - 1  # the largest number of an image
-COUNTS = ("px_count_all", "px_count_valid")  # they scale with the size of a mask
+DIGITS = 6  # digits of an image number in file names
+MAX_IMAGE_NUMBER = 10**9 - 1  # the largest image number
+COUNTS = ("px_count_all", "px_count_valid")  # fields that scale with the size of a mask
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,15 @@ from clpipe.reference.carried import RESAMPLING, LayerKind, Vector
 
 CARRIED = "carried"  # in file names: the carried layers of NAME are in NAME.carried.exr
 
-SUFFIXES = (".exr", ".pfm", ".tif", ".tiff", ".png")  # of companions, in order of preference
+SUFFIXES = (
+    ".exr",
+    ".pfm",
+    ".tif",
+    ".tiff",
+    ".png",
+)  # companions' extensions, in order of preference
 
-SEPARATORS = "_.-"  # between an image's name and that of a layer, in the name of a companion
+SEPARATORS = "_.-"  # between the image's name and the layer's name, in the name of a companion
 
 
 @dataclass(frozen=True)
@@ -96,8 +102,8 @@ class LayerFinder:
                 if len(locations) != 1:
                     listed = ", ".join(each.name or "one without a name" for each in locations)
                     raise ImageError(
-                        f"{file}: this file has no layer called {spec.name}, but several others "
-                        f"({listed}). Name one of them in --carry"
+                        f"{file}: this file has no layer {spec.name!r}. It has the layers "
+                        f"{listed}; name one of these in --carry"
                     )
                 named = locations
             if named:

@@ -48,7 +48,7 @@ class Job:
         name: the path of its outputs in the output directory, without extension; "" uses the key.
         named_by_user: whether the user named the file by path, glob or manifest, not its folder.
         values: settings of this image only, nested like a configuration.
-        frames: the number of frames; None uses that of the request.
+        frames: the number of frames; None uses the request's number.
         location: its manifest and row; "" if it is not in a manifest.
         renditions: the renditions to make; None is all.
         as_written: the path as the user wrote it, if ``path`` has been made absolute.

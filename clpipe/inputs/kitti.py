@@ -16,9 +16,9 @@ from clpipe.base.reading import read_named
 from clpipe.base.types import Doubles
 from clpipe.inputs.annotations import MAX_BYTES, MAX_COORDINATE, AnnotatedRender, reject
 
-FIELD_COUNT = 15  # of a line, without a score
-CALIBRATION = "calib"  # the folder next to that of the labels
-MATRICES = ("P0", "P1", "P2", "P3")  # of cameras; labels use the third
+FIELD_COUNT = 15  # fields of a line, without a score
+CALIBRATION = "calib"  # name of the calibration folder, next to the label folder
+MATRICES = ("P0", "P1", "P2", "P3")  # projection matrices of the cameras; labels use the third
 CENTRE = 0.5  # px from the image's corner to the first pixel's centre
 
 
@@ -39,7 +39,7 @@ class KittiObject:
 
 @dataclass(frozen=True)
 class Kitti:
-    """A folder of labels, see :class:`~clpipe.inputs.annotations.Annotations`.
+    """A folder of KITTI labels, see :class:`~clpipe.inputs.annotations.Annotations`.
 
     Args:
         file: the folder.

@@ -45,7 +45,7 @@ class Row:
         key: its name among the inputs.
         name: the path of its outputs in the output directory, without extension; "" uses the key.
         values: its settings, nested like a configuration.
-        frames: the number of frames; None uses that of the request.
+        frames: the number of frames; None uses the request's number.
         location: the manifest and the row, for messages.
     """
 
@@ -115,7 +115,7 @@ def manifest_text(folder: Path, rows: Sequence[Row]) -> bytes:
 
     Args:
         folder: the folder that the manifest will be in.
-        rows: the rows. File names in their values include their folder.
+        rows: the rows. Values that name files are complete paths.
     """
     records: list[dict[str, str]] = []
     for row in rows:

@@ -168,7 +168,7 @@ def read_panorama(job: Job, read: Callable[[Path], SourceImage], wide: WideAngle
     A render that is not a panorama, according to its header and name, is returned unchanged.
 
     Raises:
-        ImageError: a file cannot be read, or its size differs from that of the first.
+        ImageError: a file cannot be read, or its size differs from the first file's.
     """
     sources: list[SourceImage] = []
     for path in job.paths:

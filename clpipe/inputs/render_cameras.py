@@ -134,7 +134,7 @@ def _from_view(view: Mapping[str, Any], common: Mapping[str, Any]) -> View:
 
 
 def _from_frame(frame: Mapping[str, Any], common: Mapping[str, Any]) -> View:
-    """Return a frame of a transforms.json. Values that the frame lacks are those of all frames.
+    """Return a frame of a transforms.json. Values that the frame lacks are taken from all frames.
 
     Raises:
         ValueError: a value is not allowed; the message names it.

@@ -91,7 +91,9 @@ def average(
     """
     found: list[SourceImage] = []
     totals: Floats = np.empty(0, np.float32)
-    weights: list[tuple[Doubles, Doubles]] = []  # of a frame, and in addition of its light layer
+    weights: list[
+        tuple[Doubles, Doubles]
+    ] = []  # weights of a frame, and extra weights of its light layer
     for number, path in enumerate(job.paths):
         with check_unchanged(path):
             source = read(path, None)
@@ -115,9 +117,9 @@ def average(
             totals = np.zeros((len(spans), *pixels.shape), np.float32)
         elif (pixels.shape, source.margins) != (totals.shape[1:], found[0].margins):
             raise ImageError(
-                f"{path}: the size of this frame is {_size(source, pixels)}, but that of "
-                f"{job.path}, in the same exposure, is {_size(found[0], totals[0])}; render all "
-                "frames at one size"
+                f"{path}: the size of this frame is {_size(source, pixels)}, but {job.path}, in "
+                f"the same exposure, has {_size(found[0], totals[0])}; render all frames at one "
+                "size"
             )
         for total, (unlit, extra) in zip(totals, weights, strict=True):
             _add(total, unlit[number], pixels)

@@ -104,7 +104,7 @@ def json_records(
 ) -> Iterator[tuple[int, Record]]:
     """Yield the lines of a JSONL that are not empty, with their numbers.
 
-    The arguments are those of :func:`csv_records`.
+    For the arguments, see :func:`csv_records`.
     """
     for number, line in enumerate(text.split("\n"), 1):
         if line.strip():
@@ -112,7 +112,7 @@ def json_records(
 
 
 def _from_json(line: str, check_column: Callable[[str], None]) -> dict[str, Any]:
-    """Return the values of a JSON object by dotted columns, without null.
+    """Return a JSON object as values by dotted column, such as ``sensor_noise.a``, without nulls.
 
     Raises:
         RequestError: the line is not an object, or has a repeated key or an unknown column.

@@ -93,7 +93,7 @@ class PixelMapping:
 def warp_annotation(annotation: Record, mapping: PixelMapping) -> Record | None:
     """Return the changed values of an annotation, or None if its object is not in the picture.
 
-    The box is that of the mapped outline or mask. Without either, it encloses the mapped edges of
+    The box encloses the mapped outline or mask. Without either, it encloses the mapped edges of
     the old box. ``truncated`` is the share of the object outside the picture.
 
     Raises:

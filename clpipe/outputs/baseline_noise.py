@@ -18,7 +18,7 @@ from clpipe.reference.curve import to_8_bit
 from clpipe.stage import run_reference
 from clpipe.stages.picture_noise import CHANNELS, IidGaussian, IntensityDependent, NoNoise
 
-MAX_SIGMA = 1.0  # of full scale
+MAX_SIGMA = 1.0  # relative to full scale
 CURVE_POINTS = 65  # intensities at which the sigma of INTENSITY is known
 HISTOGRAM_BINS = 1024  # bins of the histogram of the clean picture
 QUANTILES = np.array([NormalDist().inv_cdf((i + 0.5) / 64) for i in range(64)])

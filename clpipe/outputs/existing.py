@@ -169,7 +169,7 @@ def match_sidecar(
 ) -> ExistingFiles:
     """Compare the input, request and program of a sidecar with the current ones.
 
-    The arguments are those of :func:`find_existing`.
+    For the arguments, see :func:`find_existing`.
     """
     if not _same_request(values.get("request"), request) or not _same_input(values, job, verify):
         return ExistingFiles.NOTHING

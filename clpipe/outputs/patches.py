@@ -149,7 +149,7 @@ class PatchLayout:
 
     Args:
         patches: the number and size of patches.
-        width, height: size of the picture in px, at least that of a patch.
+        width, height: size of the picture in px, at least the size of a patch.
         pattern: the pattern of its mosaic, such as "RGGB", or rows of letters.
         seed: the seed of random draws.
     """

@@ -216,7 +216,7 @@ def map_flow(samples: Array, vectors: Sequence[Vector], move: PixelOrigins) -> A
     frame is assumed to have the same geometry.
 
     Args:
-        samples: (..., channel), float64, those of each pixel's origin.
+        samples: (..., channel), float64, at each pixel's origin.
         vectors: see :class:`Layer`.
         move: the pixels.
     """
@@ -236,7 +236,7 @@ def map_flow(samples: Array, vectors: Sequence[Vector], move: PixelOrigins) -> A
 
 
 def _normalized(normals: Array) -> Array:
-    """Scale the first three channels of normals to length 1; those of length 0 stay 0."""
+    """Scale the first three channels of normals to length 1; normals of length 0 stay 0."""
     length = np.linalg.norm(normals[..., :3], axis=-1, keepdims=True)
     scaled = normals[..., :3] / np.where(length > 0, length, 1)
     return np.concatenate([scaled, normals[..., 3:]], axis=-1)

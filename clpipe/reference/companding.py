@@ -42,8 +42,8 @@ def parse_knots(pairs: Sequence[Sequence[float]]) -> Knots:
     rising = all(a[0] < b[0] and a[1] < b[1] for a, b in pairwise(knots))
     if not are_pairs or not rising or knots[0] != (0, 0):
         raise ValueError(
-            f"knots: found {pairs}; expected pairs of DN before and after, from [0, 0] on, rising "
-            "in both"
+            f"knots: found {pairs}; expected pairs [DN before, DN after] that start at "
+            "[0, 0] and increase in both"
         )
     return knots
 

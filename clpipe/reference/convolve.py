@@ -11,7 +11,7 @@ from clpipe.base.tracing import traceable
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.image import tap
 
-NEGLIGIBLE = 5e-4  # share of the light that may be omitted, from the smallest weights
+NEGLIGIBLE = 5e-4  # the smallest weights are omitted, up to this share of the light
 
 
 def taps_of(psf: Doubles) -> Floats:

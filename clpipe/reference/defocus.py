@@ -60,7 +60,7 @@ def parse_depth(pixels: Array) -> Floats:
 def aperture_taps(blades: int, largest: float) -> Floats:
     """Return the positions that a disc may cover, with its edge: (tap, 4) float32, by rows.
 
-    A tap starts with dx and dy in px, from the pixel that receives light to the one that emits it.
+    The first two numbers are dx and dy in px, from the pixel that receives light to its source.
     The third number is the radius at which the edge of the aperture's image reaches it, measured by
     the circle around its corners. The last number is the weight with which it replaces a hidden
     surface.
@@ -119,7 +119,7 @@ def defocus(image: Floats, radii: Floats, taps: Floats) -> Floats:
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
     centre, size = radii, abs(radii)
     area = _area(size)
-    # of the surfaces in front, level and behind
+    # Sums for surfaces in front, level and behind.
     light: Floats = np.zeros((3, *image.shape), np.float32)
     total: Floats = np.zeros((3, *radii.shape), np.float32)
     free: Floats = np.zeros(radii.shape, np.float32)

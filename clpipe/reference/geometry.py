@@ -30,11 +30,11 @@ class Margins(NamedTuple):
         return any(self)
 
     def frame_size(self, width: int, height: int) -> tuple[int, int]:
-        """Return the width and height of the frame, from those of the image."""
+        """Return the width and height of the frame, from the image's."""
         return width - self.left - self.right, height - self.top - self.bottom
 
     def image_size(self, width: int, height: int) -> tuple[int, int]:
-        """Return the width and height of the image, from those of the frame."""
+        """Return the width and height of the image, from the frame's."""
         return width + self.left + self.right, height + self.top + self.bottom
 
     def cropped(self, image: Array) -> Array:
@@ -50,7 +50,7 @@ class Geometry(Protocol):
     """How a stage moves the pixels of an image of some width and height, in px."""
 
     def size(self, width: int, height: int) -> tuple[int, int]:
-        """Return the width and height of the output, from those of the input."""
+        """Return the width and height of the output, from the input's."""
         ...
 
     def origins(self, x: Array, y: Array, width: int, height: int) -> tuple[Array, Array]:
@@ -66,7 +66,7 @@ class Geometry(Protocol):
         ...
 
     def intrinsics(self, known: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
-        """Return the intrinsics of the output, from those of the input; None if not known.
+        """Return the intrinsics of the output, from the input's; None if not known.
 
         Raises:
             RequestError: they contradict this stage.
@@ -108,7 +108,7 @@ class Scaling(ForwardMapped):
         return sizes(self.resamplings, width, height)[-1]
 
     def shown(self, width: int, height: int) -> tuple[int, int]:
-        """Return how many columns and rows of the image the result shows, from the upper left.
+        """Return the columns and rows of the image that the result covers, from the upper left.
 
         >>> from clpipe.reference.resample import Bins
         >>> Scaling((Bins("rows", 2), Bins("columns", 2))).shown(611, 407)

@@ -26,7 +26,7 @@ COEFFICIENTS = {
 
 LAWSON_ITERATIONS = 40  # iterations of a fit
 
-FOCAL_TOLERANCE = 0.01  # of focal lengths; those in mm are often rounded
+FOCAL_TOLERANCE = 0.01  # relative error of a focal length; values in mm are often rounded
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Intrinsics:
         fx, fy: focal lengths in px.
         cx, cy: the principal point in px from the upper left corner.
         model: a key of :data:`COEFFICIENTS`.
-        distortion: the coefficients by name; those of green if there is lateral colour.
+        distortion: the coefficients by name, for green if there is lateral colour.
         residual: the largest position error in px of a model that is fitted to a lens.
     """
 

@@ -207,7 +207,7 @@ class _ScaledLens:
         self.corner = float(np.hypot(*(offsets / self.unit).T).max())
         self.corner_side = float(np.hypot(*(offsets / self.side).T).max()) / scale
         offsets = self._corners(-left, -top, width + right, height + bottom)
-        self.farthest = float(np.hypot(*(offsets / self.unit).T).max())  # of the input
+        self.farthest = float(np.hypot(*(offsets / self.unit).T).max())  # corner of the input
         self._check(lens.radial, self.farthest, self.corner, "distortion", max(self.unit))
         for lateral in (lens.red, lens.blue):
             self._check(lateral, self.corner_side, self.corner_side, "lateral colour", self.side)
@@ -271,7 +271,7 @@ class _ScaledLens:
                 np.where(r > farthest, outer_slope, slope),
             )
             ratio = distorted / r
-            curvature = (slope - ratio) / (r * r)  # of the ratio, over r
+            curvature = (slope - ratio) / (r * r)  # slope of the ratio over r, divided by r
             fx = ux * ratio + 2 * p1 * ux * uy + p2 * (r * r + 2 * ux * ux) - dx
             fy = uy * ratio + p1 * (r * r + 2 * uy * uy) + 2 * p2 * ux * uy - dy
             xx = ratio + ux * ux * curvature + 2 * p1 * uy + 6 * p2 * ux

@@ -71,7 +71,7 @@ def covariance(
     Args:
         responses: the response of each tap to a colour, (tap, 3).
         tap_correlation: the correlation of two taps' colours, (tap, tap).
-        chroma: the variance of chroma, relative to that of luma.
+        chroma: the variance of chroma, relative to the variance of luma.
         noise: the variance of the rest that the model does not describe.
     """
     return np.asarray(
@@ -101,7 +101,7 @@ def mmse_filters(
         responses: the response of each tap to a colour, (tap, 3).
         tap_correlation: the correlation of the colours of two taps, (tap, tap).
         centre_correlation: the correlation of the colours of a tap and the centre, (tap,).
-        chroma: the variance of chroma, relative to that of luma.
+        chroma: the variance of chroma, relative to the variance of luma.
         noise: the variance of the rest that the model does not describe.
     """
     samples = covariance(responses, tap_correlation, chroma, noise)

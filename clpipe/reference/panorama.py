@@ -17,7 +17,7 @@ from clpipe.reference.warp import FILTERS
 
 BORDER = 4  # px; filters extend 3 px around a position
 BORDER_PASSES = 2  # to fill borders; in the second pass also from each other
-EDGE = 1e-6  # of a view's side: distance outside it up to which a direction still belongs to it
+EDGE = 1e-6  # a view also covers directions this far outside it, relative to its side
 
 Rotation = tuple[tuple[float, float, float], ...]
 

@@ -17,7 +17,7 @@ Matrix: TypeAlias = tuple[Vector, Vector, Vector]
 
 OPENGL = np.diag([1.0, -1.0, -1.0])  # OpenCV's axes in OpenGL's, and back
 
-TOLERANCE = 1e-3  # of R R^T - 1; text files may be rounded to four digits
+TOLERANCE = 1e-3  # largest element of R R^T - 1; text files may be rounded to four digits
 
 
 def rotation(rows: Matrix) -> Matrix:

@@ -16,7 +16,7 @@ from clpipe.reference.rational import fit_even
 # Newton's method ends when the error after distortion is below this value, in the unit of r: 4e-9
 # px for a focal length of 4000 px.
 RESIDUAL = 1e-12
-SAMPLES = 2049  # of a radial model, as starting points for its inverse
+SAMPLES = 2049  # starting points for the inverse of a radial model
 # The model continues outside the corner for this share of its radius, for interpolation. After
 # that, it continues as a straight line.
 EXTENSION = 1.25

@@ -136,7 +136,7 @@ def normal_of(words: Words) -> Floats:
 def normals_of(distance: Words, direction: Words) -> tuple[Floats, Floats]:
     """Return two independent standard normals from two words: up to 6.6 sigma.
 
-    The error is 2e-5 of the radius. The method is that of Box and Muller, "A note on the generation
+    The error is 2e-5 of the radius. The method comes from Box and Muller, "A note on the generation
     of random normal deviates" (1958). The angle is at most an eighth of a turn to either side. The
     top bit of ``direction`` exchanges sine and cosine, and the next one is the cosine's sign.
 

@@ -44,7 +44,7 @@ class Resampler(Protocol):
         ...
 
     def resized(self, width: int, height: int) -> tuple[int, int]:
-        """Return the width and height of the new image, from those of the old one."""
+        """Return the width and height of the new image, from the old one's."""
         ...
 
     def values(self, width: int, height: int) -> Mapping[str, Any]:

@@ -24,10 +24,10 @@ DEPTH, NORMAL, FLOW = Tolerance(relative=1e-3), Tolerance(absolute=0.02), Tolera
 
 
 def cells(values: Array, tolerance: Tolerance | None) -> Mask:
-    """Return whether the four pixels around each corner of a layer's pixels show one surface.
+    """Return for each pixel corner whether the four pixels around it show one surface.
 
-    Two neighbours do if they hardly differ, or by no more than expected from the pixels before and
-    after them, like on a slanted plane. A NaN pixel shows no surface.
+    Two neighbours show one surface if they hardly differ, or differ no more than the slope of the
+    surrounding pixels explains. A NaN pixel shows no surface.
 
     Args:
         values: (rows, columns, channel).

@@ -36,7 +36,7 @@ def shape_and_scale(shape: float) -> tuple[np.float32, np.float32]:
 def tukey_lambda_of(words: Words, shape: np.float32, scale: np.float32) -> Floats:
     """Return a Tukey lambda number of mean 0 and variance 1 per random word, by inverse CDF.
 
-    ``shape`` and ``scale`` are those of :func:`shape_and_scale`.
+    ``shape`` and ``scale`` come from :func:`shape_and_scale`.
 
     >>> words = np.uint32([0x7fffffff, 0x14514514, 0x94514514])
     >>> tukey_lambda_of(words, *shape_and_scale(0.14)).round(2).tolist()

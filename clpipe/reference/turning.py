@@ -101,7 +101,7 @@ class CameraRotation:
         half_rotation = math.radians(self.rotation) / 2
         x, y = self.principal_point(width, height)
         focal = self.focal(width, height)
-        u = math.hypot(max(x, width - x), max(y, height - y)) / focal  # of a corner
+        u = math.hypot(max(x, width - x), max(y, height - y)) / focal  # the farthest corner
         if math.atan(u) + half_rotation > math.radians(85):
             raise ImageError(
                 f"motion_blur: a rotation of {self.rotation:g} degrees at a focal length of "

@@ -20,10 +20,10 @@ from clpipe.reference.lens import DistortionMap
 from clpipe.reference.radial import Radial
 from clpipe.reference.resample import Axis, Parameters, lanczos3
 
-MAX_ERROR = 0.003  # px, of the map at the centre of a cell
+MAX_ERROR = 0.003  # px, largest error of the map at the centre of a cell
 STEPS = (64, 32, 16, 8, 4, 2, 1)  # px from node to node
 MAX_NODES = 2**22
-FIELDS = 8  # of a node: x and y of red, green and blue, and two for alignment
+FIELDS = 8  # values of a node: x and y of red, green and blue, and two for alignment
 
 
 def _catmull_rom() -> Floats:
@@ -308,7 +308,7 @@ def _lines(warp: Warp, axis: Axis, width: int, height: int) -> tuple[Array, Arra
     """See :meth:`GatherResampler.lines`."""
     grid, support = warp.grid(width, height), warp.support
     sizes = warp.resized(width, height)
-    # How far the pixels among each four by four nodes look to either side, of all channels.
+    # How far pixels between 4x4 nodes sample to each side, over all channels.
     windows = sliding_window_view(grid.nodes[..., :6], (4, 4), (0, 1))
     low, high = windows.min((-2, -1)), windows.max((-2, -1))
     overshoot = OVERSHOOT * (high - low) + 0.01

@@ -16,7 +16,7 @@ from clpipe.reference.intrinsics import OPENCV_FISHEYE, Intrinsics, minimax_fit
 
 Coefficients = tuple[float, ...]
 
-ANGLES = 1 << 16  # of a table from the axis to the edge of the field of view
+ANGLES = 1 << 16  # angles of a table from the axis to the edge of the field of view
 
 
 def kannala_brandt(theta: Array, k: Coefficients) -> Array:
@@ -68,7 +68,7 @@ class WideLens:
 
     Args:
         model: a key of :data:`MODELS`.
-        coefficients: those of the model.
+        coefficients: the coefficients of the model.
         fx, fy: focal lengths in px.
         field_of_view: the visible angle, in degrees, through the axis.
         size: width and height of the image in px; None is that of the whole field of view, to

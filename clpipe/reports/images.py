@@ -29,7 +29,7 @@ BATCH_SIZE = 64  # thumbnails in one batch
 MAX_COMPARED = 8  # images to compare
 MAX_COMPARED_PIXELS = 1_200_000  # px; larger images are reduced for the comparison
 CROP = 320, 240  # px, width and height of full-resolution regions of reduced images
-TRUE_QUALITY, REDUCED_QUALITY = 93, 85  # of JPEGs at full and at reduced resolution
+TRUE_QUALITY, REDUCED_QUALITY = 93, 85  # quality of JPEGs at full and at reduced resolution
 PICTURE = "image"  # its label in the comparison
 SHOWN = ("jpg", "png", "tif", "tif16", "exr", "npy")
 
@@ -66,7 +66,9 @@ def checked(blob: Blob) -> bytes:
     except OSError as error:
         raise ImageError(f"{blob.name}: cannot be read: {error.strerror}") from None
     if hashlib.sha256(data).hexdigest() != blob.sidecar_entry["sha256"]:
-        raise ImageError(f"{blob.name}: was changed since; its SHA-256 is not that of its sidecar")
+        raise ImageError(
+            f"{blob.name}: has changed since the run; its SHA-256 differs from its sidecar"
+        )
     return data
 
 
@@ -85,7 +87,7 @@ class Sheet:
     """The contact sheet: entries of images for the script of the page."""
 
     entries: list[dict[str, Any]] = field(default_factory=list)
-    pictures: int = 0  # of the run
+    pictures: int = 0  # pictures of the run
     problems: list[str] = field(default_factory=list)
 
 
@@ -360,10 +362,10 @@ def _kept(picture: RunPicture) -> Iterator[tuple[str, Blob]]:
 
 
 def add_stages(shown: ComparedImage, picture: RunPicture, budget: Budget) -> None:
-    """Add the kept stages of a picture as views, within the budget.
+    """Add the kept stages of a picture as views, until the page's budget is used up.
 
-    Stages of another size, before the picture is resized, are skipped. Unreadable files are
-    reported with the thumbnails.
+    Stages that differ in size from the picture are skipped. Unreadable files are reported with the
+    thumbnails.
     """
     for name, file in _kept(picture):
         try:

@@ -32,7 +32,7 @@ TEMPLATES = Path(__file__).parent / "page"
 LISTED = 40  # failures, warnings, problems
 HISTOGRAMS = 12
 BARS = 8  # distinct values of a bar chart
-SHEET_SHARE = 0.45  # of the budget, for contact sheets
+SHEET_SHARE = 0.45  # share of the budget for contact sheets
 MAX_STAGED = 2  # images whose kept stages can be compared
 MAX_PLOTS = 3  # pictures whose noise is plotted
 SESSIONS = 12  # the latest starts of the program
@@ -42,7 +42,7 @@ SESSIONS = 12  # the latest starts of the program
 # et al., CVPR 2016), measured by clpipe.analysis.signature. See docs/validation.md.
 REAL_LEFT = (0.57, 0.63)
 REAL_RIGHT = (0.51, 0.59)
-REAL_EDGES = (1.1, 2.4)  # luma noise of the steepest areas over that of the flattest
+REAL_EDGES = (1.1, 2.4)  # luma noise of the steepest areas, relative to the flattest ones
 
 
 @dataclass(frozen=True)

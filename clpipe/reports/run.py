@@ -31,9 +31,9 @@ class Blob:
     """A file or a member of a tar, and its record in the sidecar."""
 
     path: str
-    name: str  # relative to the output directory; for members, after the name of the tar
+    name: str  # path in the output directory; for a member, the tar's path and the member's name
     sidecar_entry: Mapping[str, Any]  # its size and SHA-256
-    offset: int | None = None  # of a member in its tar
+    offset: int | None = None  # offset of a member in its tar
     size: int = -1  # the actual size; -1 is a missing file
 
     def read(self) -> bytes:
@@ -91,8 +91,8 @@ class Run:
 
     folder: Path
     all_pictures: list[RunPicture] = field(default_factory=list)
-    logs: list[Mapping[str, Any]] = field(default_factory=list)  # lines, of all logs
-    problems: list[str] = field(default_factory=list)  # of sidecars, tars and logs
+    logs: list[Mapping[str, Any]] = field(default_factory=list)  # lines of all logs
+    problems: list[str] = field(default_factory=list)  # problems of sidecars, tars and logs
 
     @property
     def pictures(self) -> Sequence[RunPicture]:

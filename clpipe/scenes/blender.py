@@ -15,9 +15,9 @@ from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.base.files import write_new
 
 SCRIPT = Path(__file__).with_name("blender_script.py")
-REQUEST_FILE = ".rendering.json"  # the request, in the folder of the renders
+REQUEST_FILE = ".rendering.json"  # name of the request's file in the folder of the renders
 EVENT_PREFIX = "@clpipe "  # prefix of the script's messages on standard output
-LAST_LINES = 12  # of Blender's output that are shown if it ends unexpectedly
+LAST_LINES = 12  # lines of Blender's output to show if it ends unexpectedly
 
 
 class RenderError(ClpipeError):
@@ -127,8 +127,8 @@ class Renderer(AbstractContextManager["Renderer"]):
             )
         except OSError as error:
             raise RequestError(
-                f"--blender: {program} cannot be started: {error.strerror}; give the path of a "
-                "Blender"
+                f"--blender: {program} cannot be started: {error.strerror}; give the path of "
+                "Blender's program"
             ) from None
 
     def __enter__(self) -> Self:

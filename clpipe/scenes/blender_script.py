@@ -180,7 +180,8 @@ def main(request: Mapping[str, Any]) -> None:
             obstructed.append(f"{name} ({problem})")
     if len(obstructed) == len(views):
         raise SceneError(
-            f"no view sees enough: {', '.join(obstructed[:5])}; move the camera, or use --poses"
+            f"every view sees too little: {', '.join(obstructed[:5])}; move the camera, or use "
+            "--poses"
         )
     if obstructed:
         more = f" and {len(obstructed) - 5} others" if len(obstructed) > 5 else ""

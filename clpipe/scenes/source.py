@@ -71,7 +71,7 @@ class Source:
         If rendering fails, the rest is missing, and ``failure`` contains the reason.
 
         Args:
-            jobs: the jobs; those of one render are consecutive.
+            jobs: the jobs; all jobs of a render are consecutive.
             tell: prints a line.
         """
         if not self.renderer:

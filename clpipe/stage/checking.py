@@ -40,7 +40,7 @@ def run_reference(
 ) -> Floats:
     """Run the reference of a method on an image of the default camera, for examples.
 
-    The noise is that of the image key "".
+    The noise is drawn for the image key "".
     """
     context = Context(load_camera(DEFAULT_CAMERA), iso, pattern)
     resolved = method.resolve(context)

@@ -24,19 +24,19 @@ class Context:
     camera: Camera
     iso: float
     pattern: Pattern = "RGGB"
-    array: FilterArray | None = None  # of a mosaic that has no Bayer pattern
+    array: FilterArray | None = None  # the filter array of a mosaic without a Bayer pattern
     light: tuple[float, float] | None = None  # red, blue: to be divided out; None is the camera's
     gains: tuple[float, float] = (1.0, 1.0)  # red, blue: divided out by inverse_white_balance
     applied_gains: tuple[float, float] = (1.0, 1.0)  # red, blue: applied again by white_balance
     exposure_time: float | None = None  # s, if exposure knows it
     headroom: float = 0.0  # stops by which exposure darkened the scene
     colours: Matrix = IDENTITY  # linear sRGB to the image's red, green and blue, white-balanced
-    noise: NoiseModel | None = None  # of the sensor noise that was added
+    noise: NoiseModel | None = None  # the sensor noise that was added
     full_scale: float = 1.0  # the signal at the white level: above 1 after several readouts
     light_changes: bool = False  # during the exposure
-    knots: Knots = ()  # of companding, DN to fewer DN; () is none
+    knots: Knots = ()  # the companding curve, DN to fewer DN; () is none
     optics: Optics = field(default_factory=Optics, compare=False, repr=False)
-    # the image has no noise, and parameters that depend on noise must be those of zero noise
+    # the image has no noise, and parameters that depend on noise must assume none
     clean: bool = False
     black_level: float | None = None  # DN, used by quantize
     white_level: float | None = None

@@ -69,8 +69,8 @@ class Method(BaseModel):
     tolerance: ClassVar[float] = 0.0  # kernel against reference; 0 is bit for bit
     example: ClassVar[Mapping[str, Any]] = {}  # parameters for checks, if defaults do nothing
     other_examples: ClassVar[tuple[Mapping[str, Any], ...]] = ()  # that use other code paths
-    # Parameters of which only one may be set. An option replaces that of a configuration, and a
-    # manifest that of an option.
+    # Parameters of which only one may be set. An option replaces a configuration's
+    # parameter, and a manifest replaces an option's.
     alternatives: ClassVar[frozenset[str]] = frozenset()
     # Whether it accepts mosaics of any filter array, if others of its stage only accept Bayer
     # patterns.
@@ -219,7 +219,7 @@ class Stage:
     writes: Kind
     methods: tuple[type[Method], ...]
     explain: Callable[[Context], str] | None = None
-    folder: Path | None = None  # of a plug-in's kernel files
+    folder: Path | None = None  # folder of a plug-in's kernel files
     also_reads: tuple[Kind, ...] = ()
     role: StageRole | None = None
     default_method: Callable[[Context], Method | None] | None = None

@@ -47,7 +47,7 @@ def no_arguments(method: Any, context: Context) -> tuple[Any, ...]:
 class Backend(ABC):
     """Functions and random numbers that :meth:`SignalMethod.apply` uses besides operators.
 
-    Random numbers are new in each image, except those of :meth:`fixed`.
+    Random numbers are new in each image, except with :meth:`fixed`.
     """
 
     where: ClassVar[Callable[..., Any]]
@@ -58,7 +58,7 @@ class Backend(ABC):
     photons: ClassVar[Callable[..., Any]]  # Poisson numbers, from means and words
     tukey_lambda: ClassVar[Callable[..., Any]]  # from words, shape and scale
     in_upper_half: ClassVar[Callable[..., Any]]  # whether a word's top bit is 0
-    tap: ClassVar[Callable[..., Any]]  # of a signal, the value dx to the right and dy below
+    tap: ClassVar[Callable[..., Any]]  # the signal's value dx to the right and dy below
 
     @abstractmethod
     def normals(self, draw: int = 0) -> Signal:

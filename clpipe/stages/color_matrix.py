@@ -158,7 +158,7 @@ class CameraToSrgb(FixedMatrix):
         """
         if context.array and context.array.is_polarised:
             raise RequestError(
-                "color_matrix.method=camera needs channels that are colours, and those of "
+                "color_matrix.method=camera needs channels that are colours, and the channels of "
                 f"mosaic {context.array.name} are not; remove color_matrix.method, or skip "
                 "color_matrix"
             )

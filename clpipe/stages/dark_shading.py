@@ -277,7 +277,13 @@ def map_at_iso(height: int, width: int, stream: Stream, method: File, iso: float
 
 
 def sample_positions(pixels: int, per_px: np.float32, count: int) -> tuple[Array, Array, Floats]:
-    """Return the samples before and after each pixel of a row, and the weight of the second."""
+    """Return, for each pixel of a row, its left and right sample and the weight of the right one.
+
+    Args:
+        pixels: pixels of the row.
+        per_px: samples per pixel.
+        count: samples of the row.
+    """
     half, zero = np.float32(0.5), np.float32(0)
     t = (np.arange(pixels, dtype=np.float32) + half) * per_px - half
     t = np.minimum(np.maximum(t, zero), np.float32(count - 1))

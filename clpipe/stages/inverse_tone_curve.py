@@ -1,4 +1,4 @@
-"""Inverse tone curve: from the contrast of a photograph back to that of the scene."""
+"""Inverse tone curve: from a photograph's contrast back to the scene's contrast."""
 
 from functools import lru_cache
 from typing import ClassVar

@@ -142,7 +142,7 @@ class Pwl(Linear):
         """Return the method with its levels and knots.
 
         Raises:
-            RequestError: no knots are known, or those of quantize differ.
+            RequestError: no knots are known, or the knots of quantize differ.
         """
         resolved = self._with_levels(context)
         if self.knots is None and not context.knots:

@@ -34,7 +34,7 @@ from clpipe.stage import (
     parameter,
 )
 
-TABLE_SIZE = 256  # of the kernel's table
+TABLE_SIZE = 256  # entries of the kernel's table
 UNKNOWN = "unknown"  # the ISO of images in a report that do not state theirs
 RESOLVED_SIZE = 65  # entries of a measured curve in the resolved parameters, and so in the sidecar
 CHANNELS = Kind.DISPLAY.channels
@@ -225,7 +225,7 @@ class IntensityDependent(IndependentNoise):
     SyB3R adds such noise to finished images (Ley, Haensch, Hellwich, "SyB3R: A realistic synthetic
     benchmark for 3D reconstruction from images", ECCV 2016). In the formula, v is a display value,
     0..1, and n a standard normal for each pixel and channel. sigma(v) comes from a table. Outside
-    the measured intensities, sigma is that of the nearest one.
+    the measured intensities, sigma is taken from the nearest one.
 
     >>> from clpipe.stage import run_reference
     >>> grey = np.full((300, 300, 3), 0.5, np.float32)
@@ -286,8 +286,8 @@ def _table(sigma: tuple[Any, ...]) -> Floats:
 class MeasuredNoise(NamedTuple):
     """Measured noise of red, green and blue, in display values, 0..1.
 
-    ``sigma`` is that of all samples. A curve contains the intensities, ascending, and sigma at
-    each. ``correlation`` lists red with green, red with blue, and green with blue.
+    ``sigma`` covers all samples. A curve contains ascending intensities and the sigma at each.
+    ``correlation`` lists red with green, red with blue, and green with blue.
     """
 
     sigma: tuple[float, ...]
@@ -333,8 +333,8 @@ def _measured_noise(path: str) -> Mapping[float | None, Mapping[str, MeasuredNoi
     except (ValueError, OverflowError, LookupError, TypeError, AttributeError):
         raise ValueError("not a report of clpipe measure --json") from None
     raise ValueError(
-        f"the report is on {kind}, but this noise is in display values; measure finished images "
-        "(JPEG, PNG, or EXR kept after gamma)"
+        f"this report measures {kind} images, but picture_noise needs finished images (JPEG, PNG, "
+        "or EXR kept after gamma); run clpipe measure --json on those"
     )
 
 

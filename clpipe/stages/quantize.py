@@ -36,7 +36,7 @@ MAX_DN = 2**MAX_BITS - 1
 class Linear(SignalMethod):
     """Signal to DN: black + y * (white - black), rounded to nearest and clipped to 0..white.
 
-    After several readouts, white is that of the last one, and the raw image has correspondingly
+    After several readouts, the last one defines white, and the raw image has correspondingly
     more bits.
 
     >>> from clpipe.stage import run_reference
@@ -87,7 +87,9 @@ class Linear(SignalMethod):
         camera = context.camera
         black, white = camera.black_level, camera.white_level
         bits = self.bits
-        if bits is None and context.full_scale > 1:  # a DN is that of the first readout
+        if (
+            bits is None and context.full_scale > 1
+        ):  # more bits, because a DN keeps the size it has in the first readout
             bits = min(camera.bits + ceil(log2(context.full_scale)), MAX_BITS)
         if bits and bits != camera.bits:
             scale = (2**bits - 1) / (2**camera.bits - 1)

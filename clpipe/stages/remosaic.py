@@ -34,7 +34,7 @@ from clpipe.stage import (
 class Binning(Method):
     """The mean of each cell of equal filters: digital binning of 2x2 or 3x3 pixels.
 
-    Noise that is already present decreases like that of a mean of 4 or 9. Between mosaic and
+    Noise that is already present decreases like in a mean of 4 or 9. Between mosaic and
     sensor_noise, the stage bins charge, and noise is added once per cell. Rows and columns after
     the last whole cell are cropped.
 
@@ -114,7 +114,7 @@ def binned(array: FilterArray, factor: int) -> FilterArray | None:
 class LinearMmse(Method):
     """Samples that match the Bayer pattern are kept, others come from linear 7x7 filters.
 
-    The filters are those of ``demosaic.method=linear_mmse``, so the mosaic must be white-balanced.
+    The filters come from ``demosaic.method=linear_mmse``, so the mosaic must be white-balanced.
     """
 
     method: ClassVar = "linear_mmse"

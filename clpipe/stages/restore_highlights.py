@@ -16,7 +16,7 @@ class Brooks2019(CameraGains):
     Where a photograph is white, all three colours of the sensor are clipped, and dividing red and
     blue by their gains would tint it. Each colour is therefore multiplied by ``max(m*gain + 1 - m,
     1)``, with ``m = (max(grey - 0.9, 0) / 0.1)^2``, at most 1. In it, grey is the mean of the
-    colours. ``inverse_white_balance`` divides later. The method is that of Brooks et al.,
+    colours. ``inverse_white_balance`` divides later. The method comes from Brooks et al.,
     "Unprocessing images for learned raw denoising", CVPR 2019, sec. 3.3.
 
     >>> from clpipe.stage import run_reference

@@ -96,7 +96,7 @@ class Rows(Method):
     )
     flicker_frequency: float = parameter(
         100.0,
-        "Frequency of the light, which for lamps is twice that of the mains.",
+        "Frequency of the light, which for lamps is twice the mains frequency.",
         "Hz",
         gt=0,
         le=1e6,
@@ -119,8 +119,8 @@ class Rows(Method):
         "Layer of the render with only the flickering light; without one, all light flickers.",
     )
 
-    _span: Span = PrivateAttr(Span())  # of this exposure
-    _end: float = PrivateAttr(1.0)  # of the last exposure, in exposures of the first
+    _span: Span = PrivateAttr(Span())  # the time span of this exposure
+    _end: float = PrivateAttr(1.0)  # the end of the last exposure, in durations of the first
 
     def resolve(self, context: Context) -> Self:
         resolved = self.with_optics(context).with_defaults(exposure_time=DEFAULT_EXPOSURE_TIME)
@@ -144,7 +144,7 @@ class Rows(Method):
         """Return the method for one of several exposures.
 
         Args:
-            spans: those of all exposures.
+            spans: the spans of all exposures.
             number: the number of this exposure.
         """
         other = self.model_copy()

@@ -22,7 +22,7 @@ from clpipe.torch import numbers
 from clpipe.torch.numbers import Streams, f32
 from clpipe.torch.poisson import poisson_of
 
-MAX_CACHED_MAPS = 256  # of sensors that are cached, with some MB each at most
+MAX_CACHED_MAPS = 256  # cached sensor maps, each a few MB at most
 
 
 def tapped(y: Tensor, dx: int, dy: int) -> Tensor:

@@ -17,7 +17,7 @@ from clpipe.reference.math import LOG_COEFFICIENTS, POWER_COEFFICIENTS
 from clpipe.reference.random import COSINE_COEFFICIENTS, NORMAL_COEFFICIENTS, SINE_COEFFICIENTS
 
 WORD = 0xFFFFFFFF
-LOW, SIGN = 0x7FFFFFFF, -0x80000000  # of an int32
+LOW, SIGN = 0x7FFFFFFF, -0x80000000  # the low 31 bits and the sign bit of an int32
 
 Words: TypeAlias = Tensor | int
 

@@ -93,7 +93,7 @@ class RawNoise(ReadOnly):
                 B, (batch, 4, height / 2, width / 2). Gr is green in the rows of red. The batch axis
                 may be absent.
             key: a name for each mosaic of the batch, for repeatable noise. Pass others in each
-                epoch. Fixed patterns are then those of the upper left corner of the sensor. None
+                epoch. Fixed patterns are then taken from the upper left corner of the sensor. None
                 draws new noise and a position on the sensor for each mosaic.
 
         Returns:

@@ -337,7 +337,7 @@ def short_of_memory(trial: Trial, seconds: float, total: int) -> None:
             found = {p.name: p.read_bytes() for p in of_large}
             assert found == expected, f"files of the large image: {sorted(found)}"
         elif status == 1:
-            assert re.search(r"large\.exr: it takes about .* are left by", trial.stderr), (
+            assert re.search(r"large\.exr: it takes about .* is available", trial.stderr), (
                 trial.stderr
             )
         for path in of_large:

@@ -1,6 +1,6 @@
 """Estimates the noise parameters of a sensor from its frames, one ISO at a time.
 
-The method is that of Bielova et al. (CVPR Workshops 2019). Repeated frames of a static scene give
+The method comes from Bielova et al. (CVPR Workshops 2019). Repeated frames of a static scene give
 each pixel a mean and a variance. A line through them gives a and b of Var[y] = a*y + b. Values are
 in DN, and light is counted from the black level.
 """

@@ -124,7 +124,9 @@ def line_notes(pooled: Line, rounding: float, lines: dict[str, Line] | None = No
     for name, line in (lines or {}).items():
         difference = line.gain.value - gain.value
         if abs(difference) > max(5 * line.gain.error, 0.03 * gain.value):
-            notes.append(f"a of {name} is {difference / gain.value:+.0%} from that of all channels")
+            notes.append(
+                f"a of {name} is {difference / gain.value:+.0%} from the value for all channels"
+            )
     return notes
 
 

@@ -16,9 +16,9 @@ from clpipe.base.types import Array, Doubles, Floats, Mask
 
 MIN_FRAMES_FOR_LEVELS = 4  # frames needed to measure the scatter of their levels
 MIN_FRAMES_FOR_JUMPS = 8  # frames needed to find pixels that jump
-SAMPLES = 400_000  # of residuals, for the shape of read noise
-SHAPES = np.linspace(-0.4, 0.4, 17)  # of Tukey lambda distributions that are compared
-GROUPS = 16  # of samples, for the error of their shape
+SAMPLES = 400_000  # residuals that determine the shape of read noise
+SHAPES = np.linspace(-0.4, 0.4, 17)  # shapes of the Tukey lambda distributions to compare
+GROUPS = 16  # groups of samples, for the standard error of their shape
 FALSE_ALARM = 1e-4  # probability of finding a wave if there is none
 FINER = 8  # the number of frequencies to search, relative to the number of rows
 BLOCK = 32  # px, over which maps are averaged
@@ -57,7 +57,7 @@ class Shading:
 class DarkFigures:
     """Figures of dark frames in DN; None if there are too few frames."""
 
-    color_bias: FourEstimates  # R, G in R's rows, G in B's, B
+    color_bias: FourEstimates  # R, G in rows with R, G in rows with B, B
     black_level_error: Estimate | None
     tukey_lambda: Estimate | None
     banding: Wave | None
@@ -117,7 +117,7 @@ def sites_of(pattern: str) -> list[tuple[slice, slice]]:
 
 
 def without_rows(rest: Floats) -> Floats:
-    """Return deviations from the mean frame, without those of each row's even and odd columns."""
+    """Return deviations from the mean frame, less the mean of each row's even and odd columns."""
     own = rest.copy()
     for start in (0, 1):
         part = own[:, :, start::2]
@@ -211,7 +211,7 @@ def banding_wave(rows: Doubles) -> Wave | None:
         return None
     amplitude = 2 / height * float(np.sqrt(power[peak] - background))
     error = 2 / height * float(np.sqrt(background / (2 * frames)))
-    phases = amplitude / (2 * (frames - 1))  # of so few frames, whose mean keeps some of the wave
+    phases = amplitude / (2 * (frames - 1))  # the mean of few frames keeps some of the wave
     return Wave(Estimate(amplitude, float(np.hypot(error, phases))), FINER * height / peak)
 
 

@@ -9,12 +9,12 @@ from clpipe.analysis.calibration.repeats import Sensor, Stack
 from clpipe.base.types import Array, Floats
 from clpipe.reference.cfa import sites
 
-SURE = 7.0  # standard deviations, which not one of 1e8 pixels exceeds by chance
-# Choices; tests/test_calibrate.py shows what they find and reject.
+SURE = 7.0  # standard deviations; by chance, not one of 1e8 pixels exceeds this
+# We chose these values; tests/test_calibrate.py shows what they find and reject.
 BLOCK = 16  # px of one colour, the side of a block
 MIN_BLOCKS = 30  # flat blocks that PRNU needs
 DARKEST = 0.05  # signal units, the least light of a block that shows PRNU
-MAX_UNEVENNESS = 0.03  # relative standard deviation of the scene in a flat block, at most
+MAX_UNEVENNESS = 0.03  # largest relative standard deviation of the scene in a flat block
 MIN_DEVIATION = 0.05  # DN, the smallest assumed deviation of a mean dark frame
 
 

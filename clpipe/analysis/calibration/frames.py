@@ -69,7 +69,7 @@ class CalibrationFrame:
     exposure: str  # as text, "" if unknown
     sensor: Sensor
     signal: bool = False  # whether the file has signal instead of DN
-    facts: RawInfo | Dump | None = None  # of a camera raw, or of a dump
+    facts: RawInfo | Dump | None = None  # from a camera raw or a dump
     gains: tuple[float, float] | None = None  # white balance, red and blue (green = 1)
     xyz_to_camera: Matrix | None = None
 
@@ -234,7 +234,7 @@ def _from_kept(
 
 
 def _sensor(overrides: FrameOverrides, pattern: str, black: float, white: float) -> Sensor:
-    """Return pattern and levels: the user's, or else those of the file."""
+    """Return pattern and levels: the user's, or else the file's."""
     stated = overrides.pattern or pattern
     name = "" if stated in PATTERNS else next((n for n, r in NAMED.items() if r == stated), stated)
     return Sensor(

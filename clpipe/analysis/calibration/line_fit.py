@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from clpipe.base.types import Array
 
-CLASSES = 2048  # of the instrument
-GROUPS = 64  # of rows, for the standard errors
-BINS = 32  # for pictures
+CLASSES = 2048  # classes of the instrument, the variable that sorts pixels
+GROUPS = 64  # groups of rows, for the standard errors
+BINS = 32  # bins of the curves in plots
 MIN_IN_BIN = 50  # pixels
-DARKEST = 0.01  # share of the pixels that determine the first weights
-ROUNDS = 12  # of weights from the line of the round before
+DARKEST = 0.01  # share of pixels, the darkest ones, from which the first weights are computed
+ROUNDS = 12  # rounds; each computes weights from the line of the round before
 
 
 @dataclass(frozen=True)

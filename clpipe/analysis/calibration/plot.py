@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from clpipe.analysis.calibration.result import Calibration
 from clpipe.analysis.drawing import INK, finish, page, png_of
 
-COLUMNS = 3  # of panels, one for each ISO
+COLUMNS = 3  # columns of panels; there is a panel for each ISO
 
 
 def calibration_png(calibrations: Sequence[Calibration], title: str) -> bytes:

@@ -14,7 +14,7 @@ from clpipe.reference.filter_array import MIRRORED
 
 # The limits are choices; tests/test_calibrate.py has a case on each side of the last two.
 CLIPPING_MARGIN = 4.0  # standard deviations of a frame
-MAX_FLICKER = 0.05  # of the mean brightness; more counts as another exposure
+MAX_FLICKER = 0.05  # change of mean brightness; more counts as another exposure
 MAX_MOTION = 0.02  # share of the variance that neighbours share; more counts as motion
 
 Site = tuple[slice, slice]  # the rows and columns of a filter's place in the period
@@ -61,7 +61,7 @@ class Rows:
 
     square: Array  # (rows,), DN^2
     explained: Array  # by pixel noise; (rows,), DN^2
-    degrees: int  # of freedom
+    degrees: int  # degrees of freedom
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ def unclipped(stack: Stack, line: Line | None, top: float) -> Stack:
     """Return the stack without pixels that are clipped, or whose noise may be.
 
     With a line, the light of a pixel and of its neighbours must be more than 4 standard deviations
-    from 0 DN and from ``top`` (in DN). Without one, no sample may be at either limit.
+    from 0 DN and from ``top`` (in DN). Without a line, no sample may be at 0 DN or ``top``.
     """
     black = stack.sensor.black_level
     if line is None:
@@ -272,7 +272,7 @@ def without_rows(stack: Stack, line: Line) -> tuple[Array, Rows]:
 
 
 def row_variance(parts: Sequence[Rows]) -> Estimate:
-    """Return the variance of row offsets in DN^2: their mean square minus that of pixel noise.
+    """Return the variance of row offsets in DN^2, without the part from pixel noise.
 
     Rows are weighted by the inverse variance of that difference.
     """
@@ -308,7 +308,7 @@ def common_motion(stack: Stack, line: Line) -> Estimate:
 
 
 def noise_by_frame(stack: Stack, line: Line) -> Array:
-    """Return the variance of each frame's noise relative to that of the median frame, (frames,).
+    """Return the variance of each frame's noise relative to the median frame's, (frames,).
 
     Frames of one setting agree closely. A mean of frames, or a clean picture, has less noise.
     """

@@ -29,14 +29,14 @@ from clpipe.base.types import Floats
 # the norm 1, the scaling function the sum 1.
 WAVELET = np.array([0.035226, 0.085441, -0.135011, -0.459878, 0.806892, -0.332671])
 SCALING = np.array([0.332671, 0.806892, 0.459878, -0.135011, -0.085441, 0.035226]) / np.sqrt(2)
-# EDGE is the paper's; the others are choices. tests/test_calibrate.py holds the accuracy they give.
-LEVELS = 150  # level sets of a colour, at most
-MIN_SET_SIZE = 400  # places in a level set, at least
-MIN_EXPLAINED = 40  # places of a level set that the line explains, at least
-WINDOW = 7  # px, of the smoothing and of local variances
+# EDGE is from the paper. We chose the others; tests/test_calibrate.py checks the accuracy.
+LEVELS = 150  # largest number of level sets of a colour
+MIN_SET_SIZE = 400  # smallest number of places in a level set
+MIN_EXPLAINED = 40  # smallest number of places in a level set that the line explains
+WINDOW = 7  # px, window of the smoothing and of local variances
 EDGE = 1.0  # tau, in standard deviations of the details (sec. II-B1)
 EXPLAINED = 1.4  # times the line's variance: two standard deviations of a local variance above it
-ROUNDS = 8  # of selecting places by the line of the round before
+ROUNDS = 8  # rounds; each selects places by the line of the round before
 GRID = 2000  # points at which the model of clipping is tabulated
 Values = NDArray[np.float64]
 

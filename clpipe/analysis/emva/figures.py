@@ -13,9 +13,9 @@ from clpipe.base.types import Doubles, Mask
 
 ROUNDING = 1 / 12  # the variance of rounding to whole DN, DN^2
 MIN_DARK_VARIANCE = 0.24  # DN^2: a smaller variance is due to rounding only
-FITTED = 0.7  # of the saturation, up to which K and R are fitted
-LINEAR = 0.05, 0.95  # of the saturation, between which linearity is measured
-MOST_AT_ZERO = 0.005  # of the samples without light
+FITTED = 0.7  # K and R are fitted up to this share of saturation
+LINEAR = 0.05, 0.95  # linearity is measured between these shares of saturation
+MOST_AT_ZERO = 0.005  # largest share of dark samples that may be 0
 ENOUGH = 3  # the smallest number of exposures for a fit
 
 
@@ -24,7 +24,7 @@ class Linearity:
     """The line of mean DN over photons, and the deviations from it in % of the line.
 
     The slope is in DN per photon, and the offset in DN. There is a deviation for each exposure. The
-    least and most are those between 5 and 95 % of the saturation (LE_min and LE_max).
+    least and most are taken between 5 and 95 % of saturation (LE_min and LE_max).
     """
 
     slope: float

@@ -10,7 +10,7 @@ from clpipe.analysis.emva.series import read_series
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
 
-DEFAULT_ISO = 100.0  # of a profile if the user does not state one
+DEFAULT_ISO = 100.0  # ISO of a profile if you do not state one
 
 
 def measure_series(path: Path) -> tuple[Moments, Figures]:

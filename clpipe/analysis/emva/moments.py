@@ -84,7 +84,7 @@ class Spatial:
 
 
 def _less(measured: float, noise: float, count: float) -> Estimate:
-    """Return a variance of ``count`` values, minus that of noise in them.
+    """Return a variance of ``count`` values, minus the variance of their noise.
 
     The standard error is that of the noise only: of repeated measurements of the same sensor.
     """
@@ -107,7 +107,7 @@ class Moments:
     dark_of: Array
     bright_stack: Spatial
     dark_stack: Spatial
-    time: float  # of the stacks, ns
+    time: float  # exposure time of the stacks, ns
 
     @property
     def light(self) -> Doubles:

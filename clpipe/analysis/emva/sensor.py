@@ -9,8 +9,8 @@ NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(21)
 NODE_WEIGHTS = WEIGHTS / WEIGHTS.sum()
 FINE = np.linspace(-4, 4, 161)  # standard deviations, at which rounding is sampled
 FINE_WEIGHTS = np.exp(-FINE * FINE / 2) / np.exp(-FINE * FINE / 2).sum()
-SEARCH_RANGE = np.linspace(0.6, 1.1, 2001)  # of the light that fills the sensor
-ROUNDS = 20  # of the search for a full well
+SEARCH_RANGE = np.linspace(0.6, 1.1, 2001)  # tried light, relative to the light that fills a pixel
+ROUNDS = 20  # rounds of the search for a full well
 
 
 def before_rounding(mean: float, temporal: float, spatial: float) -> tuple[float, float, float]:

@@ -27,7 +27,7 @@ RIDGE = 1e-6  # makes the matrix invertible if two numbers have the same effect
 class Ambiguity:
     """A number that no residual constrains, or two that compensate each other.
 
-    ``correlation`` is that of the errors of two numbers; None for one number.
+    ``correlation`` is between the errors of two numbers; None for one number.
     """
 
     names: tuple[str, ...]

@@ -27,11 +27,17 @@ from clpipe.analysis.spatial import energy_left
 from clpipe.base.types import Array, Doubles, Floats, Mask
 
 MAX_LAG = 6  # px, the longest lag
-BANDS = (0.0, 0.125, 0.25, 0.375, 0.75)  # edges in cycles per pixel; a corner is at 0.71
-LEVELS = (12, 24, 40, 64, 96, 128, 160, 192, 226)  # of luma: edges of the bins of intensity
+BANDS = (
+    0.0,
+    0.125,
+    0.25,
+    0.375,
+    0.75,
+)  # edges in cycles per pixel; the corner of the spectrum is at 0.71
+LEVELS = (12, 24, 40, 64, 96, 128, 160, 192, 226)  # edges of the luma bins
 SHADOWS, MIDTONES = (24, 48), (64, 160)  # ranges of luma in which the skew of noise is compared
 BLOCK = 32  # px
-GROUPS = 8  # of blocks; the jackknife omits one at a time
+GROUPS = 8  # groups of blocks; the jackknife omits one group at a time
 MIN_FRAMES = 4  # for tails, because the difference from a mean of few frames mixes their noise
 
 
@@ -153,7 +159,7 @@ def noise_of_frames(
     Args:
         frames: frames from 0 to 255, (height, width, 3) each.
         mean: the scene without noise.
-        level: the luma by which noise is binned; None is that of the mean.
+        level: the luma by which noise is binned; None uses the mean's luma.
     """
     clean = np.mean(frames, axis=0) if mean is None else mean
     count = len(frames)

@@ -33,7 +33,7 @@ def match_files(
     device: str | None = None,
     watch: Watch | None = None,
 ) -> Match:
-    """Find the development whose noise matches that of pictures.
+    """Find the development whose noise matches the noise of pictures.
 
     Args:
         frames: files or globs, see :func:`clpipe.analysis.matching.scenes.load_scenes`.

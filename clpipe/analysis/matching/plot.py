@@ -1,4 +1,4 @@
-"""Draws a match: the noise of the camera and that of the development."""
+"""Draws a match: the noise of the camera, and the noise of the development."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -94,7 +94,7 @@ def draw_intensity(axes: Axes, match: Match) -> None:
 
 
 def draw_residuals(axes: Axes, rows: Sequence[Row]) -> None:
-    """Draw the residuals of places that were not searched, with their standard errors."""
+    """Draw the residuals in the areas held out of the search, with their standard errors."""
     shown = [row for row in rows if not np.isnan(row.residual) and row.name != "beyond_4_sigma"]
     places = np.arange(len(shown))[::-1]
     residuals, errors = ([getattr(row, key) for row in shown] for key in ("residual", "error"))

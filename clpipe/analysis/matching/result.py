@@ -51,7 +51,7 @@ class Compared(NamedTuple):
 
 @dataclass(frozen=True)
 class Match:
-    """A development, and the similarity of its noise to that of the camera.
+    """A development, and the similarity of its noise to the camera's.
 
     ``seen`` has the columns in areas that were used in the search, ``unseen`` those in held-out
     areas.

@@ -268,7 +268,9 @@ def static_mask(path: Path, frame: Floats, clean: Doubles, against: str, flat: M
     slopes = np.gradient(ndimage.gaussian_filter(luma(clean), 1.0))
     design = np.stack([slope.ravel() for slope in slopes], axis=1)
     shift = -np.linalg.lstsq(design, sharp.ravel(), rcond=None)[0]
-    errors = np.sqrt((sharp**2).mean() / np.maximum((design**2).sum(0), 1e-9))  # of white noise
+    errors = np.sqrt(
+        (sharp**2).mean() / np.maximum((design**2).sum(0), 1e-9)
+    )  # standard errors for white noise
     if (np.abs(shift) > np.maximum(SHIFT, SURE * errors)).any():
         down, right = shift
         raise RequestError(

@@ -38,38 +38,31 @@ from clpipe.engine.device import Device
 
 LOG = logging.getLogger(__name__)
 
-FIRST_STEPS, TRIAL_STEPS, FINAL_STEPS = (
-    2,
-    3,
-    20,
-)  # steps of least squares: at first, while promising, at the end
-COARSE_TOLERANCE, FINE_TOLERANCE = (
-    1e-3,
-    1e-4,
-)  # relative tolerances of least squares; the second for the last fit
-ABANDON_RATIO, PROMISING_RATIO = 5.0, 1.5  # times the best cost, before and after a glance
+# Steps of least squares: at first, while a candidate is promising, and at the end.
+FIRST_STEPS, TRIAL_STEPS, FINAL_STEPS = 2, 3, 20
+
+# Relative tolerances of least squares. The last fit uses the second.
+COARSE_TOLERANCE, FINE_TOLERANCE = 1e-3, 1e-4
+
+# A variant is abandoned if its cost exceeds the best one by the first factor before any fit, or by
+# the second after FIRST_STEPS.
+ABANDON_RATIO, PROMISING_RATIO = 5.0, 1.5
+
 GOOD_RESIDUAL = 0.5  # residual of a typical column below which no other method is tried
 CONVERGED = 0.95  # if a few steps leave more than this share of the cost, the fit ends
-DIFFERENCE_STEP = 0.03  # of a dimension's range, for differences
+DIFFERENCE_STEP = 0.03  # step of finite differences, relative to a dimension's range
 LOSS_SCALE = 3.0  # larger residuals count less than their squares (soft L1)
-IMPROVEMENT = (
-    0.9  # share of the cost below which another method is chosen, because of random effects
-)
-TRIAL_SCENES, TRIAL_CROP = (
-    4,
-    384,
-)  # scenes by which methods are compared, and the size of their crops, px
-ROUNDS = 2  # of all parts
-FINAL_FIT_TRIALS = (
-    20  # the duration of the last fit (all scenes at full size), as a number of trials
-)
+IMPROVEMENT = 0.9  # another method must cost less than this share, because costs are random
+TRIAL_SCENES, TRIAL_CROP = 4, 384  # scenes that compare methods, and the size of their crops in px
+ROUNDS = 2  # times that each part is tried
+FINAL_FIT_TRIALS = 20  # the duration of the last fit (all scenes at full size), in trials
 
 
 @dataclass(frozen=True)
 class Candidate:
     """A development: its settings, the fitted numbers, and the remaining cost.
 
-    ``residual`` is that of a typical column, in units of its error and floor together.
+    ``residual`` is the residual of a typical column, in units of its error and floor together.
     """
 
     choices: Mapping[str, Choice]
@@ -141,7 +134,7 @@ class Search:
         self.targets = [target_of(s, ~s.holdout) for s in scenes.each if s.mask.any()]
         self.evaluations = 0
         self._cache: dict[tuple[str, Scene], Figures] = {}  # by settings and scene
-        self._trials, self._expected_trials, self._share = 0, FINAL_FIT_TRIALS, 0.0  # of trials
+        self._trials, self._expected_trials, self._share = 0, FINAL_FIT_TRIALS, 0.0
 
     def run(self) -> Candidate:
         """Return the best development.
@@ -158,11 +151,11 @@ class Search:
         LOG.info("start: residuals of %.2g", best.residual)
         tried = {labels(best)}
         parts, count = list(self.space.choices) * ROUNDS, len(self.space.choices)
-        unchanged = 0  # parts that were tried since the best changed
+        unchanged = 0  # number of parts tried since the best candidate last changed
         for number, part in enumerate(parts):
             if unchanged == count:
                 break
-            ahead = parts[number:][: count - unchanged]  # more of them, when the best changes
+            ahead = parts[number:][: count - unchanged]  # more follow if the best candidate changes
             self._expected_trials = (
                 self._trials
                 + sum(self.variant_count(best, each) for each in ahead)
@@ -207,7 +200,7 @@ class Search:
     ) -> Candidate:
         """Return the better of the best candidate and a variant with another choice of a part.
 
-        The variant's numbers start from those of the best. Numbers of the part itself do so only if
+        The variant's numbers start from the best candidate's. Numbers of the part do so only if
         ``is_variant``, the choice has the same method, because they differ in meaning between
         methods. At another size, all numbers start anew.
         """

@@ -51,7 +51,7 @@ class Simulator:
             settings: the settings of the development.
             scene: the scene, whose mean is developed and encoded like its frames.
             key: the key that seeds the noise.
-            count: the number of frames; None is that of the scene.
+            count: the number of frames; None uses the scene's number.
         """
         seen = [name for name in settings.step_names if base_name(name) in SEEN]
         chain = make_chain(replace(settings, skip=(*settings.skip, *seen)))
@@ -95,7 +95,7 @@ def gain_of(chain: Chain) -> float:
 
 
 def scale_of(chain: Chain) -> float:
-    """Return the size of a chain's picture relative to that of its input."""
+    """Return the size of a chain's picture relative to its input."""
     scales = (getattr(s.method, "scale", 1.0) for s in chain.steps if s.stage.name == RESIZE)
     return math.prod(scales)
 

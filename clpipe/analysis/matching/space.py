@@ -22,7 +22,7 @@ from clpipe.stage import Method
 # The stages whose methods and numbers are searched, in the order in which they are tried.
 DEVELOPMENT = ("denoise", "demosaic", "sharpen")
 TONE = "tone_curve"
-RESIZE, SCALES = "resize", (0.5, 2 / 3, 0.75)  # of cameras' smaller pictures
+RESIZE, SCALES = "resize", (0.5, 2 / 3, 0.75)  # scales of cameras' smaller picture sizes
 BEFORE = TONE  # a stage that the chain lacks is inserted before this one
 SHARPEN = "sharpen"
 # Chroma is smoothed again and wider: cameras do so at a half or a quarter of the resolution.

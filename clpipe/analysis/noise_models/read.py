@@ -67,8 +67,8 @@ def read_model(path: Path, camera: str | None) -> SensorModel:
     is_darktable = text.lstrip().startswith("{") and darktable.MARK in text
     if camera is not None and not is_darktable:
         raise RequestError(
-            f"--camera: {path} has only one camera; remove this option, which is for darktable's "
-            "file"
+            f"--camera: {path} has only one camera; remove this option, which selects a camera in "
+            "darktable's file"
         )
     if is_tiff:
         return read_dng(path)

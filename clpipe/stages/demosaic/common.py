@@ -1,4 +1,4 @@
-"""Functions that demosaicing methods share, like those of ``kernels/lib/demosaic.h``.
+"""Functions that demosaicing methods share, like the functions of ``kernels/lib/demosaic.h``.
 
 Mosaics and planes are (height, width) in signal units; borders are mirrored.
 """

@@ -91,7 +91,7 @@ def menon2007(image: Floats, pattern: Pattern) -> Floats:
     by_row, by_column = directional_differences(image, pattern)
     in_row = change(by_row) <= change(by_column.T).T
     selected = np.where(in_row, by_row, by_column)
-    # A first estimate of own minus other, which is refined after green.
+    # First estimate of the site's own colour minus the other one (R-B or B-R), refined below.
     (left, right), (left_other, right_other) = neighbour_differences(selected, in_row)
     own_other = (left_other + right_other) * HALF
     # Refine green: own minus green becomes the mean of three values along the direction.

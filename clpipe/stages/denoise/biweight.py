@@ -1,4 +1,4 @@
-"""Means weighted by Tukey's biweight, which leave grain like that of a camera."""
+"""Means weighted by Tukey's biweight, which leave grain like a camera's."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Self

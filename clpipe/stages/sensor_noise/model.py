@@ -30,7 +30,7 @@ PAPER = ("chi", "theta", "b_before", "b_after", "p0")
 class SensorNoise(SignalMethod):
     """The strength of the noise in one of three parametrisations, and the full well.
 
-    The parametrisations are those of :mod:`clpipe.camera.noise`: a and b, EMVA 1288's or the
+    The parametrisations are described in :mod:`clpipe.camera.noise`: a and b, EMVA 1288's or the
     paper's (Bielova et al. 2019). Parameters that are not set follow from the camera and the ISO.
     Subclasses draw the noise.
     """

@@ -25,8 +25,8 @@ from clpipe.stage import (
 from clpipe.stages.sensor_noise.model import SensorNoise
 from clpipe.stages.sensor_noise.no_noise import NEVER_FULL, NoNoise, or_default
 
-DEFAULT_RATIO = 16.0  # of a sensor whose profile has no ratio
-MAX_READOUTS = 4  # readouts
+DEFAULT_RATIO = 16.0  # for sensors whose profile does not state a ratio
+MAX_READOUTS = 4
 HANDOVER_END, HANDOVER_SLOPE = (
     np.float32(0.95),
     np.float32(10.0),
@@ -38,8 +38,8 @@ class Readout(NamedTuple):
 
     Args:
         photodiode: its number; readouts of one photodiode have the same charge.
-        share: its light over that of the first one, which merging assumes.
-        gain: its gain over that of the first readout.
+        share: its light relative to the first readout's, which merging assumes.
+        gain: its gain relative to the first readout's.
         leak: share of the first photodiode's light that leaks into it, which merging ignores.
     """
 
@@ -90,18 +90,18 @@ class Readouts(SensorNoise):
         le=MAX_READOUTS - 1,
     )
 
-    _signal_range: float = PrivateAttr(1.0)  # of the camera, DN
+    _signal_range: float = PrivateAttr(1.0)  # the camera's white level minus its black level, DN
     _full_signal: float | None = PrivateAttr(None)  # the signal that fills the well, without noise
     _is_clean: bool = PrivateAttr(False)  # merges readouts that have no noise
 
     @property
     def readouts(self) -> tuple[Readout, ...]:
-        """The (resolved) readouts, the most sensitive first, those of one photodiode together."""
+        """The (resolved) readouts, the most sensitive first, grouped by photodiode."""
         raise NotImplementedError(type(self).__name__)
 
     @property
     def full_scale(self) -> float:
-        """The signal at which the last readout is white."""
+        """The signal at which the last readout saturates."""
         return 1 / self.readouts[-1].sensitivity
 
     def with_camera(self, camera: Camera) -> Self:

@@ -24,7 +24,7 @@ class SkewedGaussian(Gaussian):
 
     >>> from clpipe.stage import run_reference
     >>> noisy = run_reference(SkewedGaussian(a=0.02, b=1e-4), np.full((600, 600), 0.1, np.float32))
-    >>> third = ((noisy - 0.1) ** 3).mean()  # of a Poisson number it were 4e-5
+    >>> third = ((noisy - 0.1) ** 3).mean()  # 4e-5 for a Poisson number
     >>> round(float(noisy.mean()), 2), round(float(noisy.var()), 4), round(float(third), 5)
     (0.1, 0.0021, 4e-05)
     """

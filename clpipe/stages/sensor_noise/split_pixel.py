@@ -7,7 +7,7 @@ from clpipe.camera.profile import Camera
 from clpipe.stage import parameter
 from clpipe.stages.sensor_noise.readouts import Readout, Readouts
 
-DEFAULT_LIGHT_RATIO = 100.0  # of a sensor whose profile has no ratio
+DEFAULT_LIGHT_RATIO = 100.0  # for sensors whose profile does not state a ratio
 
 
 class SplitPhotodiode(Readouts):

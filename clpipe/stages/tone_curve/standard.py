@@ -59,7 +59,7 @@ class Standard(Method):
     It expects a raw image with one stop of headroom, the default of ``exposure``. There, 18 % grey
     is 0.09, and it becomes 0.173. One rational quadratic leads from black to grey and another from
     grey to white (Gregory and Delbourgo, IMA J. Numer. Anal. 1982). The parameters set their
-    slopes. The toe reduces the noise of shadows and the shoulder that of highlights, like in a
+    slopes. The toe reduces noise in shadows, and the shoulder reduces it in highlights, like in a
     camera.
 
     The largest of the three colours takes the curve's value, and the others keep their ratio to it.

@@ -177,7 +177,7 @@ class AsShot(Gains):
 
 
 class ArrayAsShot(ArrayMethod, AsShot):
-    """As-shot gains on any filter array; if white is 1 in the mosaic, no channel changes."""
+    """As-shot gains for any filter array. No channel changes if white is already 1 in all."""
 
     def next_context(self, context: Context) -> Context:
         after = super().next_context(context)
