@@ -176,7 +176,7 @@ def test_what_is_refused(method, report, tmp_path):
         ({"measured": str(broken)}, "not a report of clpipe measure --json"),
         (
             {"measured": report("raw.json", kind="mosaic")},
-            "report is on mosaic.*measure finished images",
+            "this report measures mosaic images",
         ),
         ({"sigma": [0.1, 0.2, 1.5]}, r"picture_noise\.sigma.*1\.5.*less than or equal to 1"),
         ({"sigma": [0.1, -0.2, 0.3]}, "greater than or equal to 0"),
