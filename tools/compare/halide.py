@@ -48,9 +48,11 @@ def main() -> None:
     options = parser.parse_args()
     if not importlib.util.find_spec("halide"):
         parser.error("this comparison needs Halide: .venv/bin/pip install -e '.[compare]'")
-    from tools.compare.halide_chain import AUTOSCHEDULERS, HalideChain
+    from tools.compare.halide_chain import AUTOSCHEDULERS, BAND, HalideChain
 
     width, height = map(int, options.size.split("x"))
+    if width % 2 or height % BAND:
+        parser.error(f"--size: the width must be even, and the height a multiple of {BAND}")
     settings = settings_from({"stages": list(STAGES), "demosaic": {"method": "malvar2004"}})
     chain = make_chain(settings, Kind.RAW)
     device = open_device(options.device)

@@ -14,7 +14,7 @@ It does less than clpipe:
 - Signals below black are clipped before demosaicing, and all signals are rounded to 14 bits.
 - Sharpening works on luma, not on its root, and adds to all colours equally.
 - The tone curve applies to each colour. clpipe applies it to the largest and keeps the ratios.
-- It has no tiles, and only accepts even sizes.
+- It has no tiles, and only accepts even widths and heights that are multiples of BAND.
 """
 
 from pathlib import Path
@@ -38,7 +38,7 @@ class HalideChain:
 
     Args:
         chain: clpipe's chain; it starts on a raw.
-        width, height: the size of the raws, which must be even.
+        width, height: the size of the raws.
         schedule: "by hand", or the name of one of Halide's autoschedulers.
         cores: the number of cores for which an autoscheduler schedules.
     """
@@ -131,17 +131,20 @@ class HalideChain:
         smooth_rows, smooth = hl.Func("smooth_rows"), hl.Func("smooth")
         smooth_rows[x, y] = hl.cast(hl.Int(16), taps(lambda k: luma[x + k, y]) >> 12)
         smooth[x, y] = hl.cast(hl.Int(16), taps(lambda k: smooth_rows[x, y + k]) >> 12)
-        change = hl.clamp(
-            (hl.cast(i32, luma[x, y]) - smooth[x, y]) * of["amount"] >> 8, -of["limit"], of["limit"]
+        change = hl.Func("change")
+        detail = hl.cast(i32, luma[x, y]) - smooth[x, y]
+        change[x, y] = hl.cast(
+            hl.Int(16), hl.clamp(detail * of["amount"] >> 8, -of["limit"], of["limit"])
         )
         table, out = hl.Buffer(of["table"]), hl.Func("out")
-        out[c, x, y] = table[hl.clamp(hl.cast(i32, corrected[x, y, c]) + change, 0, TOP)]
+        out[c, x, y] = table[hl.clamp(hl.cast(i32, corrected[x, y, c]) + change[x, y], 0, TOP)]
         return {
             "levels": levels,
             "colours": colours,
             "corrected": corrected,
             "luma": luma,
             "smooth_rows": smooth_rows,
+            "change": change,
             "out": out,
         }
 
@@ -150,15 +153,15 @@ class HalideChain:
         x, y, c = self._x, self._y, self._c
         band, row, pair, of_pair = (hl.Var(name) for name in ("band", "row", "pair", "of_pair"))
         block, of_block = hl.Var("block"), hl.Var("of_block")
-        lanes = hl.get_jit_target_from_environment().natural_vector_size(hl.Int(16))
+        lanes = hl.get_jit_target_from_environment().natural_vector_size(hl.Int(32))
         out = stages["out"]
-        out.bound(c, 0, 3).split(y, band, row, BAND, hl.TailStrategy.GuardWithIf)
-        out.split(row, pair, of_pair, 2, hl.TailStrategy.GuardWithIf)
+        out.bound(c, 0, 3).split(y, band, row, BAND, hl.TailStrategy.RoundUp)
+        out.split(row, pair, of_pair, 2, hl.TailStrategy.RoundUp)
         out.reorder(c, x, of_pair, pair, band).unroll(c).parallel(band)
         out.vectorize(x, lanes, hl.TailStrategy.GuardWithIf)
         for stage in list(stages.values())[:-1]:
             stage.store_at(out, band).compute_at(out, pair)
-        for name in ("levels", "luma", "smooth_rows"):
+        for name in ("levels", "luma", "smooth_rows", "change"):
             stages[name].vectorize(x, lanes)
         stages["levels"].align_bounds(x, 2).align_bounds(y, 2)
         stages["corrected"].bound(c, 0, 3).reorder(c, x, y).unroll(c).vectorize(x, lanes)
