@@ -285,6 +285,10 @@ def main() -> int:
         default=[Workload(20, 6000, 4000), Workload(1000, 512, 512), Workload(200, 1920, 1080)],
         help="numbers and sizes of files; none for no such comparison",
     )
+    parser.add_argument(
+        "--repeat", type=int, default=5, metavar="N", help="rounds of each comparison"
+    )
+    parser.add_argument("--methods", action="store_true", help="compare single methods as well")
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args()
     if missing := [name for name in NEEDED if not importlib.util.find_spec(name)]:
