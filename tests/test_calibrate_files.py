@@ -203,7 +203,10 @@ def test_what_is_no_frame(shots, tmp_path):
     assert "no mosaic or raw" in call("calibrate", "nothing*.dng", *out, status=2).stderr
     assert "must end in .toml" in call("calibrate", shots, "-o", "p.png", status=2).stderr
     (tmp_path / "bad.cr2").write_bytes(b"not a raw" * 100)
-    assert "LibRaw does not support it" in call("calibrate", tmp_path / "bad.cr2", *out, status=1).stderr
+    assert (
+        "LibRaw does not support it"
+        in call("calibrate", tmp_path / "bad.cr2", *out, status=1).stderr
+    )
     call("run", shots / "scene.exr", "-o", tmp_path, "--until", "demosaic", "--device", "numpy")
     message = call("calibrate", tmp_path / "scene.exr", *out, status=1).stderr
     assert "contains rgb, kept after demosaic" in message
