@@ -164,3 +164,11 @@ def test_the_cache_of_a_core_is_read_from_linux(tmp_path):
     private_cache.cache_clear()
     assert private_cache(tmp_path) == 1280 << 10
     private_cache.cache_clear()
+
+
+def test_plans_that_differ_in_a_lens_share_their_kernels():
+    lens = {"method": "brown_conrady", "fx": 200.0}
+    one, two = (plan_of(distortion=lens | {"k1": k1}) for k1 in (-0.1, -0.05))
+    first = banded(one)[-1].bands.parts[0]
+    assert first.opener and not first.stencil  # the resampling
+    assert one != two and one.unscaled == two.unscaled

@@ -154,7 +154,9 @@ def test_without_room_to_compile_pocl_is_not_asked(tmp_path, monkeypatch):
     monkeypatch.setattr(builders, "has_free_space", lambda _: True)
     monkeypatch.setattr(PoclBuilder, "_has_compiled", False)
     monkeypatch.setattr(builders, "free_memory", lambda: FreeMemory(50 << 20, "ulimit -v"))
-    with pytest.raises(DeviceError, match=r"needs about 112.0 MiB .* 50.0 MiB are left by ulimit"):
+    with pytest.raises(
+        DeviceError, match=r"needs about 112.0 MiB .* only 50.0 MiB is available \(ulimit"
+    ):
         builder.build(TEXT, [])
 
 

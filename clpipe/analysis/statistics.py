@@ -105,8 +105,8 @@ def channel_statistics(
         freedom: the degrees of freedom of a sample, below 1 if the truth is a mean of frames.
     """
     table = autocorrelation(standard, pairs)
-    # The error of a variance of correlated samples is that of fewer independent samples, by the sum
-    # of squared correlations (Bartlett 1946).
+    # Correlated samples count as fewer independent ones: their number is divided by the sum of the
+    # squared correlations (Bartlett 1946).
     independent = freedom / float(np.nansum(table**2)) if np.isfinite(table).any() else freedom
     samples = noise[:, mask].astype(np.float64)
     rows, columns = line_noise(noise, mask), line_noise(noise.swapaxes(1, 2), mask.T)

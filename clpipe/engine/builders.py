@@ -130,7 +130,7 @@ class PoclBuilder:
         if free and free.bytes < COMPILER_MEMORY:
             raise DeviceError(
                 f"PoCL's compiler needs about {format_bytes(COMPILER_MEMORY)} of memory, but "
-                f"{format_bytes(free.bytes)} are left by {free.limit}. "
+                f"only {format_bytes(free.bytes)} is available ({free.limit}). "
                 "Allow more for the first run."
             )
         PoclBuilder._has_compiled = True

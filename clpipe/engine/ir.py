@@ -182,8 +182,13 @@ def unscaled(launch: AnyLaunch) -> AnyLaunch:
     """Return a launch without the scale of the resampling that opens it, if there is one."""
     if not isinstance(launch, Launch) or not launch.opener or launch.stencil:
         return launch
+    bands = launch.bands
+    if bands:
+        first = unscaled(bands.parts[0])
+        assert isinstance(first, Launch)
+        bands = replace(bands, parts=(first, *bands.parts[1:]))
     op = replace(launch.opener, pass_=replace(launch.opener.pass_, access=Pointwise()))
-    return replace(launch, ops=(op, *launch.ops[1:]))
+    return replace(launch, ops=(op, *launch.ops[1:]), bands=bands)
 
 
 def reads_of(launch: AnyLaunch) -> tuple[Read, ...]:

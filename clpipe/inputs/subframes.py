@@ -166,7 +166,7 @@ def check_values(jobs: Sequence[Job], relation: str) -> None:
     first = jobs[0]
     if different := next((job for job in jobs if job.values != first.values), None):
         raise RequestError(
-            f"{different.label}: its values differ from those of {first.label}, which is "
+            f"{different.label}: its values differ from those of {first.label}, but both are "
             f"{relation}; give both the same values"
         )
 

@@ -92,7 +92,7 @@ class Projection(GatherResampler, ForwardMapped):
             raise ImageError(
                 f"projection: render's focal length is {known.fx:.4g} px, but a view of "
                 f"{view.width}x{view.height} pixels with this angle has {view.fx:.4g} px; "
-                "remove one of them"
+                "remove the focal length or the angle"
             )
 
     def size(self, width: int, height: int) -> tuple[int, int]:

@@ -15,8 +15,8 @@ import numpy as np
 
 from clpipe.base.types import Array, Floats
 
-# Lines after the last one whose taps a kernel reads, though it stores nothing there: rows of a
-# block and lanes.
+# A kernel also reads the taps of rows and columns after the image's last ones, because its blocks
+# and vectors are not cut. This is the largest number of such lines.
 PADDING = 16
 
 # The weight of samples by their distance from the centre of the new pixel, in pixels of the larger

@@ -42,7 +42,8 @@ def _lanczos3() -> Floats:
     return np.ascontiguousarray(np.linalg.lstsq(powers, weights.T)[0].T, np.float32)
 
 
-# By name: the polynomials of the weights, (tap, power), of the taps from 1 - count / 2 on.
+# For each filter, the polynomial of each tap's weight, (tap, power). The first of `count` taps is
+# 1 - count / 2 pixels away.
 FILTERS: dict[str, Floats] = {"bicubic": _catmull_rom(), "lanczos3": _lanczos3()}
 
 
