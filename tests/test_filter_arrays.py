@@ -146,7 +146,7 @@ def test_a_polarised_array_has_no_colours():
         on("polarised")
     with pytest.raises(
         RequestError,
-        match="method=camera needs channels that are colours, and .* of mosaic polarised",
+        match=r"method=camera needs channels that are colours, and .* of mosaic polarised",
     ):
         on("polarised", skip=["inverse_color_matrix"], color_matrix={"method": "camera"})
     chain = on("polarised", skip=["inverse_color_matrix"])
