@@ -147,9 +147,15 @@ def for_nvidia(arch: str, source: Path) -> Compiled:
     ptx, cubin = source.with_suffix(".ptx"), source.with_suffix(".cubin")
     library = builtins("nvptx64--nvidiacl.bc")
     assembler, disassembler = tool("ptxas"), tool("nvdisasm")
-    # libclc has no native_exp2 for NVIDIA; this is the intrinsic of NVIDIA's own library.
+    # libclc lacks two functions for NVIDIA. NVIDIA's own library has this intrinsic, and keeps the
+    # offset of the third dimension, the only one that kernels read, in an environment register.
     exp2 = "-Dnative_exp2=__nvvm_ex2_approx_ftz_f"
-    target = ("-target", "nvptx64-nvidia-nvcl", f"-march={arch}", exp2)
+    offset = (
+        "-Dget_global_offset(d)=({ size_t offset; "
+        '__asm__("{ .reg .u32 t; mov.u32 t, %%envreg5; cvt.u64.u32 %0, t; }" : "=l"(offset)); '
+        "offset; })"
+    )
+    target = ("-target", "nvptx64-nvidia-nvcl", f"-march={arch}", exp2, offset)
     output_of(clang(), *target, *OPENCL.split(), library, "-o", ptx, source)
     log = output_of(assembler, f"-arch={arch}", "-v", "-o", cubin, ptx)
     text = output_of(disassembler, "-c", cubin)
