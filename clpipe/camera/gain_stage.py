@@ -90,7 +90,7 @@ class GainStage(BaseModel):
         return float(np.sqrt(np.clip(after2, 0, read2.min())))
 
 
-@lru_cache(maxsize=1024)  # the same object for the same tables, so that it is traced once
+@lru_cache(maxsize=1024)  # equal tables share one object, so that it is traced once
 def _ratios(values: tuple[float, ...], divisors: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(value / divisor for value, divisor in zip(values, divisors, strict=True))
 

@@ -236,7 +236,7 @@ class Readouts(SensorNoise):
         return merged
 
 
-@lru_cache(maxsize=256)  # the same object for the same readouts, so that it is uploaded once
+@lru_cache(maxsize=256)  # equal readouts share one object, so that it is uploaded once
 def _table(readouts: tuple[Readout, ...], first: float, later: float) -> Floats:
     rows = [
         (
