@@ -33,8 +33,8 @@ MARK_SEARCH_BYTES = 1 << 16  # clpipe's mark is searched in this many bytes at b
 
 OVERWRITTEN = "would be overwritten; move it, choose another output directory, or use --redo all"
 
-# clpipe's Software tag, or one of clpipe's attributes. The name clpipe is not enough, because it is
-# also the camera of DNGs, which converters copy to their output.
+# clpipe's Software tag, or one of clpipe's attributes. The name clpipe is not enough: DNGs have a
+# camera of this name, which converters copy to their output.
 MARK = re.compile(rb"clpipe \d+\.\d|clpipe:\w")
 
 
@@ -182,7 +182,8 @@ def _same_input(values: Mapping[str, Any], job: Job, verify: bool) -> bool:
         return all(
             _is_same(path, entry, verify) for path, entry in input_entries(values, job.paths)
         )
-    except (KeyError, TypeError, ValueError):  # damaged, or for another number of files
+    # the sidecar is damaged, or describes another number of files
+    except (KeyError, TypeError, ValueError):
         return False
 
 

@@ -189,7 +189,7 @@ class PatchLayout:
         for number in numbers:
             orientation = self._orientation(drawn[f"{number}.turn"])
             position = first_aligned_position(self.pattern, orientation, size)
-            assert position  # _orientation returns only orientations that have one
+            assert position  # _orientation returns only orientations that have a position
             x, y = position
             if is_grid:
                 row, column = divmod(number, -(-self.width // size))

@@ -10,7 +10,7 @@ from clpipe.base.types import Doubles, Floats
 
 Knots = tuple[tuple[float, float], ...]
 
-# between the end knots of the default curve; each piece is a quarter as long as the next
+# Octaves between the end knots of the default curve. Each piece is a quarter as long as the next.
 OCTAVES = 7
 
 

@@ -223,7 +223,7 @@ class Crop:
 
 
 RESIDUAL = 1e-6  # px, in the input of a geometry
-STEP = 1e-3  # px, of the finite differences
+STEP = 1e-3  # px; the step of finite differences
 ITERATIONS = 20
 
 
