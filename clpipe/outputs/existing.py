@@ -52,10 +52,10 @@ class Redo(Enum):
     Pictures that are missing, or were made by another request, are always computed.
     """
 
-    MISSING = "missing"  # none
-    OLD = "old"  # pictures that another program made
+    MISSING = "missing"  # only pictures that do not exist
+    OLD = "old"  # pictures that another version of the program made
     DAMAGED = "damaged"  # damaged pictures, which are found by reading all files
-    ALL = "all"  # all, even if clpipe did not write the files
+    ALL = "all"  # all pictures, even if clpipe did not write the files
 
     @property
     def verifies(self) -> bool:

@@ -22,7 +22,7 @@ KEYS = (
     *("clpipe", "sha256", "iso", "camera", "lens", "width", "height", "noise", "clipped"),
     "warnings",
 )
-SHARED_KEYS = ("device", "versions")  # equal in most sidecars
+SHARED_KEYS = ("device", "versions")  # keys whose values are equal in most sidecars
 LOGS = "run*.jsonl"
 
 
