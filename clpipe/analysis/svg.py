@@ -33,7 +33,7 @@ NEUTRAL = INK["mosaic"]
 PAGE_FILES = resources.files("clpipe.analysis") / "page"  # files that report and explorer share
 PAGE = "#010203"  # placeholder for the page's colour
 COLOURS = ("#1f8a8a", "#d9822b", "#7a5bb5", "#c8102e")
-LONG = 18  # characters of a name next to a bar
+LONG = 18  # characters of the longest name next to a bar
 SETTINGS = {
     "svg.fonttype": "none",
     "svg.hashsalt": "clpipe",
