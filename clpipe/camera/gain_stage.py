@@ -35,7 +35,8 @@ class GainStage(BaseModel):
     column_noise: tuple[NotNegative, ...] | None = None  # DN; it is the same in each frame
     # DN; fixed offsets of R, G in rows with R, G in rows with B, and B
     color_bias: tuple[Offsets, ...] | None = None
-    black_level_error: tuple[NotNegative, ...] | None = None  # DN, of each of them, in each frame
+    # DN; sigma of each channel's level, drawn in each frame
+    black_level_error: tuple[NotNegative, ...] | None = None
 
     @model_validator(mode="after")
     def _check_lengths(self) -> "GainStage":
