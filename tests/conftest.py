@@ -48,7 +48,7 @@ def pytest_configure(config: pytest.Config) -> None:
         config.option.ignore_glob = [*config.option.ignore_glob, str(ROOT / "clpipe/torch/*")]
 
 
-# the time is part of a file's content, from which its noise is seeded
+# The time is part of a file's content, from which its noise is seeded.
 WRITTEN = "2026:01:01 00:00:00"
 
 

@@ -33,7 +33,7 @@ class Picture:
     pattern: str = "RGGB"  # a Bayer pattern, or rows of letters
     black: float | None = None
     white: float | None = None
-    # for a kept mosaic, the white balance gains that were removed and applied, as text
+    # For a kept mosaic, the white balance gains that were removed and applied, as text.
     balance: str = ""
     iso: float | None = None  # None if the file does not state it
     step: float = 0.0  # rounding step of a finished picture
@@ -74,7 +74,7 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
             "first: '--format png' develops it, '--keep normalize' keeps its mosaic"
         )
     iso, bits = photograph_info(path)
-    # 8-bit grey is a picture; grey of more bits may be a mosaic
+    # 8-bit grey is a picture; grey of more bits may be a mosaic.
     finished = read_finished(path, grey=bits == 8)
     if finished is not None:
         step = 1 / (2**bits - 1)

@@ -36,7 +36,7 @@ class NoiseReport:
     notes: tuple[str, ...]
     iso: float | None = None  # None if the images do not state it
     bursts: int = 1  # number of bursts whose noise is pooled
-    # rms of luma noise at edges relative to flat areas; only for pictures
+    # RMS of luma noise at edges relative to flat areas; only for pictures.
     at_edges: float = math.nan
     rounding: float = 0.0  # the variance that rounding in files adds to each channel
 

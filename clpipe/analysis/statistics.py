@@ -25,7 +25,7 @@ class Tails:
     skewness: float
     excess_kurtosis: float
     beyond: tuple[float, ...]  # share of samples whose distance from 0 exceeds each of SIGMAS
-    # counts between HISTOGRAM's edges; the end bins include all farther samples
+    # Counts between HISTOGRAM's edges; the end bins include all farther samples.
     histogram: NDArray[np.int64]
 
 

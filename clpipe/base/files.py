@@ -42,7 +42,7 @@ _unfinished: set[Path] = set()  # temporary files of this process, for `remove_t
 # because a signal handler may acquire it while its own thread holds it.
 _creation_lock = threading.RLock()
 
-# a temporary name repeats at most this many bytes of a name; file systems allow 255
+# A temporary name repeats at most this many bytes of a name; file systems allow 255.
 MAX_NAME_BYTES = 200
 
 

@@ -23,7 +23,7 @@ from clpipe.base.text import similar_names
 
 T = TypeVar("T")
 
-# bytes; the largest configuration, curve or sidecar (manifests may be larger)
+# Bytes; the largest configuration, curve or sidecar (manifests may be larger).
 TEXT_BYTES = 16 * 2**20
 
 KEY_PARTS = 32  # parts of a dotted key; limited because tomllib's memory grows with their square

@@ -142,7 +142,7 @@ def close_and_remove(path: Path, file: int, first: int, length: int) -> None:
             msvcrt.locking(file, msvcrt.LK_UNLCK, length)
     os.close(file)
     if msvcrt and not fcntl:
-        # on Windows, this fails if another process has opened the file
+        # On Windows, this fails if another process has opened the file.
         with contextlib.suppress(OSError):
             path.unlink()
 

@@ -307,7 +307,7 @@ class _CopyWriter:
 
     def __init__(self, trace: Trace) -> None:
         self._trace = trace
-        # holds the object as well, to keep it alive
+        # Holds the object as well, to keep it alive.
         self._texts: dict[int, tuple[Any, str | None]] = {}
         self._open: set[int] = set()
 

@@ -115,7 +115,7 @@ class Cluster:
         self._spec = spec.with_absolute_paths()
         self.is_stopping = False
         self._finished: queue.SimpleQueue[Any] = queue.SimpleQueue()  # futures; None means stop
-        # jobs of each chunk, and whether the chunk runs alone
+        # Jobs of each chunk, and whether the chunk runs alone.
         self._running: dict[Any, tuple[list[Job], bool]] = {}
         self._last_worker_time = time.monotonic()  # the last time at which there was a worker
 
@@ -186,7 +186,7 @@ class Cluster:
             self._finish()
             raise
         patches = self._spec.request.patch is not None
-        # removes files of workers that died
+        # Removes files of workers that died.
         remove_unfinished(self._spec.execution.output, jobs, patches)
         if failure:
             raise failure
@@ -234,7 +234,7 @@ class Cluster:
             return future.result()
         except KilledWorker as error:
             if not alone:
-                # another chunk on these workers may have caused the deaths
+                # Another chunk on these workers may have caused the deaths.
                 chunks.suspects += chunk
                 return ChunkReport((), LONG_CHUNK)
             deaths = f"{error.allowed_failures + 1} in all, the last one {_worker_name(error)}"

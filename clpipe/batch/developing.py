@@ -85,11 +85,10 @@ class Developers:
         self._budget = budget
         self._on_compiled = compiled
         self._fail = fail
-        self._tasks: queue.SimpleQueue[list[RenditionTask] | None] = (
-            queue.SimpleQueue()
-        )  # small ones together
+        # Small renditions are put together.
+        self._tasks: queue.SimpleQueue[list[RenditionTask] | None] = queue.SimpleQueue()
         self._encoders = ThreadPoolExecutor(threads, "encode")
-        # set when the first image has to be developed, and at the end
+        # Set when the first image has to be developed, and at the end.
         self._is_needed = threading.Event()
         self._is_closing = False
         self._usable = len(devices)
@@ -138,7 +137,7 @@ class Developers:
                 if not is_small:
                     self._put(small)
         self._put(small)
-        # waits for the last task first, so that the others are usually finished
+        # Waits for the last task first, so that the others are usually finished.
         for task in reversed(pending):
             task.written.exception()
         return tasks_by_state

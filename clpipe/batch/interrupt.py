@@ -35,7 +35,7 @@ def interruptible(stop: Callable[[], None]) -> Iterator[None]:
             os._exit(INTERRUPTED)
         is_stopping = True
         stop()
-        # print() is not used, because the signal may have interrupted a print().
+        # No print() here, because the signal may have interrupted another print().
         with contextlib.suppress(OSError):
             os.write(sys.stderr.fileno(), b"\nfinishing images in progress; repeat to stop now\n")
 

@@ -41,7 +41,7 @@ class JobState:
     outputs: list[str] = field(default_factory=list)
     carried_layers: CarriedLayers | None = None  # None after they are written
     clipped: float = 0.0  # the largest share of clipped pixels in a rendition
-    # patches that are written instead of pictures
+    # Patches that are written instead of pictures.
     patches: list[Patch] = field(default_factory=list)
     old: int = 0  # existing renditions that another version of the program made
 

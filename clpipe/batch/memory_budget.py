@@ -109,9 +109,9 @@ class MemoryBudget:
         self._max_free = 0  # the most bytes that were ever free for one image and the devices
         self._measured: tuple[float, FreeMemory | None] = 0.0, FreeMemory(0, "")
         self._taken: dict[str, int] = {}  # bytes by the stem of an image
-        # lets one image wait at a time, so that no image overtakes it
+        # Lets one image wait at a time, so that no image overtakes it.
         self._queue = threading.Lock()
-        # guards the attributes above, and is notified when one changes
+        # Guards the attributes above, and is notified when one changes.
         self._changed = threading.Condition()
         self._is_closed = False
 
@@ -189,9 +189,8 @@ class MemoryBudget:
         self._drop()
         trim_memory()
         free = self._free(size)
-        min_memory = min(
-            MIN_DEVICE_MEMORY, 4 * size + UNCOUNTED // 2
-        )  # the planes of a small image are no larger
+        # The planes of a small image are no larger than MIN_DEVICE_MEMORY.
+        min_memory = min(MIN_DEVICE_MEMORY, 4 * size + UNCOUNTED // 2)
         possible = self._max_free - sum(min(each.memory, min_memory) for each in self._sharing)
         if needed(size) <= possible:
             for device in self._sharing:

@@ -39,15 +39,15 @@ log = logging.getLogger(__name__)
 # (docs/performance.md). The values are the time under the interpreter's lock, the total time, and
 # the additional time for each megapixel.
 LOCKED_MS, IMAGE_MS, MEGAPIXEL_MS = 2.0, 3.0, 25.0
-# share of a process's time; if the lock is held for longer, threads wait for it
+# Share of a process's time; if the lock is held for longer, threads wait for it.
 MAX_LOCK_SHARE = 0.5
 MIN_WORK_MS = 1200  # ms; work that justifies a process. Starting a process takes 600 ms.
 SMALL_MEGAPIXELS = 2.5  # megapixels; up to this size, reading and developing need not overlap
 PROCESS_MEMORY = 400 << 20  # bytes per process
 
-# the most jobs that a process holds, usually and near the end of the run
+# The most jobs that a process holds, usually and near the end of the run.
 MAX_QUEUED, MIN_QUEUED = 64, 12
-# after this many deaths of processes, their job fails. If they die while starting, the run fails.
+# After this many deaths of processes, their job fails. If they die while starting, the run fails.
 MAX_DEATHS = 3
 MAX_FRUITLESS = 20  # the run fails after this many deaths in a row without an outcome
 
@@ -127,11 +127,11 @@ class Processes:
         self._messages = queue.SimpleQueue()
         self._processes: list[_Process] = []
         self._remaining: deque[Job] = deque()
-        # jobs of processes that died; each is tried separately at the end
+        # Jobs of processes that died; each is tried separately at the end.
         self._suspects: deque[Job] = deque()
-        # for each job's stem, the deaths of processes that held the job
+        # For each job's stem, the deaths of processes that held the job.
         self._deaths: Counter[str] = Counter()
-        # whether a process has compiled the kernels, which are then cached
+        # Whether a process has compiled the kernels, which are then cached.
         self._is_compiled = False
         self._early_deaths = 0  # processes in a row that died before they were ready
         self._fruitless_deaths = 0  # processes that died since the last outcome
@@ -291,7 +291,7 @@ class Processes:
             threads = self._spec.execution.threads or process.config.threads
             min_queued = MIN_QUEUED if process.config.sequential else threads + 3
             max_queued = max(min(MAX_QUEUED, len(self._remaining) // (2 * self._count)), min_queued)
-            # a message for only one or two jobs is not worthwhile
+            # A message for only one or two jobs is not worthwhile.
             if len(process.jobs) > max_queued // 2:
                 continue
             count = min(max_queued - len(process.jobs), len(self._remaining))

@@ -33,7 +33,7 @@ from clpipe.outputs.writer import OutputWriter
 # themselves.
 Source = Path | tuple[int, int] | bytes
 
-# bytes to copy at a time; tarfile's default of 16 KiB takes three times as long
+# Bytes to copy at a time; tarfile's default of 16 KiB takes three times as long.
 COPY_BYTES = 1 << 20
 
 
@@ -60,7 +60,7 @@ class Packer:
         self.tar = tar
         self._writer = writer
         self._lock = threading.Lock()  # lets one thread read the old tar's index, once
-        # files of the old tar that stay in the new one, by their sidecar
+        # Files of the old tar that stay in the new one, by their sidecar.
         self._reused: dict[str, list[str]] = {}
         self.statuses: dict[str, str] = {}  # status of each job, by its stem
 

@@ -245,8 +245,7 @@ class ImageWorker:
                 waits = [next(results) if order else None for order in orders]
             except DeviceError:
                 raise
-            # the error does not identify the image, so each image is run separately
-            except Exception:
+            except Exception:  # it does not identify the image, so each one is run separately
                 waits = [partial(o[0].run, *o[1:]) if o else None for o in orders]
         return [
             partial(self._finish, state, recipe, start, order[3].timings if order else None, wait)

@@ -33,9 +33,9 @@ class GainStage(BaseModel):
     tukey_lambda: tuple[TukeyLambda, ...] | None = None  # shape of the read noise
     row_noise: tuple[NotNegative, ...] | None = None  # DN; it differs in each frame
     column_noise: tuple[NotNegative, ...] | None = None  # DN; it is the same in each frame
-    # DN; fixed offsets of R, G in rows with R, G in rows with B, and B
+    # DN; fixed offsets of R, G in rows with R, G in rows with B, and B.
     color_bias: tuple[Offsets, ...] | None = None
-    # DN; sigma of each channel's level, drawn in each frame
+    # DN; sigma of each channel's level, drawn in each frame.
     black_level_error: tuple[NotNegative, ...] | None = None
 
     @model_validator(mode="after")

@@ -268,7 +268,7 @@ def _check_aperture(lens: Any, aperture: float) -> None:
     Raises:
         KeyedError: it cannot.
     """
-    # lensfun returns None for an unknown value
+    # lensfun returns None for an unknown value.
     low, high = lens.min_aperture or 0.0, lens.max_aperture or 0.0
     if (low and aperture < low - 0.06) or (high > low and aperture > high + 0.06):
         most = f" to f/{high:g}" if high > low else " and above"

@@ -16,7 +16,7 @@ from clpipe.camera.lens import LensCalibration
 LENGTH_TOLERANCE = 0.01  # relative tolerance of lengths and f-numbers; lenses state nominal values
 PIXEL_TOLERANCE = 1e-4  # relative tolerance of lengths in px
 
-# relative tolerance of a lens's focal length; makers round it, and aspect ratios differ
+# Relative tolerance of a lens's focal length; makers round it, and aspect ratios differ.
 FOCAL_TOLERANCE = 0.1
 FILM_WIDTH, FILM_DIAGONAL = 36.0, math.hypot(36, 24)  # mm; the width and diagonal of 35 mm film
 

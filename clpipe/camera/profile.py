@@ -68,7 +68,7 @@ class Camera(BaseModel):
     white_balance_gains: tuple[Positive, Positive]  # red, blue
     filter_array: str = ""  # a name or rows of letters, see the stage mosaic; "" is a Bayer pattern
     xyz_to_camera: Matrix | None = None  # XYZ to camera RGB at D65, like a DNG's ColorMatrix2
-    # row noise relative to read noise, for stages without a table
+    # Row noise relative to read noise, for stages without a table.
     row_noise_ratio: NotNegative = 0.0
     column_noise_ratio: NotNegative = 0.0
     quantum_efficiency: Annotated[float, Field(gt=0, le=1)] | None = None  # electrons per photon
@@ -83,7 +83,7 @@ class Camera(BaseModel):
     rts_share: Share = 0.0  # share of pixels with random telegraph noise
     rts_amplitude: NotNegative = 0.0  # e-; the mean distance between the two levels of such a pixel
     dark_current: NotNegative = 0.0  # e-/s
-    # deg C; the temperature at which dark_current was measured
+    # deg C; the temperature at which dark_current was measured.
     dark_current_temperature: Temperature = 20.0
     dark_current_doubling: Positive | None = None  # K; None: the same at every temperature
     dark_current_spread: Fraction = 0.0  # standard deviation over pixels, relative to the mean
@@ -103,7 +103,7 @@ class Camera(BaseModel):
     # small one, relative to that of the large one.
     photodiode_ratio: Annotated[float, Field(gt=1, le=10_000)] | None = None
     photodiode_crosstalk: Annotated[float, Field(ge=0, le=0.5)] | None = None
-    # um; the distance between the centres of adjacent photosites
+    # um; the distance between the centres of adjacent photosites.
     pixel_pitch: Positive | None = None
     iso_range: tuple[Positive, Positive]
     gain_stages: Annotated[tuple[GainStage, ...], Field(min_length=1)]

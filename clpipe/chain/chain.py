@@ -78,7 +78,7 @@ class Step:
         """Return whether another step does the same with the same numbers."""
         optics = self.context.optics, other.context.optics
         equals = self == other and optics[0] == optics[1] and self.passes == other.passes
-        # without arguments, there is nothing else to compare
+        # Without arguments, there is nothing else to compare.
         if not equals or "arguments" not in vars(self):
             return equals
         mine, theirs = self.arguments, other.arguments
@@ -102,7 +102,7 @@ class Chain:
     camera: Camera
     settings: Settings
     names: tuple[str, ...]  # all steps, including those before start_at and after until
-    # the settings are an example of these draws
+    # The settings are an example of these draws.
     draws: Mapping[str, Draw] = field(default_factory=dict)
     margins: Margins = NO_MARGINS  # the overscan of the chain's input
     # Results that all chains of this structure share, see of_structure(). None if there are none.

@@ -21,7 +21,7 @@ from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.stage import Method
 
-# families for settings that differ only in numbers, such as ISOs of different gain stages
+# Families for settings that differ only in numbers, such as ISOs of different gain stages.
 MAX_FAMILIES = 16
 MAX_SETTINGS = 256
 

@@ -144,7 +144,7 @@ _ALL = (
 )
 KEYS = {key.name: key for key in _ALL}
 
-# the settings that select a lens and set it
+# The settings that select a lens and set it.
 LENS = ("lens", "focal_length", "aperture", "focus_distance")
 
 

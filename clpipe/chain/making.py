@@ -166,7 +166,7 @@ def resolve_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list
             after = method.next_context(context)
             if (optics_set := method.optics()) and method.passes():
                 after = after.replace(optics=after.optics.set_to(optics_set))
-        # otherwise the stage has been checked
+        # Otherwise the stage has been checked.
         if stage.folder and not isinstance(context.iso, Traced):
             check_passes(name, stage, method, context)
         steps.append(Step(name, stage, method, context))

@@ -232,7 +232,7 @@ class Request(RecordedRequest):
         chain = make_chain(settings, start_at=start_at, until=self.until)
         known = (*chain.names, *self.image.get("skip", ()), *TABLES)
         for step, value in self.options.items():
-            # the table of a key is a draw
+            # The table of a key is a draw.
             is_table = isinstance(value, Mapping) and step not in KEYS
             if is_table and step not in known:
                 raise RequestError(unknown_name("stage in this chain", step, chain.names))

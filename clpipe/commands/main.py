@@ -32,7 +32,7 @@ GROUPS = {
 }
 COMMANDS = tuple(name for names in GROUPS.values() for name in names)
 
-# bytes; address space for the libraries, and for each of their threads. The libraries start one
+# Bytes; address space for the libraries, and for each of their threads. The libraries start one
 # thread per processor.
 LIBRARY_ADDRESSES = 240 << 20
 THREAD_ADDRESSES = 10 << 20
@@ -64,7 +64,7 @@ class LazyGroup(click.Group):
         if cmd_name not in COMMANDS:
             return None
         prepare_memory()
-        # imported objects remain in use, and collecting garbage takes a tenth of the time
+        # Imported objects remain in use, and collecting garbage takes a tenth of the time.
         gc.disable()
         command = getattr(import_module(f"clpipe.commands.{cmd_name}"), cmd_name)
         gc.enable()
@@ -144,7 +144,7 @@ def os_error(error: OSError) -> ClpipeError:
     """Return clpipe's error for an error of the operating system, with the file's name if any."""
     if error.filename is not None:
         return OutputError(f"{error.filename}: {error.strerror or error}")
-    # the error has no file name only if the working directory is missing
+    # The error has no file name only if the working directory is missing.
     if isinstance(error, FileNotFoundError):
         return RequestError("the working directory no longer exists; change to another one")
     *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
@@ -199,7 +199,7 @@ def main() -> None:
     clpipe stages sensor_noise
     """
     if isinstance(sys.stdout, io.TextIOWrapper):  # a file's name may not be UTF-8
-        sys.stdout.reconfigure(errors="backslashreplace")  # as for stderr
+        sys.stdout.reconfigure(errors="backslashreplace")  # like stderr
     logger = logging.getLogger("clpipe")
     logger.setLevel(logging.INFO)
     if NOTICES not in logger.handlers:

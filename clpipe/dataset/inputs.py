@@ -56,7 +56,7 @@ def jobs_of(
         log.warning("%s", note)
     job_by_key: dict[str, Job] = {}
     for job in jobs:
-        # files that were found in directories exist
+        # Files that were found in directories exist.
         if job.named_by_user and not job.path.exists():
             raise RequestError(f"{job.label}: there is no such file or folder")
         other = job_by_key.setdefault(job.key, job)

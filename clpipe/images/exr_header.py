@@ -68,7 +68,7 @@ def _parse(start: bytes) -> ExrHeader:
         name, offset = _null_terminated(start, offset)
         kind, offset = _null_terminated(start, offset)
         (size,) = struct.unpack_from("<I", start, offset)
-        # OpenEXR decompresses this attribute, to up to a thousand times its size
+        # OpenEXR decompresses this attribute, to up to a thousand times its size.
         if kind == b"idmanifest":
             raise ValueError
         values[name] = start[offset + 4 : offset + 4 + size]

@@ -158,7 +158,7 @@ def read_layer(
         width, height = spec.full_width, spec.full_height
         check_size(path, width, height, max_pixels)
         check_size(path, spec.width, spec.height, max_pixels)
-        # as floats, OpenImageIO would scale whole numbers
+        # OpenImageIO would scale whole numbers that are read as floats.
         type_ = FLOAT_TYPES.get(location.type, location.type)
         pixels = read_samples(path, file, location.part, location.indices, type_)
         if pixels.dtype.kind != "f":

@@ -46,7 +46,7 @@ TAG_PREFIXES = ("EXIF", "Image")  # exifread's prefixes of tags, in order of pre
 EXIF_BYTES = 1 << 20  # largest size of a tag, and of the part of a file searched for EXIF_MARKS
 MAX_READS = 200_000  # values; exifread reads each one separately, and 1,000 are usual
 DATE_TAGS = ("DateTimeOriginal", "DateTime")
-# tags of a DNG's color matrices, and of their illuminants
+# Tags of a DNG's color matrices, and of their illuminants.
 COLOR_MATRICES = {"0xC622": "0xC65B", "0xC621": "0xC65A"}
 DUMP_HINT = "if it is a headerless dump of samples, add --dump WxH:TYPE"
 OTHER_FORMATS = {b"\xff\xd8\xff": "a JPEG", b"\x89PNG": "a PNG", b"v/1\x01": "an OpenEXR image"}
@@ -65,13 +65,13 @@ class RawInfo:
     exposure: float | None  # s
     visible_area: tuple[int, int, int, int]  # left, top, width, height in sensor px
     pattern: str  # CFA of the visible area: a Bayer pattern, or rows separated by /
-    # black levels of the four sites of the pattern, row by row
+    # Black levels of the four sites of the pattern, row by row.
     black_levels: tuple[int, int, int, int]
     white_level: int
     as_shot: tuple[float, float, float]  # white balance multipliers of red, green, blue
     gains: tuple[float, float] | None  # red and blue, as shot
     xyz_to_camera: Matrix | None
-    camera_to_srgb: Matrix | None  # for linear, white-balanced RGB
+    camera_to_srgb: Matrix | None  # matrix for linear, white-balanced RGB
     orientation: int  # EXIF's number: 1 is upright
     aperture: float | None
     focal_length: float | None  # mm
@@ -352,5 +352,5 @@ def _tags(file: Any) -> dict[str, Any]:
     logging.getLogger("exifread").setLevel(logging.CRITICAL)
     try:
         return dict(exifread.process_file(_LimitedReader(file), details=False))
-    except Exception:  # on damaged files exifread raises exceptions of any type
+    except Exception:  # exifread raises exceptions of any type for damaged files
         return {}

@@ -216,7 +216,7 @@ def _jobs_at_url(url: str, endings: Sequence[str], excluded: Exclusion) -> list[
         RequestError: the URL cannot be listed, or has no images.
     """
     is_pattern = is_glob(url)
-    # if the file is missing, only its job fails
+    # If the file is missing, only its job fails.
     if not is_pattern and Path(url).suffix.lower() in endings:
         return [Job(path_of(url), url.rpartition("/")[2])]
     root = url.rstrip("/")

@@ -116,7 +116,7 @@ class KeptLoader:
             KindError: the step at ``start_at`` does not read this kind of image.
         """
         key = source.attributes.get("image_key", key)
-        # draws the same values as the image's own run
+        # Draws the same values as the image's own run.
         request = self.request.for_image(name_of_key(key), self.request.image)
         chain = self._chain_for(request, path, source.attributes)
         warnings = list(source.warnings)

@@ -74,7 +74,7 @@ class Series:
             replace(
                 job,
                 name=f"{folder}/{job.stem}",
-                # jobs share the values if they have none of their own
+                # Jobs share the values if they have none of their own.
                 values={**job.values, **values} if job.values else values,
             )
             for job in jobs

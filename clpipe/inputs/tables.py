@@ -17,7 +17,7 @@ from clpipe.base.text import unknown_name
 from clpipe.chain.keys import CODE, KEYS
 from clpipe.chain.toml import toml_value
 
-# returns the values of a row by column, or raises RequestError
+# Returns the values of a row by column, or raises RequestError.
 Record = Callable[[], dict[str, Any]]
 
 TEXT_COLUMNS = ("path", "name")  # columns that are not parsed as TOML values

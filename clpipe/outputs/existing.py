@@ -182,8 +182,7 @@ def _same_input(values: Mapping[str, Any], job: Job, verify: bool) -> bool:
         return all(
             _is_same(path, entry, verify) for path, entry in input_entries(values, job.paths)
         )
-    # the sidecar is damaged, or describes another number of files
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError):  # a damaged sidecar, or another number of files
         return False
 
 

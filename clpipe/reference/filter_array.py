@@ -16,7 +16,7 @@ from clpipe.reference.cfa import PATTERNS, Pattern
 
 MAX_PERIOD = 8
 MIRRORED = 2  # the longest period that a mirrored border (reflect-101) continues
-# lanes; the most that a device has. Each row of a table has as many extra entries, so that it loads
+# Lanes; the most that a device has. Each row of a table has as many extra entries, so that it loads
 # at once.
 LANES = 16
 

@@ -207,7 +207,7 @@ class _ScaledLens:
         self.corner = float(np.hypot(*(offsets / self.unit).T).max())
         self.corner_side = float(np.hypot(*(offsets / self.side).T).max()) / scale
         offsets = self._corners(-left, -top, width + right, height + bottom)
-        # radius of the input's corner
+        # Radius of the input's corner.
         self.farthest = float(np.hypot(*(offsets / self.unit).T).max())
         self._check(lens.radial, self.farthest, self.corner, "distortion", max(self.unit))
         for lateral in (lens.red, lens.blue):

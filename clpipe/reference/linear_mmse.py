@@ -107,7 +107,7 @@ def mmse_filters(
     samples = covariance(responses, tap_correlation, chroma, noise)
     cross_covariance = centre_correlation[:, None] * (responses @ _colours(chroma))
     has_colours = np.linalg.matrix_rank(responses, 1e-3) == 3
-    # columns are the flat colours that must be exact
+    # Columns are the flat colours that must be exact.
     exact = np.eye(3) if has_colours else np.ones((3, 1))
     flat_samples = responses @ exact
     solution = np.linalg.solve(samples, np.concatenate([cross_covariance, flat_samples], axis=1))

@@ -13,7 +13,7 @@ from numpy.polynomial.polynomial import polyder, polyval
 from clpipe.base.types import Array
 from clpipe.reference.rational import fit_even
 
-# in units of r; Newton's method ends when the error after distortion is below this value. For a
+# In units of r; Newton's method ends when the error after distortion is below this value. For a
 # focal length of 4000 px, this is 4e-9 px.
 RESIDUAL = 1e-12
 SAMPLES = 2049  # starting points for the inverse of a radial model

@@ -13,7 +13,7 @@ from clpipe.base.types import Floats
 from clpipe.reference.math import exponential_minus_1, negative_log
 from clpipe.reference.random import Words, in_upper_half, tail_probability
 
-# replaces smaller lambdas, because 1 / lambda fails at 0 (the logistic distribution)
+# Replaces smaller lambdas, because 1 / lambda fails at 0 (the logistic distribution).
 NEARLY_ZERO = 1e-4
 
 

@@ -171,7 +171,7 @@ class Parameter:
 
     name: str
     values: Counter[Any]  # JSON values; lists are counted as their text
-    # whether values were drawn, or set for single images; otherwise they were derived
+    # Whether values were drawn, or set for single images; otherwise they were derived.
     is_requested: bool = True
 
     @property

@@ -42,7 +42,7 @@ SESSIONS = 12  # the latest starts of the program
 # et al., CVPR 2016), measured by clpipe.analysis.signature. See docs/validation.md.
 REAL_LEFT = (0.57, 0.63)
 REAL_RIGHT = (0.51, 0.59)
-# ratio of luma noise in the steepest areas to the noise in the flattest areas
+# Ratio of luma noise in the steepest areas to the noise in the flattest areas.
 REAL_EDGES = (1.1, 2.4)
 
 

@@ -64,7 +64,7 @@ class RunPicture:
     image: str  # the name of its input without extension, with directories of a series
     rendition: Rendition
     record: dict[str, Any]  # the needed part of the sidecar; equal parts are shared
-    files: Mapping[str, Blob]  # by suffix: "jpg", "demosaic.exr"
+    files: Mapping[str, Blob]  # files by suffix, for example jpg or demosaic.exr
 
     @property
     def name(self) -> str:

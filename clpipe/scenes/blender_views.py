@@ -12,7 +12,7 @@ from typing import Any
 import bpy
 from mathutils import Matrix, Vector
 
-FLIP = Matrix(((1, 0, 0), (0, -1, 0), (0, 0, -1)))  # from Blender's camera axes to OpenCV's
+FLIP = Matrix(((1, 0, 0), (0, -1, 0), (0, 0, -1)))  # converts Blender's camera axes to OpenCV's
 GEOMETRY = {"MESH", "CURVE", "CURVES", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD"}
 ARC_ANGLE = math.radians(60)
 # Rays per row and per column of a picture, to test what a view sees.

@@ -25,11 +25,11 @@ class Context:
     iso: float
     pattern: Pattern = "RGGB"
     array: FilterArray | None = None  # the filter array of a mosaic without a Bayer pattern
-    # gains of red and blue to divide out; None means the camera's
+    # Gains of red and blue to divide out; None means the camera's.
     light: tuple[float, float] | None = None
-    # gains of red and blue that inverse_white_balance divided out
+    # Gains of red and blue that inverse_white_balance divided out.
     gains: tuple[float, float] = (1.0, 1.0)
-    # gains of red and blue that white_balance applies again
+    # Gains of red and blue that white_balance applies again.
     applied_gains: tuple[float, float] = (1.0, 1.0)
     exposure_time: float | None = None  # s; None if exposure does not state it
     headroom: float = 0.0  # stops by which exposure darkened the scene

@@ -66,10 +66,10 @@ class Method(BaseModel):
     method: ClassVar[str]
     kernel: ClassVar[str]  # file name in kernels/, without .cl
     summary: ClassVar[str]
-    # largest difference between kernel and reference; 0 means bit for bit
+    # Largest difference between kernel and reference; 0 means bit for bit.
     tolerance: ClassVar[float] = 0.0
     example: ClassVar[Mapping[str, Any]] = {}  # parameters for checks, if the defaults do nothing
-    # parameters for checks that use other code paths
+    # Parameters for checks that use other code paths.
     other_examples: ClassVar[tuple[Mapping[str, Any], ...]] = ()
     # Parameters of which you may set only one. An option replaces a configuration's parameter, and
     # a manifest's parameter replaces an option's.
@@ -77,7 +77,7 @@ class Method(BaseModel):
     # Whether the method accepts mosaics of any filter array. Other methods of its stage may accept
     # only Bayer patterns.
     any_array: ClassVar[bool] = False
-    # arrays for checks, if the method accepts no others
+    # Arrays for checks, if the method accepts no others.
     only_arrays: ClassVar[tuple[str, ...]] = ()
     # Whether the method's image may have overscan. If so, the method acts in the same way
     # everywhere, or counts positions from the frame, which ``margins`` locates.

@@ -56,7 +56,7 @@ class Backend(ABC):
     inverse_root: ClassVar[Callable[..., Any]]
     rounded: ClassVar[Callable[..., Any]]  # rounds to the nearest whole number, ties to even
     photons: ClassVar[Callable[..., Any]]  # returns Poisson numbers for means and random words
-    # returns noise for random words, a shape and a scale
+    # Returns noise for random words, a shape and a scale.
     tukey_lambda: ClassVar[Callable[..., Any]]
     in_upper_half: ClassVar[Callable[..., Any]]  # returns whether a word's top bit is 0
     tap: ClassVar[Callable[..., Any]]  # returns the signal's value dx to the right and dy below

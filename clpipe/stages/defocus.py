@@ -226,7 +226,7 @@ class ThinLens(FocalLengthMethod, DepthMethod):
     def _tables(self, depth: Floats) -> tuple[Floats, int, Floats]:
         """Return the radii with a border, the border's width, and the taps of the largest disc."""
         radii = self.limited_radii(depth)
-        # rounded, so that many images share a few tables
+        # Rounded, so that many images share a few tables.
         largest = float(np.ceil(abs(radii).max() * 4)) / 4
         reach = disc_reach(largest)
         border = ((reach, reach), (reach, reach + MAX_LANES))

@@ -11,7 +11,7 @@ from clpipe.analysis.calibration.repeats import Stack
 from clpipe.base.errors import ImageError
 
 MIN_VALID_SHARE = 0.25  # share of the pixels that must be valid
-# largest deviation of a frame's variance, relative to the median frame's variance
+# Largest deviation of a frame's variance, relative to the median frame's variance.
 MAX_VARIANCE_DEVIATION = 0.2
 LOW_NOISE = 0.4  # DN; below this noise, the variance of rounding depends on the noise
 MAX_NONLINEARITY = 0.1  # largest deviation of a bin's variance, relative to the line

@@ -25,7 +25,7 @@ BLOCK = 32  # px; the side of the blocks over which maps are averaged
 MIN_BLOCKS = 6  # blocks along each axis
 JUMPS = 10.0  # relative to the variance of other pixels; a pixel with more counts as jumping
 TINY = 1e-9  # DN^2
-# half width of the correlation of a cubic B-spline, relative to the distance between its knots
+# Half width of the correlation of a cubic B-spline, relative to the distance between its knots.
 WIDTH_OF_KNOTS = 0.96
 
 

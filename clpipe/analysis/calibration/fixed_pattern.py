@@ -14,7 +14,7 @@ SURE = 7.0  # standard deviations; by chance, not one of 1e8 pixels exceeds this
 BLOCK = 16  # px of one colour; the side of a block
 MIN_BLOCKS = 30  # flat blocks that are needed to measure PRNU
 DARKEST = 0.05  # signal units; the lowest mean of a block for measuring PRNU
-# largest standard deviation of the scene in a flat block, relative to its mean
+# Largest standard deviation of the scene in a flat block, relative to its mean.
 MAX_UNEVENNESS = 0.03
 MIN_DEVIATION = 0.05  # DN; the smallest assumed deviation of a mean dark frame
 

@@ -238,7 +238,7 @@ def _sensor(overrides: FrameOverrides, pattern: str, black: float, white: float)
     stated = overrides.pattern or pattern
     name = "" if stated in PATTERNS else next((n for n, r in NAMED.items() if r == stated), stated)
     return Sensor(
-        # a mono sensor's sites are all equal, so any pattern fits
+        # A mono sensor's sites are all equal, so any pattern fits.
         PATTERNS[0] if stated == MONO else stated,
         black if overrides.black_level is None else overrides.black_level,
         white if overrides.white_level is None else overrides.white_level,

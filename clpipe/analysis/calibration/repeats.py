@@ -15,7 +15,7 @@ from clpipe.reference.filter_array import MIRRORED
 # We chose these limits; tests/test_calibrate.py has a case on each side of the last two.
 CLIPPING_MARGIN = 4.0  # standard deviations of a frame; the distance from clipping levels
 MAX_FLICKER = 0.05  # change of mean brightness; more counts as another exposure
-# share of the variance that is correlated between neighbours; more counts as motion
+# Share of the variance that is correlated between neighbours; more counts as motion.
 MAX_MOTION = 0.02
 
 Site = tuple[slice, slice]  # rows and columns of one filter of the array's period
@@ -28,7 +28,7 @@ class Sensor:
     pattern: str  # a Bayer pattern, or the rows of another filter array
     black_level: float  # DN
     white_level: float  # DN
-    filter_array: str = ""  # its name in a profile; "" for a Bayer pattern
+    filter_array: str = ""  # name of the array in a profile; "" for a Bayer pattern
 
     @property
     def unit(self) -> float:

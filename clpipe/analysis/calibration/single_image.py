@@ -35,7 +35,8 @@ MIN_SET_SIZE = 400  # smallest number of places in a level set
 MIN_EXPLAINED = 40  # smallest number of places in a level set that the line explains
 WINDOW = 7  # px; the window for smoothing and for local variances
 EDGE = 1.0  # tau, in standard deviations of the details (sec. II-B1)
-EXPLAINED = 1.4  # times the line's variance: two standard deviations of a local variance above it
+# Relative to the line's variance; this is two standard deviations of a local variance above 1.
+EXPLAINED = 1.4
 ROUNDS = 8  # rounds; each selects places with the line of the previous round
 GRID = 2000  # points at which the model of clipping is tabulated
 Values = NDArray[np.float64]

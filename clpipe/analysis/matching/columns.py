@@ -39,7 +39,7 @@ LEVELS = (12, 24, 40, 64, 96, 128, 160, 192, 226)  # edges of the luma bins
 SHADOWS, MIDTONES = (24, 48), (64, 160)  # ranges of luma in which the skew of noise is compared
 BLOCK = 32  # px; the side of a block
 GROUPS = 8  # groups of blocks; the jackknife omits one group at a time
-# frames that tails need, because the difference from a mean of few frames mixes their noise
+# Frames that tails need, because the difference from a mean of few frames mixes their noise.
 MIN_FRAMES = 4
 
 

@@ -31,14 +31,14 @@ CROPS = 4
 MIN_FLAT = 4000  # px; pixels in all scenes that are neither clipped nor near an edge
 MIN_OF_EACH = 1000  # px; such pixels in each scene
 DARK = 12  # luma; noise is compared by intensity above this level
-# squared levels of 255; the energy from rounding in a mean, which noise exceeds
+# Squared levels of 255; the energy from rounding in a mean, which noise exceeds.
 ROUNDING_ENERGY = 1e-9
 HOLDOUT = 3  # one of this many crops or blocks is held out of the search
 MANY = 6  # crops; with fewer, blocks are held out instead of whole crops, which might be unusual
 SMOOTH = 1.5  # px; sigma that smooths the mean of a burst before it is developed again
 
 SHIFT = 0.5  # px, by which a frame may be shifted against its mean
-# standard errors for a significant shift, for white noise; equal to three for a camera's noise
+# Standard errors for a significant shift, for white noise; equal to three for a camera's noise.
 SURE = 15.0
 SCENE_SHARE, SCENE_BLOCK = 0.05, 64  # see clpipe.analysis.repeats
 MOVED, MOVED_BLOCK = 1.0, 16  # sigma, px: a mean of a block that noise does not reach

@@ -48,13 +48,13 @@ COARSE_TOLERANCE, FINE_TOLERANCE = 1e-3, 1e-4
 # the first limit before any fit, or the second one after FIRST_STEPS.
 ABANDON_RATIO, PROMISING_RATIO = 5.0, 1.5
 
-# no other method is tried if the residual of a typical column is below this value
+# No other method is tried if the residual of a typical column is below this value.
 GOOD_RESIDUAL = 0.5
 CONVERGED = 0.95  # the fit ends if a few steps leave more than this share of the cost
 DIFFERENCE_STEP = 0.03  # step of finite differences, relative to a dimension's range
 LOSS_SCALE = 3.0  # larger residuals count less than their squares (soft L1)
 IMPROVEMENT = 0.9  # another method must cost less than this share, because costs are random
-# number of scenes for comparing methods, and the size of their crops in px
+# Number of scenes for comparing methods, and the size of their crops in px.
 TRIAL_SCENES, TRIAL_CROP = 4, 384
 ROUNDS = 2  # number of times that each part is tried
 FINAL_FIT_TRIALS = 20  # duration of the last fit (all scenes at full size), in trials
@@ -135,7 +135,7 @@ class Search:
         self.simulator = Simulator(device)
         self.targets = [target_of(s, ~s.holdout) for s in scenes.each if s.mask.any()]
         self.evaluations = 0
-        self._cache: dict[tuple[str, Scene], Figures] = {}  # by settings and scene
+        self._cache: dict[tuple[str, Scene], Figures] = {}  # figures by settings and scene
         self._trials, self._expected_trials, self._share = 0, FINAL_FIT_TRIALS, 0.0
 
     def run(self) -> Candidate:
@@ -157,7 +157,7 @@ class Search:
         for number, part in enumerate(parts):
             if unchanged == count:
                 break
-            # if the best candidate changes, more parts follow
+            # If the best candidate changes, more parts follow.
             ahead = parts[number:][: count - unchanged]
             self._expected_trials = (
                 self._trials

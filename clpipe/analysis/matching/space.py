@@ -28,7 +28,7 @@ SHARPEN = "sharpen"
 # Cameras smooth chroma again with a wider filter, at a half or a quarter of the resolution.
 SMOOTHER = {"method": "bilateral", "luma_size": 1, "luma_strength": 0.0, "chroma_size": 7}
 COARSER = {"method": "biweight", "luma_strength": 0.0, "chroma_scale": 3}
-# units of searched numbers; numbers in signal units follow from the noise
+# Units of searched numbers; numbers in signal units follow from the noise.
 SEARCHED_UNITS = ("", "px")
 ALSO = ("sharpen.limit",)  # also searched, because it sets the noise at edges
 SPAN = 8.0  # a number is searched within this factor of its initial value

@@ -26,7 +26,7 @@ MARK = "noiseprofiles"
 RAW_OVER_DEMOSAICED = 12.8
 TRUSTED_ISO = 800.0  # the factor is accurate at this ISO and above
 LOWEST_ISO = 100.0  # lower ISOs are often ISO 100 with another exposure
-# relative uncertainty of the factor; if a/ISO deviates more, raws are scaled or denoised
+# Relative uncertainty of the factor; if a/ISO deviates more, raws are scaled or denoised.
 UNCERTAINTY = 0.3
 
 # Fujifilm's X-Trans cameras (source: rawspeed's cameras.xml); X-T100 and X-T200 are Bayer.

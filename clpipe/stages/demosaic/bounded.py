@@ -34,7 +34,7 @@ from clpipe.stages.denoise.strength import (
     offset_parameter,
 )
 
-# roots of the signal; the directions count as alike if the gradient is below this value. We chose a
+# Roots of the signal; the directions count as alike if the gradient is below this value. We chose a
 # hundredth of white: it is less than the noise of most images, and no edge is so weak.
 EQUAL_GRADIENT = np.float32(0.01**2)
 

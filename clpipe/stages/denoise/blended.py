@@ -13,7 +13,7 @@ from clpipe.reference.median import median_filter
 from clpipe.stage import Context, ReferenceContext
 from clpipe.stages.denoise.strength import WindowDenoiser, size_parameter
 
-# signal units; the assumed standard deviation of detail relative to its neighbours. We chose this
+# Signal units; the assumed standard deviation of detail relative to its neighbours. We chose this
 # value. tools/pages/quality.py measures its PSNR, and no test asserts that it is optimal.
 DETAIL = 0.02
 

@@ -38,7 +38,7 @@ class Gaussian(SensorNoise):
         return (Pass(of_tukey, arguments=names, random=NoiseScope.IMAGE),)
 
     def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats | None:
-        # in this model, a negative signal lowers the variance below b
+        # In this model, a negative signal lowers the variance below b.
         if self.tukey_lambda is None:
             return np.maximum(self.added_variance(signal), np.float32(0)) + input_variance
         return super().variance(input_variance, signal, context)

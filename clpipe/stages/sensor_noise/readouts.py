@@ -27,7 +27,7 @@ from clpipe.stages.sensor_noise.no_noise import NEVER_FULL, NoNoise, or_default
 
 DEFAULT_RATIO = 16.0  # for sensors whose profile does not state a ratio
 MAX_READOUTS = 4
-# signal of a readout at which its weight becomes 0, and the slope below it. The transition
+# Signal of a readout at which its weight becomes 0, and the slope below it. The transition
 # therefore begins at 0.85.
 HANDOVER_END, HANDOVER_SLOPE = (
     np.float32(0.95),
