@@ -104,7 +104,7 @@ class MemoryBudget:
         self._compiling = len(devices)
         self._drop = drop
         self._left = left or free_memory
-        # Memory limits that devices have again after one image uses less.
+        # The usual memory limits of devices whose limit is lowered for a large image.
         self._limits: dict[Device, int] = {}
         self._max_free = 0  # the most bytes that were ever free for one image and the devices
         self._measured: tuple[float, FreeMemory | None] = 0.0, FreeMemory(0, "")
@@ -189,7 +189,7 @@ class MemoryBudget:
         self._drop()
         trim_memory()
         free = self._free(size)
-        # The planes of a small image are no larger than MIN_DEVICE_MEMORY.
+        # A small image needs less device memory, because its planes are smaller.
         min_memory = min(MIN_DEVICE_MEMORY, 4 * size + UNCOUNTED // 2)
         possible = self._max_free - sum(min(each.memory, min_memory) for each in self._sharing)
         if needed(size) <= possible:
