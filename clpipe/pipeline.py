@@ -180,9 +180,8 @@ class Pipeline(ReadOnly):
         with self._lock:
             result = runner.run(pixels, noise_key(chain.settings, own_key))
         share = clipped_share(result, chain) or 0.0
-        if (
-            share >= WARNING_SHARE and chain.source is not Kind.DISPLAY
-        ):  # photographs are clipped already
+        # Photographs are already clipped.
+        if share >= WARNING_SHARE and chain.source is not Kind.DISPLAY:
             warnings.warn(f"{key}: {clipping_text(share)}", stacklevel=2)
         return result
 

@@ -48,7 +48,8 @@ def pytest_configure(config: pytest.Config) -> None:
         config.option.ignore_glob = [*config.option.ignore_glob, str(ROOT / "clpipe/torch/*")]
 
 
-WRITTEN = "2026:01:01 00:00:00"  # the time in a file is a part of what its noise belongs to
+# The time is part of a file's content, from which its noise is seeded.
+WRITTEN = "2026:01:01 00:00:00"
 
 
 def written(folder: Path) -> list[str]:
@@ -193,7 +194,7 @@ def launches(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _compiling_is_not_logged() -> None:
-    # With a cold cache the line would stand in the output of whichever test comes first.
+    # With a cold cache, the log line would appear in the output of the first test that compiles.
     programs._notice_logged.set()
 
 
@@ -203,7 +204,7 @@ def device() -> Iterator[Device]:
     ours = programs.programs_of(device.info)
     declared = ours.declares
     yield device
-    # Every kernel of ours, and all that a test compiled, called only what builtins.h declares.
+    # All compiled kernels, ours and those of tests, call only functions that builtins.h declares.
     assert ours.declares == declared
 
 

@@ -21,7 +21,7 @@ from clpipe.reference.transfer import srgb_curve
 LEVELS = 255  # sigmas are in 8-bit levels
 MAX_GAIN = 64  # the largest factor by which a difference is amplified
 LEFT = "2x2 leaves: the share of its variance after averaging 2x2 (independent noise: 0.25)"
-SHOWN = 99  # percentile of the differences that are not clipped after amplification
+SHOWN = 99  # percentile of the differences that amplification must not clip
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Comparison:
     labels: tuple[str, ...]
     places: tuple[Crop, ...]
     rows: tuple[Row, ...]
-    noise: tuple[Noise, ...]  # noise of each picture; empty if not known
+    noise: tuple[Noise, ...]  # noise of each picture; empty if unknown
     notes: tuple[str, ...]
 
     def record(self) -> dict[str, Any]:
@@ -106,7 +106,7 @@ def compare(
             )
     pictures, references = list(map(displayed, loaded)), list(map(displayed, true))
     places = choose_crops(crops, np.mean([one.pixels for one in references or pictures], axis=0))
-    if references:  # one for all, or one for each
+    if references:  # there is one reference for all pictures, or one for each
         references *= len(pictures) // len(references)
     rows = [Row(place.name, tuple(place.of(one.pixels) for one in pictures)) for place in places]
     if difference:

@@ -26,14 +26,14 @@ from clpipe.reference.curve import to_8_bit
 log = logging.getLogger(__name__)
 
 DPI = 300
-MAX_PIXELS = 1 << 26  # largest figure; drawing it takes 256 MB
-GAP = 12  # px, between crops and as the outer margin
-SIZE, SMALL = 7, 6  # points
-# In px, for text in DejaVu Sans of one point: the height of a line, and the width of a digit.
+MAX_PIXELS = 1 << 26  # pixels of the largest figure; drawing it takes 256 MB
+GAP = 12  # px; the gap between crops, and the outer margin
+SIZE, SMALL = 7, 6  # points; font sizes
+# px; the height of a line and the width of a digit, for DejaVu Sans at one point.
 LINE, LETTER = (each * DPI / 72 for each in (1.25, 0.64))
 
 SUFFIXES = (".png", ".pdf", ".svg")
-# Text stays text, each crop is an image, and files do not depend on the time.
+# Text remains text, and each crop is an image. Files do not depend on the time.
 STYLE = {
     "image.composite_image": False,
     "pdf.fonttype": 42,

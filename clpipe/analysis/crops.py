@@ -10,11 +10,11 @@ from clpipe.analysis.signature import luma
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Array, Doubles, Floats, Mask
 
-WIDTH, HEIGHT = 96, 64  # px, of an automatic crop
+WIDTH, HEIGHT = 96, 64  # px; the size of an automatic crop
 SMOOTH = 5  # px: the window over which noise is averaged before the search
 MIDDLE = 0.2, 0.8  # the range of a flat crop's mean display value
 BLACK = 0.08  # display value of luma below which nothing is visible
-MAX_BLACK = 0.05  # the largest share of such pixels in a dark crop
+MAX_BLACK = 0.05  # the largest share of pixels below BLACK in a dark crop
 
 MANUAL = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<box>\d{1,9},\d{1,9},\d{1,9}x\d{1,9})")
 

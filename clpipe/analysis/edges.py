@@ -12,7 +12,7 @@ from clpipe.base.types import Mask
 FLATTEST, STEEPEST = 25, 90  # percentiles of the gradient: flat below the first, steep above
 BINOMIAL = np.array([1, 4, 6, 4, 1]) / 16  # smooths luma like a Gaussian of 1 px
 REACH = len(BINOMIAL) // 2
-MIN_SAMPLES = 500  # pixels of each
+MIN_SAMPLES = 500  # pixels that flat areas and steep areas each need
 
 
 @dataclass(frozen=True, eq=False)

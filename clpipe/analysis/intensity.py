@@ -21,10 +21,10 @@ class NoiseCurve:
     """Noise by intensity: one value for each bin with enough samples, in ascending order."""
 
     bins: NDArray[np.int64]  # the numbers of the bins
-    mean: Doubles  # intensity
+    mean: Doubles  # mean intensity
     shift: Doubles  # the mean of the noise
     sigma: Doubles  # the standard deviation of the noise about the shift
-    count: NDArray[np.int64]  # samples
+    count: NDArray[np.int64]  # number of samples
 
 
 @dataclass(frozen=True)

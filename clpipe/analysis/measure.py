@@ -22,10 +22,10 @@ from clpipe.reference.cfa import sites
 from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.stage import Kind
 
-# The share of valid pixels, the channels, the correlations of their pairs, and covariances.
+# The share of valid pixels, the channels, the correlations of pairs of channels, and covariances.
 Parts = tuple[float, tuple[Channel, ...], dict[tuple[str, str], float], dict[str, Doubles]]
 
-CORRELATED = 4  # up to this many sites of a mosaic, all pairs are correlated
+CORRELATED = 4  # sites of a mosaic; if there are more, not all pairs are correlated
 
 
 def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseReport:
@@ -140,7 +140,7 @@ def clipped_samples(images: Sequence[Picture], frames: Floats) -> Mask:
     """Return a mask that is True for clipped samples, (frame, height, width[, channel])."""
     if images[0].kind != "values":
         return np.stack([image.clipped() for image in images])
-    # The levels are unknown, so only the smallest and the largest samples may be clipped.
+    # The clipping levels are unknown. Only the smallest and the largest samples may be clipped.
     low, high = frames.min(), frames.max()
     return ((frames <= low) | (frames >= high)) & (low < high)
 

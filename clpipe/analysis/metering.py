@@ -86,7 +86,7 @@ def exposures(
             own = loader.for_job(job)
             try:
                 loaded = own.enter(job, own.read(job))
-                assert loaded  # it may be None only if --start-at is used
+                assert loaded  # None is possible only with --start-at
                 runner = runner.for_chain(loaded.chain) if runner else Runner(loaded.chain, device)
                 metered = _metered(loaded, runner)
             except (ImageError, RequestError, MemoryError) as error:

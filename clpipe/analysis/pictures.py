@@ -30,10 +30,11 @@ class Picture:
     path: Path
     kind: str
     pixels: Floats
-    pattern: str = "RGGB"  # Bayer's, or rows of letters
+    pattern: str = "RGGB"  # a Bayer pattern, or rows of letters
     black: float | None = None
     white: float | None = None
-    balance: str = ""  # white balance gains removed and applied, as text, of a kept mosaic
+    # For a kept mosaic, the white balance gains that were removed and applied, as text.
+    balance: str = ""
     iso: float | None = None  # None if the file does not state it
     step: float = 0.0  # rounding step of a finished picture
 
@@ -49,7 +50,7 @@ class Picture:
         """A mask that is True for clipped samples, with the shape of the pixels."""
         clipped = np.zeros(self.pixels.shape, bool)
         if self.kind == "rgb":
-            # Linear RGB may be negative; clipping leaves exactly 0.
+            # Linear RGB may be negative, but clipped values are exactly 0.
             clipped |= self.pixels == 0
         if self.black is not None:
             clipped |= self.pixels <= self.black
@@ -67,13 +68,14 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
     Raises:
         ImageError: the file cannot be read, is a camera raw, or its settings are invalid.
     """
-    if path.suffix.lower() in RAW_SUFFIXES:  # some also contain a small picture
+    if path.suffix.lower() in RAW_SUFFIXES:  # some raws also contain a small picture
         raise ImageError(
             f"{path}: this is a camera raw, which this command does not read; run 'clpipe run' "
             "first: '--format png' develops it, '--keep normalize' keeps its mosaic"
         )
     iso, bits = photograph_info(path)
-    finished = read_finished(path, grey=bits == 8)  # grey of more bits may be a mosaic
+    # 8-bit grey is a picture; grey of more bits may be a mosaic.
+    finished = read_finished(path, grey=bits == 8)
     if finished is not None:
         step = 1 / (2**bits - 1)
         return Picture(path, "display", finished.pixels, black=0.0, white=1.0, iso=iso, step=step)

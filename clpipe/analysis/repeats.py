@@ -9,15 +9,16 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.outputs.noise_areas import halved
 
-# A repeat with less than this share of the others' noise energy counts as a ground truth. Among n
-# frames, measured against their mean, a ground truth has (n - 1) / (n^2 - n - 1), at most 0.4.
+# A repeat counts as a ground truth if it has less than this share of the others' noise energy.
+# Energies are measured against the mean of n frames. A ground truth then has the share (n - 1) /
+# (n^2 - n - 1), at most 0.4.
 TRUTH_SHARE = 0.6
 
 # A repeat shows another scene if averaging BLOCK x BLOCK pixels leaves more than this share of the
-# energy of its difference from the mean. Noise leaves 1 / BLOCK^2, and up to 0.02 if processing has
+# energy of its difference from the mean. Noise leaves 1 / BLOCK^2, or up to 0.02 if processing has
 # correlated it. Another view leaves 0.17.
 SCENE_SHARE = 0.08
-BLOCK = 32  # px
+BLOCK = 32  # px; the side of a block
 
 # A repeat is shifted if more than this share of the energy of its difference from the mean follows
 # the mean's gradient. Noise has at most 0.001, and a shift by a pixel has 0.2 at ISO 12800.

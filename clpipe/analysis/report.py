@@ -10,7 +10,7 @@ from clpipe.analysis.spatial import LineNoise
 from clpipe.analysis.statistics import HISTOGRAM, SIGMAS, Channel, gaussian_beyond
 from clpipe.base.types import Doubles
 
-# The unit of intensities and sigmas, by the kind of the images.
+# The unit of intensities and sigmas, for each kind of image.
 UNITS = {
     "display": "of full scale, display values",
     "rgb": "RGB before gamma",
@@ -36,7 +36,8 @@ class NoiseReport:
     notes: tuple[str, ...]
     iso: float | None = None  # None if the images do not state it
     bursts: int = 1  # number of bursts whose noise is pooled
-    at_edges: float = math.nan  # rms of luma noise at edges over flat areas; only for pictures
+    # RMS of luma noise at edges relative to flat areas; only for pictures.
+    at_edges: float = math.nan
     rounding: float = 0.0  # the variance that rounding in files adds to each channel
 
     def record(self) -> dict[str, Any]:

@@ -5,8 +5,8 @@ import numpy as np
 from clpipe.analysis.intensity import bin_of
 from clpipe.base.types import Doubles, Floats, Mask
 
-# If more than this share of a bin's samples are clipped, its statistics are distorted. The value is
-# a choice; tests/test_statistics.py shows what it selects.
+# Statistics of a bin are distorted if more than this share of its samples are clipped. We chose the
+# value; tests/test_statistics.py shows its effect.
 CLIPPED = 1e-3
 
 

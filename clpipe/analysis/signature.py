@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from clpipe.base.types import Doubles, Mask
 
 DRIFT = 12.0  # px; smoother differences are changes of light or focus, not noise
-SMOOTH = 3.0  # px: blur of the picture in which flat areas are found
-FLAT = 60  # percentile of the gradient
+SMOOTH = 3.0  # px; the picture is blurred by this sigma to find flat areas
+FLAT = 60  # percentile of the gradient below which an area is flat
 BIN = 8  # levels per bin of intensity
-MIN_SAMPLES = 200  # samples in a bin
-DARKEST, BRIGHTEST = 30, 225  # luma
+MIN_SAMPLES = 200  # samples that a bin needs
+DARKEST, BRIGHTEST = 30, 225  # luma of the darkest and brightest pixels that are measured
 
-LUMA = np.array([0.299, 0.587, 0.114])  # BT.601
+LUMA = np.array([0.299, 0.587, 0.114])  # weights of BT.601
 
 
 def luma(pixels: NDArray[np.number]) -> Doubles:

@@ -9,9 +9,9 @@ import numpy as np
 from clpipe.analysis.measure import measure_against
 from clpipe.analysis.pictures import Picture
 
-PER_STOP = 2  # steps of intensity
+PER_STOP = 2  # steps per stop of intensity
 MIN_SAMPLES = 400  # samples in a step, for which the standard error of the ratio is 0.3 dB
-STOPS = 24  # the lowest step is this far below the brightest
+STOPS = 24  # stops between the lowest step and the brightest one
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from clpipe.base.types import Doubles, Floats, Mask
 
-LAGS = 8  # the largest lag, px
+LAGS = 8  # px; the largest lag
 
 
 @dataclass(frozen=True)

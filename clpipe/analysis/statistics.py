@@ -14,8 +14,8 @@ from clpipe.analysis.intensity import NoiseCurve, VarianceLaw, fit_variance
 from clpipe.analysis.spatial import LineNoise, autocorrelation, energy_left, line_noise
 from clpipe.base.types import Doubles, Floats, Mask
 
-SIGMAS = (2, 3, 4, 5)  # the distances from 0 beyond which samples are counted
-HISTOGRAM = np.linspace(-6.05, 6.05, 122)  # edges, so that 0 is in the middle of a bin
+SIGMAS = (2, 3, 4, 5)  # distances from 0; samples farther away are counted
+HISTOGRAM = np.linspace(-6.05, 6.05, 122)  # edges of bins; 0 is in the middle of a bin
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,9 @@ class Tails:
 
     skewness: float
     excess_kurtosis: float
-    beyond: tuple[float, ...]  # share of the samples further from 0 than each of SIGMAS
-    histogram: NDArray[np.int64]  # counts between HISTOGRAM's edges; the end bins have the rest
+    beyond: tuple[float, ...]  # share of samples whose distance from 0 exceeds each of SIGMAS
+    # Counts between HISTOGRAM's edges; the end bins include all farther samples.
+    histogram: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -33,14 +34,14 @@ class Channel:
     """The noise of one channel; sigmas are in the channel's unit."""
 
     name: str
-    count: int  # samples, over all frames
+    count: int  # samples in all frames
     sigma: float
     curve: NoiseCurve
     law: VarianceLaw | None
     rows: LineNoise
     columns: LineNoise
     autocorrelation: Doubles  # (17, 17), down and right from -8 to 8; [8, 8] is 1
-    energy_left: float  # share, after averaging 2x2 pixels
+    energy_left: float  # share of the energy that remains after averaging 2x2 pixels
     tails: Tails
     whole_sigma: float = math.nan  # sigma of all pixels, including invalid ones
     whole_curve: NoiseCurve | None = None  # noise curve of all pixels

@@ -33,7 +33,7 @@ NEUTRAL = INK["mosaic"]
 PAGE_FILES = resources.files("clpipe.analysis") / "page"  # files that report and explorer share
 PAGE = "#010203"  # placeholder for the page's colour
 COLOURS = ("#1f8a8a", "#d9822b", "#7a5bb5", "#c8102e")
-LONG = 18  # characters of a name next to a bar
+LONG = 18  # characters of the longest name next to a bar
 SETTINGS = {
     "svg.fonttype": "none",
     "svg.hashsalt": "clpipe",
@@ -174,7 +174,7 @@ def noise_svg(report: NoiseReport) -> str:
         draw_tails(below[0], report)
         figure.legend(*above[0].get_legend_handles_labels(), loc="center right")
         for axes in (above[0], below[0]):
-            axes.get_legend().remove()  # it would cover a curve
+            axes.get_legend().remove()  # a legend would cover a curve
         first = mapped(report)[0]
         picture = draw_autocorrelation(below[1], first, peak(first), report)
         figure.colorbar(picture, ax=below[1], shrink=0.8)

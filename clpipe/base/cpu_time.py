@@ -48,7 +48,7 @@ class CpuTimes:
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self.elsewhere = 0.0
-        self._lock = threading.Lock()  # guards the sums, to which threads add at their end
+        self._lock = threading.Lock()  # guards the sums; each thread adds to them when it ends
         self._threads = threading.local()
 
     def __enter__(self) -> Self:

@@ -17,7 +17,7 @@ def stamp_of(path: Path) -> tuple[int, int]:
     """
     try:
         info = path.stat()
-    except (OSError, ValueError):  # missing, or the name is invalid
+    except (OSError, ValueError):  # the file is missing, or the name is invalid
         url = url_of(path)
         return stamp_of_url(url) if url else (0, 0)
     return info.st_size, info.st_mtime_ns

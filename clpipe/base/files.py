@@ -42,7 +42,8 @@ _unfinished: set[Path] = set()  # temporary files of this process, for `remove_t
 # because a signal handler may acquire it while its own thread holds it.
 _creation_lock = threading.RLock()
 
-MAX_NAME_BYTES = 200  # bytes of a name that its temporary name repeats; file systems allow 255
+# A temporary name repeats at most this many bytes of a name; file systems allow 255.
+MAX_NAME_BYTES = 200
 
 
 def shorten_name(name: str) -> str:
@@ -97,7 +98,7 @@ class FileGroup:
         ):
             with _write_errors(path):
                 if number == last:
-                    os.utime(temporary)  # so that it is newer than the files that it describes
+                    os.utime(temporary)  # makes the file newer than the files that it describes
                 temporary.replace(path)
             _unfinished.discard(temporary)
 
@@ -128,7 +129,7 @@ class FileGroup:
             except ImageError as error:
                 group.discard()
                 errors.append(error)
-            except BaseException:  # unexpected
+            except BaseException:  # an unexpected error ends the loop
                 for unfinished in groups[number:]:
                     unfinished.discard()
                 raise
@@ -209,7 +210,7 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
                 yield file
                 file.flush()
                 if not hasattr(_thread, "group"):
-                    os.fsync(file.fileno())  # else a power failure can leave an empty file
+                    os.fsync(file.fileno())  # otherwise a power failure can leave an empty file
             if group := getattr(_thread, "group", None):
                 group.add(temporary, path)
             else:

@@ -141,7 +141,7 @@ def _free_in_group(
             return None
         remaining = maximum - int((folder / used).read_text("utf-8"))
         lines = (folder / "memory.stat").read_text("utf-8").splitlines()
-    except (OSError, ValueError):  # missing, or "max": no limit
+    except (OSError, ValueError):  # the file is missing, or contains "max", which means no limit
         return None
     values = {name: int(value) for name, _, value in (line.partition(" ") for line in lines)}
     both = (values.get(cached.format(state), 0) for state in ("active", "inactive"))

@@ -67,7 +67,7 @@ def _create_folder(temporary: Path) -> Path:
     with suppress(OSError):
         parent.mkdir(mode=0o700)
     if parent.is_symlink() or not parent.is_dir() or writable_by_others(parent):
-        parent = temporary  # another user has created it
+        parent = temporary  # another user has created the directory
     elif fcntl:
         for folder in parent.iterdir():
             if NAME.fullmatch(folder.name) and not folder.is_symlink():

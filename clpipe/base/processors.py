@@ -26,6 +26,6 @@ def _quota(folder: Path, is_first_version: bool) -> int | None:
             quota, period = (int((folder / name).read_text()) for name in names)
         else:
             quota, period = map(int, (folder / "cpu.max").read_text().split())
-    except (OSError, ValueError):  # missing, or "max": no limit
+    except (OSError, ValueError):  # the file is missing, or contains "max", which means no limit
         return None
     return -(-quota // period) if quota > 0 and period > 0 else None

@@ -23,11 +23,12 @@ from clpipe.base.text import similar_names
 
 T = TypeVar("T")
 
-TEXT_BYTES = 16 * 2**20  # the limit for configurations, curves and sidecars, not for manifests
+# Bytes; the largest configuration, curve or sidecar (manifests may be larger).
+TEXT_BYTES = 16 * 2**20
 
-KEY_PARTS = 32  # limit for dotted keys, because tomllib's memory grows with the square of the parts
+KEY_PARTS = 32  # parts of a dotted key; limited because tomllib's memory grows with their square
 
-MAX_SEARCHED = 20_000  # the most names of a folder to search for a similar one
+MAX_SEARCHED = 20_000  # files of a folder that are searched for a similar name
 
 FILE_TYPES = {
     stat.S_IFDIR: "a folder",
@@ -156,7 +157,7 @@ def read_bytes(path: Path, max_bytes: int = TEXT_BYTES) -> bytes:
     size = check_regular(path).st_size
     with path.open("rb") as file:
         data = b"" if size > max_bytes else file.read(size + 1)
-        if len(data) > size:  # it has grown
+        if len(data) > size:  # the file has grown
             data += file.read(max_bytes + 1 - len(data))
     if max(size, len(data)) > max_bytes:
         found = format_bytes(max(size, len(data)))

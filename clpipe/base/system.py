@@ -30,7 +30,7 @@ def _optional(name: str) -> Any:
 
 fcntl, msvcrt, resource = (_optional(name) for name in ("fcntl", "msvcrt", "resource"))
 
-# Bytes of a file that can be locked, also beyond its end. Windows's C runtime counts with 31 bits.
+# Bytes of a file that can be locked, also after its end. Windows's C runtime counts with 31 bits.
 LOCKABLE_BYTES = 2**40 if fcntl else 2**30
 
 _ARENA_MAX = -8  # mallopt's parameter for the largest number of heaps in glibc
@@ -142,7 +142,8 @@ def close_and_remove(path: Path, file: int, first: int, length: int) -> None:
             msvcrt.locking(file, msvcrt.LK_UNLCK, length)
     os.close(file)
     if msvcrt and not fcntl:
-        with contextlib.suppress(OSError):  # fails on Windows if another process has it open
+        # On Windows, this fails if another process has opened the file.
+        with contextlib.suppress(OSError):
             path.unlink()
 
 
@@ -230,7 +231,7 @@ def use_single_heap() -> None:
     Otherwise glibc reserves 64 MiB of address space for each thread's heap and uses little of it.
     """
     os.environ["MALLOC_ARENA_MAX"] = "1"
-    with contextlib.suppress(OSError, TypeError, AttributeError):  # another C library
+    with contextlib.suppress(OSError, TypeError, AttributeError):  # the C library is not glibc
         _libc().mallopt(_ARENA_MAX, 1)
 
 

@@ -87,7 +87,7 @@ def one_line(text: str) -> str:
     >>> one_line("in/a" + chr(10) + chr(27) + "[31m.exr")
     'in/a\\n\\x1b[31m.exr'
     """
-    if text.isprintable():  # as nearly all are
+    if text.isprintable():  # nearly all texts are printable
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 

@@ -194,7 +194,7 @@ class Trace:
         text = self._text(function, arguments)
         index = self._line_numbers.get(text, len(self._lines))
         line = f"v{index} = {text}"
-        if self._lines[index : index + 1] != [line]:  # else it has been computed before
+        if self._lines[index : index + 1] != [line]:  # otherwise the value has been computed before
             index = self._line_numbers[text] = len(self._lines)
             self._lines.append(f"v{index} = {text}")
         return Traced(self, f"v{index}", result)
@@ -307,7 +307,8 @@ class _CopyWriter:
 
     def __init__(self, trace: Trace) -> None:
         self._trace = trace
-        self._texts: dict[int, tuple[Any, str | None]] = {}  # with the object, to keep it alive
+        # Holds the object as well, to keep it alive.
+        self._texts: dict[int, tuple[Any, str | None]] = {}
         self._open: set[int] = set()
 
     def text(self, value: Any) -> str | None:
@@ -321,7 +322,7 @@ class _CopyWriter:
         if isinstance(value, (str, type, type(None), *NUMBER_TYPES)):
             return None
         key = id(value)
-        if key in self._open:  # it refers to itself
+        if key in self._open:  # the object refers to itself
             self._texts[key] = value, None
             return None
         if key not in self._texts:
@@ -347,7 +348,7 @@ class _CopyWriter:
         if not any(texts.values()):
             return None
         constant = self._trace._constant
-        # With all names, to preserve their order.
+        # Contains all names, to preserve their order.
         known = constant({n: None if text else attributes[n] for n, text in texts.items()})
         changes = ", ".join(f"{name!r}: {text}" for name, text in texts.items() if text)
         if isinstance(value, BaseModel):

@@ -33,9 +33,9 @@ SPOOL = "clpipe-spool"
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://(.+)")
 
 MAX_TRIES = 6
-FIRST_WAIT = 0.25  # s; doubled each time
+FIRST_WAIT = 0.25  # s; each further wait is twice as long
 
-# The names of a file's checksum or modification time in file systems, in order of preference.
+# Names that file systems use for a file's checksum or modification time, in order of preference.
 CHANGE_KEYS = ["ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime"]
 CHANGE_KEYS += ["updated", "modified", "created"]
 

@@ -36,7 +36,7 @@ CONVERTERS: dict[str, Callable[[Any], Any]] = {
 # Options whose fields in Request, Images and ExecutionOptions have other names.
 FIELD_NAMES = {"format": "formats", "webdataset": "per_tar", "device": "devices", "jobs": "threads"}
 
-Texts = str | Path | Sequence[str | Path]  # one or several
+Texts = str | Path | Sequence[str | Path]  # one text or several
 
 
 @check_argument_types

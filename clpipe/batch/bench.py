@@ -32,13 +32,13 @@ from clpipe.stage import Kind
 
 TRANSFERS = ("upload", "download")
 
-# Steps that take CPU time, in order. "Python" is the time outside all other steps.
+# Steps that take CPU time, in order. "Python" is the time outside the other steps.
 CPU_STEPS = (
     *("decode", "convert", "hash", "upload", "kernels", "download", "encode", "write"),
     "Python",
 )
 
-DISTINCT_RENDERS = 4  # other renders are links to these
+DISTINCT_RENDERS = 4  # distinct renders; further renders are links to them
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def bench_batch(device: Device, request: Request, workload: Workload) -> BatchSp
             (folder / "out").mkdir()
             return Batch(ImageWorker(loader, Folder(writer), chain, trace=True), [device])
 
-        # A short batch first, so that kernels are compiled and files are cached before the timing.
+        # Run a short batch first, to compile kernels and cache files before the timing.
         list(batch().run(jobs[: 2 * DISTINCT_RENDERS]))
         reset_peak_memory()
         timed = batch()

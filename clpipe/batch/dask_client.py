@@ -36,18 +36,19 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.folder import remove_unfinished
 
-CONNECT_TIMEOUT = 10.0  # s, for the scheduler to answer and for its first worker
+CONNECT_TIMEOUT = 10.0  # s; the wait for the scheduler's answer, and for the first worker
 
-WORKER_TIMEOUT = 60.0  # s without any worker; nannies and job queues start new ones
+WORKER_TIMEOUT = 60.0  # s; the time without any worker. Nannies and job queues start new workers.
 
 RETRIES = 2  # retries of a chunk that ended with an unexpected error
 
-FIRST_CHUNK, MAX_CHUNK = 4, 64  # images in a chunk
+FIRST_CHUNK, MAX_CHUNK = 4, 64  # number of images in a chunk
 
+# s; chunks grow after one that took less time, and shrink after one that took more.
 SHORT_CHUNK, LONG_CHUNK = (
     15.0,
     60.0,
-)  # s; chunks grow after a shorter one, and shrink after a longer one
+)
 
 
 @contextlib.contextmanager
@@ -113,9 +114,10 @@ class Cluster:
         self._address = address
         self._spec = spec.with_absolute_paths()
         self.is_stopping = False
-        self._finished: queue.SimpleQueue[Any] = queue.SimpleQueue()  # futures; None: stop
-        self._running: dict[Any, tuple[list[Job], bool]] = {}  # chunks, and whether each runs alone
-        self._last_worker_time = time.monotonic()  # when there was a worker last
+        self._finished: queue.SimpleQueue[Any] = queue.SimpleQueue()  # futures; None means stop
+        # Jobs of each chunk, and whether the chunk runs alone.
+        self._running: dict[Any, tuple[list[Job], bool]] = {}
+        self._last_worker_time = time.monotonic()  # the last time at which there was a worker
 
     def stop(self) -> None:
         """Begin no more images, and finish those in flight. A signal handler may call it."""
@@ -139,7 +141,7 @@ class Cluster:
     def _probe(self, jobs: Sequence[Job]) -> None:
         """Check that all workers have one environment, and see the same files as this machine."""
         is_raw = ImageLoader(self._spec.request).raw.is_raw
-        # As in first_chain(), the chain of a raw is compiled only if all inputs are raws.
+        # Like in first_chain(), the chain of a raw is compiled only if all inputs are raws.
         usable = [job for job in jobs if not job.problem] or jobs
         first = next((job for job in usable if not is_raw(job.path)), usable[0])
         spec = replace(self._spec, first=first)
@@ -184,7 +186,8 @@ class Cluster:
             self._finish()
             raise
         patches = self._spec.request.patch is not None
-        remove_unfinished(self._spec.execution.output, jobs, patches)  # by workers that died
+        # Removes files of workers that died.
+        remove_unfinished(self._spec.execution.output, jobs, patches)
         if failure:
             raise failure
 
@@ -231,7 +234,8 @@ class Cluster:
             return future.result()
         except KilledWorker as error:
             if not alone:
-                chunks.suspects += chunk  # another chunk on these workers may be to blame
+                # Another chunk on these workers may have caused the deaths.
+                chunks.suspects += chunk
                 return ChunkReport((), LONG_CHUNK)
             deaths = f"{error.allowed_failures + 1} in all, the last one {_worker_name(error)}"
             return _failed(chunk, f"killed the worker that took it, {deaths}")
@@ -240,7 +244,7 @@ class Cluster:
                 raise self._lost_cluster() from None
             return _failed(chunk, f"on a worker: {type(error).__name__}: {error}")
         finally:
-            future.release()  # otherwise Dask repeats it if its worker dies
+            future.release()  # otherwise Dask recomputes the result if its worker dies
 
     def _halt(self) -> None:
         """Let the workers finish the images in flight, and begin no others."""

@@ -98,10 +98,10 @@ _one_chunk = threading.Lock()  # lets one chunk at a time use this worker's devi
 
 _halted: set[str] = set()
 
-_batches: dict[str, Batch] = {}  # by the name of the run
+_batches: dict[str, Batch] = {}  # batches by the name of the run
 
 
-@lru_cache(maxsize=1)  # the share changes as workers come and go
+@lru_cache(maxsize=1)  # one entry, because the share changes when workers come and go
 def _devices(
     selectors: tuple[str, ...], memory: int | None, share: tuple[int, int]
 ) -> Sequence[Device | None]:
@@ -116,7 +116,7 @@ def share_on_machine(worker: str, workers: Collection[str]) -> tuple[int, int]:
     (1, 3)
     """
     scheme_and_host, _, port = worker.rpartition(":")
-    if not port.isdecimal():  # within one process
+    if not port.isdecimal():  # the address is within one process
         return 0, 1
     neighbours = sorted({worker, *(w for w in workers if w.rpartition(":")[0] == scheme_and_host)})
     return neighbours.index(worker), len(neighbours)
@@ -204,7 +204,7 @@ def run_chunk(spec: DaskSpec, jobs: Sequence[Job]) -> ChunkReport:
             clock_offset = time.time() - time.perf_counter()
             for outcome in batch.run(jobs):
                 outcomes.append(shifted(as_written(outcome), clock_offset, f"{worker.address} "))
-                if is_abandoned():  # by the process that started the run
+                if is_abandoned():  # the process that started the run has abandoned it
                     batch.stop()
         except ClpipeError as problem:
             error = problem

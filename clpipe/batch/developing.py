@@ -19,7 +19,7 @@ from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.outputs.recipes import Recipe
 
-MAX_STACK = 16  # small images that share launches
+MAX_STACK = 16  # the most small images that share launches
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ class RenditionTask:
             written.group.discard()
 
 
-# Groups of orders that were started together, each with a function that waits for its result.
+# Groups of orders that were started together. Each group has a function that waits for its result.
 Started = deque[deque[tuple[RenditionTask, Callable[[], Result | None]]]]
 
 
@@ -79,18 +79,17 @@ class Developers:
         fail: Callable[[BaseException], None],
     ) -> None:
         self.devices = devices
-        self.max_in_flight = threads + len(
-            devices
-        )  # renditions of one image that are in flight at a time
+        # The most renditions of one image that are in flight at a time.
+        self.max_in_flight = threads + len(devices)
         self._worker = worker
         self._budget = budget
         self._on_compiled = compiled
         self._fail = fail
-        self._tasks: queue.SimpleQueue[list[RenditionTask] | None] = (
-            queue.SimpleQueue()
-        )  # small ones together
+        # Small renditions are put together.
+        self._tasks: queue.SimpleQueue[list[RenditionTask] | None] = queue.SimpleQueue()
         self._encoders = ThreadPoolExecutor(threads, "encode")
-        self._is_needed = threading.Event()  # set by the first image to be made, and at the end
+        # Set when the first image has to be developed, and at the end.
+        self._is_needed = threading.Event()
         self._is_closing = False
         self._usable = len(devices)
         self._usable_lock = threading.Lock()  # guards the number of usable devices
@@ -128,7 +127,7 @@ class Developers:
                 self._put(small)
             limit = MAX_STACK if is_small else self.max_in_flight
             for recipe in state.recipes:
-                # Baselines take their noise from the renditions before them.
+                # Baselines are matched to the noise of earlier renditions.
                 while pending and (len(pending) >= limit or recipe.matcher):
                     self._put(small)
                     pending.popleft().written.exception()
@@ -138,7 +137,8 @@ class Developers:
                 if not is_small:
                     self._put(small)
         self._put(small)
-        for task in reversed(pending):  # the last one first, so as to wait once
+        # Waits for the last task first, so that the others are usually finished.
+        for task in reversed(pending):
             task.written.exception()
         return tasks_by_state
 
@@ -150,7 +150,7 @@ class Developers:
 
     def develop_all(self, device: Device | None) -> None:
         """Develop orders until there are no more, or the device fails."""
-        self._is_needed.wait()  # a run that skips all images compiles nothing
+        self._is_needed.wait()  # if a run skips all images, nothing is compiled
         if self._is_closing:
             return
         pending: list[RenditionTask] = []
@@ -206,7 +206,7 @@ class Developers:
                 continue
             if tasks is None:
                 if taken:
-                    self._tasks.put(None)  # for the next call
+                    self._tasks.put(None)  # the next call must also find the end
                     break
                 while started:
                     self._finish(started, device)
@@ -277,6 +277,6 @@ class Developers:
         except OutputError as error:
             task.state.error = failure_text(task.state.job, error)
             self._fail(error)
-        except BaseException as error:  # no image may end a thread
+        except BaseException as error:  # an error of an image must not end the thread
             task.state.error = failure_text(task.state.job, error)
         task.written.set_result(written)

@@ -12,7 +12,7 @@ from clpipe.base.files import remove_temporary_files
 from clpipe.outputs.folder import release_folders
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-INTERRUPTED = 130  # the exit status
+INTERRUPTED = 130  # exit status
 
 
 @contextlib.contextmanager
@@ -35,7 +35,7 @@ def interruptible(stop: Callable[[], None]) -> Iterator[None]:
             os._exit(INTERRUPTED)
         is_stopping = True
         stop()
-        # Not print(): the signal may have interrupted one.
+        # No print() here, because the signal may have interrupted another print().
         with contextlib.suppress(OSError):
             os.write(sys.stderr.fileno(), b"\nfinishing images in progress; repeat to stop now\n")
 

@@ -31,17 +31,18 @@ class JobState:
     began: float = field(default_factory=time.time)
     spans: list[Span] = field(default_factory=list)
     source: SourceImage | None = None
-    stamps: Sequence[tuple[int, int]] = ()  # size and time of change of each of its files
-    request: Mapping[str, Any] = field(default_factory=dict)  # the record of its request
+    stamps: Sequence[tuple[int, int]] = ()  # size and modification time of each file of the job
+    request: Mapping[str, Any] = field(default_factory=dict)  # record of the job's request
     recipes: list[Recipe] = field(default_factory=list)
-    unwritten: int = 0  # renditions
+    unwritten: int = 0  # number of renditions that are not yet written
     status: str = DONE
     error: str = ""
     reason: str = ""
     outputs: list[str] = field(default_factory=list)
-    carried_layers: CarriedLayers | None = None  # carried layers, until they are written
-    clipped: float = 0.0  # the largest share of clipped pixels of its renditions
-    patches: list[Patch] = field(default_factory=list)  # that are written instead of pictures
+    carried_layers: CarriedLayers | None = None  # None after they are written
+    clipped: float = 0.0  # the largest share of clipped pixels in a rendition
+    # Patches that are written instead of pictures.
+    patches: list[Patch] = field(default_factory=list)
     old: int = 0  # existing renditions that another version of the program made
 
     def drop_pixels(self) -> None:

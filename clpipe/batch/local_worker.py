@@ -25,7 +25,7 @@ from clpipe.batch.spec import RunSpec
 from clpipe.batch.threads import Batch, Jobs
 from clpipe.engine.device import Device, open_devices
 
-COLLECT_SECONDS = 0.005  # s for which outcomes are collected into one message
+COLLECT_SECONDS = 0.005  # s; outcomes of this time are sent in one message
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class ProcessConfig:
 def main(file: int) -> None:
     """Work for the run at the other end of a connection, given by its file descriptor."""
     pipe = _PipeToRun(Connection(file))
-    gc.freeze()  # imported modules stay, so the collector need not visit them
+    gc.freeze()  # imported modules remain in use, so the collector need not visit them
     spec, config = pipe.receive()
     if config.processors:
         bind_to_processors(config.processors)

@@ -14,13 +14,14 @@ from clpipe.chain.formats import DNG, FORMATS
 from clpipe.engine.device import Device
 from clpipe.images.claims import MemoryClaim
 
-FLOAT_PIXEL = 12  # bytes of a pixel of three floats
-NUMPY_PIXEL = 16 * FLOAT_PIXEL  # bytes of a pixel while the chain runs in NumPy; measured: 152
-UNCOUNTED = 8 << 20  # bytes that are not counted, in addition to an eighth of an image
-COMPILE_MEMORY = 160 << 20  # bytes that compiling all kernels takes; measured: 100 to 140 MiB
-MIN_DEVICE_MEMORY = 32 << 20  # bytes of device memory that suffice for a large image in tiles
-WAIT_SECONDS = 1.0  # s to wait for memory that earlier images free a little after their end
-MEASUREMENT_SECONDS = 0.1  # s for which a measurement is used: it takes 0.4 ms, a small image 10 ms
+FLOAT_PIXEL = 12  # bytes; a pixel of three floats
+NUMPY_PIXEL = 16 * FLOAT_PIXEL  # bytes; a pixel while the chain runs in NumPy (measured: 152)
+UNCOUNTED = 8 << 20  # bytes; memory that is not counted, in addition to an eighth of an image
+COMPILE_MEMORY = 160 << 20  # bytes; memory for compiling all kernels (measured: 100 to 140 MiB)
+MIN_DEVICE_MEMORY = 32 << 20  # bytes; device memory that suffices for a large image in tiles
+WAIT_SECONDS = 1.0  # s; the wait for memory that earlier images free shortly after they end
+# s; a measurement is reused for this time. It takes 0.4 ms, and a small image takes 10 ms.
+MEASUREMENT_SECONDS = 0.1
 
 
 def default_budget(sharing: int = 1) -> int | None:
@@ -65,7 +66,7 @@ def host_bytes(
         return 0
     float_formats = [FORMATS[name] for name in formats if name != DNG and FORMATS[name].bits > 8]
     kept = len(keep) + bool(float_formats) + (DNG in formats)
-    # Encoders of integers of 16 bits compute in double precision.
+    # Encoders of 16-bit integers compute in double precision.
     encoding = max(
         (24 if each.floats else 36 for each in float_formats), default=FLOAT_PIXEL if kept else 1
     )
@@ -99,18 +100,19 @@ class MemoryBudget:
         self._size = size
         self._sharing = [each for each in devices if each and each.info.zero_copy]
         has_staged = any(each and not each.info.zero_copy for each in devices)
-        self._staging = size or 0 if has_staged else 0  # for staging buffers of GPUs
+        self._staging = size or 0 if has_staged else 0  # bytes; staging buffers of GPUs
         self._compiling = len(devices)
         self._drop = drop
         self._left = left or free_memory
-        self._limits: dict[
-            Device, int
-        ] = {}  # usual memory limits of devices while one image uses less
+        # The usual memory limits of devices whose limit is lowered for a large image.
+        self._limits: dict[Device, int] = {}
         self._max_free = 0  # the most bytes that were ever free for one image and the devices
         self._measured: tuple[float, FreeMemory | None] = 0.0, FreeMemory(0, "")
-        self._taken: dict[str, int] = {}  # bytes, by the stem of an image
-        self._queue = threading.Lock()  # lets one image wait at a time, so none overtakes it
-        self._changed = threading.Condition()  # guards all of the above; notified when they change
+        self._taken: dict[str, int] = {}  # bytes by the stem of an image
+        # Lets one image wait at a time, so that no image overtakes it.
+        self._queue = threading.Lock()
+        # Guards the attributes above, and is notified when one changes.
+        self._changed = threading.Condition()
         self._is_closed = False
 
     def acquire(self, name: str, size: int) -> None:
@@ -187,9 +189,8 @@ class MemoryBudget:
         self._drop()
         trim_memory()
         free = self._free(size)
-        min_memory = min(
-            MIN_DEVICE_MEMORY, 4 * size + UNCOUNTED // 2
-        )  # the planes of a small image are no larger
+        # A small image needs less device memory, because its planes are smaller.
+        min_memory = min(MIN_DEVICE_MEMORY, 4 * size + UNCOUNTED // 2)
         possible = self._max_free - sum(min(each.memory, min_memory) for each in self._sharing)
         if needed(size) <= possible:
             for device in self._sharing:

@@ -35,17 +35,21 @@ from clpipe.outputs.folder import remove_unfinished
 
 log = logging.getLogger(__name__)
 
-# A model of an image's CPU time, which determines the number of processes (docs/performance.md):
-# ms under the interpreter's lock, ms in total, and further ms for each megapixel.
+# ms; a model of an image's CPU time, which determines the number of processes
+# (docs/performance.md). The values are the time under the interpreter's lock, the total time, and
+# the additional time for each megapixel.
 LOCKED_MS, IMAGE_MS, MEGAPIXEL_MS = 2.0, 3.0, 25.0
-MAX_LOCK_SHARE = 0.5  # threads wait for the lock if it is held for more of a process's time
-MIN_WORK_MS = 1200  # ms of work that justify a process; starting one takes 600
-SMALL_MEGAPIXELS = 2.5  # up to this size, reading and developing need not overlap
-PROCESS_MEMORY = 400 << 20  # bytes for each process
+# Share of a process's time; if the lock is held for longer, threads wait for it.
+MAX_LOCK_SHARE = 0.5
+MIN_WORK_MS = 1200  # ms; work that justifies a process. Starting a process takes 600 ms.
+SMALL_MEGAPIXELS = 2.5  # megapixels; up to this size, reading and developing need not overlap
+PROCESS_MEMORY = 400 << 20  # bytes per process
 
-MAX_QUEUED, MIN_QUEUED = 64, 12  # jobs that a process holds: at most, and towards the end
-MAX_DEATHS = 3  # deaths of processes after which their job fails, or during their start the run
-MAX_FRUITLESS = 20  # deaths in a row without an outcome after which the run fails
+# The most jobs that a process holds, usually and near the end of the run.
+MAX_QUEUED, MIN_QUEUED = 64, 12
+# After this many deaths of processes, their job fails. If they die while starting, the run fails.
+MAX_DEATHS = 3
+MAX_FRUITLESS = 20  # the run fails after this many deaths in a row without an outcome
 
 PROGRAM = (
     "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "
@@ -53,10 +57,11 @@ PROGRAM = (
     "import json, sys; sys.path[:] = json.loads({path!r}); {start}"
 )
 START = "from clpipe.batch.local_worker import main; main(int(sys.argv[1]))"
+# The name up to PoCL 3.1, and the name since PoCL 4.
 THREADS = (
     "POCL_MAX_PTHREAD_COUNT",
     "POCL_CPU_MAX_CU_COUNT",
-)  # the name up to PoCL 3.1, and the name since PoCL 4
+)
 
 
 def default_processes(images: int, claim: MemoryClaim, processors: int) -> int:
@@ -93,9 +98,9 @@ class _Process:
     popen: "subprocess.Popen[bytes]"
     connection: Connection
     listener: threading.Thread = field(default_factory=threading.Thread)
-    jobs: dict[str, Job] = field(default_factory=dict)  # that it holds, by stem
-    is_alone: bool = False  # whether it is testing one suspect job
-    is_ready: bool = False  # whether it has opened its devices
+    jobs: dict[str, Job] = field(default_factory=dict)  # jobs of the process, by stem
+    is_alone: bool = False  # whether the process is testing one suspect job
+    is_ready: bool = False  # whether the process has opened its devices
 
     def close(self) -> int:
         """Wait for its end, and return its exit status."""
@@ -122,9 +127,12 @@ class Processes:
         self._messages = queue.SimpleQueue()
         self._processes: list[_Process] = []
         self._remaining: deque[Job] = deque()
-        self._suspects: deque[Job] = deque()  # held by a process that died; tried alone at the end
-        self._deaths: Counter[str] = Counter()  # deaths of processes that held a job, by its stem
-        self._is_compiled = False  # whether one has compiled the kernels, which are cached
+        # Jobs of processes that died; each is tried separately at the end.
+        self._suspects: deque[Job] = deque()
+        # For each job's stem, the deaths of processes that held the job.
+        self._deaths: Counter[str] = Counter()
+        # Whether a process has compiled the kernels, which are then cached.
+        self._is_compiled = False
         self._early_deaths = 0  # processes in a row that died before they were ready
         self._fruitless_deaths = 0  # processes that died since the last outcome
         self._logged: set[str] = set()
@@ -153,7 +161,7 @@ class Processes:
                 except RequestError:
                     if not self._processes:
                         raise
-                    self._count = number  # the system allows no more
+                    self._count = number  # the system allows no more processes
                     break
             self._distribute_jobs()
             while not self._is_finished:
@@ -166,9 +174,8 @@ class Processes:
         finally:
             self._end()
             patches = self._spec.request.patch is not None
-            remove_unfinished(
-                self._spec.execution.output, all_jobs, patches
-            )  # by processes that died
+            # Remove the unfinished files of processes that died.
+            remove_unfinished(self._spec.execution.output, all_jobs, patches)
         if self._failure:
             raise self._failure
 
@@ -210,7 +217,7 @@ class Processes:
             with blocked_signals(SIGNALS), child_end:
                 file = child_end.fileno()
                 popen = subprocess.Popen(  # noqa: S603 - this program
-                    # -P: no module comes from the working directory.
+                    # -P: do not import modules from the working directory.
                     [sys.executable, "-P", "-c", program, str(file)],
                     stdin=subprocess.DEVNULL,
                     stdout=2,  # libraries may print; stdout is for the run's own output
@@ -232,7 +239,7 @@ class Processes:
         try:
             while True:
                 self._messages.put((process, process.connection.recv()))
-        except Exception:  # EOFError at its end; a damaged message counts as its end
+        except Exception:  # EOFError marks the end; a damaged message counts as the end
             self._messages.put((process, ("gone",)))
 
     @staticmethod
@@ -255,7 +262,7 @@ class Processes:
                 process.is_alone &= bool(process.jobs)
                 return [shifted(outcome, 0.0, f"{process.config.number} ") for outcome in outcomes]
             case ("log", int(level), str(text)):
-                if text not in self._logged:  # every process logs it
+                if text not in self._logged:  # every process logs the same text
                     self._logged.add(text)
                     log.log(level, "%s", text)
             case ("failed", ClpipeError() as error):
@@ -284,7 +291,8 @@ class Processes:
             threads = self._spec.execution.threads or process.config.threads
             min_queued = MIN_QUEUED if process.config.sequential else threads + 3
             max_queued = max(min(MAX_QUEUED, len(self._remaining) // (2 * self._count)), min_queued)
-            if len(process.jobs) > max_queued // 2:  # a message for one or two jobs does not pay
+            # A message for only one or two jobs is not worthwhile.
+            if len(process.jobs) > max_queued // 2:
                 continue
             count = min(max_queued - len(process.jobs), len(self._remaining))
             if not count and self._suspects and not process.jobs:
@@ -340,7 +348,7 @@ class Processes:
             self._send(process, "stop" if process.jobs else "end")
         for process in self._processes:
             process.close()
-        while not self._messages.empty():  # errors and log lines that came last
+        while not self._messages.empty():  # the last errors and log lines
             process_, message = self._messages.get()
             if process_ and message[0] in ("failed", "log"):
                 self._handle(process_, message)

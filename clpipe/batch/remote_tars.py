@@ -120,7 +120,7 @@ class RemoteTars(Tars):
         failed = sorted(stem for stem, status in statuses.items() if status == FAILED)
         if not tar.path.exists():  # all images failed
             return
-        self._write(tar, {})  # marks the tar as ours
+        self._write(tar, {})  # marks the tar as written by this program
         digest, size = sha256_of(tar.path)
         url = url_of(tar.path)
         assert url

@@ -17,7 +17,7 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.manifest import check_output_name
 from clpipe.outputs.sidecar import SidecarError, input_entries, output_entries, read_sidecar
 
-CODE = (".py", ".cl")  # extensions of files that contain code
+CODE = (".py", ".cl")  # extensions of code files
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ class Summary:
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STEPS, 0.0))
     began: float = field(default_factory=time.perf_counter)
     interrupted: bool = False
-    much_clipped: int = 0  # images whose clipped share is MUCH or more
+    much_clipped: int = 0  # images with a clipped share of MUCH or more
     most_clipped: tuple[float, str] = (0.0, "")  # the largest clipped share, and its image
     old: int = 0  # existing pictures that another version of the program made
 
@@ -153,7 +153,7 @@ class RunLog:
         if status.st_size:
             os.lseek(file, -1, os.SEEK_END)
             if os.read(file, 1) != b"\n":
-                _append(file, b"\n")  # the last line is cut off
+                _append(file, b"\n")  # the last line is incomplete
         return file
 
     def add(self, outcome: Outcome) -> None:

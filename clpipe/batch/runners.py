@@ -35,7 +35,7 @@ class Runners:
         first = writer.runner(Recipe(DEFAULT_RENDITION, chain, (), ""), device)
         try:
             first.compile(half)
-        except ImageError as error:  # not even 8x8 pixels fit
+        except ImageError as error:  # the memory is not enough for 8x8 pixels
             raise RequestError(f"--memory: too little for any image: {error}") from None
         self._latest = [(chain, first)]
         self._by_results = {(first.keep, first.encode, first.final): first}

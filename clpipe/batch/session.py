@@ -139,7 +139,8 @@ class Run:
         arguments: Sequence[str] = (),
         echo: Callable[[bytes], None] | None = None,
     ) -> None:
-        # In a checkout the version comes from git, which takes time; nothing waits for it here.
+        # In a checkout, the version comes from git, which takes time. Nothing waits for the version
+        # here.
         threading.Thread(target=full_version, daemon=True).start()
         check_output(execution.output, images.per_tar)
         check_processes(execution, dask, images.per_tar)
@@ -230,7 +231,7 @@ class Run:
             began = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
             try:
                 upload(path, f"{url}/{path.stem}.{began}-{secrets.token_hex(2)}.jsonl")
-            except OutputError as error:  # it must not hide an error of the run
+            except OutputError as error:  # this error must not hide an error of the run
                 log.warning("%s; the log of this run is lost", error)
 
     def _log_outcomes(
@@ -304,13 +305,14 @@ class Run:
             from clpipe.batch.dask_worker import DaskSpec
 
             return connected(self._dask, DaskSpec(self._request, execution, self.jobs[0]))
-        # The size of the first image stands for all, because reading every header takes time.
+        # All images are assumed to have the size of the first one, because reading every header
+        # takes time.
         claim = self._loader.claim(self.jobs[0])
         if not sink.allows_processes:
             count = 1
         elif execution.processes:
             count = execution.processes
-        elif jobs is not self.jobs:  # a lazy iterable, whose length is unknown
+        elif jobs is not self.jobs:  # the length of a lazy iterable is unknown
             count = 1
         else:
             count = default_processes(len(self.jobs), claim, available_processors())

@@ -29,17 +29,19 @@ from clpipe.outputs.record import patch_text
 from clpipe.outputs.sidecar import SIDECAR, output_entries, read_sidecar
 from clpipe.outputs.writer import OutputWriter
 
-# The bytes of a member: a file, an offset and size in the old tar, or the bytes themselves.
+# The bytes of a member. They are a file, an offset and size in the old tar, or the bytes
+# themselves.
 Source = Path | tuple[int, int] | bytes
 
-COPY_BYTES = 1 << 20  # bytes that are copied at a time; tarfile's 16 KiB take three times as long
+# Bytes to copy at a time; tarfile's default of 16 KiB takes three times as long.
+COPY_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
 class StagedWriter(OutputWriter):
     """A writer that puts each picture into the directory of its tar."""
 
-    folders: Mapping[str, str] = field(default_factory=dict)  # by the stem of a job
+    folders: Mapping[str, str] = field(default_factory=dict)  # folders by the stem of a job
 
     def name(self, job: Job, ending: str) -> str:
         """Return the name of a job's file before it is packed."""
@@ -58,7 +60,8 @@ class Packer:
         self.tar = tar
         self._writer = writer
         self._lock = threading.Lock()  # lets one thread read the old tar's index, once
-        self._reused: dict[str, list[str]] = {}  # files of the old tar that stay, by their sidecar
+        # Files of the old tar that stay in the new one, by their sidecar.
+        self._reused: dict[str, list[str]] = {}
         self.statuses: dict[str, str] = {}  # status of each job, by its stem
 
     @cached_property
@@ -200,7 +203,7 @@ class Packer:
                         start, info.size = source
                         data.seek(start)
                     tar.addfile(info, data)
-        sync_folder(self.tar.folder)  # before its pictures are removed
+        sync_folder(self.tar.folder)  # saves the tar before its pictures are removed
 
 
 class Tars(Folder):
@@ -227,8 +230,8 @@ class Tars(Folder):
         packed = self._packers[self._folders[job.stem]].found(job, rendition, request, self.redo)
         if packed is not ExistingFiles.NOTHING:
             return packed
-        # Without fsync a file may have its size and time after a loss of power, but neither its
-        # bytes nor the mark that says whose it is.
+        # Without fsync, a power failure may leave a file with its size and time, but without its
+        # bytes. The mark that identifies the writer may be missing as well.
         files = self.writer.files(job, rendition)
         return find_existing(files, job, request, verify=True, is_exclusive=True)
 

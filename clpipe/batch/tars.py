@@ -20,7 +20,7 @@ STAGING = ".clpipe."  # prefix of the directory that holds a tar's pictures unti
 
 NUMBERED = re.compile(rf"({re.escape(STAGING)})?(\d{{6,}})\.tar")
 
-# What tarfile raises for a damaged tar, whose header may state an absurd size.
+# Exceptions that tarfile raises for a damaged tar, whose header may state an absurd size.
 DAMAGED = (OSError, tarfile.TarError, ValueError, OverflowError, MemoryError)
 
 OF_PATCHES = "__clpipe__/"  # the directory of the sidecars of images that are cut into patches

@@ -29,11 +29,11 @@ from clpipe.engine.device import Device
 from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.find import Job
 
-Jobs = queue.SimpleQueue[Job | Exception | None]  # None is the end; an error ends the run
+Jobs = queue.SimpleQueue[Job | Exception | None]  # None marks the end; an error ends the run
 
 Made = tuple[JobState, list[Written]]  # a job, and its renditions under temporary names
 
-MAX_COMMIT = 64  # most images that are synchronised to the disk at a time
+MAX_COMMIT = 64  # images that are synchronised to the disk at a time
 
 
 class Batch:
@@ -62,7 +62,7 @@ class Batch:
     ) -> None:
         self.devices = list(devices)
         self.threads = threads or available_processors()
-        results = self.threads + sum(map(depth_of, self.devices))  # that exist at a time
+        results = self.threads + sum(map(depth_of, self.devices))  # results that exist at a time
         self.in_flight = in_flight or results + 1
         self._worker = worker
         worker.reserve(results)
@@ -75,7 +75,7 @@ class Batch:
             worker, self.devices, self.threads, self._budget, compiled, self._fail
         )
         self._jobs: Jobs = queue.SimpleQueue()
-        # None: one of the threads has ended.
+        # None means that one of the threads has ended.
         self._made: queue.Queue[Made | None] = queue.Queue(MAX_COMMIT)
         self._outcomes: queue.Queue[Outcome | None] = queue.Queue(MAX_COMMIT)
 
@@ -127,7 +127,7 @@ class Batch:
         finally:
             self.stop()
             self._budget.close()
-            for _ in range(self.in_flight - started):  # threads that could not be started
+            for _ in range(self.in_flight - started):  # for threads that could not be started
                 self._made.put(None)
             while not is_over and self._outcomes.get() is not None:
                 pass
@@ -147,7 +147,7 @@ class Batch:
         thread = threading.Thread(target=timed, name=name, daemon=True)
         try:
             thread.start()
-        except RuntimeError:  # no more threads are allowed, or their stacks do not fit
+        except RuntimeError:  # the system allows no more threads, or has no memory for their stacks
             raise RequestError(
                 f"--jobs: {self.threads}: no thread can be started for '{name}'; ask for fewer, or "
                 "allow more threads (ulimit -u) or memory (ulimit -v)"
@@ -181,7 +181,7 @@ class Batch:
             self._fail(job)
         if isinstance(job, Job) and not self.is_stopping:
             return job
-        self._jobs.put(None)  # for the other threads
+        self._jobs.put(None)  # ends the other threads
         return None
 
     def _make_all(self) -> None:
@@ -190,7 +190,7 @@ class Batch:
         max_in_flight = MAX_STACK if self.in_flight == 1 else 1
         try:
             while True:
-                with self._decoding:  # before a job is taken, so that jobs begin in order
+                with self._decoding:  # acquired before taking a job, so that jobs begin in order
                     if job := self._next(not decoded):
                         decoded.append(self._decoded(job, decoded))
                 if not decoded:
@@ -221,9 +221,9 @@ class Batch:
         except OutputError as error:
             state.error = failure_text(job, error)
             self._fail(error)
-        except BaseException as error:  # no image may end a thread
+        except BaseException as error:  # an error of an image must not end the thread
             state.error = failure_text(job, error)
-        state.spans = [  # without the wait for memory
+        state.spans = [  # subtracts the wait for memory
             replace(span, start=span.start + sum(waits), seconds=span.seconds - sum(waits))
             for span in state.spans
         ]
@@ -243,7 +243,7 @@ class Batch:
         size = worker.bytes_of(job, developers.max_in_flight, None in self.devices)
         start = time.perf_counter()
         if waiting_states and not self._budget.fits(size):
-            self._make(waiting_states)  # which frees their memory
+            self._make(waiting_states)  # frees the memory of the waiting images
         self._budget.acquire(job.stem, size)
         waits.append(time.perf_counter() - start)
 

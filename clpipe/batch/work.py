@@ -104,7 +104,7 @@ class ImageWorker:
         extra_images = 2 * self.layer_count + self.later_exposures
         if shutter := self.loader.shutter(job):
             extra_images += 1 + self.later_exposures + bool(shutter.light_layer)
-        # The noise of baselines is measured on floats.
+        # The noise of baselines is measured in floats.
         formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
         kinds = results, formats, writer.request.keep, extra_images, in_numpy
         return host_bytes(self.loader.claim(job), self.chain, *kinds)
@@ -193,7 +193,7 @@ class ImageWorker:
             state.status = LEFT_OUT
             return
         self.writer.check_size(loaded.source, loaded.chain)
-        intrinsics_of(loaded.chain, loaded.source)  # raises if they are impossible
+        intrinsics_of(loaded.chain, loaded.source)  # raises an error for impossible intrinsics
         if patches := self.writer.patches:
             height, width = loaded.source.pixels.shape[:2]
             state.patches = all_patches(patches, loaded.chain, width, height, job.key)
@@ -245,7 +245,7 @@ class ImageWorker:
                 waits = [next(results) if order else None for order in orders]
             except DeviceError:
                 raise
-            except Exception:  # it does not say whose it is, so each is run alone instead
+            except Exception:  # it does not identify the image, so each one is run separately
                 waits = [partial(o[0].run, *o[1:]) if o else None for o in orders]
         return [
             partial(self._finish, state, recipe, start, order[3].timings if order else None, wait)

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from clpipe.base.tracing import call
 
-MAX_VALUE = 1e9  # value of a sensor; its square must be finite as well
+MAX_VALUE = 1e9  # the largest value of a sensor, so that its square is finite as well
 Positive = Annotated[float, Field(gt=0, le=MAX_VALUE, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, le=MAX_VALUE, allow_inf_nan=False)]
 Offset = Annotated[float, Field(ge=-65535, le=65535, allow_inf_nan=False)]
@@ -29,12 +29,14 @@ class GainStage(BaseModel):
 
     iso: Annotated[tuple[Positive, ...], Field(min_length=1)]
     system_gain: tuple[Positive, ...]  # DN/e-
-    read_noise: tuple[Positive, ...]  # DN, of a pixel, before rounding to whole DN
+    read_noise: tuple[Positive, ...]  # DN; noise of a pixel before rounding to whole DN
     tukey_lambda: tuple[TukeyLambda, ...] | None = None  # shape of the read noise
-    row_noise: tuple[NotNegative, ...] | None = None  # DN, new in each frame
-    column_noise: tuple[NotNegative, ...] | None = None  # DN, fixed
-    color_bias: tuple[Offsets, ...] | None = None  # DN, of R, G in its row, G in B's row, B; fixed
-    black_level_error: tuple[NotNegative, ...] | None = None  # DN, of each of them, in each frame
+    row_noise: tuple[NotNegative, ...] | None = None  # DN; it differs in each frame
+    column_noise: tuple[NotNegative, ...] | None = None  # DN; it is the same in each frame
+    # DN; fixed offsets of R, G in rows with R, G in rows with B, and B.
+    color_bias: tuple[Offsets, ...] | None = None
+    # DN; sigma of each channel's level, drawn in each frame.
+    black_level_error: tuple[NotNegative, ...] | None = None
 
     @model_validator(mode="after")
     def _check_lengths(self) -> "GainStage":
@@ -90,7 +92,7 @@ class GainStage(BaseModel):
         return float(np.sqrt(np.clip(after2, 0, read2.min())))
 
 
-@lru_cache(maxsize=1024)  # the same object for the same tables, so that it is traced once
+@lru_cache(maxsize=1024)  # equal tables share one object, so that it is traced once
 def _ratios(values: tuple[float, ...], divisors: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(value / divisor for value, divisor in zip(values, divisors, strict=True))
 

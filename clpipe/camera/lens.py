@@ -16,10 +16,10 @@ from clpipe.base.text import one_line
 from clpipe.camera.profile import Camera
 
 INSTALL = install_command("lensfunpy")
-INFINITY_DISTANCE = 1000.0  # m, for lensfun's calibrations at infinity
-MAX_EXTRA_WORDS = 2  # words of a lens's name, besides the maker, that you may omit
+INFINITY_DISTANCE = 1000.0  # m; the distance used for lensfun's calibrations at infinity
+MAX_EXTRA_WORDS = 2  # words of a lens's name, in addition to the maker, that you may omit
 RECTILINEAR = "RECTILINEAR"  # lensfun's type of the lenses that clpipe supports
-SAME_CROP = 1.01  # ratio of crop factors that count as equal
+SAME_CROP = 1.01  # crop factors with at most this ratio count as equal
 ASPECT = 1.5  # assumed aspect ratio of the calibration images if the database lacks it
 
 
@@ -65,7 +65,7 @@ def calibration_of(
         RequestError: lensfunpy is not installed, there is no such lens, or it cannot be set to
             these values.
     """
-    # A camera cannot be a key of a cache.
+    # A camera cannot be a key of a cache, so its names are passed.
     models = camera.make, camera.model, *camera.aliases
     return _calibration(name, models, focal_length, aperture, focus_distance)
 
@@ -268,7 +268,8 @@ def _check_aperture(lens: Any, aperture: float) -> None:
     Raises:
         KeyedError: it cannot.
     """
-    low, high = lens.min_aperture or 0.0, lens.max_aperture or 0.0  # None if it does not
+    # lensfun returns None for an unknown value.
+    low, high = lens.min_aperture or 0.0, lens.max_aperture or 0.0
     if (low and aperture < low - 0.06) or (high > low and aperture > high + 0.06):
         most = f" to f/{high:g}" if high > low else " and above"
         raise KeyedError(

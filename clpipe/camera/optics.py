@@ -13,13 +13,14 @@ from typing import Any
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.camera.lens import LensCalibration
 
-LENGTH_TOLERANCE = 0.01  # relative, for lengths and f-numbers; lenses state nominal values
-PIXEL_TOLERANCE = 1e-4  # relative, for lengths in px
+LENGTH_TOLERANCE = 0.01  # relative tolerance of lengths and f-numbers; lenses state nominal values
+PIXEL_TOLERANCE = 1e-4  # relative tolerance of lengths in px
 
-FOCAL_TOLERANCE = 0.1  # relative, for a lens's focal length; makers round, and aspect ratios differ
-FILM_WIDTH, FILM_DIAGONAL = 36.0, math.hypot(36, 24)  # mm, of 35 mm film
+# Relative tolerance of a lens's focal length; makers round it, and aspect ratios differ.
+FOCAL_TOLERANCE = 0.1
+FILM_WIDTH, FILM_DIAGONAL = 36.0, math.hypot(36, 24)  # mm; the width and diagonal of 35 mm film
 
-DEFAULT_EXPOSURE_TIME = 0.01  # s, default exposure time
+DEFAULT_EXPOSURE_TIME = 0.01  # s
 
 IN_PIXELS = ("fx", "fy", "cx", "cy")
 

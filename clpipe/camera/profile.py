@@ -19,8 +19,8 @@ from clpipe.camera.noise import NoiseModel
 from clpipe.camera.text import normalized_name
 
 DEFAULT_CAMERA = "sony-a7r2"
-MAX_LISTED = 5  # cameras in a message
-PUSH_FACTOR = 4.0  # times the highest ISO of a camera: two stops
+MAX_LISTED = 5  # cameras that a message lists
+PUSH_FACTOR = 4.0  # relative to a camera's highest ISO; the factor is two stops
 Coefficient = Annotated[float, Field(ge=-100, le=100)]
 Row = tuple[Coefficient, Coefficient, Coefficient]
 Matrix = tuple[Row, Row, Row]
@@ -38,7 +38,7 @@ Share = Annotated[float, Field(ge=0, le=0.1)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Temperature = Annotated[float, Field(ge=-100, le=150)]  # deg C
 
-# Keys that need another key, and its description.
+# Keys that need another key, with a description of that key.
 REQUIRED_KEYS = {
     ("hot_pixel_share", "hot_pixel_level"): "the smallest extra charge of a hot pixel in e-",
     ("banding_amplitude", "banding_period"): "in rows",
@@ -68,38 +68,43 @@ class Camera(BaseModel):
     white_balance_gains: tuple[Positive, Positive]  # red, blue
     filter_array: str = ""  # a name or rows of letters, see the stage mosaic; "" is a Bayer pattern
     xyz_to_camera: Matrix | None = None  # XYZ to camera RGB at D65, like a DNG's ColorMatrix2
-    row_noise_ratio: NotNegative = 0.0  # row sigma over read noise, for stages without a table
+    # Row noise relative to read noise, for stages without a table.
+    row_noise_ratio: NotNegative = 0.0
     column_noise_ratio: NotNegative = 0.0
     quantum_efficiency: Annotated[float, Field(gt=0, le=1)] | None = None  # electrons per photon
     full_well: Positive | None = None  # e-; None: the ADC clips first
     tukey_lambda: TukeyLambda | None = None  # distribution of read noise; None: Gaussian
-    prnu: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # standard deviation over mean
+    prnu: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # standard deviation relative to the mean
     crosstalk: Share = 0.0  # share of a pixel's charge that leaks to each side
     dsnu: NotNegative = 0.0  # e-
     hot_pixel_share: Share = 0.0
     hot_pixel_level: NotNegative = 0.0  # e-, the smallest extra charge of a hot pixel
     dead_pixel_share: Share = 0.0
     rts_share: Share = 0.0  # share of pixels with random telegraph noise
-    rts_amplitude: NotNegative = 0.0  # e-, the mean distance of their two levels
+    rts_amplitude: NotNegative = 0.0  # e-; the mean distance between the two levels of such a pixel
     dark_current: NotNegative = 0.0  # e-/s
-    dark_current_temperature: Temperature = 20.0  # at which dark_current was measured
+    # deg C; the temperature at which dark_current was measured.
+    dark_current_temperature: Temperature = 20.0
     dark_current_doubling: Positive | None = None  # K; None: the same at every temperature
-    dark_current_spread: Fraction = 0.0  # variation between pixels, standard deviation over mean
-    dark_shading_slope: NotNegative = 0.0  # DN per ISO, standard deviation over the sensor
-    # DN, standard deviation over the sensor of the part that does not depend on the ISO
+    dark_current_spread: Fraction = 0.0  # standard deviation over pixels, relative to the mean
+    dark_shading_slope: NotNegative = 0.0  # DN per unit of ISO; standard deviation over the sensor
+    # DN; standard deviation over the sensor of the part that does not depend on the ISO.
     dark_shading_offset: NotNegative = 0.0
-    dark_shading_length: Positive = 500.0  # px, over which both change
-    banding_amplitude: NotNegative = 0.0  # e-, of a wave along the columns
-    banding_period: Positive | None = None  # rows
-    # With several readouts: the ratio between the sensitivities of one and the next, and the read
-    # noise in DN of later ones over the first one's. The gain stages describe the first.
+    dark_shading_length: Positive = 500.0  # px; the distance over which both parts change
+    banding_amplitude: NotNegative = 0.0  # e-; the amplitude of a wave along the columns
+    banding_period: Positive | None = None  # rows; the period of that wave
+    # For sensors with several readouts. The first value is the ratio between the sensitivities of
+    # successive readouts. The second is the read noise in DN of later readouts, relative to the
+    # first one's. The gain stages describe the first readout.
     readout_ratio: Annotated[float, Field(gt=1, le=1024)] | None = None
     readout_noise: NotNegative | None = None
-    # The light that the large photodiode sees over that of the small one, and the charge that leaks
-    # into the small one, over that of the large one.
+    # For sensors with two photodiodes per pixel. The first value is the light of the large
+    # photodiode relative to that of the small one. The second is the charge that leaks into the
+    # small one, relative to that of the large one.
     photodiode_ratio: Annotated[float, Field(gt=1, le=10_000)] | None = None
     photodiode_crosstalk: Annotated[float, Field(ge=0, le=0.5)] | None = None
-    pixel_pitch: Positive | None = None  # um, between the centres of adjacent photosites
+    # um; the distance between the centres of adjacent photosites.
+    pixel_pitch: Positive | None = None
     iso_range: tuple[Positive, Positive]
     gain_stages: Annotated[tuple[GainStage, ...], Field(min_length=1)]
     sources: dict[str, str]

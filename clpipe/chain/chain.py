@@ -78,7 +78,8 @@ class Step:
         """Return whether another step does the same with the same numbers."""
         optics = self.context.optics, other.context.optics
         equals = self == other and optics[0] == optics[1] and self.passes == other.passes
-        if not equals or "arguments" not in vars(self):  # then there is nothing else to compare
+        # Without arguments, there is nothing else to compare.
+        if not equals or "arguments" not in vars(self):
             return equals
         mine, theirs = self.arguments, other.arguments
         return mine.keys() == theirs.keys() and all(
@@ -101,9 +102,10 @@ class Chain:
     camera: Camera
     settings: Settings
     names: tuple[str, ...]  # all steps, including those before start_at and after until
-    draws: Mapping[str, Draw] = field(default_factory=dict)  # the settings are an example of them
+    # The settings are an example of these draws.
+    draws: Mapping[str, Draw] = field(default_factory=dict)
     margins: Margins = NO_MARGINS  # the overscan of the chain's input
-    # Results that all chains of this structure share, see of_structure(); None if not shared.
+    # Results that all chains of this structure share, see of_structure(). None if there are none.
     structure: dict[Any, Any] | None = field(default=None, init=False)
 
     def __repr__(self) -> str:
@@ -314,7 +316,7 @@ class Chain:
     def _with(self, methods: Sequence[tuple[Step, Method | None]], clean: bool) -> "Chain":
         """Return the chain with other methods and without noise; see :meth:`without_noise`."""
         *others, (last, method) = methods
-        contexts: dict[int, Context] = {}  # most steps share theirs
+        contexts: dict[int, Context] = {}  # most steps share a context
 
         def context_of(step: Step) -> Context:
             key = id(step.context)

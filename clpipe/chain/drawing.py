@@ -13,7 +13,7 @@ from clpipe.chain.draws import Choice, Draw, Limits, parse_draw
 from clpipe.chain.keys import KEYS
 from clpipe.reference.random import philox_rounds, stream_of
 
-LimitsOf = Callable[[str], Limits | None]  # by the dotted name of a value
+LimitsOf = Callable[[str], Limits | None]  # returns the limits of the value with a dotted name
 
 
 def parse_drawn(key: str, table: Mapping[str, Any]) -> Draw:

@@ -17,11 +17,11 @@ from clpipe.base.errors import KeyedError
 from clpipe.base.text import unknown_name
 from clpipe.base.validation import first_fault
 
-SMALLEST_FLOAT = math.ulp(0.0)  # the least number above 0
+SMALLEST_FLOAT = math.ulp(0.0)  # the smallest number above 0
 
-MAX_SIGMAS = 9.0  # standard deviations; a uniform number of 52 bits gives no normal beyond 8.3
+MAX_SIGMAS = 9.0  # standard deviations; a uniform number of 52 bits gives a normal of at most 8.3
 
-MAX_VALIDATED = 64  # whole numbers of a range that are validated
+MAX_VALIDATED = 64  # the most whole numbers of a range that are validated
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.stage import Method
 
-MAX_FAMILIES = 16  # per settings that differ in numbers, such as ISOs of different gain stages
+# Families for settings that differ only in numbers, such as ISOs of different gain stages.
+MAX_FAMILIES = 16
 MAX_SETTINGS = 256
 
 Numbers = Sequence[Any]  # floats, or the objects that replace them while code is traced
@@ -139,7 +140,7 @@ class Families:
         try:
             family = Family(make, numbers)
             computed = family.chain(numbers)
-        except Exception:  # a stage's code may raise anything when its numbers are no floats
+        except Exception:  # a stage's code may raise any error if its numbers are not floats
             computed = None
         if computed and computed.equals(chain):
             self._known.append(family)

@@ -12,7 +12,7 @@ class Format:
     floats: bool = False
 
 
-FORMATS = {  # of the picture
+FORMATS = {  # formats of pictures
     "jpg": Format("jpg", 8),
     "png": Format("png", 8),
     "png16": Format("png", 16),
@@ -25,7 +25,7 @@ FORMATS = {  # of the picture
 }
 
 NPY = "npy"  # also a format of kept images
-DNG = "dng"  # holds the raw instead of the picture
+DNG = "dng"  # contains the raw instead of the picture
 
 ALL_FORMATS = (*FORMATS, DNG)
 

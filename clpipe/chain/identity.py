@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from clpipe.chain.settings import Settings
 
-MAX_FRAMES = 100_000  # per image
+MAX_FRAMES = 100_000  # the most frames per image
 
 DIGITS = 16  # hexadecimal digits of the digest of an image's content
 

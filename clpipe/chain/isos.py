@@ -59,8 +59,7 @@ def draw_note(settings: Settings) -> str:
         )
     for camera in map(load_camera, settings.names_of("camera")) if draw else ():
         truncated = draw and draw.truncated(Limits(*camera.iso_range))
-        if truncated != draw and not isinstance(
-            truncated, Truncated
-        ):  # a normal loses only its tails
+        # Truncating a normal distribution only removes its tails.
+        if truncated != draw and not isinstance(truncated, Truncated):
             parts.append("{} from {:g} to {:g}".format(camera.name, *camera.iso_range))
     return f"iso: drawn within each camera's range: {', '.join(parts)}" if parts else ""

@@ -13,12 +13,12 @@ from clpipe.images.dump import TYPES
 
 CODE = "stage_files"  # the key that only a configuration file may have
 
-OUTPUT, RENDER = "output", "render"  # the tables that belong to no stage
+OUTPUT, RENDER = "output", "render"  # names of tables that do not belong to a stage
 TABLES = (OUTPUT, RENDER)
 
-NOISE = "noise"  # under "skip": the noise of every stage
+NOISE = "noise"  # an item of "skip": the noise of every stage
 
-MAX_STAGES = 256  # per chain, because files of others may contain one
+MAX_STAGES = 256  # stages per chain; limited because other people's files may contain a chain
 DEFAULT_ISO = 100.0
 
 WORDS = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
@@ -144,7 +144,8 @@ _ALL = (
 )
 KEYS = {key.name: key for key in _ALL}
 
-LENS = ("lens", "focal_length", "aperture", "focus_distance")  # how a lens is named and set
+# The settings that select a lens and set it.
+LENS = ("lens", "focal_length", "aperture", "focus_distance")
 
 
 def check_type(key: str, value: Any) -> None:

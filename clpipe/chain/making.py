@@ -160,13 +160,14 @@ def resolve_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list
                 wide_step = f"{name}.method={method.method}"
             if not fits:
                 if isinstance(method, Unchanged) and stage.reads is stage.writes:
-                    continue  # so that --skip gamma need not skip later idle stages as well
+                    continue  # thus --skip gamma does not require you to skip later idle stages
                 raise RequestError(misfit_message(name, stage, previous, kind or stage.reads))
             _check_array(name, method, context)
             after = method.next_context(context)
             if (optics_set := method.optics()) and method.passes():
                 after = after.replace(optics=after.optics.set_to(optics_set))
-        if stage.folder and not isinstance(context.iso, Traced):  # else it has been checked
+        # Otherwise the stage has been checked.
+        if stage.folder and not isinstance(context.iso, Traced):
             check_passes(name, stage, method, context)
         steps.append(Step(name, stage, method, context))
         context = after
@@ -207,7 +208,7 @@ def optics_of(settings: Settings, camera: Camera, methods: Mapping[str, Method])
     return optics.with_lens(lens)
 
 
-# The optics that keys of settings set, by the keys.
+# The optics that each key of the settings sets.
 OPTICS_SETTINGS = dict(zip(LENS[1:], ("focal_length", "f_number", "focus_distance"), strict=True))
 
 

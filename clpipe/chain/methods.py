@@ -140,7 +140,7 @@ def method_named(stage: Stage, name: str, chosen: Any) -> type[Method]:
     return stage.by_name[chosen]
 
 
-# The models of the tables that belong to no stage.
+# Models of the tables that do not belong to a stage.
 TABLE_MODELS: dict[str, type[BaseModel]] = {OUTPUT: Encoding, RENDER: RenderCamera}
 
 

@@ -21,8 +21,8 @@ Moments = Literal["start", "middle", "end", "all"]
 Transfer = Literal["srgb", "linear"]
 RedoName = Literal["missing", "old", "damaged", "all"]
 
-MAX_PATCHES = 9999  # per image, because file names have four digits
-DEFAULT_PATCHES = 16  # patches by default
+MAX_PATCHES = 9999  # patches per image; file names have four digits
+DEFAULT_PATCHES = 16  # patches per image
 
 DEVICE = Key(
     "device",

@@ -13,16 +13,15 @@ from clpipe.stage import Kind, Method, ReferenceContext, StageRole, Unchanged
 from clpipe.stages.exposure.gain import Gain
 
 RESPONSE_SIZE = 256  # entries of a table of the response, and of its inverse
-INVERSION_STEPS = 64  # steps between two entries, for the inversion
+INVERSION_STEPS = 64  # steps between two entries when the response is inverted
 DIGITS = 6  # significant digits of written numbers
-METERED = "metered_ev"  # among the estimates of exposure
+METERED = "metered_ev"  # key in the estimates of exposure
 
 Estimates = Mapping[str, Mapping[str, float]]
 Tables = dict[str, list[float]]
 
-RESPONSES: BoundedCache[Tables] = BoundedCache(
-    64
-)  # tables by methods, shared by the images of a run
+# Tables by methods, shared by the images of a run.
+RESPONSES: BoundedCache[Tables] = BoundedCache(64)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ ENTRY_POINTS = "clpipe.stages"
 
 _from_files: dict[Path, Stage] = {}
 
-_loading = RLock()  # so that each file is run once
+_loading = RLock()  # ensures that each file runs only once
 
 
 def all_stages() -> dict[str, Stage]:

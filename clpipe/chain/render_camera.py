@@ -11,7 +11,7 @@ from clpipe.reference.pose import rotation
 Length = Annotated[float, Field(gt=0, le=10000, allow_inf_nan=False)]
 Pixels = Annotated[float, Field(gt=0, le=1e7, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Vector = Annotated[tuple[Finite, Finite, Finite], Field(strict=False)]  # or a list
+Vector = Annotated[tuple[Finite, Finite, Finite], Field(strict=False)]  # accepts lists as well
 Matrix = Annotated[tuple[Vector, Vector, Vector], Field(strict=False), AfterValidator(rotation)]
 Pose = Annotated[tuple[Matrix, Vector], Field(strict=False)]
 
@@ -27,8 +27,8 @@ class RenderCamera(BaseModel):
     exposure_time: Annotated[float, Field(gt=0, le=86400, allow_inf_nan=False)] | None = None  # s
     focal_length: Length | None = None  # mm
     sensor_width: Length | None = None  # mm, along the longer side of the image
-    # In px; the centre of the first pixel is at 0.5. None is derived from the lengths in mm and the
-    # centre of the image.
+    # px; the centre of the first pixel is at 0.5. If None, the value follows from the lengths in mm
+    # and the centre of the image.
     fx: Pixels | None = None
     fy: Pixels | None = None
     cx: Finite | None = None
@@ -39,7 +39,8 @@ class RenderCamera(BaseModel):
     rotation: Matrix | None = None
     translation: Vector | None = None
 
-    # Poses of the same form while the shutter is open, in equal steps from its opening to its end.
+    # Poses of the same form while the shutter is open, in equal steps from its opening to its
+    # closing.
     motion: Annotated[tuple[Pose, ...] | None, Field(strict=False, min_length=2)] = None
 
     @model_validator(mode="after")

@@ -30,7 +30,7 @@ from clpipe.stage import Kind
 
 DEFAULTS = Settings()
 
-SETTINGS_CACHE_SIZE = 8  # settings that a request and its copies cache
+SETTINGS_CACHE_SIZE = 8  # number of settings that a request and its copies cache
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class Request(RecordedRequest):
             # These settings are already validated.
             request.settings_cache.get(Identity(request.config), lambda: configuration.settings)
         request.settings()
-        request.aov_specs()  # rejects wrong texts
+        request.aov_specs()  # raises an error for invalid specifications
         return request
 
     @classmethod
@@ -161,7 +161,7 @@ class Request(RecordedRequest):
                 f"{', '.join(ALL_FORMATS)}"
             )
         request = cls(**vars(found))
-        request.aov_specs()  # rejects wrong texts
+        request.aov_specs()  # raises an error for invalid specifications
         return request
 
     def for_image(self, name: str, values: Mapping[str, Any]) -> Self:
@@ -232,7 +232,8 @@ class Request(RecordedRequest):
         chain = make_chain(settings, start_at=start_at, until=self.until)
         known = (*chain.names, *self.image.get("skip", ()), *TABLES)
         for step, value in self.options.items():
-            is_table = isinstance(value, Mapping) and step not in KEYS  # there it is a draw
+            # The table of a key is a draw.
+            is_table = isinstance(value, Mapping) and step not in KEYS
             if is_table and step not in known:
                 raise RequestError(unknown_name("stage in this chain", step, chain.names))
         return chain

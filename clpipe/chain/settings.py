@@ -65,8 +65,8 @@ class Settings:
     aperture: float | None = None  # f-number
     focus_distance: float | None = None  # m
     seed: int = 0
-    noise_key: str = ""  # "" follows from the image and the ISO
-    dump: str = ""  # headerless dumps: WIDTHxHEIGHT:TYPE
+    noise_key: str = ""  # "": derived from the image and the ISO
+    dump: str = ""  # format of headerless dumps, WIDTHxHEIGHT:TYPE
     stages: tuple[str, ...] = DEFAULT_CHAIN
     skip: tuple[str, ...] = ()
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -74,7 +74,7 @@ class Settings:
     render: RenderCamera = field(default_factory=RenderCamera)
     pushed: bool = False  # the ISO was drawn, and may be outside the camera's range
     draws: Mapping[str, Draw] = field(default_factory=dict)
-    # By step: the table that overlay() validated, and the resulting model.
+    # The table that overlay() validated for each step, and the resulting model.
     validated: Mapping[str, tuple[Mapping[str, Any], Method]] = field(
         default_factory=dict, compare=False, repr=False
     )
@@ -284,7 +284,7 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
     return changed
 
 
-# Aliases of a camera become its name, so that requests can be compared.
+# Replace a camera's aliases by its name, so that requests can be compared.
 CONVERSIONS: dict[str, Callable[[Any], Any]] = {
     "iso": float,
     **dict.fromkeys(LENS[1:], float),

@@ -123,7 +123,7 @@ def variance_of(noise: Sequence[Step], signal: Floats) -> Floats:
     for i, step in enumerate(noise):
         with user_code_errors(f"stage {step.name}", step.stage.folder):
             after = step.method.variance(variance, signal, step.context)
-            # After the last noise no variance depends on the signal.
+            # After the last noise stage, no variance depends on the signal.
             clean = step.method.without_noise() if i < last else None
             if clean and clean.passes():
                 signal = clean.reference(signal, ReferenceContext(step.context, {}, {}))

@@ -11,7 +11,7 @@ from clpipe.chain.panorama import projection_of
 from clpipe.reference.geometry import Composition
 
 SAMPLES = 128, 96  # samples across and down the picture
-MIN_BLACK_SHARE = 5e-4  # the smallest black share of a picture that causes a warning
+MIN_BLACK_SHARE = 5e-4  # the smallest share of black pixels that causes a warning
 MAX_OVERSCAN = 0.5  # the largest overscan that a warning proposes, relative to the longer side
 
 

@@ -74,7 +74,8 @@ def bench(
     settings = request.settings()
     if request.start_at is None and (names := settings.step_names):
         reads = stage_named("--stages", base_name(names[0])).reads
-        if len(reads.channels) == 1:  # such a chain has no renders as input
+        # If the chain begins with a mosaic, renders cannot be its input.
+        if len(reads.channels) == 1:
             request = replace(request, start_at=names[0])
     chain = request.chain()
     device = open_device(selector)

@@ -41,7 +41,7 @@ def patch_count(text: str) -> int | str:
     return text if text == "grid" else count
 
 
-# Keys whose options are not --name, and keys whose options have special types.
+# Keys whose options are not called --name, and keys whose options have special types.
 FLAGS = {"config": ("-c", "--config"), CODE: ("--stage-file",)}
 TYPES: dict[str, Any] = {
     "stages": lambda text: [name.strip() for name in text.split(",") if name.strip()],
@@ -110,7 +110,7 @@ set_option = click.option(
 out_option = output_option("OUT", OPTIONS["output"].text)
 device_option = option(DEVICE, "selector")
 
-# The settings that are options of a chain, besides the camera and the ISO.
+# Settings with an option, in addition to the camera and the ISO.
 SETTINGS = tuple(key for name, key in KEYS.items() if name not in ("camera", "iso", "dump", CODE))
 
 

@@ -182,7 +182,7 @@ def dataset(
     request = Request.from_options(values=values, **options)
     if not series.isos and "iso" not in request.settings().draws:
         series = replace(series, isos=(request.settings().iso,))
-    series.jobs((), request.settings())  # rejects errors before anything is rendered
+    series.jobs((), request.settings())  # raises errors before anything is rendered
     with ExitStack() as stack:
         if source.suffix.lower() == ".blend":
             check_chain(request)
@@ -214,7 +214,7 @@ def rendering_from(
     rendering = dict(options)
     named = {name: rendering.pop(name) for name in VIEW_OPTIONS}
     views = requested_views(**named, poses=poses, seed=seed)
-    # Blender has another working directory.
+    # Paths are absolute, because Blender has another working directory.
     return Rendering(scene.absolute(), (output / RENDERS).absolute(), views, **rendering, seed=seed)
 
 
@@ -253,7 +253,7 @@ def check_chain(request: Request) -> None:
     except RequestError:
         try:
             request.for_image("", {"render": {"fx": 1000.0}}).chain()
-            return  # only a focal length was missing, which the scene's cameras have
+            return  # only the focal length was missing, and the scene's cameras have one
         except RequestError:
             pass
         raise

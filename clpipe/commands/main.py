@@ -32,8 +32,8 @@ GROUPS = {
 }
 COMMANDS = tuple(name for names in GROUPS.values() for name in names)
 
-# Bytes of address space that the libraries need, and that each of their threads needs. They start
-# one thread per processor.
+# Bytes; address space for the libraries, and for each of their threads. The libraries start one
+# thread per processor.
 LIBRARY_ADDRESSES = 240 << 20
 THREAD_ADDRESSES = 10 << 20
 
@@ -64,7 +64,8 @@ class LazyGroup(click.Group):
         if cmd_name not in COMMANDS:
             return None
         prepare_memory()
-        gc.disable()  # imported objects stay, and collecting garbage takes a tenth of the time
+        # Imported objects remain in use, and collecting garbage takes a tenth of the time.
+        gc.disable()
         command = getattr(import_module(f"clpipe.commands.{cmd_name}"), cmd_name)
         gc.enable()
         assert isinstance(command, click.Command)
@@ -76,7 +77,7 @@ class LazyGroup(click.Group):
                 formatter.write_dl([(name, summary(name)) for name in names])
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        # The method of the base class imports every command.
+        # The base class's method would import every command.
         names = [name for name in COMMANDS if name.startswith(incomplete)]
         items = [CompletionItem(name, help=summary(name)) for name in names]
         return [*items, *click.Command.shell_complete(self, ctx, incomplete)]
@@ -143,7 +144,8 @@ def os_error(error: OSError) -> ClpipeError:
     """Return clpipe's error for an error of the operating system, with the file's name if any."""
     if error.filename is not None:
         return OutputError(f"{error.filename}: {error.strerror or error}")
-    if isinstance(error, FileNotFoundError):  # only the working directory has no name
+    # The error has no file name only if the working directory is missing.
+    if isinstance(error, FileNotFoundError):
         return RequestError("the working directory no longer exists; change to another one")
     *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
     package, _, _ = innermost.f_globals["__name__"].partition(".")
@@ -165,7 +167,7 @@ def summary(name: str) -> str:
 
 def fail(error: ClpipeError) -> NoReturn:
     """Print an error and exit with its status."""
-    lines = map(one_line, str(error).split("\n"))  # a compiler's message has several
+    lines = map(one_line, str(error).split("\n"))  # a compiler's message has several lines
     click.echo("clpipe: " + "\n".join(lines), err=True)
     sys.exit(error.exit_status)
 
@@ -197,7 +199,7 @@ def main() -> None:
     clpipe stages sensor_noise
     """
     if isinstance(sys.stdout, io.TextIOWrapper):  # a file's name may not be UTF-8
-        sys.stdout.reconfigure(errors="backslashreplace")  # as for stderr
+        sys.stdout.reconfigure(errors="backslashreplace")  # like stderr
     logger = logging.getLogger("clpipe")
     logger.setLevel(logging.INFO)
     if NOTICES not in logger.handlers:

@@ -20,8 +20,8 @@ from clpipe.base.urls import is_url
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# The options of commands with many options, by heading. --help shows those marked "+" briefly;
-# --help-all shows all in full.
+# The options of commands with many options, by heading. --help lists the options marked "+"
+# briefly. --help-all describes all options in full.
 GROUPS = {
     "Camera": "+config +camera +iso +lens lens_model focal_length aperture focus_distance +seed "
     "noise_key",
@@ -155,8 +155,8 @@ def brief(text: str) -> str:
     return f"{first}.{f' [{end[1]}]' if end else ''}"
 
 
-ALL = "clpipe.help_all"  # in a context's meta: show every option
-ARGUMENTS = "clpipe.arguments"  # in a context's meta: the arguments of the command line
+ALL = "clpipe.help_all"  # key in a context's meta: whether to show every option
+ARGUMENTS = "clpipe.arguments"  # key in a context's meta: the command line's arguments
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 

@@ -45,7 +45,7 @@ def show(headings: Sequence[str], rows: Iterable[Sequence[str]], left: int | Non
         left: the number of columns that are aligned left; the others are aligned right. None
             aligns all left.
     """
-    # Imported here, because --json does not need them.
+    # Imported here, because --json does not need this module.
     from rich.console import Console
     from rich.table import Table
 

@@ -27,9 +27,9 @@ from clpipe.outputs.existing import Redo
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-MAX_LINES = 50  # without a terminal, up to this many images have a line each
-COMPILE_DELAY = 0.5  # s; compiling that takes longer is shown
-LINE_INTERVAL = 10.0  # s between lines if there are more images
+MAX_LINES = 50  # without a terminal, each image has a line if there are at most this many images
+COMPILE_DELAY = 0.5  # s; compiling is shown if it takes longer
+LINE_INTERVAL = 10.0  # s; the interval between lines if there are more than MAX_LINES images
 
 
 def bar_on(console: Console) -> "Progress":
@@ -91,7 +91,7 @@ class Reporter:
         self._bar: Progress | None = None
         self._is_live = console.is_terminal and not quiet
         self._live = contextlib.ExitStack()
-        self._warnings: Counter[str] = Counter()  # each is printed once, and counted
+        self._warnings: Counter[str] = Counter()  # each warning is printed once, and counted
 
     def __enter__(self) -> Self:
         self._live.enter_context(NOTICES.printed_by(self.print))

@@ -263,7 +263,7 @@ class Dataset(ReadOnly):
         groups: dict[tuple[int, ...], list[int]] = {}
         together = self._patches and not self._draws_by_patch
         for i, position in enumerate(positions):
-            # Whole pictures are not grouped: a repeated index is developed again.
+            # Whole pictures are not grouped, so a repeated index is developed again.
             groups.setdefault(position[:2] if together else (i,), []).append(i)
         samples: list[Sample] = [{}] * len(positions)
         requested = [

@@ -16,7 +16,7 @@ from clpipe.inputs.loader import ImageLoader
 
 log = logging.getLogger(__name__)
 
-NO_OUTPUT = Path(os.devnull)  # nothing is written
+NO_OUTPUT = Path(os.devnull)  # no output is written
 
 
 def cache_size(cache: int | str) -> int:
@@ -56,7 +56,8 @@ def jobs_of(
         log.warning("%s", note)
     job_by_key: dict[str, Job] = {}
     for job in jobs:
-        if job.named_by_user and not job.path.exists():  # files of directories exist
+        # Files that were found in directories exist.
+        if job.named_by_user and not job.path.exists():
             raise RequestError(f"{job.label}: there is no such file or folder")
         other = job_by_key.setdefault(job.key, job)
         if other is not job:

@@ -18,8 +18,8 @@ Read = Future[tuple[LoadedImage, Sample]]
 Pending = tuple[SampleBatch, Callable[[], list[Sample]]]
 
 PATCHES_TOGETHER = 16  # patches with their own draws in one batch
-# Samples are developed together until either limit is reached. In a shuffled dataset, every sample
-# may have its own render. Larger groups only take more memory.
+# Samples are developed together until one of these limits is reached. In a shuffled dataset, every
+# sample may have its own render. Larger groups only use more memory.
 MAX_BYTES = 2**27  # bytes of renders
 MAX_PIXELS = 2**21  # pixels of samples
 

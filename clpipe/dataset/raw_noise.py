@@ -16,8 +16,8 @@ from clpipe.images.arrays import as_array
 from clpipe.pipeline import Pipeline
 from clpipe.reference.cfa import PATTERNS
 
-FIRST, LAST = "crosstalk", "normalize"  # from the clean mosaic to the noisy one
-MOSAIC, PACKED = 1, 4  # channels
+FIRST, LAST = "crosstalk", "normalize"  # the stages from the clean mosaic to the noisy one
+MOSAIC, PACKED = 1, 4  # numbers of channels
 
 
 class RawNoise(ReadOnly):
@@ -72,7 +72,7 @@ class RawNoise(ReadOnly):
         self._opened: tuple[int, Pipeline, np.random.Generator] | None = None
 
     def __getstate__(self) -> Mapping[str, Any]:
-        return {**self.__dict__, "_opened": None}  # a device stays with its process
+        return {**self.__dict__, "_opened": None}  # a device cannot leave its process
 
     def __repr__(self) -> str:
         return f"RawNoise({self._settings['camera']!r}, {self._settings['iso']!r})"

@@ -17,7 +17,7 @@ from clpipe.base.files import atomic_file, unsynced_files
 from clpipe.engine.buffers import is_planar
 from clpipe.images.read import SourceImage
 
-MAX_OPEN = 4096  # files that a process maps
+MAX_OPEN = 4096  # files that a process maps at a time
 
 
 class RenderCache:
@@ -88,7 +88,7 @@ class RenderCache:
         return opened
 
 
-HEADER = 128  # bytes of the header of .npy files
+HEADER = 128  # bytes; the header of .npy files
 
 
 def _open_mapped(path: Path) -> SourceImage | None:
@@ -112,9 +112,8 @@ def _write(path: Path, source: SourceImage) -> bool:
         with unsynced_files():
             with atomic_file(path.with_suffix(".npy")) as file:
                 np.save(file, pixels.transpose(2, 0, 1) if planar else pixels)
-            with atomic_file(
-                path.with_suffix(".pickle")
-            ) as file:  # last, so the other file is complete
+            # Written last, so that the .npy file is complete if this file exists.
+            with atomic_file(path.with_suffix(".pickle")) as file:
                 pickle.dump((without_pixels, planar), file)
     except (ImageError, OSError):
         return False

@@ -76,7 +76,7 @@ class SampleLoader:
         self._warned: set[str] = set()
 
     def __getstate__(self) -> Mapping[str, Any]:
-        return {**self.__dict__, "_open_developer": None}  # a device stays with its process
+        return {**self.__dict__, "_open_developer": None}  # a device cannot leave its process
 
     def drain(self) -> None:
         """Wait for all samples whose development was started."""
@@ -118,14 +118,14 @@ class SampleLoader:
                 f"{job.path}: this image was not kept directly before "
                 f"{loader.request.start_at}. Select such images with a glob"
             )
-        for warning in set(loaded.source.warnings) - self._warned:  # once, not for each image
+        for warning in set(loaded.source.warnings) - self._warned:  # warn once, not for each image
             self._warned.add(warning)
             warnings.warn(f"{job.path}: {warning}", stacklevel=2)
         return loaded, carried
 
     def _source(self, job: Job, loader: ImageLoader) -> SourceImage:
         """Return the image of a job, from the cache unless sub-frames are combined."""
-        if loader.shutter(job):  # its settings may be drawn
+        if loader.shutter(job):  # the shutter's settings may be drawn, so the image is not cached
             return loader.read(job)
         overscan = not loader.raw.is_raw(job.path) and loader.reads_overscan
         key = job.key, stamp_of(job.path), overscan

@@ -11,7 +11,7 @@ from clpipe.images.openexr import MAX_EXTRA
 from clpipe.images.openimageio import open_image
 from clpipe.images.raw import RAW_SUFFIXES, raw_size
 
-FLOAT = 4  # bytes
+FLOAT = 4  # bytes per float
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ NO_BLACK_RENDER = 1  # DefaultBlackRender: the converter subtracts nothing near 
 CURVE_POINTS = 33
 D50_XYZ = np.array([0.9642, 1.0, 0.8251])  # CIE XYZ of the white D50, Y = 1; sources differ by 1e-4
 
-# Tags of fields that point to other parts of the file, filled in last.
+# Tags of offset fields, which are filled in last.
 STRIP_OFFSETS, SUB_IFDS, EXIF_IFD = 273, 330, 34665
 
 
@@ -172,7 +172,7 @@ def preview(dn: Array, negative: Negative) -> Array:
         strongest = neutral.argmax()
         linear = clipped @ np.linalg.pinv(to_camera).T * to_camera.sum(1)[strongest]
     picture = negative.tone(np.clip(linear, 0, 1).astype(np.float32))
-    encoded = np.clip(picture.astype(np.float64), 0, 1)  # which rounding may leave
+    encoded = np.clip(picture.astype(np.float64), 0, 1)  # rounding may leave values outside 0 to 1
     return to_8_bit(srgb_curve(encoded).astype(np.float32))
 
 
@@ -208,14 +208,14 @@ def main_directory(
             50778: tiff.short(D65),  # CalibrationIlluminant1
         }
     return {
-        **tiff.image_fields(thumbnail, subfile_type=1, photometric=2),  # RGB
+        **tiff.image_fields(thumbnail, subfile_type=1, photometric=2),  # photometric 2 is RGB
         **noise_fields(negative),
         **tone_fields(negative),
         **({306: tiff.text(tags.taken)} if tags.taken else {}),  # DateTime
         271: tiff.text(tags.make),  # Make
-        # Model. It differs from the real camera's name, for which RawTherapee crops optically black
-        # columns and sets its own white level. LibRaw uses its own matrix even if a name only
-        # begins with the name of a real camera.
+        # Model. This name differs from the real camera's name. With the real name, RawTherapee
+        # would crop optically black columns and set its own white level. LibRaw uses its own matrix
+        # even if a name only begins with the name of a real camera.
         272: tiff.text(SIMULATED + tags.model),
         274: tiff.short(orientation),  # Orientation
         305: tiff.text(f"clpipe {__version__}"),  # Software
@@ -223,9 +223,8 @@ def main_directory(
         EXIF_IFD: tiff.long(0),
         50706: tiff.byte(1, 4, 0, 0),  # DNGVersion
         50707: tiff.byte(1, 1, 0, 0),  # DNGBackwardVersion
-        50708: tiff.text(
-            SIMULATED + whole_name + array_suffix(negative.array)
-        ),  # UniqueCameraModel
+        # UniqueCameraModel
+        50708: tiff.text(SIMULATED + whole_name + array_suffix(negative.array)),
         **colour,
     }
 
@@ -237,12 +236,10 @@ def raw_directory(dn: Array, negative: Negative) -> tiff.Directory:
     if not array.is_gray:
         filters = {
             33421: tiff.short(*array.period),  # CFARepeatPatternDim
-            33422: tiff.byte(
-                *(CFA_COLORS[letter] for row in array.rows for letter in row)
-            ),  # CFAPattern
-            50710: tiff.byte(
-                *(CFA_COLORS[letter] for letter in plane_order(array))
-            ),  # CFAPlaneColor
+            # CFAPattern
+            33422: tiff.byte(*(CFA_COLORS[letter] for row in array.rows for letter in row)),
+            # CFAPlaneColor
+            50710: tiff.byte(*(CFA_COLORS[letter] for letter in plane_order(array))),
             50711: tiff.short(1),  # CFALayout: rectangular
         }
     return {

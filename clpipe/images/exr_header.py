@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-HEADER_BYTES = 1 << 16  # longer headers are unusual
+HEADER_BYTES = 1 << 16  # bytes; longer headers are unusual
 ALLOWED_FLAGS = 0x600  # tiles, long names; other flags mean several parts or deep images
 TYPES: dict[int, np.dtype[Any]] = {
     0: np.dtype(np.uint32),
@@ -68,7 +68,8 @@ def _parse(start: bytes) -> ExrHeader:
         name, offset = _null_terminated(start, offset)
         kind, offset = _null_terminated(start, offset)
         (size,) = struct.unpack_from("<I", start, offset)
-        if kind == b"idmanifest":  # the package decompresses it, to up to a thousand times its size
+        # OpenEXR decompresses this attribute, to up to a thousand times its size.
+        if kind == b"idmanifest":
             raise ValueError
         values[name] = start[offset + 4 : offset + 4 + size]
         offset += 4 + size

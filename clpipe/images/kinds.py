@@ -26,7 +26,7 @@ KIND_NAMES: dict[LayerKind, tuple[str, ...]] = {
     "colour": ("albedo", "basecolor", "basecolour"),
 }
 
-MIN_CHANNELS: dict[LayerKind, int] = {"flow": 2, "normal": 3}  # the smallest number
+MIN_CHANNELS: dict[LayerKind, int] = {"flow": 2, "normal": 3}  # smallest number of channels
 
 # Layers that renderers write next to the picture: data, and single components of the light. The
 # names are from the manuals of Blender, LuxCore, RenderMan, Arnold, V-Ray, Houdini and Unreal, in

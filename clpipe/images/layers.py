@@ -131,7 +131,7 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
         raise NoPictureError(f"{path}: there are {missing}; found {printable(listed)}", advice)
     best = _preferred(path, pictures) if layer is None else _picture_in_layer(path, pictures, layer)
     file.seek_subimage(best.part, 0)
-    file.geterror()  # clears it: the loop asked for parts and levels that do not exist
+    file.geterror()  # clears the error: the loop asked for parts and levels that do not exist
     return best
 
 

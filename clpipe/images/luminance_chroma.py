@@ -16,7 +16,7 @@ from clpipe.images.openimageio import error_text
 from clpipe.images.pixels import check_size
 
 CHANNELS = ("Y", "RY", "BY")
-MAX_CHANNELS = 8  # in all parts: luminance, chroma, alpha, depth and a few more
+MAX_CHANNELS = 8  # channels in all parts: luminance, chroma, alpha, depth and a few more
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
         try:
             parts = open_exr(path, header_only).parts
             return parts[0], parts
-        except Exception as error:  # exceptions of the C++ library arrive as many types
+        except Exception as error:  # the C++ library raises many types of exceptions
             raise ImageError(f"{path}: damaged: {error_text(str(error))}") from None
 
     first, parts = read(header_only=True)

@@ -17,7 +17,7 @@ from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.types import Array
 from clpipe.images.exr_header import read_header
 
-MAX_EXTRA = 2  # all channels take at most this many times the memory of the requested ones
+MAX_EXTRA = 2  # the memory of all channels, relative to the memory of the requested channels
 
 
 def open_exr(path: Path, header_only: bool = False, separate: bool = True) -> Any:

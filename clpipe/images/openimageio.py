@@ -95,9 +95,8 @@ def open_image(path: Path) -> Iterator[Any]:
         hints = oiio.ImageSpec()
         hints.attribute("pnm:pfmflip", 1)  # without it, OpenImageIO 3.2 reads PFM upside down
         hints.attribute("oiio:UnassociatedAlpha", 1)  # do not multiply encoded values by alpha
-        has_text = signature.startswith(
-            TEXT_HEADERS
-        )  # a text header, which OpenImageIO may misread
+        # OpenImageIO may misread files with a text header.
+        has_text = signature.startswith(TEXT_HEADERS)
         with _readable_copy(path, signature, size) if has_text else nullcontext(path) as readable:
             file = oiio.ImageInput.open(str(readable), hints)
             if file is None:

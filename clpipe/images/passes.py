@@ -93,7 +93,7 @@ def find_layers(path: Path) -> list[LayerLocation]:
                 part_name = str(spec.getattribute("oiio:subimagename") or "") if several else ""
                 found += _layers_in(part, part_name, spec)
             part += 1
-        file.geterror()  # clears it: the loop asked for a part that does not exist
+        file.geterror()  # clears the error: the loop asked for a part that does not exist
     return found
 
 
@@ -158,7 +158,8 @@ def read_layer(
         width, height = spec.full_width, spec.full_height
         check_size(path, width, height, max_pixels)
         check_size(path, spec.width, spec.height, max_pixels)
-        type_ = FLOAT_TYPES.get(location.type, location.type)  # whole numbers would be scaled
+        # OpenImageIO would scale whole numbers that are read as floats.
+        type_ = FLOAT_TYPES.get(location.type, location.type)
         pixels = read_samples(path, file, location.part, location.indices, type_)
         if pixels.dtype.kind != "f":
             pixels = pixels.astype(np.uint32)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 MAGIC = b"\x89PNG\r\n\x1a\n"
-MAX_CHUNKS = 1000  # before the first chunk of samples
+MAX_CHUNKS = 1000  # chunks before the first chunk of samples
 
 # Codes of ITU-T H.273 (2024). Table 2: x and y of red, green, blue and white. Table 3: curves.
 PRIMARIES = {

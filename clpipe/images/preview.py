@@ -16,7 +16,7 @@ from clpipe.reference.curve import to_8_bit
 from clpipe.reference.transfer import srgb_curve
 from clpipe.stage import Kind
 
-# The exceptions that Pillow raises for a file that is damaged, or claims to be very large.
+# Exceptions that Pillow raises for damaged files, and for files that claim to be very large.
 PILLOW_ERRORS = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
 
 

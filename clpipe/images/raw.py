@@ -44,9 +44,10 @@ EXIF_MARKS = (b"CMT1", b"CMT2", b"Exif\0\0")
 MODEL = "Tag 0xC614"  # UniqueCameraModel of a DNG
 TAG_PREFIXES = ("EXIF", "Image")  # exifread's prefixes of tags, in order of preference
 EXIF_BYTES = 1 << 20  # largest size of a tag, and of the part of a file searched for EXIF_MARKS
-MAX_READS = 200_000  # by exifread, which reads each value separately; 1,000 are usual
+MAX_READS = 200_000  # values; exifread reads each one separately, and 1,000 are usual
 DATE_TAGS = ("DateTimeOriginal", "DateTime")
-COLOR_MATRICES = {"0xC622": "0xC65B", "0xC621": "0xC65A"}  # a DNG's, and their illuminants
+# Tags of a DNG's color matrices, and of their illuminants.
+COLOR_MATRICES = {"0xC622": "0xC65B", "0xC621": "0xC65A"}
 DUMP_HINT = "if it is a headerless dump of samples, add --dump WxH:TYPE"
 OTHER_FORMATS = {b"\xff\xd8\xff": "a JPEG", b"\x89PNG": "a PNG", b"v/1\x01": "an OpenEXR image"}
 
@@ -64,13 +65,14 @@ class RawInfo:
     exposure: float | None  # s
     visible_area: tuple[int, int, int, int]  # left, top, width, height in sensor px
     pattern: str  # CFA of the visible area: a Bayer pattern, or rows separated by /
-    black_levels: tuple[int, int, int, int]  # of the four sites of the pattern, row by row
+    # Black levels of the four sites of the pattern, row by row.
+    black_levels: tuple[int, int, int, int]
     white_level: int
     as_shot: tuple[float, float, float]  # white balance multipliers of red, green, blue
-    gains: tuple[float, float] | None  # red, blue, as shot
+    gains: tuple[float, float] | None  # red and blue, as shot
     xyz_to_camera: Matrix | None
-    camera_to_srgb: Matrix | None  # for linear, white-balanced RGB
-    orientation: int  # EXIF's: 1 is upright
+    camera_to_srgb: Matrix | None  # matrix for linear, white-balanced RGB
+    orientation: int  # EXIF's number: 1 is upright
     aperture: float | None
     focal_length: float | None  # mm
     taken: str  # "YYYY:MM:DD HH:MM:SS", or ""
@@ -350,5 +352,5 @@ def _tags(file: Any) -> dict[str, Any]:
     logging.getLogger("exifread").setLevel(logging.CRITICAL)
     try:
         return dict(exifread.process_file(_LimitedReader(file), details=False))
-    except Exception:  # on damaged files exifread raises exceptions of any type
+    except Exception:  # exifread raises exceptions of any type for damaged files
         return {}

@@ -120,7 +120,8 @@ def read_image(
     elif not mosaic:
         pixels, notes = _to_srgb(path, pixels, stated)
         warnings += notes
-    # Values beyond half are so bright that clipping loses nothing, and squares cannot overflow.
+    # Values above the largest half are so bright that clipping loses nothing. Their squares could
+    # overflow.
     if not mosaic and pixels.dtype == np.float32 and (clipped := clip_to_half(pixels)):
         samples = "1 sample" if clipped == 1 else f"{clipped} samples"
         were = "was" if clipped == 1 else "were"

@@ -10,8 +10,8 @@ from clpipe.images.preview import thumbnail
 
 SHEET_SUFFIXES = (".jpg", ".png", ".tif")  # extensions of pictures that can be on a sheet
 
-THUMBNAIL = 240  # px, the longer side
-TEXT = 14  # px high
+THUMBNAIL = 240  # px; the longer side of a thumbnail
+TEXT = 14  # px; the height of text
 GAP = 6  # px
 BACKGROUND, INK = (250, 250, 250), (30, 30, 30)
 

@@ -97,7 +97,7 @@ def read_statements(path: Path, file: Any, xyz: bool = False) -> Statements:
         if file.seek_subimage(part + 1, 0):
             warnings.append("it has several pages; only the first one was read")
         file.seek_subimage(part, 0)
-        file.geterror()  # clears it: the next page need not exist
+        file.geterror()  # clears the error: the next page need not exist
     chromaticities = CIE_XYZ if xyz else spec.getattribute("chromaticities")
     curve = ""
     if format_ == "png":

@@ -33,7 +33,7 @@ class Tags:
     aperture: Positive | None = None  # f-number
     bias: float | None = None  # EV relative to the render
     focal_length: Positive | None = None  # mm
-    lens: str = ""  # its model
+    lens: str = ""  # model of the lens
     focus_distance: Positive | None = None  # m
     taken: str = ""  # "YYYY:MM:DD HH:MM:SS"
     sensor_width: Positive | None = None  # mm, along the longer side

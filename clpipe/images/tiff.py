@@ -26,7 +26,7 @@ class Field:
         return 0 if len(self.data) <= 4 else len(self.data) + len(self.data) % 2
 
 
-Directory = dict[int, Field]  # by tag
+Directory = dict[int, Field]  # fields by tag number
 
 
 def _numbers(type_: int, code: str, *values: float) -> Field:

@@ -38,7 +38,7 @@ NO_TIME = "1970:01:01 00:00:00"
 def srgb_profile() -> bytes:
     """Return an ICC profile of sRGB, with the same bytes in each call."""
     profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
-    profile[24:36] = bytes(12)  # the date of creation
+    profile[24:36] = bytes(12)  # removes the date of creation
     return bytes(profile)
 
 
@@ -182,7 +182,7 @@ def _stored(path: Path, size: int, encode: Callable[[str], None]) -> Stored:
     Raises:
         ImageError: the file cannot be written.
     """
-    # Encoders do not notice every error of a full disk, and libjpeg then ends the process. They
+    # Encoders do not notice every error of a full disk, and libjpeg then ends the process. Encoders
     # therefore write to memory, or to a disk with enough space.
     try:
         _check_file_limit(2 * size)

@@ -8,7 +8,7 @@ from typing import Any, NoReturn, Protocol
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import parse_json, read_named
 
-MAX_BYTES = 1 << 30  # size of a file
+MAX_BYTES = 1 << 30  # bytes; the largest file
 MAX_COORDINATE = 1e5  # px, inside or outside the render
 MAX_PIXELS = 10**10  # pixels of a render: MAX_COORDINATE squared
 

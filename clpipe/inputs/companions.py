@@ -17,15 +17,16 @@ from clpipe.reference.carried import RESAMPLING, LayerKind, Vector
 
 CARRIED = "carried"  # in file names: the carried layers of NAME are in NAME.carried.exr
 
+# Extensions of companions, in order of preference.
 SUFFIXES = (
     ".exr",
     ".pfm",
     ".tif",
     ".tiff",
     ".png",
-)  # companions' extensions, in order of preference
+)
 
-SEPARATORS = "_.-"  # between the image's name and the layer's name, in the name of a companion
+SEPARATORS = "_.-"  # in a companion's name, between the image's name and the layer's name
 
 
 @dataclass(frozen=True)

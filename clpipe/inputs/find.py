@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 log = logging.getLogger(__name__)
 
-# By extension: why a file is not an image, and which option or command takes it.
+# For each extension, why a file is not an image, and which option or command reads it.
 NON_IMAGES = {
     ".json": "this is JSON, not an image; to recompute a sidecar's picture, use 'clpipe replay'",
     ".toml": "this is a configuration or a camera, not an image; pass it with -c or --camera",
@@ -216,7 +216,8 @@ def _jobs_at_url(url: str, endings: Sequence[str], excluded: Exclusion) -> list[
         RequestError: the URL cannot be listed, or has no images.
     """
     is_pattern = is_glob(url)
-    if not is_pattern and Path(url).suffix.lower() in endings:  # one that is missing fails alone
+    # If the file is missing, only its job fails.
+    if not is_pattern and Path(url).suffix.lower() in endings:
         return [Job(path_of(url), url.rpartition("/")[2])]
     root = url.rstrip("/")
     jobs = []

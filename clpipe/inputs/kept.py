@@ -21,7 +21,7 @@ from clpipe.images.attributes import read_attributes
 from clpipe.images.read import SourceImage
 from clpipe.inputs.plausibility import input_warnings
 
-# The attribute of an image without sensor noise: "clean" for --truth clean, otherwise "none".
+# The attribute of an image without sensor noise. It is "clean" for --truth clean, otherwise "none".
 NOISE = "sensor_noise"
 
 
@@ -116,7 +116,8 @@ class KeptLoader:
             KindError: the step at ``start_at`` does not read this kind of image.
         """
         key = source.attributes.get("image_key", key)
-        request = self.request.for_image(name_of_key(key), self.request.image)  # draws the same
+        # Draws the same values as the image's own run.
+        request = self.request.for_image(name_of_key(key), self.request.image)
         chain = self._chain_for(request, path, source.attributes)
         warnings = list(source.warnings)
         if not self._is_next(chain, source.attributes):

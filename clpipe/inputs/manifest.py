@@ -29,11 +29,12 @@ from clpipe.inputs.tables import (
 )
 
 MANIFEST_SUFFIXES = (".csv", ".jsonl")
+# No other setting depends on these keys, and their values often differ by row.
 INDEPENDENT_KEYS = (
     "seed",
     "noise_key",
-)  # no other setting depends on these, and they often differ by row
-MANIFEST_BYTES = 256 * 2**20  # enough for two million rows
+)
+MANIFEST_BYTES = 256 * 2**20  # bytes; enough for two million rows
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,8 @@ from clpipe.stages.projection import WideAngle
 
 FACES = 6
 RIGHT_ANGLE = 90.0
-POSITION_TOLERANCE = 1e-6  # cameras may be this far apart, relative to their largest coordinate
+# Relative to the largest coordinate; cameras this close count as at one place.
+POSITION_TOLERANCE = 1e-6
 
 CUBE_MAP, LATITUDE_LONGITUDE = "CubeFace Environment", "LatLong Environment"
 

@@ -121,7 +121,7 @@ class RawLoader:
         """Return the chain for a raw, and warnings about missing or wrong metadata."""
         embedded, warnings = settings_of(facts)
         parameters = dict(embedded.parameters)
-        own = self.request.settings().drawn("")  # an example of settings that may be drawn
+        own = self.request.settings().drawn("")  # an example, because settings may be drawn
         balance = stage_name(StageRole.BALANCE)
         if balance in warnings and own.parameters.get(balance):
             del parameters[balance]  # the user's setting replaces the fallback

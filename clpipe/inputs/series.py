@@ -74,7 +74,8 @@ class Series:
             replace(
                 job,
                 name=f"{folder}/{job.stem}",
-                values={**job.values, **values} if job.values else values,  # shared
+                # Jobs share the values if they have none of their own.
+                values={**job.values, **values} if job.values else values,
             )
             for job in jobs
             for folder, values in members

@@ -91,9 +91,8 @@ def average(
     """
     found: list[SourceImage] = []
     totals: Floats = np.empty(0, np.float32)
-    weights: list[
-        tuple[Doubles, Doubles]
-    ] = []  # weights of a frame, and extra weights of its light layer
+    # Weights of a frame, and extra weights of its light layer.
+    weights: list[tuple[Doubles, Doubles]] = []
     for number, path in enumerate(job.paths):
         with check_unchanged(path):
             source = read(path, None)

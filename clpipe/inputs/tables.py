@@ -17,13 +17,14 @@ from clpipe.base.text import unknown_name
 from clpipe.chain.keys import CODE, KEYS
 from clpipe.chain.toml import toml_value
 
-Record = Callable[[], dict[str, Any]]  # the values of a row by column, or a RequestError
+# Returns the values of a row by column, or raises RequestError.
+Record = Callable[[], dict[str, Any]]
 
 TEXT_COLUMNS = ("path", "name")  # columns that are not parsed as TOML values
 
 NON_SETTINGS = (*TEXT_COLUMNS, "frames")  # columns that are not settings
 
-# Columns of settings that are not in a table.
+# Columns with settings that do not belong to a table.
 TOP_LEVEL_KEYS = tuple(key for key in KEYS if key not in (CODE, "dump", "stages"))
 
 

@@ -181,7 +181,7 @@ class BopWriter:
             if "cam_K" in known:
                 picture_camera = _picture_camera(known["cam_K"], mapping)
                 camera["cam_K"] = _camera_matrix(picture_camera).ravel().tolist()
-                if picture_camera.model != PINHOLE:  # BOP itself cannot describe distortion
+                if picture_camera.model != PINHOLE:  # BOP cannot describe distortion
                     camera |= lens_record(picture_camera)
         objects = [_WarpedObject(each, mapping) for each in render.content]
         self._pictures.append((file, render, camera, objects))

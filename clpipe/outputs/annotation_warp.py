@@ -20,10 +20,10 @@ from clpipe.reference.geometry import (
 )
 from clpipe.reference.intrinsics import Intrinsics
 
-SEGMENT_LENGTH = 2.0  # px: the length of the segments into which an outline is divided
-SIMPLIFY_TOLERANCE = 0.05  # px: the tolerance with which a mapped outline is simplified
-MAX_SAMPLES = 4096  # pixels of a mask that are sampled to estimate how much of it is cut off
-MIN_AREA = 0.5  # px^2: an object whose visible area is smaller is dropped
+SEGMENT_LENGTH = 2.0  # px; the length of the segments into which an outline is divided
+SIMPLIFY_TOLERANCE = 0.05  # px; the tolerance for simplifying a warped outline
+MAX_SAMPLES = 4096  # pixels of a mask that are sampled to estimate how much of the mask is cut off
+MIN_AREA = 0.5  # px^2; an object with a smaller visible area is dropped
 
 
 @dataclass(frozen=True)

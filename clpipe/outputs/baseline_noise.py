@@ -18,14 +18,14 @@ from clpipe.reference.curve import to_8_bit
 from clpipe.stage import run_reference
 from clpipe.stages.picture_noise import CHANNELS, IidGaussian, IntensityDependent, NoNoise
 
-MAX_SIGMA = 1.0  # relative to full scale
+MAX_SIGMA = 1.0  # largest sigma, relative to full scale
 CURVE_POINTS = 65  # intensities at which the sigma of INTENSITY is known
 HISTOGRAM_BINS = 1024  # bins of the histogram of the clean picture
 QUANTILES = np.array([NormalDist().inv_cdf((i + 0.5) / 64) for i in range(64)])
 QUANTILES /= QUANTILES.std()
 INDEPENDENT_LEFT = 0.25  # averaging 2x2 leaves this share of the variance of independent noise
-MAX_ITERATIONS = 8  # each applies noise to the picture; four are usually enough
-TOLERANCE = 0.003  # relative error of a variance at which the search stops
+MAX_ITERATIONS = 8  # iterations; each applies noise to the picture, and four are usually enough
+TOLERANCE = 0.003  # the search stops at this relative error of a variance
 
 
 @dataclass(eq=False)
@@ -45,8 +45,8 @@ class NoiseMatcher:
     matching: NoNoise
     encoding: Encoding
     _noisy: Floats | None = None
-    _clean: Floats | None = None  # only if noise has to be applied to it
-    _mask: Mask | None = None  # the pixels in which noise is matched; None is all
+    _clean: Floats | None = None  # None if no noise has to be applied to the clean picture
+    _mask: Mask | None = None  # the pixels in which noise is matched; None means all
     _covariance: Doubles = field(default_factory=lambda: np.zeros((3, 3)))
     _curves: list[Doubles] = field(default_factory=list)
     _intensities: list[Array] = field(default_factory=list)
@@ -113,7 +113,8 @@ class NoiseMatcher:
         if self._clean is None or not (target > 0).all():
             return method, {}
         # JPEG's luma and chroma couple the channels, so the error of a channel depends on all
-        # strengths. Broyden's method (1965) in logarithms, starting from the unit matrix.
+        # strengths. Solve for them with Broyden's method (1965) in logarithms. Start from the unit
+        # matrix.
         clean, best, best_ratio, best_error = (
             self._as_displayed(self._clean),
             method,

@@ -103,7 +103,7 @@ def write_camera_files(
             write_atomic(path, texts[name].encode())
             sync_folder(path.parent)
         elif texts:
-            path.unlink(missing_ok=True)  # a file of pictures that have been removed
+            path.unlink(missing_ok=True)  # describes pictures that have been removed
     reasons = tuple(
         f"{len(files)} picture{'s' * (len(files) > 1)} {reason}, such as {min(files)}"
         for reason, files in skipped.items()

@@ -177,7 +177,7 @@ def nerfstudio(
         split: [prefix + each.file for each in pictures if splits.get(each.name) == split]
         for split in dict.fromkeys(splits.values())
     }
-    if "val" in of_split:  # nerfstudio needs all three lists if there is one
+    if "val" in of_split:  # nerfstudio needs all three lists if there is any list
         of_split.setdefault("test", of_split["val"])
     lists = {f"{split}_filenames": files for split, files in of_split.items()}
     header = {"note": OPENGL_NOTE, "camera_model": model, **shared, **responses.record, **lists}

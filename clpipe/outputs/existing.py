@@ -33,8 +33,8 @@ MARK_SEARCH_BYTES = 1 << 16  # clpipe's mark is searched in this many bytes at b
 
 OVERWRITTEN = "would be overwritten; move it, choose another output directory, or use --redo all"
 
-# clpipe's Software tag, or one of clpipe's attributes. The name clpipe is not enough, because it is
-# also the camera of DNGs, which converters copy to their output.
+# clpipe's Software tag, or one of clpipe's attributes. The name clpipe is not enough: DNGs have a
+# camera of this name, which converters copy to their output.
 MARK = re.compile(rb"clpipe \d+\.\d|clpipe:\w")
 
 
@@ -52,10 +52,10 @@ class Redo(Enum):
     Pictures that are missing, or were made by another request, are always computed.
     """
 
-    MISSING = "missing"  # none
-    OLD = "old"  # pictures that another program made
+    MISSING = "missing"  # only pictures that do not exist
+    OLD = "old"  # pictures that another version of the program made
     DAMAGED = "damaged"  # damaged pictures, which are found by reading all files
-    ALL = "all"  # all, even if clpipe did not write the files
+    ALL = "all"  # all pictures, even if clpipe did not write the files
 
     @property
     def verifies(self) -> bool:
@@ -182,7 +182,7 @@ def _same_input(values: Mapping[str, Any], job: Job, verify: bool) -> bool:
         return all(
             _is_same(path, entry, verify) for path, entry in input_entries(values, job.paths)
         )
-    except (KeyError, TypeError, ValueError):  # damaged, or for another number of files
+    except (KeyError, TypeError, ValueError):  # a damaged sidecar, or another number of files
         return False
 
 

@@ -64,7 +64,7 @@ def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
         ) from None
     if reason := write_problem(folder, with_space=False):
         raise RequestError(f"{folder}: {reason}")
-    # Each shard locks its part of a file that stays empty.
+    # Each shard locks its own range of this empty file.
     start = LOCKABLE_BYTES * (shard.number - 1) // shard.of
     length = LOCKABLE_BYTES * shard.number // shard.of - start
     entry = folder / LOCK, _locked(folder / LOCK, length, start), start, length
@@ -100,7 +100,7 @@ def _locked(path: Path, length: int, start: int) -> int:
         try:
             is_ours = lock_range(lock, start, length)
         except OSError:
-            return lock  # a file system without locks
+            return lock  # the file system does not support locks
         if not is_ours:
             os.close(lock)
             raise RequestError(
@@ -110,7 +110,7 @@ def _locked(path: Path, length: int, start: int) -> int:
         with contextlib.suppress(OSError):
             if os.fstat(lock).st_ino == path.stat().st_ino:
                 return lock
-        os.close(lock)  # its last holder removed the file after it was opened
+        os.close(lock)  # the previous holder removed the file after it was opened
 
 
 def remove_unfinished(folder: Path, jobs: Iterable[Job], patches: bool = False) -> None:

@@ -36,7 +36,7 @@ def negative_of(chain: Chain) -> Negative:
     context, final_context = chain.raw_context, chain.context_after
     is_balanced = is_input and chain.step_in(StageRole.BALANCE) is not None
     gains = final_context.applied_gains if is_balanced else context.gains
-    # A raw that is the input has the levels of normalize.
+    # If the input is a raw, its levels are the input levels of normalize.
     levels = chain.steps[0].method if is_input else context
     black = _level(levels, "black_level", chain.camera.black_level)
     white = _level(levels, "white_level", chain.camera.white_level)

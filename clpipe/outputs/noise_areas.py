@@ -11,7 +11,7 @@ PICTURE, FLAT, HALVED = PLACES = ("picture", "flat", "halved")
 
 WINDOW = 5  # px: side of the window that decides whether a pixel is flat
 FLATTEST = 0.25  # share of a picture that always counts as flat
-MAD_TO_SIGMA = 1.4826  # sigma over the median absolute deviation of a normal distribution
+MAD_TO_SIGMA = 1.4826  # sigma of a normal distribution, relative to its median absolute deviation
 
 
 def covariance(noise: Floats) -> Doubles:

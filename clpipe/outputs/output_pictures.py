@@ -14,8 +14,8 @@ from clpipe.outputs.carried import carried_files
 from clpipe.outputs.sidecar import SIDECAR, SidecarError, output_entries, sidecar_files, values_at
 from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
 
-# A training set has one kind of picture. The cameras of noisy pictures are at the top of the
-# output directory, and models of other kinds in models/.
+# A training set has one kind of picture. Camera models of noisy pictures are at the top of the
+# output directory, and those of other kinds are in models/.
 OTHERS = (*PICTURES, *BASELINES)
 
 MODEL_FOLDERS = {NOISY: "", **{role: f"models/{Rendition(role).label[1:]}/" for role in OTHERS}}

@@ -72,7 +72,7 @@ def first_aligned_position(pattern: str, orientation: int, size: int) -> tuple[i
     """
     cell = parse_array(pattern).letters
     rows, columns = cell.shape
-    period = math.lcm(rows, columns)  # on both axes, because a rotation may swap them
+    period = math.lcm(rows, columns)  # the same on both axes, because a rotation may swap them
     side = period + size % period
     mosaic = np.tile(cell, (4 * period // rows, 4 * period // columns))
     for y in range(rows):
@@ -189,7 +189,7 @@ class PatchLayout:
         for number in numbers:
             orientation = self._orientation(drawn[f"{number}.turn"])
             position = first_aligned_position(self.pattern, orientation, size)
-            assert position  # _orientation returns only orientations that have one
+            assert position  # _orientation returns only orientations that have a position
             x, y = position
             if is_grid:
                 row, column = divmod(number, -(-self.width // size))

@@ -98,7 +98,7 @@ class OutputPlan:
 
     def formats_of(self, rendition: Rendition) -> tuple[str, ...]:
         """Return the formats of a rendition."""
-        if rendition.role in BASELINES:  # it has no raw
+        if rendition.role in BASELINES:  # baselines have no raw
             return tuple(format_ for format_ in self.formats if format_ != DNG)
         return (self.kept_format,) if rendition.role in FLOAT_MOSAICS else self.formats
 
@@ -156,9 +156,8 @@ class OutputPlan:
         if DNG in self.formats:
             dng_of(chain)  # rejects a chain without a raw
         for frames in {job.frames for job in jobs}:
-            recipes(
-                self._all_renditions(frames), chain, ""
-            )  # rejects a chain that has no such truth
+            # Reject a chain that cannot produce the requested ground truth.
+            recipes(self._all_renditions(frames), chain, "")
         if self.patches:
             self._check_patches(chain)
         endings: dict[str, str] = {}

@@ -135,7 +135,7 @@ def recipes(selected: Iterable[Rendition], chain: Chain, key: str) -> list[Recip
         RequestError: the chain has no such ground truth, or no such exposure.
     """
     found: list[Recipe] = []
-    matchers: dict[float | None, NoiseMatcher] = {}  # baselines of one exposure share theirs
+    matchers: dict[float | None, NoiseMatcher] = {}  # all baselines of one exposure share a matcher
     for each in selected:
         exposed_chain = chain if each.ev is None else with_exposure(chain, each.ev)
         exposed_key = bracket_key(key, each.ev or 0.0)
@@ -156,7 +156,7 @@ def reference_pictures(baseline: Rendition) -> tuple[Rendition, Rendition, Rendi
     return baseline.with_role(NOISY), baseline.with_role(DEVELOPMENT), baseline.with_role(CLEAN)
 
 
-@lru_cache(maxsize=64)  # for the same reason as chain_and_noise
+@lru_cache(maxsize=64)  # plans are cached per chain, see chain_and_noise
 def with_exposure(chain: Chain, ev: float) -> Chain:
     """Return a chain whose exposure is increased by ``ev``, with different noise.
 

@@ -24,7 +24,7 @@ SIDECAR = "json"  # the extension of sidecars
 
 VERSION_KEY = "clpipe"  # the first key of every sidecar
 
-DIGEST_KEY = "sidecar_sha256"  # the last one: the SHA-256 of all lines before its own
+DIGEST_KEY = "sidecar_sha256"  # the last key: the SHA-256 of all lines before its own
 
 BEGINNING = b'{\n  "%b": ' % VERSION_KEY.encode()
 
@@ -33,7 +33,7 @@ _BEGINNING = re.compile(rb'\s*\{\s*"%b"\s*:' % VERSION_KEY.encode())
 _END = re.compile(rb'"%b"\s*:' % DIGEST_KEY.encode())
 
 
-to_json = json.JSONEncoder().encode  # json.dumps without its checks of options
+to_json = json.JSONEncoder().encode  # json.dumps without checking its options
 
 
 class SidecarError(ImageError):
@@ -75,8 +75,8 @@ def parse_sidecar(data: bytes, name: Path | str) -> dict[str, Any] | None:
     end = data.rfind(b'  "%b": "' % DIGEST_KEY.encode())
     if end > 0 and data[end:] == _digest_lines(data[:end]):
         try:
-            # pydantic's parser takes a third of the time of json's. It rejects the escapes by which
-            # json writes file names that are not UTF-8.
+            # pydantic's parser takes a third of the time of json's parser. It rejects the escapes
+            # that json writes for file names that are not UTF-8.
             values = parse_json(data) if b"\\ud" in data else from_json(data)
         except ValueError:
             values = None

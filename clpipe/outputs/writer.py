@@ -42,7 +42,8 @@ class OutputWriter(OutputPlan):
         """Return a runner that computes only what the files of a rendition require."""
         formats, keep = self.formats_of(recipe.rendition), self.kept_steps(recipe.rendition)
         steps, encode, final = required_results(recipe.chain, formats, keep)
-        final |= bool(self.request.baselines)  # to measure its noise
+        # The noise of baselines is measured on the final picture.
+        final |= bool(self.request.baselines)
         return Runner(recipe.chain, device, steps, encode, final)
 
     def check_size(self, source: SourceImage, chain: Chain) -> None:

@@ -16,7 +16,7 @@ from clpipe.reference.geometry import Geometry, destinations
 LayerKind = Literal["depth", "label", "normal", "flow", "colour"]
 
 # How each kind is resampled. Between two surfaces there is no valid depth, label, normal or vector,
-# so values there are those of one pixel.
+# so each value there comes from one pixel.
 RESAMPLING: dict[LayerKind, str] = {
     "depth": "its inverse bilinear within a surface, else nearest",
     "label": "nearest",
@@ -25,11 +25,11 @@ RESAMPLING: dict[LayerKind, str] = {
     "colour": "bilinear",
 }
 
-TIE_DISTANCE = 1e-6  # px: distance from the border of two pixels up to which a position is on it
+TIE_DISTANCE = 1e-6  # px; a position this close to the border of two pixels counts as on the border
 
 BLOCK = 1 << 17  # pixels that are warped at a time
 
-# The channels of a vector to the right and down, and the signs of those in the file.
+# The channels that point right and down, and the signs of these directions in the file.
 Vector = tuple[tuple[int, int], tuple[int, int]]
 
 
@@ -204,9 +204,8 @@ def bilinear(pixels: Array, x: Array, y: Array) -> Array:
 
 def _clamped_index(position: Array, size: int) -> Array:
     """Return the numbers of the rows or columns that contain positions, or are nearest to them."""
-    return np.clip(position, 0, size - 1).astype(
-        np.intp
-    )  # positive values are truncated, not rounded
+    # astype() truncates positive values and does not round them.
+    return np.clip(position, 0, size - 1).astype(np.intp)
 
 
 def map_flow(samples: Array, vectors: Sequence[Vector], move: PixelOrigins) -> Array:

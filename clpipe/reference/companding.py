@@ -10,7 +10,7 @@ from clpipe.base.types import Doubles, Floats
 
 Knots = tuple[tuple[float, float], ...]
 
-# between the end knots of the default curve; each piece is a quarter as long as the next
+# Octaves between the end knots of the default curve. Each piece is a quarter as long as the next.
 OCTAVES = 7
 
 
@@ -48,7 +48,7 @@ def parse_knots(pairs: Sequence[Sequence[float]]) -> Knots:
     return knots
 
 
-@lru_cache(maxsize=64)  # the same object for the same knots, so that it is uploaded once
+@lru_cache(maxsize=64)  # equal knots share one object, so that it is uploaded once
 def pieces_of(knots: Knots, inverse: bool = False) -> Floats:
     """Return the pieces between knots, or their inverse: start, value there, slope; (piece, 3)."""
     points: Doubles = np.array(knots)[:, ::-1] if inverse else np.array(knots)

@@ -7,7 +7,7 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.random import Stream, normal_at
 
-TOLERANCE = 1e-6  # by which a measured and rounded correlation may be impossible
+TOLERANCE = 1e-6  # a measured and rounded correlation may exceed the possible range by this much
 
 
 def mixing(red_green: float, red_blue: float, green_blue: float) -> tuple[np.float32, ...]:

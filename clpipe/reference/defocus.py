@@ -12,8 +12,8 @@ from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.reference.image import tap
 
-HIDDEN_WEIGHT = 1.0  # a weight, see aperture_taps
-FAR = 1e9  # from here on, a surface is infinitely far; Blender's sky is at 1e10
+HIDDEN_WEIGHT = 1.0  # see aperture_taps
+FAR = 1e9  # distance from which a surface counts as infinitely far; Blender's sky is at 1e10
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,7 @@ def defocus(image: Floats, radii: Floats, taps: Floats) -> Floats:
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
     centre, size = radii, abs(radii)
     area = _area(size)
-    # Sums for surfaces in front, level and behind.
+    # Sums for surfaces that are nearer than, level with and farther than the pixel's surface.
     light: Floats = np.zeros((3, *image.shape), np.float32)
     total: Floats = np.zeros((3, *radii.shape), np.float32)
     free: Floats = np.zeros(radii.shape, np.float32)

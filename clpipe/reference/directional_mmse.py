@@ -23,17 +23,17 @@ from clpipe.reference.linear_mmse import (
     windows,
 )
 
-DIRECTIONS = 4  # the row, the falling diagonal, the column, the rising one
-# The models. Lengths in px along and across the direction, within which the correlation falls to
-# 1/e. Its shape between exponential (1) and Gaussian (2). The variances of chroma, relative to that
-# of luma. The variance of the rest that a model does not describe. Chosen on sixteen images of the
-# Kodak set that docs/quality.md does not show, and every second one of McMaster's, for X-Trans,
-# quad, RGBW and Bayer.
+DIRECTIONS = 4  # the row, the falling diagonal, the column and the rising diagonal
+# Parameters of the models. ALONG and ACROSS are the lengths in px within which the correlation
+# falls to 1/e. SHAPE is between exponential (1) and Gaussian (2). CHROMAS are variances of chroma
+# relative to luma. NOISE is the variance that a model does not describe. We chose the values for
+# X-Trans, quad, RGBW and Bayer arrays. We used sixteen images of the Kodak set that docs/quality.md
+# does not show, and every second image of McMaster's.
 ALONG, ACROSS, SHAPE = 32.0, 11.0, 1.65
 CHROMAS = (0.002, 0.3)
 NOISE = 2.5e-5
 MODELS = DIRECTIONS * len(CHROMAS)
-REACH = 2  # px: errors are averaged over 5x5
+REACH = 2  # px; errors are averaged over 5x5 pixels
 ERROR_FLOOR = np.float32(1e-6)  # a negligible squared error: a thousandth of white
 
 
@@ -58,7 +58,8 @@ def models(array: FilterArray) -> tuple[Floats, Floats]:
             for number, chroma in enumerate(CHROMAS, direction * len(CHROMAS)):
                 model_filters = mmse_filters(responses, taps, to_centre, chroma, NOISE)
                 colours[row, column, :, number] = model_filters
-                # The row of a precision matrix is the value minus its best estimate.
+                # A row of a precision matrix computes the value minus its best estimate from the
+                # others.
                 precision_row = np.linalg.inv(covariance(responses, taps, chroma, NOISE))[middle]
                 error_filters[row, column, :, number] = precision_row / precision_row[middle]
     return colours, error_filters

@@ -16,12 +16,14 @@ from clpipe.reference.cfa import PATTERNS, Pattern
 
 MAX_PERIOD = 8
 MIRRORED = 2  # the longest period that a mirrored border (reflect-101) continues
-LANES = 16  # the most lanes of a device: entries after a row of a table, so that it loads at once
+# Lanes; the most that a device has. Each row of a table has as many extra entries, so that it loads
+# at once.
+LANES = 16
 
-# The raw red, green and blue that pass a filter. Clear and two-colour filters pass the sum of their
-# colours, like ideal dyes. The arrays are those of Bayer (R, G, B), Yamanaka, US 4,054,906, Compton
-# and Hamilton, US 8,139,130, and others. A mono sensor has no filter. An RGB render contains no
-# near infrared: that channel sees a quarter of a clear one.
+# The raw red, green and blue that pass a filter. Like ideal dyes, clear and two-colour filters pass
+# the sum of their colours. The arrays are by Bayer (R, G, B), Yamanaka (US 4,054,906), Compton and
+# Hamilton (US 8,139,130), and others. A mono sensor has no filter. An RGB render contains no near
+# infrared, so that channel sees a quarter of a clear one.
 TRANSMISSIONS: dict[str, tuple[float, ...]] = {
     "R": (1, 0, 0),
     "G": (0, 1, 0),

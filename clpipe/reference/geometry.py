@@ -222,8 +222,8 @@ class Crop:
         return replace(known, width=self.width, height=self.height, cx=cx, cy=cy)
 
 
-RESIDUAL = 1e-6  # px, in the input of a geometry
-STEP = 1e-3  # px, of the finite differences
+RESIDUAL = 1e-6  # px in the input of a geometry; the largest error of an inverted position
+STEP = 1e-3  # px; the step of finite differences
 ITERATIONS = 20
 
 

@@ -207,7 +207,8 @@ class _ScaledLens:
         self.corner = float(np.hypot(*(offsets / self.unit).T).max())
         self.corner_side = float(np.hypot(*(offsets / self.side).T).max()) / scale
         offsets = self._corners(-left, -top, width + right, height + bottom)
-        self.farthest = float(np.hypot(*(offsets / self.unit).T).max())  # corner of the input
+        # Radius of the input's corner.
+        self.farthest = float(np.hypot(*(offsets / self.unit).T).max())
         self._check(lens.radial, self.farthest, self.corner, "distortion", max(self.unit))
         for lateral in (lens.red, lens.blue):
             self._check(lateral, self.corner_side, self.corner_side, "lateral colour", self.side)
@@ -331,7 +332,7 @@ def fitting_scale(lens: DistortionMap, width: int, height: int) -> float:
             f"distortion: no scale fits the image of {width}x{height} pixels into the render; "
             "check that cx and cy are in the image, or set fit=false"
         )
-    for _ in range(26):  # to 1e-7
+    for _ in range(26):  # 26 bisections, for a precision of 1e-7
         middle = (low * high) ** 0.5
         low, high = (low, middle) if is_full(middle) else (middle, high)
     return high

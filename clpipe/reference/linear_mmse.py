@@ -14,15 +14,15 @@ import numpy as np
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.filter_array import FilterArray, periodic_indices
 
-RADIUS = 3  # px: windows of 7x7
+RADIUS = 3  # px; windows are 7x7
 SIDE = 2 * RADIUS + 1
-# The model: luma, the same in red, green and blue, of variance 1, and chroma, with the sum zero and
-# the variance CHROMA each. Both are isotropic, with a correlation of NEIGHBOURS to the power of the
-# distance in px. Chosen on eight images of the Kodak set, for RGGB, quad and X-Trans
-# (docs/quality.md).
+# The model. Luma is the same in red, green and blue and has variance 1. Chroma sums to zero, and
+# each colour's chroma has the variance CHROMA. Both are isotropic. The correlation is NEIGHBOURS to
+# the power of the distance in px. We chose the values on eight images of the Kodak set, for RGGB,
+# quad and X-Trans (docs/quality.md).
 CORRELATION = 0.95
 CHROMA = 0.05
-NOISE = 1e-4  # variance of the rest that the model does not describe
+NOISE = 1e-4  # variance that the model does not describe
 
 
 @lru_cache(maxsize=16)
@@ -107,14 +107,15 @@ def mmse_filters(
     samples = covariance(responses, tap_correlation, chroma, noise)
     cross_covariance = centre_correlation[:, None] * (responses @ _colours(chroma))
     has_colours = np.linalg.matrix_rank(responses, 1e-3) == 3
-    exact = np.eye(3) if has_colours else np.ones((3, 1))  # flat colours, in columns
+    # Columns are the flat colours that must be exact.
+    exact = np.eye(3) if has_colours else np.ones((3, 1))
     flat_samples = responses @ exact
     solution = np.linalg.solve(samples, np.concatenate([cross_covariance, flat_samples], axis=1))
     free, flat = solution[:, :3], solution[:, 3:]
     residual = exact.T - flat_samples.T @ free
     result = np.asarray(free + flat @ np.linalg.solve(flat_samples.T @ flat, residual))
     middle = len(responses) // 2
-    # a colour that was sampled
+    # A colour that was sampled keeps its sample.
     if 1 in responses[middle].tolist() and np.isclose(responses[middle].sum(), 1):
         result[:, responses[middle].argmax()] = np.arange(len(responses)) == middle
     return result

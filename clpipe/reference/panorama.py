@@ -16,8 +16,9 @@ from clpipe.reference.carried import bilinear, nearest
 from clpipe.reference.warp import FILTERS
 
 BORDER = 4  # px; filters extend 3 px around a position
-BORDER_PASSES = 2  # to fill borders; in the second pass also from each other
-EDGE = 1e-6  # a view also covers directions this far outside it, relative to its side
+# Passes that fill borders; in the second pass, borders are also filled from each other.
+BORDER_PASSES = 2
+EDGE = 1e-6  # relative to a view's side; a view also covers directions this far outside it
 
 Rotation = tuple[tuple[float, float, float], ...]
 

@@ -10,7 +10,7 @@ from clpipe.base.types import Floats
 from clpipe.reference.math import estrin, exponential, inverse_root
 from clpipe.reference.random import Words, in_upper_half, normal_of, tail_probability
 
-LARGE = np.float32(10)  # mean from which the expansion is used
+LARGE = np.float32(10)  # the expansion is used for this mean and above
 TERMS = 36  # a Poisson number of mean 10 exceeds this with a probability of 1e-10
 
 # The polynomials of the expansion, lowest power first: our own weighted least-squares fits.

@@ -15,7 +15,7 @@ from clpipe.base.types import Array
 Vector: TypeAlias = tuple[float, float, float]
 Matrix: TypeAlias = tuple[Vector, Vector, Vector]
 
-OPENGL = np.diag([1.0, -1.0, -1.0])  # OpenCV's axes in OpenGL's, and back
+OPENGL = np.diag([1.0, -1.0, -1.0])  # converts between OpenCV's axes and OpenGL's
 
 TOLERANCE = 1e-3  # largest element of R R^T - 1; text files may be rounded to four digits
 
@@ -49,7 +49,7 @@ def from_opengl(matrix: Array) -> tuple[Array, Array]:
     ([1.0, -1.0, -1.0], [-5.0, 6.0, 7.0])
     """
     r = OPENGL @ matrix[:3, :3].T
-    return r + 0.0, -(r @ matrix[:3, 3]) + 0.0  # no -0.0
+    return r + 0.0, -(r @ matrix[:3, 3]) + 0.0  # adding 0.0 turns -0.0 into 0.0
 
 
 def to_opengl(rows: Matrix, t: Vector) -> Array:

@@ -16,9 +16,9 @@ from clpipe.reference.resample import PADDING, Axis, Parameters
 from clpipe.reference.warp import FILTERS, GatherResampler, gather, with_mirrored_lines
 from clpipe.reference.wide import WideLens
 
-FACE_SAMPLES = 256  # positions across a face at which it is searched
+FACE_SAMPLES = 256  # positions across the picture at which visible faces are searched
 
-OUTSIDE = -1e6  # px: a position outside every image
+OUTSIDE = -1e6  # px; marks positions outside every image
 
 OpticsValues = tuple[tuple[str, float], ...]
 
@@ -148,7 +148,7 @@ def visible_faces(lens: WideLens) -> tuple[int, list[str]]:
     x, y = np.meshgrid(np.linspace(0, width, FACE_SAMPLES), np.linspace(0, height, FACE_SAMPLES))
     _, row = cube.positions(lens.rays(x, y))
     numbers = np.unique(row[np.isfinite(row)] * len(CUBE) // cube.size[1])
-    # In its centre, where a face is coarsest, one radian is half its side.
+    # A face is coarsest at its centre, where one radian is half its side.
     side = 2 * int(np.ceil(lens.finest))
     return side, [list(CUBE)[int(number)] for number in numbers]
 

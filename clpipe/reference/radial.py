@@ -13,12 +13,12 @@ from numpy.polynomial.polynomial import polyder, polyval
 from clpipe.base.types import Array
 from clpipe.reference.rational import fit_even
 
-# Newton's method ends when the error after distortion is below this value, in the unit of r: 4e-9
-# px for a focal length of 4000 px.
+# In units of r; Newton's method ends when the error after distortion is below this value. For a
+# focal length of 4000 px, this is 4e-9 px.
 RESIDUAL = 1e-12
 SAMPLES = 2049  # starting points for the inverse of a radial model
-# The model continues outside the corner for this share of its radius, for interpolation. After
-# that, it continues as a straight line.
+# For interpolation, the model continues outside the corner up to this multiple of its radius.
+# Farther out, it continues as a straight line.
 EXTENSION = 1.25
 
 
@@ -94,7 +94,7 @@ class Radial:
         return r + (r_d - inside) / slope
 
 
-STRAIGHT = Radial()  # every r_d is r
+STRAIGHT = Radial()  # r_d equals r
 
 
 @lru_cache(maxsize=64)

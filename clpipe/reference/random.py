@@ -19,8 +19,8 @@ from clpipe.reference.math import estrin, negative_log, square_root
 
 Words = NDArray[np.uint32]
 
-# Lowest power first. The form is after M. Giles, "Approximating the erfinv function", GPU Computing
-# Gems 2011. The fit is our own, and tests/test_noise.py checks its error.
+# Coefficients, lowest power first. Their form is after M. Giles, "Approximating the erfinv
+# function", GPU Computing Gems 2011. The fit is our own, and tests/test_noise.py checks its error.
 NORMAL_COEFFICIENTS = np.array(
     [
         2.9601128,

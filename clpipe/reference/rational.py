@@ -4,7 +4,7 @@ import numpy as np
 
 from clpipe.base.types import Array
 
-DEGREE = 3  # degree of numerator and denominator in r^2, like OpenCV's k1 to k6
+DEGREE = 3  # degree in r^2 of numerator and denominator, like OpenCV's k1 to k6
 ITERATIONS = 40
 
 

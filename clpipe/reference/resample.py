@@ -15,12 +15,12 @@ import numpy as np
 
 from clpipe.base.types import Array, Floats
 
-# A kernel also reads the taps of rows and columns after the image's last ones, because its blocks
-# and vectors are not cut. This is the largest number of such lines.
+# The largest number of rows or columns after the image's last ones for which a kernel reads taps. A
+# kernel reads them because its blocks and vectors are not cut.
 PADDING = 16
 
-# The weight of samples by their distance from the centre of the new pixel, in pixels of the larger
-# image. The new pixel is ``ratio`` of these wide.
+# The weights of samples by their distance from the centre of the new pixel, in pixels of the larger
+# image. A new pixel is ``ratio`` of these pixels wide.
 Weight = Callable[[Array, float], Array]
 
 
@@ -238,7 +238,7 @@ def _taps(resampling: Resampling, size: int) -> Taps:
     line = np.arange(count)[:, None]
 
     def weights(positions: Array) -> Array:
-        # The distance of two centres, in whole numbers up to the division.
+        # The distance between two centres, computed in whole numbers before the division.
         distance = (2 * positions * count - (2 * line + 1) * size + count) / (2 * count)
         return resampling.weight(distance, ratio)
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from clpipe.base.types import Array, Mask
 
-# a slope steeper by this factor than both adjacent slopes is an edge between surfaces
+# A slope that is steeper by this factor than both adjacent slopes is an edge between surfaces.
 EDGE_STEEPNESS = 3.0
 
 
@@ -19,7 +19,7 @@ class Tolerance:
     relative: float = 0.0
 
 
-# For inverse depth, which is linear on a plane; for normals; for flow in px.
+# Tolerances for inverse depth (which is linear on a plane), for normals, and for flow in px.
 DEPTH, NORMAL, FLOW = Tolerance(relative=1e-3), Tolerance(absolute=0.02), Tolerance(absolute=0.05)
 
 

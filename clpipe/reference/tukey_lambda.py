@@ -13,7 +13,8 @@ from clpipe.base.types import Floats
 from clpipe.reference.math import exponential_minus_1, negative_log
 from clpipe.reference.random import Words, in_upper_half, tail_probability
 
-NEARLY_ZERO = 1e-4  # replaces smaller lambdas: at 0, the logistic distribution, 1 / lambda fails
+# Replaces smaller lambdas, because 1 / lambda fails at 0 (the logistic distribution).
+NEARLY_ZERO = 1e-4
 
 
 @traceable

@@ -14,9 +14,9 @@ from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.resample import Axis, Parameters
 from clpipe.reference.warp import gather
 
-# (tap, power), see :data:`clpipe.reference.warp.FILTERS`
+# Indices are (tap, power), see :data:`clpipe.reference.warp.FILTERS`.
 BILINEAR = np.array([[1, -1], [0, 1]], np.float32)
-SPACING = 0.5  # px at most between the positions that make up a streak
+SPACING = 0.5  # px; the largest distance between the positions that make up a streak
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from clpipe.reference.lens import DistortionMap
 from clpipe.reference.radial import Radial
 from clpipe.reference.resample import Axis, Parameters, lanczos3
 
-MAX_ERROR = 0.003  # px, largest error of the map at the centre of a cell
-STEPS = (64, 32, 16, 8, 4, 2, 1)  # px from node to node
+MAX_ERROR = 0.003  # px; the largest error of the map at the centre of a cell
+STEPS = (64, 32, 16, 8, 4, 2, 1)  # px; possible distances between nodes
 MAX_NODES = 2**22
 FIELDS = 8  # values of a node: x and y of red, green and blue, and two for alignment
 
@@ -42,8 +42,8 @@ def _lanczos3() -> Floats:
     return np.ascontiguousarray(np.linalg.lstsq(powers, weights.T)[0].T, np.float32)
 
 
-# For each filter, the polynomial of each tap's weight, (tap, power). The first of `count` taps is
-# 1 - count / 2 pixels away.
+# For each filter, the coefficients of each tap's weight, (tap, power of the fraction). The first of
+# `count` taps is 1 - count / 2 pixels away.
 FILTERS: dict[str, Floats] = {"bicubic": _catmull_rom(), "lanczos3": _lanczos3()}
 
 
@@ -298,8 +298,8 @@ def _error(lens: DistortionMap, width: int, height: int, grid: Grid) -> float:
     return largest
 
 
-# For cubic interpolation in two dimensions between four nodes in a row: the sum of the weights'
-# magnitudes is at most 1.632 in each dimension. A value exceeds those of the nodes by at most this
+# For cubic interpolation between four nodes in each of two dimensions. The magnitudes of the
+# weights sum to at most 1.632 in each dimension. A value exceeds those of the nodes by at most this
 # share of their range.
 OVERSHOOT = (1.632**2 - 1) / 2
 
@@ -309,7 +309,7 @@ def _lines(warp: Warp, axis: Axis, width: int, height: int) -> tuple[Array, Arra
     """See :meth:`GatherResampler.lines`."""
     grid, support = warp.grid(width, height), warp.support
     sizes = warp.resized(width, height)
-    # How far pixels between 4x4 nodes sample to each side, over all channels.
+    # How far pixels between 4x4 nodes sample to each side, for all channels.
     windows = sliding_window_view(grid.nodes[..., :6], (4, 4), (0, 1))
     low, high = windows.min((-2, -1)), windows.max((-2, -1))
     overshoot = OVERSHOOT * (high - low) + 0.01
@@ -322,7 +322,7 @@ def _lines(warp: Warp, axis: Axis, width: int, height: int) -> tuple[Array, Arra
         first = begin.reshape(shape) + low[..., number::2].min(-1)
         last = end.reshape(shape) + high[..., number::2].max(-1)
         visible.append((last >= -1) & (first <= size))
-    is_visible = visible[0] & visible[1]  # the others see no part of the image
+    is_visible = visible[0] & visible[1]  # invisible pixels see no part of the image
     number, size = (1, height) if axis == "rows" else (0, width)
     least = np.where(is_visible, low[..., number::2].min(-1), np.inf).min(number)
     most = np.where(is_visible, high[..., number::2].max(-1), -np.inf).max(number)

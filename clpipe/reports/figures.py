@@ -14,8 +14,8 @@ from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS
 from clpipe.engine.clipping import WARNING_SHARE
 from clpipe.reports.run import Run, RunPicture
 
-TIMES = 60  # intervals of a run, at most
-DISTINCT = 12  # values of a parameter that are listed
+TIMES = 60  # the most intervals into which a run is divided
+DISTINCT = 12  # the most values of a parameter that are listed
 
 
 @dataclass(frozen=True)
@@ -170,8 +170,9 @@ class Parameter:
     """The values of a parameter over the pictures of a run."""
 
     name: str
-    values: Counter[Any]  # JSON values, lists as their text
-    is_requested: bool = True  # drawn, or set for single images; else derived
+    values: Counter[Any]  # JSON values; lists are counted as their text
+    # Whether values were drawn, or set for single images; otherwise they were derived.
+    is_requested: bool = True
 
     @property
     def varies(self) -> bool:
@@ -221,7 +222,7 @@ class Step:
     name: str
     methods: Counter[str]
     parameters: Sequence[Parameter]
-    pictures: int  # with this step
+    pictures: int  # number of pictures with this step
 
     @property
     def is_idle(self) -> bool:
@@ -232,7 +233,7 @@ class Step:
 def steps_of(pictures: Sequence[RunPicture]) -> list[Step]:
     """Return the steps of the chains of pictures, in the order of the longest chain."""
     order: list[str] = []
-    records: dict[int, Mapping[str, Any]] = {}  # equal steps are the same object
+    records: dict[int, Mapping[str, Any]] = {}  # by id; equal steps are the same object
     counts: Counter[int] = Counter()
     for picture in pictures:
         ids = [id(step) for step in picture.steps]

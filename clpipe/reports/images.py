@@ -24,13 +24,14 @@ from clpipe.reports.run import Blob, Run, RunPicture
 
 BUDGET = 14 << 20  # bytes of the whole page
 THUMBNAIL_SIZE = 160  # px, the longer side of a thumbnail
-MAX_THUMBNAIL_PIXELS = 4e9  # to read for the contact sheet: about a minute of one processor
+# Pixels to read for the contact sheet; they take one processor about a minute.
+MAX_THUMBNAIL_PIXELS = 4e9
 BATCH_SIZE = 64  # thumbnails in one batch
-MAX_COMPARED = 8  # images to compare
+MAX_COMPARED = 8  # the most images that can be compared
 MAX_COMPARED_PIXELS = 1_200_000  # px; larger images are reduced for the comparison
 CROP = 320, 240  # px, width and height of full-resolution regions of reduced images
 TRUE_QUALITY, REDUCED_QUALITY = 93, 85  # quality of JPEGs at full and at reduced resolution
-PICTURE = "image"  # its label in the comparison
+PICTURE = "image"  # label of the picture in the comparison
 SHOWN = ("jpg", "png", "tif", "tif16", "exr", "npy")
 
 
@@ -184,14 +185,14 @@ class ComparedImage:
     name: str
     facts: str
     unusual: Sequence[str]
-    width: int  # px, of the picture
+    width: int  # px; the width of the picture
     height: int
     reduction: int  # the reduction factor; 1 is full resolution
     places: Sequence[Crop]  # regions of interest; reduced images have these at full resolution
-    views: list[dict[str, Any]] = field(default_factory=list)  # label, image, crops
-    stage_thumbnails: list[dict[str, str]] = field(
-        default_factory=list
-    )  # thumbnails of kept stages
+    # Each has a label, an image and crops.
+    views: list[dict[str, Any]] = field(default_factory=list)
+    # Thumbnails of kept stages.
+    stage_thumbnails: list[dict[str, str]] = field(default_factory=list)
 
     @classmethod
     def of(cls, picture: RunPicture, pixels: Array) -> "ComparedImage":

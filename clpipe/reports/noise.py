@@ -20,7 +20,7 @@ from clpipe.reports.images import checked, picture_file
 from clpipe.reports.run import Blob, Run, RunPicture
 
 MAX_LAWS = 12  # raws that are compared with the noise model
-LIMIT = 5.0  # standard errors
+LIMIT = 5.0  # standard errors; a larger deviation from the model is reported
 NORMALIZED = "normalize.exr"  # the mosaic in signal units
 
 

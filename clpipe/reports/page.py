@@ -29,9 +29,9 @@ from clpipe.reports.noise import LIMIT, laws, noises
 from clpipe.reports.run import Run, RunPicture
 
 TEMPLATES = Path(__file__).parent / "page"
-LISTED = 40  # failures, warnings, problems
+LISTED = 40  # the most failures, warnings and problems that are listed
 HISTOGRAMS = 12
-BARS = 8  # distinct values of a bar chart
+BARS = 8  # bars of a chart, one for each distinct value
 SHEET_SHARE = 0.45  # share of the budget for contact sheets
 MAX_STAGED = 2  # images whose kept stages can be compared
 MAX_PLOTS = 3  # pictures whose noise is plotted
@@ -42,7 +42,8 @@ SESSIONS = 12  # the latest starts of the program
 # et al., CVPR 2016), measured by clpipe.analysis.signature. See docs/validation.md.
 REAL_LEFT = (0.57, 0.63)
 REAL_RIGHT = (0.51, 0.59)
-REAL_EDGES = (1.1, 2.4)  # luma noise of the steepest areas, relative to the flattest ones
+# Ratio of luma noise in the steepest areas to the noise in the flattest areas.
+REAL_EDGES = (1.1, 2.4)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ KEYS = (
     *("clpipe", "sha256", "iso", "camera", "lens", "width", "height", "noise", "clipped"),
     "warnings",
 )
-SHARED_KEYS = ("device", "versions")  # equal in most sidecars
+SHARED_KEYS = ("device", "versions")  # keys whose values are equal in most sidecars
 LOGS = "run*.jsonl"
 
 
@@ -64,7 +64,7 @@ class RunPicture:
     image: str  # the name of its input without extension, with directories of a series
     rendition: Rendition
     record: dict[str, Any]  # the needed part of the sidecar; equal parts are shared
-    files: Mapping[str, Blob]  # by suffix: "jpg", "demosaic.exr"
+    files: Mapping[str, Blob]  # files by suffix, for example jpg or demosaic.exr
 
     @property
     def name(self) -> str:

@@ -136,7 +136,7 @@ class Renderer(AbstractContextManager["Renderer"]):
 
     def __exit__(self, *error: object) -> None:
         self.stop()
-        with self._process:  # closes its output, and waits
+        with self._process:  # closes the process's output, and waits
             pass
         self._asked.unlink(missing_ok=True)
 

@@ -15,7 +15,8 @@ from typing import Any
 
 import bpy
 
-sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))  # Blender does not
+# Blender does not add this directory.
+sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 from blender_views import (
     GEOMETRY,
     SceneError,
@@ -112,11 +113,11 @@ def prepare(scene: Any, request: Mapping[str, Any]) -> None:
     layer.use_pass_z = layer.use_pass_normal = layer.use_pass_object_index = True
     layer.use_pass_vector = True
     settings = render.image_settings
-    if hasattr(settings, "media_type"):  # from Blender 5.0 on
+    if hasattr(settings, "media_type"):  # Blender 5.0 and later
         settings.media_type = "MULTI_LAYER_IMAGE"
     settings.file_format = "OPEN_EXR_MULTILAYER"
     settings.color_depth, settings.exr_codec = "16", "ZIP"
-    for name in dir(render):  # dates and times would differ each time
+    for name in dir(render):  # disable metadata: dates and times would differ each time
         if name.startswith("use_stamp"):
             setattr(render, name, False)
 

@@ -12,16 +12,16 @@ from typing import Any
 import bpy
 from mathutils import Matrix, Vector
 
-FLIP = Matrix(((1, 0, 0), (0, -1, 0), (0, 0, -1)))  # from Blender's camera axes to OpenCV's
+FLIP = Matrix(((1, 0, 0), (0, -1, 0), (0, 0, -1)))  # converts Blender's camera axes to OpenCV's
 GEOMETRY = {"MESH", "CURVE", "CURVES", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD"}
 ARC_ANGLE = math.radians(60)
 # Rays per row and per column of a picture, to test what a view sees.
 RAY_GRID = 9
-# A flat surface fills the view above this share of the picture and cosine between its normals.
+# Share of the picture, and cosine between its normals, above which a flat surface fills the view.
 FILLED_SHARE, FLAT_COSINE = 0.85, 0.98
-OCCLUDER_SHARE = 0.8  # an occluder is nearer than this share of the distance to the target
+OCCLUDER_SHARE = 0.8  # an occluder is nearer than this share of the target's distance
 CANDIDATES_PER_VIEW = 16  # candidates on a path for each view
-MAX_DRAWS = 50  # candidates in a box for each view, at most
+MAX_DRAWS = 50  # the most candidates in a box for each view
 
 View = tuple[str, int, Callable[[], object]]  # name, number, and a function that sets up the scene
 

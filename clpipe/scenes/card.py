@@ -17,7 +17,7 @@ from clpipe.scenes.members import PICTURE, Member, members_of, splits_of
 from clpipe.scenes.record import RECORD
 
 SHEET, MANIFEST, README = "contact_sheet.jpg", "manifest.csv", "README.md"
-MAX_ROWS = 12  # of the contact sheet
+MAX_ROWS = 12  # rows of the contact sheet
 TRUTH = Rendition("clean").suffix.removeprefix(".")
 SPLITS = ("train", "val", "test")
 

@@ -14,9 +14,8 @@ from clpipe.outputs.carried import carried_files
 from clpipe.outputs.sidecar import SidecarError, output_entries, sidecar_files, values_at
 
 PICTURE = "picture"
-SERIES = re.compile(
-    r"(?:[^/]+/)?iso[0-9.e+]+(?=/)|"
-)  # folder of a series: CAMERA/isoNUMBER or isoNUMBER
+# The folder of a series: CAMERA/isoNUMBER or isoNUMBER.
+SERIES = re.compile(r"(?:[^/]+/)?iso[0-9.e+]+(?=/)|")
 SPLITS = {3: "val", 7: "test"}  # the split of a view, by its number modulo 8
 
 # The exceptions that values of a forged sidecar may raise.

@@ -20,7 +20,7 @@ from clpipe.scenes.view_request import dependencies
 
 RENDERS, UNIT, NOTE = "renders", "Unit of depth and poses", "Which views"
 CAMERAS = "cameras.json"
-FLOW = "Vector"  # Blender's layer of flow, for frames
+FLOW = "Vector"  # name of Blender's flow layer, for frames
 
 
 @dataclass

@@ -12,7 +12,7 @@ from clpipe.inputs.render_cameras import read_views
 PATHS = ("orbit", "arc", "random")
 DEFAULT_VIEWS = 24
 MAX_SIDE = 2**16  # px, the longer side of a render
-LAST_FRAME = 2**20 - 2  # the largest that Blender knows
+LAST_FRAME = 2**20 - 2  # the largest frame number in Blender
 
 
 def requested_views(

@@ -14,7 +14,7 @@ def period_of(period: tuple[int, ...]) -> dict[str, CompileTime]:
     return dict(zip(PERIOD, (CompileTime(f"{size}u") for size in period), strict=True))
 
 
-@lru_cache(maxsize=64)  # the same object for the same array, so that it is uploaded once
+@lru_cache(maxsize=64)  # equal arrays share one object, so that it is uploaded once
 def levels_table(array: FilterArray, inverse: bool) -> Floats:
     """Return the level of white at each position, or its inverse, for kernels: (row, column)."""
     levels = {k: 1 / v if inverse else v for k, v in array.levels.items()}

@@ -25,23 +25,26 @@ class Context:
     iso: float
     pattern: Pattern = "RGGB"
     array: FilterArray | None = None  # the filter array of a mosaic without a Bayer pattern
-    light: tuple[float, float] | None = None  # red, blue: to be divided out; None is the camera's
-    gains: tuple[float, float] = (1.0, 1.0)  # red, blue: divided out by inverse_white_balance
-    applied_gains: tuple[float, float] = (1.0, 1.0)  # red, blue: applied again by white_balance
-    exposure_time: float | None = None  # s, if exposure knows it
+    # Gains of red and blue to divide out; None means the camera's.
+    light: tuple[float, float] | None = None
+    # Gains of red and blue that inverse_white_balance divided out.
+    gains: tuple[float, float] = (1.0, 1.0)
+    # Gains of red and blue that white_balance applies again.
+    applied_gains: tuple[float, float] = (1.0, 1.0)
+    exposure_time: float | None = None  # s; None if exposure does not state it
     headroom: float = 0.0  # stops by which exposure darkened the scene
     colours: Matrix = IDENTITY  # linear sRGB to the image's red, green and blue, white-balanced
     noise: NoiseModel | None = None  # the sensor noise that was added
     full_scale: float = 1.0  # the signal at the white level: above 1 after several readouts
-    light_changes: bool = False  # during the exposure
+    light_changes: bool = False  # whether the light changes during the exposure
     knots: Knots = ()  # the companding curve, DN to fewer DN; () is none
     optics: Optics = field(default_factory=Optics, compare=False, repr=False)
-    # the image has no noise, and parameters that depend on noise must assume none
+    # Whether the image has no noise. If so, parameters that depend on noise must assume none.
     clean: bool = False
     black_level: float | None = None  # DN, used by quantize
     white_level: float | None = None
-    # Depends on the image, which holds it: chains live longer. Chains of the same structure are
-    # equal.
+    # A weak reference, because the image holds the depth and chains live longer. It is not
+    # compared, so that chains of the same structure are equal.
     depth: weakref.ref[Depth] | None = field(default=None, compare=False, repr=False)
 
     def replace(self, **changes: Any) -> "Context":

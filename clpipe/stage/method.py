@@ -66,21 +66,24 @@ class Method(BaseModel):
     method: ClassVar[str]
     kernel: ClassVar[str]  # file name in kernels/, without .cl
     summary: ClassVar[str]
-    tolerance: ClassVar[float] = 0.0  # kernel against reference; 0 is bit for bit
-    example: ClassVar[Mapping[str, Any]] = {}  # parameters for checks, if defaults do nothing
-    other_examples: ClassVar[tuple[Mapping[str, Any], ...]] = ()  # that use other code paths
-    # Parameters of which only one may be set. An option replaces a configuration's
-    # parameter, and a manifest replaces an option's.
+    # Largest difference between kernel and reference; 0 means bit for bit.
+    tolerance: ClassVar[float] = 0.0
+    example: ClassVar[Mapping[str, Any]] = {}  # parameters for checks, if the defaults do nothing
+    # Parameters for checks that use other code paths.
+    other_examples: ClassVar[tuple[Mapping[str, Any], ...]] = ()
+    # Parameters of which you may set only one. An option replaces a configuration's parameter, and
+    # a manifest's parameter replaces an option's.
     alternatives: ClassVar[frozenset[str]] = frozenset()
-    # Whether it accepts mosaics of any filter array, if others of its stage only accept Bayer
-    # patterns.
+    # Whether the method accepts mosaics of any filter array. Other methods of its stage may accept
+    # only Bayer patterns.
     any_array: ClassVar[bool] = False
-    only_arrays: ClassVar[tuple[str, ...]] = ()  # on which it is checked, if it accepts no others
-    # Whether its image may have overscan. Then it acts the same everywhere, or counts positions
-    # from the frame, which ``margins`` locates.
+    # Arrays for checks, if the method accepts no others.
+    only_arrays: ClassVar[tuple[str, ...]] = ()
+    # Whether the method's image may have overscan. If so, the method acts in the same way
+    # everywhere, or counts positions from the frame, which ``margins`` locates.
     overscan: ClassVar[bool] = False
 
-    _margins: Margins = PrivateAttr(default_factory=lambda: NO_MARGINS)  # which is not copied
+    _margins: Margins = PrivateAttr(default_factory=lambda: NO_MARGINS)  # not copied with the model
 
     @property
     def margins(self) -> Margins:

@@ -165,7 +165,7 @@ class CompileTime:
 
 
 Argument = np.float32 | np.uint32 | np.int32 | Array | CompileTime
-# By name. A float becomes a np.float32; None is a parameter that is not resolved yet.
+# Arguments by name. A float becomes a np.float32. None is a parameter that is not resolved yet.
 Arguments = Mapping[str, Argument | float | None]
 
 

@@ -30,10 +30,10 @@ from clpipe.stage.context import Context, ReferenceContext
 from clpipe.stage.method import Method
 from clpipe.stage.passes import CompileTime, NoiseScope
 
-# float32: an array (height, width), or a tensor (sample, height, width). Both have the operators
-# + - * < and the methods clip and abs.
+# A float32 array (height, width), or a tensor (sample, height, width). Both have the operators + -
+# * < and the methods clip and abs.
 Signal: TypeAlias = Any
-Numbers: TypeAlias = Mapping[str, Any]  # np.float32 each, or a tensor (sample, 1, 1)
+Numbers: TypeAlias = Mapping[str, Any]  # each value is a np.float32, or a tensor (sample, 1, 1)
 
 
 ExtraArguments: TypeAlias = Callable[[Any, Context], tuple[Any, ...]]
@@ -54,11 +54,12 @@ class Backend(ABC):
     minimum: ClassVar[Callable[..., Any]]
     square_root: ClassVar[Callable[..., Any]]
     inverse_root: ClassVar[Callable[..., Any]]
-    rounded: ClassVar[Callable[..., Any]]  # to the nearest whole number, ties to even
-    photons: ClassVar[Callable[..., Any]]  # Poisson numbers, from means and words
-    tukey_lambda: ClassVar[Callable[..., Any]]  # from words, shape and scale
-    in_upper_half: ClassVar[Callable[..., Any]]  # whether a word's top bit is 0
-    tap: ClassVar[Callable[..., Any]]  # the signal's value dx to the right and dy below
+    rounded: ClassVar[Callable[..., Any]]  # rounds to the nearest whole number, ties to even
+    photons: ClassVar[Callable[..., Any]]  # returns Poisson numbers for means and random words
+    # Returns noise for random words, a shape and a scale.
+    tukey_lambda: ClassVar[Callable[..., Any]]
+    in_upper_half: ClassVar[Callable[..., Any]]  # returns whether a word's top bit is 0
+    tap: ClassVar[Callable[..., Any]]  # returns the signal's value dx to the right and dy below
 
     @abstractmethod
     def normals(self, draw: int = 0) -> Signal:

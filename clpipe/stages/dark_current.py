@@ -94,7 +94,7 @@ class Thermal(SignalMethod):
     )
 
     def optics(self) -> Mapping[str, float]:
-        return super().optics() if self.exposure_time else {}  # 0 disables it
+        return super().optics() if self.exposure_time else {}  # 0 disables the stage
 
     def resolve(self, context: Context) -> "Thermal":
         camera = context.camera

@@ -29,9 +29,9 @@ from clpipe.stage import (
     parameter,
 )
 
-PRODUCTS = (
-    4  # products of a curve over the rows and one over the columns: two for each of the two maps
-)
+# Each product multiplies a curve over the rows by a curve over the columns. Each of the two maps
+# has two products.
+PRODUCTS = 4
 
 
 def curve(count: int, number: int, per_px: np.float32, stream: Stream) -> Floats:

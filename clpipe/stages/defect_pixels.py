@@ -22,7 +22,8 @@ from clpipe.stage import (
 )
 
 RANDOM_WORDS = 1 << 31  # number of different random words that choose the pixels
-DEFAULT_LEVEL = 0.1  # signal units; chosen to be visible, if the camera has no value
+# Signal units; used if the camera has no value, and chosen so that defects are visible.
+DEFAULT_LEVEL = 0.1
 
 
 class Random(SignalMethod):

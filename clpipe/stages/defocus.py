@@ -226,7 +226,8 @@ class ThinLens(FocalLengthMethod, DepthMethod):
     def _tables(self, depth: Floats) -> tuple[Floats, int, Floats]:
         """Return the radii with a border, the border's width, and the taps of the largest disc."""
         radii = self.limited_radii(depth)
-        largest = float(np.ceil(abs(radii).max() * 4)) / 4  # so that many images share a few tables
+        # Rounded, so that many images share a few tables.
+        largest = float(np.ceil(abs(radii).max() * 4)) / 4
         reach = disc_reach(largest)
         border = ((reach, reach), (reach, reach + MAX_LANES))
         return np.pad(radii, border, "reflect"), reach, aperture_taps(self.blades, largest)

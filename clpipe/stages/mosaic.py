@@ -95,7 +95,7 @@ class AnyArray(Method):
     )
 
     def resolve(self, context: Context) -> "Method":
-        array = self._parsed(context)  # or it is rejected
+        array = self._parsed(context)  # raises an error if the array is invalid
         if array.is_polarised and context.colours != IDENTITY:
             raise KeyedError(
                 "mosaic.array",
@@ -129,7 +129,7 @@ def responses_of(array: FilterArray) -> Floats:
     return np.stack([array.by_position(each) for each in colours], axis=1)
 
 
-@lru_cache(maxsize=64)  # the same object for the same array, so that it is uploaded once
+@lru_cache(maxsize=64)  # equal arrays share one object, so that it is uploaded once
 def responses_table(array: FilterArray) -> Floats:
     """Return :func:`responses_of` an array in the layout of kernels."""
     return kernel_table(responses_of(array))

@@ -26,8 +26,8 @@ from clpipe.stage import (
     parameter,
 )
 
-MAX_LENGTH = 200.0  # px
-TAPS_PER_PIXEL = 64  # per pixel of a streak's length, one tap each
+MAX_LENGTH = 200.0  # px; the longest streak
+TAPS_PER_PIXEL = 64  # kernel taps per pixel of a streak's length
 
 
 @traceable

@@ -27,11 +27,10 @@ from clpipe.stage import (
 )
 
 WAVELENGTHS = (0.600, 0.540, 0.460)  # um, about the middle of the passbands of red, green and blue
-MAX_PSF_SIZE = 65  # px, of a measured function
+MAX_PSF_SIZE = 65  # px; the side of a measured point spread function
 OVERSAMPLING = 8  # samples per pixel for the calculation of diffraction
-ENCLOSED_ENERGY = (
-    0.995  # share of the light of a diffraction pattern that is kept: its rings are infinite
-)
+# Share of the light of a diffraction pattern that is kept, because its rings are infinite.
+ENCLOSED_ENERGY = 0.995
 DEFAULT_SIGMA = 0.4  # px
 MAX_UNROLLED_RADIUS = 3  # px; a wider blur takes two launches, one along rows and one along columns
 

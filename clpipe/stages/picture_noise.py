@@ -35,7 +35,7 @@ from clpipe.stage import (
 )
 
 TABLE_SIZE = 256  # entries of the kernel's table
-UNKNOWN = "unknown"  # the ISO of images in a report that do not state theirs
+UNKNOWN = "unknown"  # the ISO of images without a stated ISO, in a report
 RESOLVED_SIZE = 65  # entries of a measured curve in the resolved parameters, and so in the sidecar
 CHANNELS = Kind.DISPLAY.channels
 MIXING_NAMES = (

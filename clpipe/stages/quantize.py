@@ -87,9 +87,8 @@ class Linear(SignalMethod):
         camera = context.camera
         black, white = camera.black_level, camera.white_level
         bits = self.bits
-        if (
-            bits is None and context.full_scale > 1
-        ):  # more bits, because a DN keeps the size it has in the first readout
+        # More bits, because the size of a DN stays that of the first readout.
+        if bits is None and context.full_scale > 1:
             bits = min(camera.bits + ceil(log2(context.full_scale)), MAX_BITS)
         if bits and bits != camera.bits:
             scale = (2**bits - 1) / (2**camera.bits - 1)

@@ -155,7 +155,7 @@ def weights_of(array: FilterArray, pattern: Pattern) -> Floats:
     return np.ascontiguousarray(selected[..., 0])
 
 
-@lru_cache(maxsize=16)  # the same object for the same array, so that it is uploaded once
+@lru_cache(maxsize=16)  # equal arrays share one object, so that it is uploaded once
 def table_of(array: FilterArray, pattern: Pattern) -> Floats:
     """Return :func:`weights_of` in the layout of kernels: (row, tap, column)."""
     return kernel_table(weights_of(array, pattern).transpose(0, 2, 1))

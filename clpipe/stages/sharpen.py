@@ -34,8 +34,9 @@ from clpipe.stages.denoise.strength import (
 # images. These are the amount without noise, the amount that is added where denoising softens most,
 # and the luma noise of that maximum, in roots of the signal.
 MIN_AMOUNT, EXTRA_AMOUNT, SOFTEST_NOISE = 0.2, 0.55, 0.009
-THRESHOLD = 0.2  # times the luma noise; without it, small noise is sharpened and large noise is not
-MIN_LIMIT = 0.008  # without noise; two levels of 255
+# Relative to the luma noise; without it, small noise is sharpened and large noise is not.
+THRESHOLD = 0.2
+MIN_LIMIT = 0.008  # roots of the signal; the limit without noise: two levels of 255
 
 
 def blur_step(radius: float) -> int:

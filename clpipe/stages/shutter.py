@@ -208,7 +208,7 @@ class Rows(Method):
         return self.depth * (1 - self.flicker_duty) * (self.cycles % 1) / self.cycles
 
     def passes(self) -> tuple[Pass, ...]:
-        if not self.swing or self.light_layer:  # which was applied when the file was read
+        if not self.swing or self.light_layer:  # the light layer was applied when the file was read
             return ()
         table = Pass(
             "flicker_of_rows", LineTable("rows"), ("step", "start", "swing"), writes="rows"

@@ -91,7 +91,7 @@ def raw_inverse_root(x: Tensor) -> Tensor:
     half = x * 0.5
     r = (0x5F375A86 - (x.view(torch.int32) >> 1)).view(torch.float32)
     for _ in range(2):
-        # (half * r) * r, in the same order as in the reference
+        # The product is (half * r) * r, in the same order as in the reference.
         r = r * (half * r).mul_(r).neg_().add_(1.5)
     return r
 
@@ -128,7 +128,7 @@ def _round(word: Words, factor: int, other: Words, key: Tensor) -> tuple[Words, 
     low = product & WORD
     if not isinstance(other, int) and other.shape != product.shape:
         return (product >> 32 ^ other ^ key) & WORD, low
-    # In place, because memory bandwidth limits the speed.
+    # Operations are in place, because memory bandwidth limits the speed.
     high = product.bitwise_right_shift_(32).bitwise_xor_(other)
     if key.dim() and key.numel() > 1 and len(high) == 1:
         return (high ^ key).bitwise_and_(WORD), low
@@ -148,7 +148,7 @@ def philox(c0: Words, c1: Words, draw: int, streams: Streams) -> tuple[Tensor, .
         int32 of (sample, height, width), with the bits of the words.
     """
     key0, key1 = streams.keys[:, :, None, None]
-    w0, w1, w2, w3 = c0, c1, draw, streams.stage  # they grow to full size in the second round
+    w0, w1, w2, w3 = c0, c1, draw, streams.stage  # the words grow to full size in the second round
     for _ in range(10):
         new0, new1 = _round(w2, 0xCD9E8D57, w1, key0)
         new2, new3 = _round(w0, 0xD2511F53, w3, key1)

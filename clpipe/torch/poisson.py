@@ -13,14 +13,14 @@ from clpipe.torch.numbers import (
     tail_probability,
 )
 
-CDF_TERMS = 11  # terms of the CDF below its middle, for a mean of 10
+CDF_TERMS = 11  # terms of the lower half of the CDF, for a mean of 10
 
 
 def poisson_of(mean: Tensor, words: Tensor) -> Tensor:
     """The counterpart of :func:`clpipe.reference.poisson.poisson_of`, without a derivative."""
     result = _large(mean.clamp(min=float(LARGE)), words)
     small = mean < float(LARGE)
-    # Only for small means, because the sum takes most of the time.
+    # Use the sum only for small means, because it takes most of the time.
     result[small] = _small(mean[small], words[small])
     return result
 

@@ -23,8 +23,8 @@ from clpipe.stage import NoiseScope
 from clpipe.torch.table import SampleDraws, Table
 
 FIRST, LAST = "crosstalk", "normalize"
-MAX_CHAINS = 1024  # chains, if values are drawn
-POSITION_RANGE = 512  # px; positions on the sensor are drawn from the size of a sample plus this
+MAX_CHAINS = 1024  # number of chains if values are drawn
+POSITION_RANGE = 512  # px; positions are drawn from a sensor that is this much larger than a sample
 
 
 class RawNoise(ReadOnly):
@@ -79,7 +79,7 @@ class RawNoise(ReadOnly):
             self._random.manual_seed(seed)
         self._table: Table | None = None
         self._cached_chain = lru_cache(maxsize=MAX_CHAINS)(self._chain)
-        Table([self._chain("")])  # rejects stages without a PyTorch version
+        Table([self._chain("")])  # raises an error for stages without a PyTorch version
 
     def __repr__(self) -> str:
         return f"RawNoise({self._settings.label})"

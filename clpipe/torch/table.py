@@ -17,7 +17,7 @@ from clpipe.stage.signal import scalar_arguments
 from clpipe.torch.backend import TorchBackend
 from clpipe.torch.numbers import Streams
 
-CPU_BATCH_PIXELS = 1 << 17  # pixels on a CPU, which fit its cache
+CPU_BATCH_PIXELS = 1 << 17  # pixels per batch on a CPU, which fit into its cache
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Table:
             for position in range(len(chains[0].steps))
             for variant in _variants(chains, position)
         ]
-        # For each chain, the plane (R, Gr, Gb, B) of each site of the filter array, by rows.
+        # For each chain, the plane (R, Gr, Gb, B) of each site of the filter array, row by row.
         plane_orders = []
         for chain in chains:
             site_slices = sites(chain.context_after.pattern).values()

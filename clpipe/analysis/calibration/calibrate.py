@@ -29,7 +29,7 @@ from clpipe.analysis.calibration.single_image import LevelSets
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Floats
 
-ROUNDING = 1 / 12  # the variance of rounding to whole DN, DN^2
+ROUNDING = 1 / 12  # DN^2; the variance of rounding to whole DN
 
 
 def calibrate(
@@ -130,7 +130,7 @@ def _from_repeats(
     if brighter.any():
         spread = f"{brighter.min():+.2%} to {brighter.max():+.2%}"
         notes.append(f"brightness flickers by {spread}; frames were scaled to the same mean")
-    # A first line, row noise included, to find bad and clipped pixels.
+    # Fit a first line, which includes row noise, to find bad and clipped pixels.
     line = fit_line(list(stack.tables(stack.variance()).values()))
     hot = darkness.hot if darkness else fixed_pattern.hot_in_scene(stack, line)
     if not darkness and len(hot.rows):
@@ -140,7 +140,7 @@ def _from_repeats(
         stack.used[bad.rows, bad.columns] = False
     stack = repeats.unclipped(stack, line, top)
     check_enough(float(stack.used.mean()))
-    # A second line, after the offsets of rows were subtracted.
+    # Fit a second line after subtracting the offsets of rows.
     stacks = [stack, *([darkness.stack] if darkness and darkness.stack else [])]
     row2 = repeats.row_variance([repeats.row_offsets(each, line)[2] for each in stacks])
     line = line.lowered(max(row2.value, 0))

@@ -11,9 +11,10 @@ from clpipe.analysis.calibration.repeats import Stack
 from clpipe.base.errors import ImageError
 
 MIN_VALID_SHARE = 0.25  # share of the pixels that must be valid
-MAX_VARIANCE_DEVIATION = 0.2  # deviation of a frame's variance from the median frame's, relative
-LOW_NOISE = 0.4  # DN of noise below which rounding depends on the noise
-MAX_NONLINEARITY = 0.1  # deviation of a bin's variance from the line, relative
+# Largest deviation of a frame's variance, relative to the median frame's variance.
+MAX_VARIANCE_DEVIATION = 0.2
+LOW_NOISE = 0.4  # DN; below this noise, the variance of rounding depends on the noise
+MAX_NONLINEARITY = 0.1  # largest deviation of a bin's variance, relative to the line
 
 
 def check_enough(share: float) -> None:

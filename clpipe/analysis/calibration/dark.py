@@ -11,7 +11,7 @@ from clpipe.analysis.calibration.line_fit import Estimate, Line
 from clpipe.analysis.calibration.repeats import Sensor, Stack
 from clpipe.base.types import Floats
 
-CLIPPED = 1e-3  # share of samples at 0 DN above which noise cannot be measured
+CLIPPED = 1e-3  # noise cannot be measured if more than this share of samples is at 0 DN
 
 
 class DarkPattern(NamedTuple):

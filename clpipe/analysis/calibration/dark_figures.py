@@ -21,11 +21,12 @@ SHAPES = np.linspace(-0.4, 0.4, 17)  # shapes of the Tukey lambda distributions 
 GROUPS = 16  # groups of samples, for the standard error of their shape
 FALSE_ALARM = 1e-4  # probability of finding a wave if there is none
 FINER = 8  # the number of frequencies to search, relative to the number of rows
-BLOCK = 32  # px, over which maps are averaged
-MIN_BLOCKS = 6  # along each axis
-JUMPS = 10.0  # variance relative to other pixels, above which a pixel counts as jumping
+BLOCK = 32  # px; the side of the blocks over which maps are averaged
+MIN_BLOCKS = 6  # blocks along each axis
+JUMPS = 10.0  # relative to the variance of other pixels; a pixel with more counts as jumping
 TINY = 1e-9  # DN^2
-WIDTH_OF_KNOTS = 0.96  # half width of the correlation of a cubic B-spline, in its knots' distance
+# Half width of the correlation of a cubic B-spline, relative to the distance between its knots.
+WIDTH_OF_KNOTS = 0.96
 
 
 FourEstimates = tuple[Estimate, Estimate, Estimate, Estimate]
@@ -57,7 +58,7 @@ class Shading:
 class DarkFigures:
     """Figures of dark frames in DN; None if there are too few frames."""
 
-    color_bias: FourEstimates  # R, G in rows with R, G in rows with B, B
+    color_bias: FourEstimates  # R, G in rows with R, G in rows with B, and B
     black_level_error: Estimate | None
     tukey_lambda: Estimate | None
     banding: Wave | None
@@ -203,7 +204,7 @@ def banding_wave(rows: Doubles) -> Wave | None:
 
     frames, height = rows.shape
     power = (np.abs(np.fft.rfft(rows, FINER * height)) ** 2).mean(axis=0)
-    power[: 2 * FINER] = 0  # slower waves are changes of shading
+    power[: 2 * FINER] = 0  # slower waves count as changes of shading
     background = float(np.median(power[2 * FINER :]) / stats.gamma.median(frames) * frames)
     peak = int(power.argmax())
     limit = stats.gamma.isf(FALSE_ALARM / height, frames) / frames

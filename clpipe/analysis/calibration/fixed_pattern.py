@@ -11,11 +11,12 @@ from clpipe.reference.cfa import sites
 
 SURE = 7.0  # standard deviations; by chance, not one of 1e8 pixels exceeds this
 # We chose these values; tests/test_calibrate.py shows what they find and reject.
-BLOCK = 16  # px of one colour, the side of a block
-MIN_BLOCKS = 30  # flat blocks that PRNU needs
-DARKEST = 0.05  # signal units, the least light of a block that shows PRNU
-MAX_UNEVENNESS = 0.03  # largest relative standard deviation of the scene in a flat block
-MIN_DEVIATION = 0.05  # DN, the smallest assumed deviation of a mean dark frame
+BLOCK = 16  # px of one colour; the side of a block
+MIN_BLOCKS = 30  # flat blocks that are needed to measure PRNU
+DARKEST = 0.05  # signal units; the lowest mean of a block for measuring PRNU
+# Largest standard deviation of the scene in a flat block, relative to its mean.
+MAX_UNEVENNESS = 0.03
+MIN_DEVIATION = 0.05  # DN; the smallest assumed deviation of a mean dark frame
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ def dark_pattern(
     in_column = good.sum(axis=0).clip(1)
     columns = values.sum(axis=0) / in_column
     values -= columns * good
-    # The means of rows and columns cost degrees of freedom.
+    # The means of rows and columns reduce the degrees of freedom.
     freedom = good.sum() * (1 - 1 / height) * (1 - 1 / width)
     scatter = (values**2).sum() / freedom
     scatter_error = np.sqrt(max((values**4).sum() / freedom - scatter**2, 0) / freedom)

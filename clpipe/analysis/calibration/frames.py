@@ -66,11 +66,11 @@ class CalibrationFrame:
     make: str
     model: str
     iso: float
-    exposure: str  # as text, "" if unknown
+    exposure: str  # exposure as text; "" if unknown
     sensor: Sensor
-    signal: bool = False  # whether the file has signal instead of DN
+    signal: bool = False  # whether the file has signal units instead of DN
     facts: RawInfo | Dump | None = None  # from a camera raw or a dump
-    gains: tuple[float, float] | None = None  # white balance, red and blue (green = 1)
+    gains: tuple[float, float] | None = None  # white balance gains of red and blue (green = 1)
     xyz_to_camera: Matrix | None = None
 
     @property
@@ -238,7 +238,8 @@ def _sensor(overrides: FrameOverrides, pattern: str, black: float, white: float)
     stated = overrides.pattern or pattern
     name = "" if stated in PATTERNS else next((n for n, r in NAMED.items() if r == stated), stated)
     return Sensor(
-        PATTERNS[0] if stated == MONO else stated,  # all sites are equal, so any pattern fits
+        # A mono sensor's sites are all equal, so any pattern fits.
+        PATTERNS[0] if stated == MONO else stated,
         black if overrides.black_level is None else overrides.black_level,
         white if overrides.white_level is None else overrides.white_level,
         name,

@@ -6,8 +6,8 @@ import numpy as np
 
 from clpipe.analysis.calibration.result import Calibration
 
-# A stage ends where the read noise is below this share of what the stage before predicts; chosen,
-# see test_gain_stages_are_cut_where_the_conversion_gain_changes.
+# A gain stage ends where the read noise is below this share of the value that the previous stage
+# predicts. We chose the value; see test_gain_stages_are_cut_where_the_conversion_gain_changes.
 LEAST_OF_PREDICTED = 0.7
 
 

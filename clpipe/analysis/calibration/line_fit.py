@@ -19,9 +19,9 @@ from clpipe.base.types import Array
 CLASSES = 2048  # classes of the instrument, the variable that sorts pixels
 GROUPS = 64  # groups of rows, for the standard errors
 BINS = 32  # bins of the curves in plots
-MIN_IN_BIN = 50  # pixels
-DARKEST = 0.01  # share of pixels, the darkest ones, from which the first weights are computed
-ROUNDS = 12  # rounds; each computes weights from the line of the round before
+MIN_IN_BIN = 50  # pixels that a bin needs
+DARKEST = 0.01  # share of pixels; the first weights are computed from the darkest ones
+ROUNDS = 12  # rounds; each computes weights from the line of the previous round
 
 
 @dataclass(frozen=True)
@@ -162,9 +162,9 @@ def fit_line(tables: Sequence[Table]) -> Line:
     total = count.sum()
     if total < 3 or np.ptp(z) == 0:
         raise ValueError("too few pixels can be used, or all have the same brightness")
-    # The first weights are those of a rising line through the darkest pixels and the mean of all.
-    # Variances are at least half of the darkest pixels' variance, so that no weight grows without
-    # limit.
+    # The first weights are from a rising line through the darkest pixels and the mean of all
+    # pixels. Variances are at least half of the darkest pixels' variance, so that weights are
+    # bounded.
     order = np.argsort(z)
     darkest = order[np.cumsum(count[order]) <= max(DARKEST * total, count[order[0]], MIN_IN_BIN)]
     dark = s[darkest].sum() / count[darkest].sum()

@@ -12,12 +12,13 @@ from clpipe.base.types import Array, Floats
 from clpipe.reference.cfa import PATTERNS, Pattern, sites
 from clpipe.reference.filter_array import MIRRORED
 
-# The limits are choices; tests/test_calibrate.py has a case on each side of the last two.
-CLIPPING_MARGIN = 4.0  # standard deviations of a frame
+# We chose these limits; tests/test_calibrate.py has a case on each side of the last two.
+CLIPPING_MARGIN = 4.0  # standard deviations of a frame; the distance from clipping levels
 MAX_FLICKER = 0.05  # change of mean brightness; more counts as another exposure
-MAX_MOTION = 0.02  # share of the variance that neighbours share; more counts as motion
+# Share of the variance that is correlated between neighbours; more counts as motion.
+MAX_MOTION = 0.02
 
-Site = tuple[slice, slice]  # the rows and columns of a filter's place in the period
+Site = tuple[slice, slice]  # rows and columns of one filter of the array's period
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Sensor:
     pattern: str  # a Bayer pattern, or the rows of another filter array
     black_level: float  # DN
     white_level: float  # DN
-    filter_array: str = ""  # its name in a profile; "" for a Bayer pattern
+    filter_array: str = ""  # name of the array in a profile; "" for a Bayer pattern
 
     @property
     def unit(self) -> float:
@@ -60,7 +61,7 @@ class Rows:
     """The mean square of each row's offset over the frames, and the part due to pixel noise."""
 
     square: Array  # (rows,), DN^2
-    explained: Array  # by pixel noise; (rows,), DN^2
+    explained: Array  # (rows,), DN^2; the part that pixel noise explains
     degrees: int  # degrees of freedom
 
 

@@ -25,18 +25,19 @@ from clpipe.analysis.calibration.line_fit import Estimate, Line
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.base.types import Floats
 
-# Daubechies' wavelet and scaling function with three vanishing moments (sec. II-A). The wavelet has
-# the norm 1, the scaling function the sum 1.
+# Daubechies' wavelet and scaling function with three vanishing moments (sec. II-A). The norm of the
+# wavelet is 1, and the sum of the scaling function is 1.
 WAVELET = np.array([0.035226, 0.085441, -0.135011, -0.459878, 0.806892, -0.332671])
 SCALING = np.array([0.332671, 0.806892, 0.459878, -0.135011, -0.085441, 0.035226]) / np.sqrt(2)
 # EDGE is from the paper. We chose the others; tests/test_calibrate.py checks the accuracy.
 LEVELS = 150  # largest number of level sets of a colour
 MIN_SET_SIZE = 400  # smallest number of places in a level set
 MIN_EXPLAINED = 40  # smallest number of places in a level set that the line explains
-WINDOW = 7  # px, window of the smoothing and of local variances
+WINDOW = 7  # px; the window for smoothing and for local variances
 EDGE = 1.0  # tau, in standard deviations of the details (sec. II-B1)
-EXPLAINED = 1.4  # times the line's variance: two standard deviations of a local variance above it
-ROUNDS = 8  # rounds; each selects places by the line of the round before
+# Relative to the line's variance; this is two standard deviations of a local variance above 1.
+EXPLAINED = 1.4
+ROUNDS = 8  # rounds; each selects places with the line of the previous round
 GRID = 2000  # points at which the model of clipping is tabulated
 Values = NDArray[np.float64]
 
@@ -182,7 +183,7 @@ def most_likely_line(sets: LevelSets, low: float) -> tuple[float, float, Values]
     from scipy.optimize import minimize
 
     mean, deviation, count = sets.mean, sets.deviation, sets.count
-    # Sets in which nearly every sample is clipped have nothing to measure.
+    # Sets in which nearly every sample is clipped cannot be measured.
     used = (mean < 0.995) & (mean > low + 0.005 * (1 - low)) & (deviation > 0)
     mean, deviation, count = mean[used], deviation[used], count[used]
     if len(mean) < 8 or np.ptp(mean) < 0.02:
@@ -263,7 +264,7 @@ def single_image(
     def line(parts: Sequence[SmoothSamples]) -> tuple[Line, LevelSets]:
         a, b, sets, errors = explained_line(parts, low, dark_sets)
         gain, floor = Estimate(a, float(errors[0])), Estimate(b, float(errors[1]))
-        pixels = int(sets.count.sum()) * 4  # a place is a detail, one of every 2x2 pixels
+        pixels = int(sets.count.sum()) * 4  # there is one place for every 2x2 pixels
         return Line(gain.scaled(unit), floor.scaled(unit**2), pixels), sets
 
     whole, sets = line([part for parts in places.values() for part in parts])

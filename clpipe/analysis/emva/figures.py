@@ -11,10 +11,10 @@ from clpipe.analysis.emva.series import NS
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Doubles, Mask
 
-ROUNDING = 1 / 12  # the variance of rounding to whole DN, DN^2
-MIN_DARK_VARIANCE = 0.24  # DN^2: a smaller variance is due to rounding only
-FITTED = 0.7  # K and R are fitted up to this share of saturation
-LINEAR = 0.05, 0.95  # linearity is measured between these shares of saturation
+ROUNDING = 1 / 12  # DN^2; the variance of rounding to whole DN
+MIN_DARK_VARIANCE = 0.24  # DN^2; a smaller variance is only due to rounding
+FITTED = 0.7  # share of saturation up to which K and R are fitted
+LINEAR = 0.05, 0.95  # shares of saturation between which linearity is measured
 MOST_AT_ZERO = 0.005  # largest share of dark samples that may be 0
 ENOUGH = 3  # the smallest number of exposures for a fit
 
@@ -58,7 +58,7 @@ class Figures:
     system_gain: Estimate  # K, DN/e-
     responsivity: Estimate  # R, DN per photon
     quantum_efficiency: Estimate  # electrons per photon
-    dark_noise_dn: Estimate  # sigma_y.dark, DN, with rounding
+    dark_noise_dn: Estimate  # sigma_y.dark, DN, including rounding
     dark_noise: Estimate  # sigma_d, e-
     threshold: Estimate  # mu_p.min, photons: the light whose SNR is 1
     saturation: Estimate  # mu_p.sat, photons
@@ -71,7 +71,7 @@ class Figures:
     dark_current: Estimate | None  # from means, e-/s
     dark_current_of_noise: Estimate | None  # from variances, e-/s
     saturated: int
-    fitted: Mask  # exposures
+    fitted: Mask  # exposures that the fit used
 
     def record(self) -> dict[str, Any]:
         """Return the figures as JSON values, each with its error."""
@@ -113,7 +113,7 @@ def figures(moments: Moments) -> Figures:
     dark2, noise_slope = _dark_variance(moments.dark, moments.dark_stack.mean_frame.size)
     dark_dn = dark2.root()
     dark_noise = _quotient(Estimate(dark2.value - ROUNDING, dark2.error).root(), gain)
-    # (sigma / K + 1/2) / QE, in which most of K cancels.
+    # (sigma / K + 1/2) / QE, where sigma is in DN. Most of K cancels.
     least = Estimate(dark_dn.value + gain.value / 2, float(np.hypot(dark_dn.error, gain.error / 2)))
     threshold = _quotient(least, responsivity)
     # The saturation is within half a step of the exposures.
@@ -200,7 +200,7 @@ def _dark_variance(dark: Temporal, pixels: int) -> tuple[Estimate, Estimate | No
         variance = float(dark.variance[np.argmin(dark.time)])
         found, slope = Estimate(variance, variance * (2 / pixels) ** 0.5), None
     else:
-        # In ms, so that squares do not lose precision.
+        # Times are in ms, so that squares do not lose precision.
         per_ms, found = _line(dark.time / 1e6, dark.variance)
         slope = per_ms.scaled(1e-6)
     return (found if found.value > MIN_DARK_VARIANCE else Estimate(MIN_DARK_VARIANCE, 0.0)), slope
@@ -232,7 +232,8 @@ def _linearity(moments: Moments, saturated: int) -> Linearity:
     slope, offset = np.polyfit(photons[used], light[used], 1, w=1 / light[used])
     line = slope * photons + offset
     deviation = 100 * (light / line - 1)
-    # What the light source, or the sensor, wavers between two frames, halved for their mean.
+    # Variation of the light source or the sensor between two frames, halved because the mean of
+    # both is used.
     wavering = 100 * moments.bright.flicker[used] / 2 / line[used]
     error = float(np.sqrt(np.square(wavering).mean()))
     least, most = (Estimate(float(f(deviation[used])), error) for f in (np.min, np.max))

@@ -16,7 +16,7 @@ class Temporal:
     time: Doubles  # ns
     photons: Doubles
     mean: Doubles
-    variance: Doubles  # temporal, of a frame
+    variance: Doubles  # temporal variance of a frame
     flicker: Doubles  # the difference between the means of the two frames
 
 
@@ -32,7 +32,7 @@ class Spatial:
     frames: int
     mean_frame: Doubles  # (height, width), DN
     temporal: float
-    at_zero: float = 0.0  # the share of samples of 0 DN
+    at_zero: float = 0.0  # share of samples that are 0 DN
 
     @property
     def mean(self) -> float:

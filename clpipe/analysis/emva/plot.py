@@ -13,7 +13,7 @@ from clpipe.analysis.emva.moments import Moments
 from clpipe.base.types import Doubles
 
 MEASURED, MODEL, OTHER, LIMIT = "#1f5fbf", "#222222", "#c8102e", "#8a8a8a"
-BOX = 5  # px, of the mean that is subtracted before the histogram of PRNU
+BOX = 5  # px; the window of the mean that is subtracted before the histogram of PRNU
 BINS = 256
 
 

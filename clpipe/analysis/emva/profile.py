@@ -26,7 +26,7 @@ def emva_profile(name: str, iso: float, source: str, moments: Moments, figures: 
     dark2 = figures.dark_noise_dn.value**2
     temporal = dark.temporal if dark2 <= MIN_DARK_VARIANCE else dark2
     black, read_noise, pattern = before_rounding(dark.mean, temporal, dark.variance.value)
-    # If rounding reduces dark noise, it tilts the line of K, which goes through zero.
+    # If rounding reduces dark noise, the fitted line of K is tilted, because it goes through zero.
     used = moments.light[figures.fitted]
     hidden = read_noise**2 + ROUNDING - temporal
     gain = figures.system_gain.value - hidden * float(used.sum() / (used @ used))

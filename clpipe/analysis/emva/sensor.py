@@ -4,12 +4,12 @@ import numpy as np
 
 from clpipe.base.types import Doubles
 
-COARSE = 1.0  # DN: with more noise, the only effect of rounding is to add 1/12 DN^2
+COARSE = 1.0  # DN; if noise is larger, rounding only adds 1/12 DN^2
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(21)
 NODE_WEIGHTS = WEIGHTS / WEIGHTS.sum()
-FINE = np.linspace(-4, 4, 161)  # standard deviations, at which rounding is sampled
+FINE = np.linspace(-4, 4, 161)  # standard deviations; the points at which rounding is sampled
 FINE_WEIGHTS = np.exp(-FINE * FINE / 2) / np.exp(-FINE * FINE / 2).sum()
-SEARCH_RANGE = np.linspace(0.6, 1.1, 2001)  # tried light, relative to the light that fills a pixel
+SEARCH_RANGE = np.linspace(0.6, 1.1, 2001)  # light to try, relative to the light that fills a pixel
 ROUNDS = 20  # rounds of the search for a full well
 
 

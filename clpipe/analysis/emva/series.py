@@ -25,11 +25,11 @@ from clpipe.images.samples import read_whole_numbers
 
 NAME = "EMVA1288_Data.txt"
 RELEASE = "3.1"
-PAIR = 2  # frames of one exposure, for temporal figures
+PAIR = 2  # frames per exposure, to measure temporal noise
 MAX_BITS = 16
-SIDES = 16, 16_384  # px, least and most
-MIN_EXPOSURES = 9  # with light; the standard asks for 50
-NS = 1e9  # nanoseconds in a second
+SIDES = 16, 16_384  # px; the smallest and largest side of a frame
+MIN_EXPOSURES = 9  # exposures with light; the standard asks for 50
+NS = 1e9  # ns per second
 FORMS = {
     "v": "v RELEASE",
     "n": "n BITS WIDTH HEIGHT",
@@ -44,9 +44,9 @@ class Exposure:
     """The frames of one exposure: its time in ns, the mean photons per pixel, their paths."""
 
     time: float
-    photons: float  # 0: dark
+    photons: float  # 0 for dark frames
     frames: tuple[Path, ...]
-    line: int = field(default=0, compare=False)  # in the text; 0 if there is none
+    line: int = field(default=0, compare=False)  # line number in the text; 0 if there is none
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from clpipe.engine.runner import Runner
 from clpipe.images.write import write_grey_png
 
 FIRST, LAST = "crosstalk", "quantize"  # the stages between the clean mosaic and the raw
-BEYOND = 0.1  # exposures beyond saturation, relative to the number below it
-SATURATED = 0.01  # s: the exposure time at which the light saturates the sensor
+BEYOND = 0.1  # number of exposures above saturation, relative to the number below it
+SATURATED = 0.01  # s; the exposure time at which the light saturates the sensor
 SHARE = 0.5  # exposure of the PRNU stack, relative to saturation
 
 

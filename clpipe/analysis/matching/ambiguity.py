@@ -17,9 +17,9 @@ from clpipe.analysis.matching.search import Candidate, Search, with_numbers
 from clpipe.analysis.matching.space import Dimension
 from clpipe.base.types import Doubles
 
-NEAR = 0.1  # the step in a logarithm, on either side, for differences of residuals
+NEAR = 0.1  # step of a logarithm to either side, to compute differences of residuals
 TWICE = math.log(2)
-CORRELATED = 0.95  # above this, two numbers cannot be distinguished
+CORRELATED = 0.95  # two numbers with a larger correlation cannot be distinguished
 RIDGE = 1e-6  # makes the matrix invertible if two numbers have the same effect
 
 

@@ -27,18 +27,20 @@ from clpipe.analysis.spatial import energy_left
 from clpipe.base.types import Array, Doubles, Floats, Mask
 
 MAX_LAG = 6  # px, the longest lag
+# Cycles per pixel; the edges of bands. The corner of the spectrum is at 0.71.
 BANDS = (
     0.0,
     0.125,
     0.25,
     0.375,
     0.75,
-)  # edges in cycles per pixel; the corner of the spectrum is at 0.71
+)
 LEVELS = (12, 24, 40, 64, 96, 128, 160, 192, 226)  # edges of the luma bins
 SHADOWS, MIDTONES = (24, 48), (64, 160)  # ranges of luma in which the skew of noise is compared
-BLOCK = 32  # px
+BLOCK = 32  # px; the side of a block
 GROUPS = 8  # groups of blocks; the jackknife omits one group at a time
-MIN_FRAMES = 4  # for tails, because the difference from a mean of few frames mixes their noise
+# Frames that tails need, because the difference from a mean of few frames mixes their noise.
+MIN_FRAMES = 4
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ class ValidPixels:
         return np.where(count > 0, count, np.nan)
 
 
-Figures = dict[str, float]  # by the names of COLUMNS; NaN if not computable
+Figures = dict[str, float]  # figures by names of COLUMNS; NaN if a figure cannot be computed
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from clpipe.base.types import Doubles
 
 INKS = {"theirs": "#222222", "ours": "#c8102e"}
 STEP = 16  # levels between two points of noise by intensity
-MIN_SAMPLES = 500  # samples for such a point
+MIN_SAMPLES = 500  # samples that a point needs
 
 
 def draw(match: Match, path: Path) -> None:

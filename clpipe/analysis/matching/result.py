@@ -18,7 +18,7 @@ from clpipe.base.types import Mask
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import value_text
 
-AT_END = 0.01  # an ISO within this share of an end of the range counts as at the end
+AT_END = 0.01  # share of the range; an ISO this close to an end counts as at the end
 CHECKED = 4  # frames of each pair that are developed to measure the result
 
 

@@ -28,19 +28,21 @@ from clpipe.images.read import read_finished
 MAX_UNCROPPED = 640  # px; larger pictures are reduced to their flattest crops of CROP x CROP
 CROP = 512  # px; crops begin at multiples of 16, to align with the blocks of a JPEG
 CROPS = 4
-MIN_FLAT = 4000  # pixels of all scenes that are neither clipped nor near an edge
-MIN_OF_EACH = 1000  # such pixels of each scene
-DARK = 12  # luma, above which noise is compared by intensity
-ROUNDING_ENERGY = 1e-9  # squared levels of 255, due to rounding in a mean; noise has more
-HOLDOUT = 3  # one crop or block of this many is held out of the search
-MANY = 6  # crops from which whole ones are held out; with fewer, one might be unusual
-SMOOTH = 1.5  # px, over which the mean of a burst is smoothed before it is developed again
+MIN_FLAT = 4000  # px; pixels in all scenes that are neither clipped nor near an edge
+MIN_OF_EACH = 1000  # px; such pixels in each scene
+DARK = 12  # luma; noise is compared by intensity above this level
+# Squared levels of 255; the energy from rounding in a mean, which noise exceeds.
+ROUNDING_ENERGY = 1e-9
+HOLDOUT = 3  # one of this many crops or blocks is held out of the search
+MANY = 6  # crops; with fewer, blocks are held out instead of whole crops, which might be unusual
+SMOOTH = 1.5  # px; sigma that smooths the mean of a burst before it is developed again
 
 SHIFT = 0.5  # px, by which a frame may be shifted against its mean
-SURE = 15.0  # standard errors of white noise for a significant shift; three of a camera's noise
+# Standard errors for a significant shift, for white noise; equal to three for a camera's noise.
+SURE = 15.0
 SCENE_SHARE, SCENE_BLOCK = 0.05, 64  # see clpipe.analysis.repeats
 MOVED, MOVED_BLOCK = 1.0, 16  # sigma, px: a mean of a block that noise does not reach
-MAX_MOVED = 0.1  # share of the blocks
+MAX_MOVED = 0.1  # the largest share of moved blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,9 +270,8 @@ def static_mask(path: Path, frame: Floats, clean: Doubles, against: str, flat: M
     slopes = np.gradient(ndimage.gaussian_filter(luma(clean), 1.0))
     design = np.stack([slope.ravel() for slope in slopes], axis=1)
     shift = -np.linalg.lstsq(design, sharp.ravel(), rcond=None)[0]
-    errors = np.sqrt(
-        (sharp**2).mean() / np.maximum((design**2).sum(0), 1e-9)
-    )  # standard errors for white noise
+    # These are the standard errors for white noise.
+    errors = np.sqrt((sharp**2).mean() / np.maximum((design**2).sum(0), 1e-9))
     if (np.abs(shift) > np.maximum(SHIFT, SURE * errors)).any():
         down, right = shift
         raise RequestError(

@@ -38,24 +38,26 @@ from clpipe.engine.device import Device
 
 LOG = logging.getLogger(__name__)
 
-# Steps of least squares: at first, while a candidate is promising, and at the end.
+# Steps of least squares at first, while a candidate is promising, and at the end.
 FIRST_STEPS, TRIAL_STEPS, FINAL_STEPS = 2, 3, 20
 
 # Relative tolerances of least squares. The last fit uses the second.
 COARSE_TOLERANCE, FINE_TOLERANCE = 1e-3, 1e-4
 
-# A variant is abandoned if its cost exceeds the best one by the first factor before any fit, or by
-# the second after FIRST_STEPS.
+# Limits of a variant's cost, relative to the best cost. A variant is abandoned if its cost exceeds
+# the first limit before any fit, or the second one after FIRST_STEPS.
 ABANDON_RATIO, PROMISING_RATIO = 5.0, 1.5
 
-GOOD_RESIDUAL = 0.5  # residual of a typical column below which no other method is tried
-CONVERGED = 0.95  # if a few steps leave more than this share of the cost, the fit ends
+# No other method is tried if the residual of a typical column is below this value.
+GOOD_RESIDUAL = 0.5
+CONVERGED = 0.95  # the fit ends if a few steps leave more than this share of the cost
 DIFFERENCE_STEP = 0.03  # step of finite differences, relative to a dimension's range
 LOSS_SCALE = 3.0  # larger residuals count less than their squares (soft L1)
 IMPROVEMENT = 0.9  # another method must cost less than this share, because costs are random
-TRIAL_SCENES, TRIAL_CROP = 4, 384  # scenes that compare methods, and the size of their crops in px
-ROUNDS = 2  # times that each part is tried
-FINAL_FIT_TRIALS = 20  # the duration of the last fit (all scenes at full size), in trials
+# Number of scenes for comparing methods, and the size of their crops in px.
+TRIAL_SCENES, TRIAL_CROP = 4, 384
+ROUNDS = 2  # number of times that each part is tried
+FINAL_FIT_TRIALS = 20  # duration of the last fit (all scenes at full size), in trials
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class StoppedError(Exception):
 class Watch:
     """Receives the progress of a search. This base class ignores it, and never stops a search."""
 
-    is_stopping = False  # whether the search is to raise StoppedError
+    is_stopping = False  # set to True to make the search raise StoppedError
 
     def advanced(self, share: float, best: Candidate, scenes: Scenes) -> None:
         """Receive the share of the search that is done, 0 to 1, and the best development so far."""
@@ -133,7 +135,7 @@ class Search:
         self.simulator = Simulator(device)
         self.targets = [target_of(s, ~s.holdout) for s in scenes.each if s.mask.any()]
         self.evaluations = 0
-        self._cache: dict[tuple[str, Scene], Figures] = {}  # by settings and scene
+        self._cache: dict[tuple[str, Scene], Figures] = {}  # figures by settings and scene
         self._trials, self._expected_trials, self._share = 0, FINAL_FIT_TRIALS, 0.0
 
     def run(self) -> Candidate:
@@ -155,7 +157,8 @@ class Search:
         for number, part in enumerate(parts):
             if unchanged == count:
                 break
-            ahead = parts[number:][: count - unchanged]  # more follow if the best candidate changes
+            # If the best candidate changes, more parts follow.
+            ahead = parts[number:][: count - unchanged]
             self._expected_trials = (
                 self._trials
                 + sum(self.variant_count(best, each) for each in ahead)
@@ -172,7 +175,7 @@ class Search:
                     )
             unchanged = unchanged + 1 if best is before else 1
         last = self.fit(best.choices, best.numbers, self.targets, FINAL_STEPS)
-        # Again, with a new trust region.
+        # Fit again, with a new trust region.
         again = self.fit(last.choices, last.numbers, self.targets, FINAL_STEPS)
         return min(last, again, key=lambda candidate: candidate.cost)
 
@@ -262,11 +265,12 @@ class Search:
             is_variant = with_numbers(settings, values)
             return Candidate(choices, is_variant, values, cost, typical_residual(cost, targets))
 
-        # From 1 to 2, not from 0: SciPy's steps for differences are relative.
+        # Positions are from 1 to 2, because SciPy's steps for differences are relative and would
+        # vanish at 0.
         positions = np.clip([1 + d.share(numbers[d.name]) for d in dimensions], 1.01, 1.99)
         if not (dimensions and steps):
             knee = (residuals(positions) / LOSS_SCALE) ** 2
-            cost = float(LOSS_SCALE**2 * (np.sqrt(1 + knee) - 1).sum())  # as SciPy's soft_l1
+            cost = float(LOSS_SCALE**2 * (np.sqrt(1 + knee) - 1).sum())  # like SciPy's soft_l1
             return made(numbers, cost)
         tolerance = FINE_TOLERANCE if targets is self.targets else COARSE_TOLERANCE
         found = least_squares(

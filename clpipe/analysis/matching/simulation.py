@@ -21,8 +21,8 @@ from clpipe.engine.runner import Runner
 from clpipe.images.jpeg import jpeg_round_trip
 from clpipe.stage import Kind, Method, ReferenceContext
 
-LINEAR = 16  # scenes in linear light that are cached, for one tone curve
-UNDONE = ("gamma", "tone_curve")  # by the stage of that name with "inverse_" before it
+LINEAR = 16  # linear-light scenes that are cached for one tone curve
+UNDONE = ("gamma", "tone_curve")  # stages that an inverse_gamma or inverse_tone_curve stage undoes
 # Stages that have already been applied to a picture.
 SEEN = ("shutter", "defocus", "motion_blur", "distortion", "vignetting", "optical_blur")
 

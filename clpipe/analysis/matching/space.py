@@ -25,12 +25,13 @@ TONE = "tone_curve"
 RESIZE, SCALES = "resize", (0.5, 2 / 3, 0.75)  # scales of cameras' smaller picture sizes
 BEFORE = TONE  # a stage that the chain lacks is inserted before this one
 SHARPEN = "sharpen"
-# Chroma is smoothed again and wider: cameras do so at a half or a quarter of the resolution.
+# Cameras smooth chroma again with a wider filter, at a half or a quarter of the resolution.
 SMOOTHER = {"method": "bilateral", "luma_size": 1, "luma_strength": 0.0, "chroma_size": 7}
 COARSER = {"method": "biweight", "luma_strength": 0.0, "chroma_scale": 3}
-SEARCHED_UNITS = ("", "px")  # numbers in units of the signal follow from the noise
-ALSO = ("sharpen.limit",)  # searched nevertheless, because it sets the noise at edges
-SPAN = 8.0  # a number is searched within this factor of where it starts
+# Units of searched numbers; numbers in signal units follow from the noise.
+SEARCHED_UNITS = ("", "px")
+ALSO = ("sharpen.limit",)  # also searched, because it sets the noise at edges
+SPAN = 8.0  # a number is searched within this factor of its initial value
 
 
 @dataclass(frozen=True)

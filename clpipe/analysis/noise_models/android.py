@@ -13,7 +13,7 @@ from clpipe.base.errors import RequestError
 
 MARK = "noise_model_A"
 
-# Lengths are bounded, so that the time is proportional to the length of the text.
+# Lengths are bounded, so that matching takes time in proportion to the length of the text.
 _SPACE = r"\s{0,9}"
 _COEFFICIENTS = rf'"?{_SPACE}(?:\[{_SPACE}\])?{_SPACE}[=:]{_SPACE}[\[{{]([^\]}}]{{1,999}})[\]}}]'
 _NUMBER = r"([0-9.]{1,30}(?:[eE][+-]?[0-9]{1,4})?)"

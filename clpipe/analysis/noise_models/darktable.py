@@ -26,7 +26,8 @@ MARK = "noiseprofiles"
 RAW_OVER_DEMOSAICED = 12.8
 TRUSTED_ISO = 800.0  # the factor is accurate at this ISO and above
 LOWEST_ISO = 100.0  # lower ISOs are often ISO 100 with another exposure
-UNCERTAINTY = 0.3  # relative, of the factor; if a/ISO deviates more, raws are scaled or denoised
+# Relative uncertainty of the factor; if a/ISO deviates more, raws are scaled or denoised.
+UNCERTAINTY = 0.3
 
 # Fujifilm's X-Trans cameras (source: rawspeed's cameras.xml); X-T100 and X-T200 are Bayer.
 X_TRANS = re.compile(r"X-(?:E|H|M|Pro)\d.*|X-S\d\d|X-T\d\d?(?: II)?|X100[STFV].*|X[237]0|XQ\d")
@@ -38,7 +39,7 @@ class Profile(BaseModel):
     """The noise at an ISO; ``skip`` marks a profile that darktable does not use."""
 
     iso: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
-    a: tuple[Any, Slope, Any]  # red, green, blue; red and blue depend on the light
+    a: tuple[Any, Slope, Any]  # red, green and blue; red and blue depend on the light
     skip: bool = False
 
 

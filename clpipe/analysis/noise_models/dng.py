@@ -8,7 +8,7 @@ from clpipe.analysis.noise_models.model import Law, Levels, SensorModel
 from clpipe.base.errors import ImageError
 from clpipe.images.raw import read_exif, read_raw_info
 
-NOISE_PROFILE = "Tag 0xC761"  # exifread's name
+NOISE_PROFILE = "Tag 0xC761"  # exifread's name of the tag
 
 
 def read_dng(path: Path) -> SensorModel:

@@ -12,13 +12,13 @@ from clpipe.base.text import printable
 from clpipe.camera.profile import SRGB_TO_XYZ, Camera, Matrix, built_in_name, load_camera
 from clpipe.camera.text import profile_text
 
-# The middle of the ranges of Brooks et al. (CVPR 2019): red 1.9 to 2.4, blue 1.5 to 1.9.
+# The middles of the ranges in Brooks et al. (CVPR 2019): red 1.9 to 2.4, blue 1.5 to 1.9.
 DEFAULT_GAINS = (2.15, 1.70)
 
-# ln(read noise in 14-bit DN) over ln(system gain): means of the laws of the five cameras of
-# Wei et al., CVPR 2020 (github.com/Vandermode/ELD).
+# Slope and offset of ln(read noise in 14-bit DN) as a function of ln(system gain). They are means
+# over the five cameras of Wei et al., CVPR 2020 (github.com/Vandermode/ELD).
 READ_NOISE_SLOPE, READ_NOISE_OFFSET = 0.600, 1.521
-READ_NOISE_RANGE = 15871.0  # DN of signal 1 in that source: 14 bits, black level 512
+READ_NOISE_RANGE = 15871.0  # DN of the signal 1 in Wei et al.: 14 bits, black level 512
 
 NOT_IN_FILE = "not in the file, and not known; assumed to be zero"
 

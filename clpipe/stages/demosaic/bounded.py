@@ -34,8 +34,8 @@ from clpipe.stages.denoise.strength import (
     offset_parameter,
 )
 
-# Both directions count as alike if the gradient, in roots of the signal, is below this value.
-# Chosen: a hundredth of white is less than the noise of most images, and is no edge.
+# Roots of the signal; the directions count as alike if the gradient is below this value. We chose a
+# hundredth of white: it is less than the noise of most images, and no edge is so weak.
 EQUAL_GRADIENT = np.float32(0.01**2)
 
 

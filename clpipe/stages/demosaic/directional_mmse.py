@@ -22,7 +22,7 @@ from clpipe.stage import (
 ERRORS = tuple(f"errors_{first}" for first in range(0, MODELS, 2))
 
 
-@lru_cache(maxsize=16)  # the same object for the same array, so that it is uploaded once
+@lru_cache(maxsize=16)  # equal arrays share one object, so that it is uploaded once
 def tables(array: FilterArray) -> tuple[Floats, Floats]:
     """Return the filters of an array in the layout that kernels read.
 
@@ -45,7 +45,7 @@ class DirectionalMmse(Method):
     method: ClassVar = "directional_mmse"
     kernel: ClassVar = "demosaic_directional_mmse"
     summary: ClassVar = "mix of linear filters along four directions, for any filter array"
-    tolerance: ClassVar = 1e-5  # fused sums of 49 terms, squared, and to the power of four
+    tolerance: ClassVar = 1e-5  # the kernel uses fused sums of 49 terms, squares and fourth powers
     any_array: ClassVar = True
 
     def passes(self) -> tuple[Pass, ...]:

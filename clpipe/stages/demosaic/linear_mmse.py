@@ -22,7 +22,7 @@ from clpipe.stage import (
 )
 
 
-@lru_cache(maxsize=16)  # the same object for the same array, so that it is uploaded once
+@lru_cache(maxsize=16)  # equal arrays share one object, so that it is uploaded once
 def weights_table(array: FilterArray) -> Floats:
     """Return the filters of an array in the layout of kernels: (row, tap, channel, column)."""
     return kernel_table(filters(array).transpose(0, 2, 3, 1))

@@ -87,18 +87,21 @@ def menon2007(image: Floats, pattern: Pattern) -> Floats:
     >>> bool(np.allclose(menon2007(edge, "BGGR"), edge[..., None]))
     True
     """
-    # Directional green, and the choice of the direction in which colour differences change less.
+    # Interpolate green in both directions, and choose the one in which colour differences change
+    # less.
     by_row, by_column = directional_differences(image, pattern)
     in_row = change(by_row) <= change(by_column.T).T
     selected = np.where(in_row, by_row, by_column)
-    # First estimate of the site's own colour minus the other one (R-B or B-R), refined below.
+    # First estimate of the difference between the site's own colour and the other one (R-B or B-R).
+    # It is refined below.
     (left, right), (left_other, right_other) = neighbour_differences(selected, in_row)
     own_other = (left_other + right_other) * HALF
     # Refine green: own minus green becomes the mean of three values along the direction.
     refined = (left + selected + right) * THIRD
     refined = by_site(image.shape, pattern, refined, selected, refined)
     green = image - refined
-    # Refine the other colour in the same way; red and blue at green sites are bilinear.
+    # Refine the other colour in the same way. At green sites, red and blue are interpolated
+    # bilinearly.
     _, (left_other, right_other) = neighbour_differences(refined, in_row)
     other = image - (left_other + own_other + right_other) * THIRD
     red, blue = red_and_blue(

@@ -13,7 +13,7 @@ from clpipe.reference.image import tap
 from clpipe.stage import Context, ReferenceContext, parameter
 from clpipe.stages.denoise.strength import WindowDenoiser
 
-# Sigma of the range weight, in multiples of strength * noise. Chosen, not derived.
+# Sigma of the range weight, in multiples of strength * noise. We chose this value.
 # tools/pages/quality.py measures its PSNR, and no test asserts that it is optimal.
 RANGE = 3.0
 

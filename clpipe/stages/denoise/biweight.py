@@ -23,18 +23,19 @@ from clpipe.stage import (
 )
 from clpipe.stages.denoise.strength import MID_GREY, Denoiser, offset_of_roots, offset_parameter
 
-# The difference with weight 0, in multiples of strength * noise. Found by experiment. At 6 in luma,
-# large noise values remain alone and make the tails of the noise longer than a camera's. Above 16,
+# The difference that gets weight 0, in multiples of strength * noise. Found by experiment. At 6 in
+# luma, isolated large noise values remain, so noise has longer tails than a camera's. Above 16,
 # edges become softer.
 RANGE_LUMA, RANGE_CHROMA = 16.0, 2.5
-# The least noise that luma is filtered for, in roots: less than one level of 255. Found by
-# experiment: at 0.006, an image at ISO 100 is further from the ground truth than without denoising.
+# Roots of the signal; the smallest noise for which luma is filtered, less than one level of 255.
+# Found by experiment: at 0.006, an image at ISO 100 is further from the ground truth than without
+# denoising.
 MIN_NOISE = 0.0025
 
 GRAIN = 0.35  # share of luma's noise that remains at strength 1, at low noise
 
-# Weights by squared distance, px. Luma has a binomial window. Chroma has a wider one, of pixels
-# that demosaicing interpolated from other samples than the centre's.
+# Weights by squared distance in px. Luma has a binomial window. Chroma has a wider window, with
+# pixels that demosaicing interpolated from samples other than the centre's.
 LUMA_WINDOW = {1: 0.5, 2: 0.25}
 CHROMA_WINDOW = {2: 0.4, 4: 0.25}
 

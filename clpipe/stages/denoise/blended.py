@@ -13,8 +13,8 @@ from clpipe.reference.median import median_filter
 from clpipe.stage import Context, ReferenceContext
 from clpipe.stages.denoise.strength import WindowDenoiser, size_parameter
 
-# Assumed standard deviation of detail against its neighbours, signal units. Chosen, not derived.
-# tools/pages/quality.py measures its PSNR, and no test asserts that it is optimal.
+# Signal units; the assumed standard deviation of detail relative to its neighbours. We chose this
+# value. tools/pages/quality.py measures its PSNR, and no test asserts that it is optimal.
 DETAIL = 0.02
 
 
@@ -67,7 +67,7 @@ class Mean(BlendedFilter):
     method: ClassVar = "mean"
     kernel: ClassVar = "denoise_mean"
     summary: ClassVar = "mean of a window, mixed in more strongly if there is more noise"
-    tolerance: ClassVar = 2e-6  # sums in another order
+    tolerance: ClassVar = 2e-6  # the kernel adds in another order
     function: ClassVar = "mean_filter"
     vectors_per_row: ClassVar = 1
 
@@ -99,7 +99,7 @@ class Median(BlendedFilter):
     method: ClassVar = "median"
     kernel: ClassVar = "denoise_median"
     summary: ClassVar = "median of a window, mixed in more strongly if there is more noise"
-    tolerance: ClassVar = 1e-6  # luma and chroma are not exact
+    tolerance: ClassVar = 1e-6  # conversion to luma and chroma is not exact
     function: ClassVar = "median_filter"
     largest_size: ClassVar = 5
 

@@ -193,7 +193,7 @@ class WindowDenoiser(Denoiser):
     first_pass: ClassVar[Pass] = Pass("to_luma_chroma", writes="planes", kind=Kind.YCBCR)
     last_pass: ClassVar[Pass] = Pass("from_luma_chroma", reads=("filtered",))
     extra_reach: ClassVar[int] = 0  # px that the stencil reads outside its window
-    vectors_per_row: ClassVar[int] = 0  # like in Stencil
+    vectors_per_row: ClassVar[int] = 0  # see Stencil
 
     luma_size: int = size_parameter("luma", 5, 15)
     chroma_size: int = size_parameter("chroma", 5, 15)

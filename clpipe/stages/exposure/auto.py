@@ -19,15 +19,15 @@ from clpipe.stage import (
 )
 from clpipe.stages.exposure.gain import Gain
 
-STEPS = 4096  # per unit of the logarithm to base 2, which is stored as an integer
+STEPS = 4096  # steps per factor of two; the base-2 logarithm is stored as an integer
 _PER_NEPER = np.float32(-STEPS * 1.4426950408889634)
 
-OCTAVES = 36  # of the histogram, from 2^-18 on; each has 256 bins
+OCTAVES = 36  # octaves of the histogram, from 2^-18 on; each has 256 bins
 BINS = OCTAVES * 256
 _LOWEST = np.float32(2.0**-18)
 _FIRST = int(_LOWEST.view(np.int32))
 
-# Shorter side of the image over the diameter of the metered circle; 0 means no circle.
+# The image's shorter side, divided by the diameter of the metered circle. 0 means no circle.
 CIRCLES = {"average": 0, "centre_weighted": 2, "spot": 6}
 # Weights of a pixel inside and outside the circle.
 WEIGHTS = {"average": (1, 0), "centre_weighted": (20, 1), "spot": (1, 0)}
@@ -85,7 +85,7 @@ class Auto(Gain):
 
     method: ClassVar = "auto"
     kernel: ClassVar = "exposure_auto"
-    overscan: ClassVar = False  # it meters the finished image
+    overscan: ClassVar = False  # the finished image is metered
     summary: ClassVar = "meter the image and scale its luminance to a target"
     example: ClassVar = {"metering": "centre_weighted"}
 

@@ -11,9 +11,9 @@ from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
 from clpipe.stage import Arguments, Context, ReferenceContext, parameter
 from clpipe.stages.exposure.gain import Gain
 
-SATURATION = 78.0  # lx s, over the ISO: the exposure that saturates the sensor
-GREY = 10.0  # lx s, over the ISO: the exposure of a correctly exposed 18 % grey
-WHITE = GREY / 0.18 / SATURATION  # level of a white surface, over the sensor's full scale
+SATURATION = 78.0  # lx s at ISO 1; the exposure that saturates the sensor
+GREY = 10.0  # lx s at ISO 1; the exposure of a correctly exposed 18 % grey
+WHITE = GREY / 0.18 / SATURATION  # level of a white surface, relative to the sensor's full scale
 
 
 class Photometric(Gain):

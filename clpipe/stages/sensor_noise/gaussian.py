@@ -27,7 +27,7 @@ class Gaussian(SensorNoise):
     kernel: ClassVar = "sensor_noise_gaussian"
     summary: ClassVar = "add Gaussian noise of variance a*y + b"
     other_examples: ClassVar = ({"tukey_lambda": -0.2, "full_well": 1000.0},)
-    functions: ClassVar = ("sensor_noise", "sensor_noise_tukey")  # in the kernel file
+    functions: ClassVar = ("sensor_noise", "sensor_noise_tukey")  # names in the kernel file
 
     def passes(self) -> tuple[Pass, ...]:
         of_gaussian, of_tukey = self.functions
@@ -38,7 +38,8 @@ class Gaussian(SensorNoise):
         return (Pass(of_tukey, arguments=names, random=NoiseScope.IMAGE),)
 
     def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats | None:
-        if self.tukey_lambda is None:  # here a negative signal lowers the variance below b
+        # In this model, a negative signal lowers the variance below b.
+        if self.tukey_lambda is None:
             return np.maximum(self.added_variance(signal), np.float32(0)) + input_variance
         return super().variance(input_variance, signal, context)
 

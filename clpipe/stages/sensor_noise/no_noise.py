@@ -5,7 +5,7 @@ from typing import ClassVar
 from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Backend, Context, Numbers, Pass, Signal, SignalMethod, parameter
 
-NEVER_FULL = 1e30  # stands for no full well, in electrons or in signal units
+NEVER_FULL = 1e30  # full well in electrons or signal units, for sensors that never saturate
 
 
 def or_default(value: float | None, default: float) -> float:

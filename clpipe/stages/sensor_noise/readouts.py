@@ -27,10 +27,12 @@ from clpipe.stages.sensor_noise.no_noise import NEVER_FULL, NoNoise, or_default
 
 DEFAULT_RATIO = 16.0  # for sensors whose profile does not state a ratio
 MAX_READOUTS = 4
+# Signal of a readout at which its weight becomes 0, and the slope below it. The transition
+# therefore begins at 0.85.
 HANDOVER_END, HANDOVER_SLOPE = (
     np.float32(0.95),
     np.float32(10.0),
-)  # of a transition, which begins at 0.85
+)
 
 
 class Readout(NamedTuple):
@@ -236,7 +238,7 @@ class Readouts(SensorNoise):
         return merged
 
 
-@lru_cache(maxsize=256)  # the same object for the same readouts, so that it is uploaded once
+@lru_cache(maxsize=256)  # equal readouts share one object, so that it is uploaded once
 def _table(readouts: tuple[Readout, ...], first: float, later: float) -> Floats:
     rows = [
         (

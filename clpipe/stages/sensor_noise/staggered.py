@@ -11,7 +11,7 @@ from clpipe.reference.filter_array import LANES
 from clpipe.stage import Arguments, Context, Span, parameter
 from clpipe.stages.sensor_noise.readouts import MAX_READOUTS, Readout, Readouts
 
-NO_IMAGES = np.zeros((MAX_READOUTS - 1, 1, 1), np.float32)  # exists before there is an image
+NO_IMAGES = np.zeros((MAX_READOUTS - 1, 1, 1), np.float32)  # default before there is an image
 
 
 class Staggered(Readouts):
@@ -29,7 +29,7 @@ class Staggered(Readouts):
     count: int = parameter(3, "Number of exposures.", structural=True, ge=2, le=MAX_READOUTS)
 
     _light_changes: bool = PrivateAttr(False)  # each exposure sees different light
-    # the light of all exposures but the first, of an image
+    # The light of an image in all exposures after the first.
     _later_images: Floats | None = PrivateAttr(None)
 
     @property

@@ -8,10 +8,10 @@ from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext
 from clpipe.stages.tone_curve.hue import keep_hue
 
-# y = x (a x + b) / (x (c x + d) + 1), with a + b = c + d + 1, so that 1 stays 1. It is fitted (in
-# roots of y) to three fifths of Camera Raw's default curve and two fifths of the render's own
-# light. That light is 2 x up to 0.25 and rolls off from there. 0.09, which is 18 % grey with a stop
-# of headroom, becomes 0.173. A render's 1.0 becomes 0.8.
+# y = x (a x + b) / (x (c x + d) + 1), with a + b = c + d + 1, so that 1 stays 1. The curve was
+# fitted in roots of y. The target is three fifths of Camera Raw's default curve and two fifths of
+# the render's own light. The render's light is 2 x up to 0.25 and rolls off above 0.25. An input of
+# 0.09, which is 18 % grey with a stop of headroom, becomes 0.173. A render's 1.0 becomes 0.8.
 A, B, C, D = (np.float32(value) for value in (13.5, 1.27, 11.6, 2.17))
 
 

@@ -10,7 +10,7 @@ from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, parameter
 from clpipe.stages.tone_curve.hue import clip_to_unit
 
-# 18 % grey with one stop of headroom, and its result, which is nearly as bright as in sRGB.
+# The level of 18 % grey with one stop of headroom. Its result is nearly as bright as in sRGB.
 GREY, GREY_OUT = 0.09, 0.173
 NAMES = ("grey", "a", "b", "c", "d", "bright_a", "bright_b", "bright_c", "bright_d")
 HIGHLIGHT_DESATURATION = (

@@ -81,7 +81,8 @@ def parse_csv(text: str) -> Knots:
             raise ValueError(
                 f"line {number}: x and y must be within 0 and 1; this line is {line!r}"
             )
-        if knots and pair[0] < knots[-1][0] + 1e-12:  # so that no slope is infinite
+        # Equal positions would make the slope infinite.
+        if knots and pair[0] < knots[-1][0] + 1e-12:
             before = knots[-1][0]
             raise ValueError(f"line {number}: x is {pair[0]:g} after {before:g}; x must ascend")
         knots.append((pair[0], pair[1]))
