@@ -317,7 +317,7 @@ def test_a_single_image_that_clips_and_has_rows():
 
 def test_a_single_image_with_nothing_smooth_is_refused():
     noise = np.random.default_rng(0).random((1, 64, 64)).astype(np.float32) * 9000 + 600
-    with pytest.raises(ImageError, match="ISO 100: too few smooth places"):
+    with pytest.raises(ImageError, match="ISO 100: the image has too few smooth areas"):
         calibrate(100, noise, None, SENSOR)
 
 

@@ -306,7 +306,7 @@ def test_folders_of_photographs_are_a_burst_each_and_what_is_refused(tmp_path, m
         ([tmp_path / "empty"], "empty: this folder has no pictures (.jpg, "),
         (
             [photos / "a", files[3], files[4], "--truth", files[0]],
-            "found 2 bursts, but one truth",
+            "found 2 bursts, but one ground truth",
         ),
     ):
         assert message in clpipe("measure", *arguments, status=2).stderr
@@ -430,7 +430,7 @@ def test_wrong_partners_are_refused(developed, clpipe):
     other = developed("--until", "quantize", "--seed", "1", "--iso", "1600")
     before = developed("--until", "mosaic")
     found = clpipe("measure", f"{noisy}.exr", f"{other}.exr", status=2)
-    assert "give repeats of one ISO" in found.stderr
+    assert "give images of one ISO" in found.stderr
     found = clpipe("measure", f"{noisy}.exr", "--truth", f"{before}.exr", status=2)
     assert "keep both after the same stage" in found.stderr
 

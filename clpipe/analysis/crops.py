@@ -85,8 +85,8 @@ def choose_crops(texts: Sequence[str], picture: Floats) -> list[Crop]:
         place = Crop(match["name"] or match["box"], *map(int, re.split("[,x]", match["box"])))
         if not place.within(width, height):
             raise RequestError(
-                f"--crop {text}: this crop is empty or exceeds the pictures, whose size is "
-                f"{width}x{height}"
+                f"--crop {text}: this crop is empty or extends outside the pictures; choose a "
+                f"crop inside {width}x{height} pixels"
             )
         places.append(place)
     return places

@@ -66,9 +66,10 @@ def reject_shifted(images: Sequence[Picture], mean: Floats, noise: Floats) -> No
     if follows > SHIFTED_SHARE * energy[worst]:
         others = "the others" if len(noise) > 2 else images[0].path
         raise RequestError(
-            f"{images[worst].path} is not aligned with {others}: {follows / energy[worst]:.0%} of "
-            f"the difference follows edges, but of noise less than {SHIFTED_SHARE:.0%} would; "
-            "the camera or the scene moved. Give repeats from one position, or a --truth"
+            f"{images[worst].path} is not aligned with {others}: {follows / energy[worst]:.0%} "
+            "of the difference follows edges, but noise would give less than "
+            f"{SHIFTED_SHARE:.0%}. The camera or the scene moved. Give repeats from one "
+            "position, or add --truth"
         )
 
 

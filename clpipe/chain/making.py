@@ -226,7 +226,7 @@ def _check_after_wide(wide: str, name: str, method: Method) -> None:
         raise KeyedError(
             "lens",
             f"lens: a lens from lensfun needs a picture in perspective, but {wide} already "
-            f"applies a wide lens; remove lens or {wide}",
+            f"applies a wide lens; remove lens, or skip {wide}",
         )
     if "fx" in type(method).model_fields:
         raise KeyedError(

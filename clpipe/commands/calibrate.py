@@ -105,7 +105,7 @@ def calibrate(
         calibrate_emva(emva, output, iso, as_json)
         return
     if not inputs:
-        raise RequestError("FRAMES: none is named; name raw frames, or a series with --emva")
+        raise RequestError("FRAMES: no frames are named; name raw frames, or a series with --emva")
     dumped = parse_dump(dump) if dump else None
     overrides = FrameOverrides(black_level, white_level, pattern, iso, dumped)
     frames, calibrations = calibrate_files(inputs, dark, overrides)

@@ -125,7 +125,7 @@ def read_psf(path: str) -> Doubles:
         )
     total = pixels.sum((0, 1), dtype=np.float64)
     if not total.all():
-        raise ValueError(f"{path}: a channel has no light")
+        raise ValueError(f"{path}: every pixel of a channel is 0; give each channel some light")
     return np.asarray(pixels / total)
 
 

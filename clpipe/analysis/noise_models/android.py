@@ -38,7 +38,8 @@ def parse_android(text: str, path: Path) -> SensorModel:
     highest = _number(found[1]) if found else math.inf
     if not highest > 0:
         raise RequestError(
-            f"{path}: its highest analogue ISO is {found and found[1]}, but must be above 0"
+            f"{path}: its highest analogue ISO is {found and found[1]}, but this ISO must "
+            "be above 0"
         )
     isos, range_source = _isos(text, highest)
     laws = []

@@ -23,8 +23,8 @@ def read_dng(path: Path) -> SensorModel:
     tag = next(tags, None)
     if tag is None:
         raise ImageError(
-            f"{path}: this DNG has no NoiseProfile (tag 51041), which states noise; DNGs of "
-            "Android phones, Adobe's converter and clpipe have one"
+            f"{path}: this DNG has no NoiseProfile (tag 51041); give a DNG from an Android "
+            "phone, Adobe's converter or clpipe"
         )
     values = _numbers(tag)
     if len(values) not in (2, 6):
