@@ -180,7 +180,10 @@ def test_the_default_has_a_good_lens_and_the_paper_none():
             {"motion_blur": {"rotation": 1.0, "fx": 99.0, "length": 1.0}},
             "set either length or rotation",
         ),
-        ({"camera": "sony-imx686", "optical_blur": {"f_number": 2.0}}, "diffraction needs it"),
+        (
+            {"camera": "sony-imx686", "optical_blur": {"f_number": 2.0}},
+            "diffraction needs this parameter",
+        ),
     ],
 )
 def test_what_is_refused(stages, message, write_exr, monkeypatch, tmp_path):

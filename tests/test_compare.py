@@ -203,14 +203,17 @@ def test_mosaics_are_grey(tmp_path):
             "this crop is empty or extends outside",
         ),
         (("a.png", "b.png", "--crop", "sky", "-o", "f.png"), "found 'sky'; expected X,Y,WxH"),
-        (("small.png", "small.png", "-o", "f.png"), "--crop flat: the pictures are 50x40, smaller"),
+        (
+            ("small.png", "small.png", "-o", "f.png"),
+            "--crop flat: the pictures are 50x40, but an automatic crop",
+        ),
         (("a.png", "b.png", "--label", "x", "-o", "f.png"), "found 1 for 2 pictures"),
         (("a.png", "b.png", *["--truth", "c.png"] * 3, "-o", "f.png"), "found 3 for 2 pictures"),
         (
             ("a.png", "b.png", *["--crop", "0,0,120x80"] * 4, "--zoom", 32, "-o", "f.png"),
             "more than 67,108,864; give smaller crops",
         ),
-        (("a.png", "mosaic.exr", "-o", "f.png"), "mosaic that does not say its levels"),
+        (("a.png", "mosaic.exr", "-o", "f.png"), "mosaic without known levels"),
         (
             ("a.png", "shot.DNG", "-o", "f.png"),
             "shot.DNG: this command does not read camera raws",

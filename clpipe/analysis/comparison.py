@@ -164,8 +164,8 @@ def displayed(picture: Picture) -> Picture:
     """
     if picture.kind == "values":
         raise RequestError(
-            f"{picture.path}: this is {picture.what}, which cannot be shown; develop it first with "
-            "'clpipe run'"
+            f"{picture.path}: this image ({picture.what}) cannot be shown; first develop it "
+            "with 'clpipe run'"
         )
     pixels = picture.pixels
     if picture.kind != "display":

@@ -124,8 +124,8 @@ def check_partners(images: Sequence[Picture], truth: Picture | None) -> None:
             )
         if other.balance and first.balance and other.balance != first.balance:
             raise RequestError(
-                f"{other.path} is {other.balance}, but {first.path} is {first.balance}; "
-                "keep both after the same stage of the same camera"
+                f"{other.path} is {other.balance}, but {first.path} is {first.balance}; keep "
+                "both images after the same stage of the same camera"
             )
         isos = {other.iso, first.iso} - {None}
         if other is not truth and len(isos) > 1:

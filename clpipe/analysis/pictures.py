@@ -41,7 +41,7 @@ class Picture:
     def what(self) -> str:
         """The kind, pattern and size as text."""
         height, width = self.pixels.shape[:2]
-        name = "mosaic that does not say its levels" if self.kind == "values" else self.kind
+        name = "mosaic without known levels" if self.kind == "values" else self.kind
         bayer = f" {self.pattern}" if self.pixels.ndim == 2 else ""
         return f"{name}{bayer}, {width}x{height}"
 

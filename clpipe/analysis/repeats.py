@@ -114,6 +114,6 @@ def reject_truth_among_repeats(images: Sequence[Picture], noise: Floats) -> None
     others = float(np.median(np.delete(energy, least)))
     if len(images) > 2 and noise[0].size >= MIN_SAMPLES and energy[least] < TRUTH_SHARE * others:
         raise RequestError(
-            f"{images[least].path} has {energy[least] / others:.2g} times the others' noise; "
-            "if it is their clean ground truth, pass it with --truth"
+            f"{images[least].path} has {energy[least] / others:.2g} times the noise of the "
+            "other images; if this image is the clean ground truth, pass it with --truth"
         )

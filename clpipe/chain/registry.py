@@ -225,6 +225,6 @@ def _check_stage_name(place: str, name: str, existing: dict[str, Stage]) -> None
     if name in existing:
         owner = existing[name].folder or "clpipe itself"
         raise RequestError(
-            f"{place}: its stage is called '{name}', but that name is taken ({owner}); "
-            "choose another name"
+            f"{place}: its stage is called '{name}', but another stage has this name "
+            f"({owner}); choose another name"
         )

@@ -100,7 +100,8 @@ def calibrate(
         if inputs or disallowed:
             other = "FRAMES" if inputs else disallowed[0]
             raise RequestError(
-                f"--emva: found {other} as well, but the series names its frames; remove {other}"
+                f"--emva: found {other} as well, but the series already lists its frames; "
+                f"remove {other}"
             )
         calibrate_emva(emva, output, iso, as_json)
         return

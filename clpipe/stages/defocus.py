@@ -138,9 +138,9 @@ class ThinLens(FocalLengthMethod, DepthMethod):
             resolved = resolved.with_defaults(pixel_pitch=context.camera.pixel_pitch)
             if not resolved.pixel_pitch:
                 raise RequestError(
-                    "defocus.sensor_width: the pixel size is needed, and the profile of camera "
-                    f"{context.camera.name} does not contain it; set sensor_width in mm, or "
-                    "pixel_pitch in um"
+                    "defocus.sensor_width: this stage needs the pixel size, but the profile "
+                    f"of camera {context.camera.name} does not contain it; set sensor_width in "
+                    "mm, or pixel_pitch in um"
                 )
             if resolved.fx:
                 resolved = resolved.with_defaults(

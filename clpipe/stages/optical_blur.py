@@ -254,8 +254,8 @@ class Lens(Method):
         pitch = context.optics.pixel_pitch or context.camera.pixel_pitch
         if self.f_number and not (pitch or self.pixel_pitch):
             raise ValueError(
-                "pixel_pitch: diffraction needs it, and the profile of camera "
-                f"{context.camera.name} does not contain it; set it in um"
+                "pixel_pitch: diffraction needs this parameter, but the profile of camera "
+                f"{context.camera.name} does not contain it; set pixel_pitch in um"
             )
         return self.with_defaults(sigma=0.0 if self.psf else DEFAULT_SIGMA, pixel_pitch=pitch)
 

@@ -146,6 +146,6 @@ def _different_sizes(
     """Return the error that two frames differ in size."""
     (height, width), (other_height, other_width) = mosaic.shape, other_mosaic.shape
     return RequestError(
-        f"{frame.path}: {width}x{height} pixels, but {other.path} has "
+        f"{frame.path}: this frame has {width}x{height} pixels, but {other.path} has "
         f"{other_width}x{other_height}; all frames must have one size"
     )

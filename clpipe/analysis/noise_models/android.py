@@ -78,8 +78,8 @@ def _green(text: str, key: str, path: Path) -> float:
     planes = [_number(part) for part in found[1].split(",") if part.strip()]
     if len(planes) not in (1, 4) or not all(map(math.isfinite, planes)):
         raise RequestError(
-            f"{path}: noise_model_{key} is {found[1].strip()!r}, but must be four numbers, for "
-            "R, Gr, Gb, B, or one for all"
+            f"{path}: noise_model_{key} is {found[1].strip()!r}, but expected one number for "
+            "all channels, or four numbers for R, Gr, Gb and B"
         )
     return planes[0] if len(planes) == 1 else (planes[1] + planes[2]) / 2
 

@@ -29,8 +29,8 @@ def read_dng(path: Path) -> SensorModel:
     values = _numbers(tag)
     if len(values) not in (2, 6):
         raise ImageError(
-            f"{path}: its NoiseProfile has {len(values)} numbers, but needs a and b, once for all "
-            "colours, or for each of three"
+            f"{path}: its NoiseProfile has {len(values)} numbers; expected 2 (a and b for all "
+            "colours) or 6 (a and b for each of three colours)"
         )
     a, b = values[2:4] if len(values) == 6 else values
     if not (math.isfinite(a) and math.isfinite(b) and a > 0 and b > 0):

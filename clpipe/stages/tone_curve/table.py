@@ -144,7 +144,8 @@ def parse_cube(text: str) -> Knots:
         )
     if not low < high or not np.isfinite([low, high, *rows]).all():
         raise ValueError(
-            f"its domain is {low:g} to {high:g}; it must ascend, and every number must be finite"
+            f"its domain is {low:g} to {high:g}; the domain must ascend, and every number "
+            "must be finite"
         )
     return np.stack([np.linspace(low, high, len(rows)), rows], axis=1)
 
