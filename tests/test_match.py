@@ -467,7 +467,9 @@ def test_wrong_names_and_files_are_refused(clpipe, burst, tmp_path):
     wrong = clpipe("match", name, "-o", tmp_path / "a.txt", status=2).stderr
     assert "expected a name that ends in .toml" in wrong
     Image.fromarray(burst[0]).save(tmp_path / "b.jpg", quality=80)
-    assert "give pictures of one setting" in refusal(clpipe, tmp_path, name, tmp_path / "b.jpg")
+    assert "give pictures taken with the same camera" in refusal(
+        clpipe, tmp_path, name, tmp_path / "b.jpg"
+    )
 
 
 PAIRS = {"canon-5d3-jpeg": "5dmark3_iso3200", "nikon-d800-jpeg": "d800_iso1600"}
