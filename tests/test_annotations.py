@@ -334,7 +334,7 @@ def test_annotations_of_another_size_are_told(clpipe, coco):
     del coco["annotations"][3]  # a mask, which is refused
     Path("coco.json").write_text(json.dumps(coco))
     stderr = clpipe("run", "in", "-o", "o", *RUN).stderr
-    assert "the annotations are for a render of 100x120 pixels" in stderr
+    assert "the annotations state a render of 100x120 pixels" in stderr
     coco["images"][0]["file_name"] = "b.jpg"
     Path("coco.json").write_text(json.dumps(coco))
     stderr = clpipe("run", "in", "-o", "o", *RUN).stderr
@@ -378,7 +378,10 @@ def mask_with(counts, size=(HEIGHT, WIDTH)):
             lambda coco: coco["images"][0].update(width=10**4000, height=10**4000),
             "expected whole px from 1 to 100000",
         ),
-        (mask_with([10**4299] * 20), "expected run lengths (each must be a whole number from 0"),
+        (
+            mask_with([10**4299] * 20),
+            "expected run lengths (each count must be a whole number from 0",
+        ),
     ],
 )
 def test_coco_files_that_are_none(clpipe, coco, damage, message):

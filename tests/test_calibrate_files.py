@@ -183,7 +183,7 @@ def test_frames_that_do_not_belong_together(shots, tmp_path):
         ("camera", ("--camera", "sony-a7s2"), "has the camera Sony ILCE-7SM2"),
         ("pattern", ("--set", "mosaic.pattern=GRBG"), "has the pattern GRBG"),
         ("levels", ("--set", "quantize.black_level=500"), "has the levels black 500"),
-        ("exposure", ("--set", "exposure.ev=1"), "is +1 EV, that of"),
+        ("exposure", ("--set", "exposure.ev=1"), "is +1 EV, but the exposure of"),
     ):
         call("run", shots / "scene.exr", "-o", tmp_path / name, *options, *more)
         message = call("calibrate", one, tmp_path / name / "scene.exr", *out, status=2).stderr

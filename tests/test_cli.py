@@ -136,7 +136,7 @@ def test_a_folder_keeps_its_structure_and_a_bad_file_stops_nobody(clpipe, write_
         (["--set", "denoise.grain=true"], 2, "denoise.grain: found True"),
         (["--device", ""], 3, "unknown device ''"),
         (["--keep", "noise"], 2, "unknown stage in this chain 'noise'"),
-        (["--stages", "mosaic,quantize"], 2, "ends in DN, which jpg cannot hold"),
+        (["--stages", "mosaic,quantize"], 2, "ends in DN, but jpg cannot store DN"),
         (["--device", "quantum"], 3, "unknown device 'quantum'"),
         (["--format", "bmp"], 2, "bmp"),
     ],

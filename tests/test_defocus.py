@@ -210,7 +210,7 @@ def test_depth_that_cannot_be_used(render, clpipe, depth, options, message):
         ),
         ({"blades": 3}, "5 to 9 blades"),
         ({"sensor_width": 36.0, "pixel_pitch": 5.0}, "set either sensor_width or pixel_pitch"),
-        ({"camera": "sony-imx686"}, "sensor_width: the pixel size is needed"),
+        ({"camera": "sony-imx686"}, "sensor_width: this stage needs the pixel size"),
     ],
 )
 def test_lenses_that_cannot_be(lens, message):

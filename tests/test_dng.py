@@ -330,8 +330,8 @@ def test_a_mosaic_from_elsewhere_as_a_dng(write_exr, tmp_path):
     ("options", "message"),
     [
         (("--stages", "exposure,gamma"), "starts on rgb and has no quantize"),
-        (("--until", "sensor_noise"), "the raw in DN that quantize produces"),
-        (("--until", "quantize", "--format", "jpg"), "ends in DN, which jpg cannot hold"),
+        (("--until", "sensor_noise"), "the DN that quantize produces"),
+        (("--until", "quantize", "--format", "jpg"), "ends in DN, but jpg cannot store DN"),
         (("--set", "quantize.white_level=1000.5"), r"white level of 1000\.5, but DNG needs whole"),
     ],
 )

@@ -271,7 +271,7 @@ def test_syb3r():
         ("iso = { uniform = [100, inf] }", "iso: uniform: found inf: .*finite"),
         ("iso = { uniform = [200, 100] }", "uniform: found .200, 100.; put the lower end first"),
         ("iso = { log_uniform = [0, 100] }", "both ends must be above 0"),
-        ("iso = { normal = [800, -1] }", "a standard deviation is 0 or more"),
+        ("iso = { normal = [800, -1] }", "the standard deviation must be 0 or more"),
         ("iso = { uniform = [100, 200], sigma = 2 }", "unknown key of uniform 'sigma'"),
         (
             "seed = { choice = [1, 2] }",
@@ -286,7 +286,7 @@ def test_syb3r():
         ("[sensor_noise]\na = { normal = [2, 1] }", "line 2: sensor_noise.a: found 2"),
         ("[sensor_noise]\naa = { uniform = [0, 1] }", "line 2: unknown parameter of sensor_noise"),
         ("[sensr_noise]\na = { uniform = [0, 1] }", "unknown stage 'sensr_noise'"),
-        ("[mosaic]\npattern = { uniform = [0, 1] }", "no single number; draw it by choice"),
+        ("[mosaic]\npattern = { uniform = [0, 1] }", "with one number as its value; use choice"),
         ("[mosaic]\npattern = { choice = ['RGGB', 'RGBG'] }", "mosaic.pattern: found 'RGBG'"),
         ("[mosaic_denoise]\nsize = { uniform = [3, 7] }", "size: found 4: it must be odd"),
         ("[mosaic_denoise]\nsize = { uniform = [3.5, 7] }", "size: found 3.5: .*integer"),
@@ -319,7 +319,7 @@ def test_syb3r():
         (
             "[sensor_noise]\na = { normal = [0.01, 0.01] }\n"
             "b = { log_normal_of = 'sensor_noise.a', slope = 1, intercept = 0, sigma = 1 }",
-            "sensor_noise.b: found .*sensor_noise.a, which must be above 0",
+            "sensor_noise.b: found .*sensor_noise.a, but sensor_noise.a can be",
         ),
         (
             "[quantize]\nblack_level = { uniform = [0, 600] }\nwhite_level = 500.0",

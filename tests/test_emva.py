@@ -135,20 +135,24 @@ def test_other_forms_of_the_text_are_read(series, tmp_path):
 
 
 LINES = {
-    "unknown letter": ("v 3.1", "x 3.1", "line 3: found 'x 3.1'; a line begins with v, n, b, d, i"),
+    "unknown letter": (
+        "v 3.1",
+        "x 3.1",
+        "line 3: found 'x 3.1'; expected a line that begins with v, n, b, d, i",
+    ),
     "too few words": ("n 10 160 128", "n 10 160", "line 4: found 'n 10 160'; expected n BITS"),
     "bits": ("n 10", "n 17", "line 4: bits: found '17'; allowed: 1 to 16"),
     "size": ("n 10 160", "n 10 wide", "line 4: side: found 'wide'; allowed: 16 to 16384"),
-    "twice": ("v 3.1", "n 8 20 20", "line 4: a second line n"),
+    "twice": ("v 3.1", "n 8 20 20", "line 4: this is the second line n"),
     "no size": ("n 10 160 128", "v 3.1", "the line n BITS WIDTH HEIGHT is missing"),
     "time": ("d 5000000", "d -1", "time: found '-1'; allowed: 0 to 1e+15"),
-    "no light": (" 3100", " 0", "photons: found 0; frames without light are a line d"),
+    "no light": (" 3100", " 0", "photons: found 0; for frames without light, use a line d"),
     "one frame": ("i images/b3_1.png\n", "", "found 1 frames of this exposure; at least 2"),
-    "frame of none": ("v 3.1", "i a.png", "line 3: a frame of no exposure"),
+    "frame of none": ("v 3.1", "i a.png", "line 3: this frame belongs to no exposure"),
     "other times": (
         "d 10000000",
         "d 1",
-        "two frames without light are missing that were exposed for 1e+07 ns",
+        "this exposure of 1e+07 ns has no counterpart without light",
     ),
     "stacks": ("b 5000000 3100", "b 1 3100", "the stacks were exposed for 1 and 5e+06 ns"),
 }
@@ -180,7 +184,7 @@ def test_missing_exposures_are_named(series, clpipe):
     at = text.index("b 5000000 3100\ni images/bs")
     for changed, message in (
         (only(text, "b"), "found 0 exposures of two frames with light; at least 9 are needed"),
-        (only(text, "d"), "an exposure of two frames without light (d) is missing"),
+        (only(text, "d"), "there is no exposure of two frames without light"),
         (text[:at], "found 0 stacks of more than two frames with light (b); expected one"),
     ):
         Path("a.txt").write_text(changed)
@@ -231,7 +235,7 @@ def test_what_does_not_go_with_a_series_is_refused(series, clpipe):
     for more, found in (("a.dng",), "FRAMES"), (("--dark", "a.dng"), "--dark"):
         arguments = ("calibrate", "--emva", series.path, "-o", "c.toml", *more)
         assert f"--emva: found {found} as well" in clpipe(*arguments, status=2).stderr
-    assert "FRAMES: none is named" in clpipe("calibrate", "-o", "c.toml", status=2).stderr
+    assert "FRAMES: no frames are named" in clpipe("calibrate", "-o", "c.toml", status=2).stderr
 
 
 def test_noise_is_greatest_where_it_scatters_little():

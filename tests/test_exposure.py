@@ -276,9 +276,9 @@ def test_meter_takes_sub_frames_as_one_exposure(clpipe, sequence, tmp_path):
     [
         (["frames", "-o", "a.txt"], "found a.txt; expected a name that ends in .csv"),
         (["frames/day/0.exr", "no.exr", "-o", "a.csv"], "no.exr: there is no such file"),
-        (["a.csv", "-o", "./a.csv"], "found a.csv, which is an input; choose another name"),
-        (["frames", "-o", "a.csv", "--set", "exposure.method=gain"], "but only auto meters"),
-        (["a.dng", "-o", "a.csv"], "a.dng: this is a raw, whose exposure is fixed"),
+        (["a.csv", "-o", "./a.csv"], "found a.csv, but this file is an input; choose another name"),
+        (["frames", "-o", "a.csv", "--set", "exposure.method=gain"], "but only auto measures"),
+        (["a.dng", "-o", "a.csv"], "a.dng: this is a raw, and its exposure is fixed"),
         (["frames", "-o", "a.csv", "--set", "exposure.key=1"], "unknown parameter of exposure"),
     ],
 )

@@ -127,7 +127,7 @@ def test_a_chain_without_a_raw_is_named(names):
     ):
         load_configs(names)
     output = clpipe("plan", *(o for name in names for o in ("-c", name)), status=2)
-    assert "but none of these makes the raw" in output
+    assert "but none of these stages produces a raw" in output
 
 
 @pytest.fixture

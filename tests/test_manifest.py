@@ -351,7 +351,7 @@ def test_a_row_completes_and_replaces_what_options_set(tmp_path, monkeypatch):
     assert sigma(measured, sigma=0.1) == (0.02, 0.02, 0.02)
     own = ("picture_noise.sigma", "0.3")
     assert sigma(own, measured="rows/noise.json") == (0.3, 0.3, 0.3)
-    with pytest.raises(RequestError, match="picture_noise: set sigma, or measured"):
+    with pytest.raises(RequestError, match="picture_noise: set sigma, or set measured"):
         sigma(("iso", "400"))
 
 

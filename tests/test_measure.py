@@ -306,7 +306,7 @@ def test_folders_of_photographs_are_a_burst_each_and_what_is_refused(tmp_path, m
         ([tmp_path / "empty"], "empty: this folder has no pictures (.jpg, "),
         (
             [photos / "a", files[3], files[4], "--truth", files[0]],
-            "found 2 bursts, but one truth",
+            "found 2 bursts, but one ground truth",
         ),
     ):
         assert message in clpipe("measure", *arguments, status=2).stderr
@@ -365,7 +365,7 @@ def test_refusals(clpipe, tmp_path, write_exr):
         ((one, small), 2, "small.png is display, 30x10, but .*one.png is display, 30x20"),
         ((one, "--truth", small), 2, "small.png is display, 30x10"),
         ((one, linear), 2, "linear.exr is rgb, 30x20"),
-        ((one, "--truth", mosaic), 2, "mosaic that does not say its levels RGGB"),
+        ((one, "--truth", mosaic), 2, "mosaic without known levels RGGB"),
         (
             (white, white),
             1,
@@ -430,9 +430,9 @@ def test_wrong_partners_are_refused(developed, clpipe):
     other = developed("--until", "quantize", "--seed", "1", "--iso", "1600")
     before = developed("--until", "mosaic")
     found = clpipe("measure", f"{noisy}.exr", f"{other}.exr", status=2)
-    assert "give repeats of one ISO" in found.stderr
+    assert "give images of one ISO" in found.stderr
     found = clpipe("measure", f"{noisy}.exr", "--truth", f"{before}.exr", status=2)
-    assert "keep both after the same stage" in found.stderr
+    assert "keep both images after the same stage" in found.stderr
 
 
 def test_a_truth_among_the_repeats_is_refused(clpipe, tmp_path):

@@ -207,7 +207,7 @@ def test_the_poses_of_a_35_mm_render_are_those_of_its_depth_of_field(clpipe, poi
     clpipe(*posed, "-o", "p", "--focal-length", 35)
     assert spread_of(Path("p/a.exr")) == pytest.approx(disc(35, 0.5, 0.1), abs=0.3)
     stderr = clpipe(*posed, "-o", "q", status=2).stderr
-    assert "the focal length is 350 px, and its length in mm is not known; set" in stderr
+    assert "the focal length is 350 px, but this stage needs it in mm; set" in stderr
 
 
 def test_a_lens_is_that_of_the_depth_of_field(clpipe, point):

@@ -115,7 +115,7 @@ def test_light_beyond_half_is_clipped_in_half(write_exr, tmp_path):
     ("options", "message"),
     [
         (("--format", "png", "--format", "png16"), r"png and png16 would both write NAME\.png"),
-        (("--format", "exr16", "--until", "quantize"), "ends in DN, which exr16 cannot hold"),
+        (("--format", "exr16", "--until", "quantize"), "ends in DN, but exr16 cannot store DN"),
         (("--set", "output.png_compression=10"), "output.png_compression: found 10: .* than or eq"),
         (("--set", "output.jpeg_quality=101"), "output.jpeg_quality: found 101: .* less than or"),
         (("--set", "output.jpeg_qualty=9"), "unknown key of output 'jpeg_qualty'.*jpeg_quality"),

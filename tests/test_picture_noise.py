@@ -169,7 +169,7 @@ def test_what_is_refused(method, report, tmp_path):
     broken.write_text("{")
     sigma = [0.1, 0.2, 0.3]
     for values, message in (
-        ({}, "picture_noise: set sigma, or measured"),
+        ({}, "picture_noise: set sigma, or set measured"),
         ({"sigma": sigma, "measured": report()}, "sigma and measured are both set"),
         ({"measured": "nowhere.json"}, r"picture_noise\.measured.*cannot be read: No such file"),
         ({"measured": str(tmp_path)}, "cannot be read"),

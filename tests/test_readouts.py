@@ -171,7 +171,7 @@ KNOTS = "[[0,0],[4096,1024],[16383,4095]]"
         (("normalize.method=pwl",), "no knots are known"),
         (
             ("normalize.method=pwl", f"normalize.knots={KNOTS}"),
-            "but quantize.method=linear has none",
+            "but quantize.method=linear applies no curve",
         ),
         (
             ("quantize.method=pwl", "normalize.method=linear"),

@@ -234,7 +234,10 @@ def test_settings_that_an_image_carries_may_be_of_no_use(kept, tmp_path):
         (("--until", "denoise_2"), "unknown stage in this chain 'denoise_2'"),
         (("--start-at", "gamma", "--until", "mosaic"), "gamma comes after mosaic"),
         (("--until", "demosaic", "--keep", "gamma"), "unknown stage in this chain 'gamma'"),
-        (("--until", "quantize", "--format", "jpg"), "the chain ends in DN, which jpg cannot hold"),
+        (
+            ("--until", "quantize", "--format", "jpg"),
+            "the chain ends in DN, but jpg cannot store DN",
+        ),
     ],
 )
 def test_a_part_that_cannot_be_run(kept, tmp_path, options, message):

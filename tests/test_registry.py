@@ -56,7 +56,7 @@ def test_without_its_file_the_stage_is_unknown(clpipe):
         (("import numpy as np", "import numpi as np"), r"vignette.py, line 5: ModuleNotFound"),
         (
             ('"vignette", "Darken', '"denoise", "Darken'),
-            "'denoise', but that name is taken",
+            "'denoise', but another stage has this name",
         ),
         (('"vignette", "Darken', '"denoise_2", "Darken'), "does not end in a digit"),
         (("(CosineFourth,)", "(CosineFourth)"), r"the methods of vignette must be a tuple"),
@@ -126,7 +126,7 @@ def test_a_name_is_taken_by_another_file(clpipe, stage_file, tmp_path):
     (other / "mine.py").write_text(PYTHON)
     (other / "vignette.cl").write_text(OPENCL)
     files = ("--stage-file", stage_file, "--stage-file", other / "mine.py")
-    assert f"name is taken ({tmp_path})" in clpipe("stages", *files, status=2)
+    assert f"another stage has this name ({tmp_path})" in clpipe("stages", *files, status=2)
 
 
 @pytest.mark.parametrize("name", ["no.py", "vignette.cl"])

@@ -195,13 +195,13 @@ def test_hot_pixels_can_be_seen_where_the_camera_does_not_say_how_hot(develop):
     ("given", "message"),
     [
         ({"chi": 100.0}, "sensor_noise: .*need both chi and theta; only chi is set"),
-        ({"chi": 1e3, "theta": 1.0, "system_gain": 2.0}, "set the noise in one parametrisation"),
+        ({"chi": 1e3, "theta": 1.0, "system_gain": 2.0}, "use only one of these parametrisations"),
         (
             {"a": 1e-3, "system_gain": 2.0},
             "sensor_noise: set the noise in one parametrisation; a",
         ),
         ({"chi": 1e3, "theta": 1.0, "p0": 0.1}, "sensor_noise: p0 = 0.1 makes b negative"),
-        ({"method": "poisson", "a": 0.0}, "poisson needs an a above 0"),
+        ({"method": "poisson", "a": 0.0}, "poisson needs the parameter a above 0"),
         ({"tukey_lambda": -0.5}, "tukey_lambda"),
     ],
 )

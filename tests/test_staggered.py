@@ -173,7 +173,7 @@ def test_a_lamp_flickers_in_each_exposure(develop):
     ("settings", "message"),
     [
         ({"exposure": {"method": "auto"}}, "this method would measure each exposure"),
-        ({"start_at": "mosaic"}, "an image that enters at mosaic shows one"),
+        ({"start_at": "mosaic"}, "an image that starts at mosaic shows only one"),
     ],
 )
 def test_what_is_refused(settings, message):

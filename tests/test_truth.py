@@ -332,7 +332,7 @@ def test_noise_behind_the_mosaic_alone_has_no_clean_mosaic(clpipe, write_exr):
     noise = ("--set", "picture_noise.method=iid_gaussian", "--set", "picture_noise.sigma=0.1")
     quiet = (*noise, "--skip", "sensor_noise", "--skip", "row_noise")
     run = ("run", crop(write_exr), "-o", "o", *quiet)
-    assert "added by picture_noise, after the mosaic" in clpipe(*run, *ALL, status=2).stderr
+    assert "picture_noise, comes after the mosaic" in clpipe(*run, *ALL, status=2).stderr
     clpipe(*run, "--truth", "development", "--format", "exr")
     assert "a.truth.exr" in written(Path("o"))
 

@@ -61,7 +61,7 @@ def test_the_neutral_curve_is_undone_for_all_colours():
 
 def test_a_curve_that_falls_cannot_be_undone(tmp_path):
     (tmp_path / "falling.csv").write_text("0,0\n0.5,0.8\n1,0.6\n")
-    with pytest.raises(ValueError, match="only a rising curve can be inverted"):
+    with pytest.raises(ValueError, match="falls or is flat, so it cannot be inverted"):
         InverseFile(path=str(tmp_path / "falling.csv"))
 
 

@@ -444,6 +444,6 @@ def test_patches_that_cannot_be(clpipe, renders, options, message):
 
 def test_a_patch_larger_than_an_image_fails_that_image(clpipe, renders):
     result = clpipe("run", renders(2), *RUN, "--patch", 20, "--patches-per-image", "grid", status=1)
-    assert "in/r.000.exr: its picture has 40x17 pixels" in result.stderr
+    assert "in/r.000.exr: the picture of this image has 40x17 pixels" in result.stderr
     keys = [s["__key__"] for s in samples("out/000000.tar")][1:]
     assert keys == [f"r_001_000{n}" for n in range(4)]

@@ -102,7 +102,7 @@ def compare(
         if other.pixels.shape[:2] != loaded[0].pixels.shape[:2]:
             raise RequestError(
                 f"{other.path} has {_size(other)}, but {loaded[0].path} has {_size(loaded[0])} "
-                "pixels; give pictures of one size, which show the same scene"
+                "pixels; give pictures of the same scene and the same size"
             )
     pictures, references = list(map(displayed, loaded)), list(map(displayed, true))
     places = choose_crops(crops, np.mean([one.pixels for one in references or pictures], axis=0))
@@ -137,8 +137,8 @@ def _check_counts(paths: Sequence[Path], labels: Sequence[str], truths: Sequence
     """
     if len(paths) < 2:
         raise RequestError(
-            f"{paths[0] if paths else 'nothing'}: there is nothing to compare this picture with; "
-            "give two or more"
+            f"{paths[0] if paths else 'nothing'}: there is nothing to compare this picture "
+            "with; give two or more pictures"
         )
     if labels and len(labels) != len(paths):
         raise RequestError(
@@ -164,8 +164,8 @@ def displayed(picture: Picture) -> Picture:
     """
     if picture.kind == "values":
         raise RequestError(
-            f"{picture.path}: this is {picture.what}, which cannot be shown; develop it first with "
-            "'clpipe run'"
+            f"{picture.path}: this image ({picture.what}) cannot be shown; first develop it "
+            "with 'clpipe run'"
         )
     pixels = picture.pixels
     if picture.kind != "display":

@@ -70,9 +70,9 @@ def choose_crops(texts: Sequence[str], picture: Floats) -> list[Crop]:
         if text in FOUND:
             if width < WIDTH or height < HEIGHT:
                 raise RequestError(
-                    f"--crop {text}: the pictures are {width}x{height}, smaller than the "
-                    f"{WIDTH}x{HEIGHT} of an automatic crop; choose crops yourself, such as "
-                    f"--crop 0,0,{width}x{height}"
+                    f"--crop {text}: the pictures are {width}x{height}, but an automatic crop "
+                    f"needs {WIDTH}x{HEIGHT}; set the crop yourself, such as --crop "
+                    f"0,0,{width}x{height}"
                 )
             places.append(finder.find(text))
             continue
@@ -85,8 +85,8 @@ def choose_crops(texts: Sequence[str], picture: Floats) -> list[Crop]:
         place = Crop(match["name"] or match["box"], *map(int, re.split("[,x]", match["box"])))
         if not place.within(width, height):
             raise RequestError(
-                f"--crop {text}: this crop is empty or exceeds the pictures, whose size is "
-                f"{width}x{height}"
+                f"--crop {text}: this crop is empty or extends outside the pictures; choose a "
+                f"crop inside {width}x{height} pixels"
             )
         places.append(place)
     return places

@@ -119,18 +119,19 @@ def check_partners(images: Sequence[Picture], truth: Picture | None) -> None:
     for other in (*images[1:], *([truth] if truth else [])):
         if other.what != first.what:
             raise RequestError(
-                f"{other.path} is {other.what}, but {first.path} is {first.what}; give equal images"
+                f"{other.path} is {other.what}, but {first.path} is {first.what}; give "
+                "images of the same kind and size"
             )
         if other.balance and first.balance and other.balance != first.balance:
             raise RequestError(
-                f"{other.path} is {other.balance}, but {first.path} is {first.balance}; "
-                "keep both after the same stage of the same camera"
+                f"{other.path} is {other.balance}, but {first.path} is {first.balance}; keep "
+                "both images after the same stage of the same camera"
             )
         isos = {other.iso, first.iso} - {None}
         if other is not truth and len(isos) > 1:
             raise RequestError(
-                f"{other.path} was made at ISO {other.iso:g}, {first.path} at {first.iso:g}; "
-                "give repeats of one ISO"
+                f"{other.path} was made at ISO {other.iso:g}, but {first.path} at ISO "
+                f"{first.iso:g}; give images of one ISO"
             )
     if min(first.pixels.shape[:2]) < 2:
         raise ImageError(f"{first.path}: this image, {first.what}, is too small to measure")

@@ -50,13 +50,16 @@ def check_request(loader: ImageLoader, jobs: Sequence[Job]) -> None:
     """
     for job in jobs:
         if loader.raw.is_raw(job.path):
-            raise RequestError(f"{job.label}: this is a raw, whose exposure is fixed; give renders")
+            raise RequestError(
+                f"{job.label}: this is a raw, and its exposure is fixed; give renders"
+            )
     loader.check(jobs)
     for each in {id(one): one for one in map(loader.for_job, jobs)}.values():
         method = each.chain.step_named(EXPOSURE).method
         if not isinstance(method, Auto):
             raise RequestError(
-                f"exposure.method: found {method.method}, but only auto meters; remove this setting"
+                f"exposure.method: found {method.method}, but only auto measures the "
+                "exposure; remove this setting"
             )
 
 

@@ -42,7 +42,7 @@ class Picture:
     def what(self) -> str:
         """The kind, pattern and size as text."""
         height, width = self.pixels.shape[:2]
-        name = "mosaic that does not say its levels" if self.kind == "values" else self.kind
+        name = "mosaic without known levels" if self.kind == "values" else self.kind
         bayer = f" {self.pattern}" if self.pixels.ndim == 2 else ""
         return f"{name}{bayer}, {width}x{height}"
 
@@ -70,8 +70,8 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
     """
     if path.suffix.lower() in RAW_SUFFIXES:  # some raws also contain a small picture
         raise ImageError(
-            f"{path}: this is a camera raw, which this command does not read; run 'clpipe run' "
-            "first: '--format png' develops it, '--keep normalize' keeps its mosaic"
+            f"{path}: this command does not read camera raws. First run 'clpipe run' with "
+            "'--format png' to develop the raw, or with '--keep normalize' to keep its mosaic"
         )
     iso, bits = photograph_info(path)
     # 8-bit grey is a picture; grey of more bits may be a mosaic.
@@ -109,8 +109,8 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
     lowest = float(-black / (white - black) * full)
     if kind == Kind.RAW.label and context.knots:
         raise ImageError(
-            f"{path}: a curve has compressed its DN, which the next stage undoes; give the image "
-            "that is kept after that stage"
+            f"{path}: a curve has compressed its DN; give the image that is kept after the "
+            "next stage, which undoes the curve"
         )
     if kind == Kind.RAW.label:
         pixels = (pixels - np.float32(black)) / np.float32(white - black) * full

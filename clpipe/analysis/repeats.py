@@ -67,9 +67,10 @@ def reject_shifted(images: Sequence[Picture], mean: Floats, noise: Floats) -> No
     if follows > SHIFTED_SHARE * energy[worst]:
         others = "the others" if len(noise) > 2 else images[0].path
         raise RequestError(
-            f"{images[worst].path} is not aligned with {others}: {follows / energy[worst]:.0%} of "
-            f"the difference follows edges, but of noise less than {SHIFTED_SHARE:.0%} would; "
-            "the camera or the scene moved. Give repeats from one position, or a --truth"
+            f"{images[worst].path} is not aligned with {others}: {follows / energy[worst]:.0%} "
+            "of the difference follows edges, but noise would give less than "
+            f"{SHIFTED_SHARE:.0%}. The camera or the scene moved. Give repeats from one "
+            "position, or add --truth"
         )
 
 
@@ -114,6 +115,6 @@ def reject_truth_among_repeats(images: Sequence[Picture], noise: Floats) -> None
     others = float(np.median(np.delete(energy, least)))
     if len(images) > 2 and noise[0].size >= MIN_SAMPLES and energy[least] < TRUTH_SHARE * others:
         raise RequestError(
-            f"{images[least].path} has {energy[least] / others:.2g} times the others' noise; "
-            "if it is their clean ground truth, pass it with --truth"
+            f"{images[least].path} has {energy[least] / others:.2g} times the noise of the "
+            "other images; if this image is the clean ground truth, pass it with --truth"
         )

@@ -164,7 +164,10 @@ class NumberDraw(Draw):
 
     def extremes(self, limits: Limits | None, followed: Sequence[Any]) -> Sequence[Any]:
         if limits is None:
-            raise ValueError("the value is no single number; draw it by choice or same_as")
+            raise ValueError(
+                "this draw needs a parameter with one number as its value; use choice or "
+                "same_as instead"
+            )
         return limits.validation_samples(*self.range_of(limits, followed))
 
     def value(self, uniform: float, limits: Limits | None, followed: Any) -> Any:
@@ -249,7 +252,9 @@ class Normal(NumberDraw):
     @model_validator(mode="after")
     def _check_sigma(self) -> "Normal":
         if self.normal[1] < 0:
-            raise ValueError(f"found {list(self.normal)}, but a standard deviation is 0 or more")
+            raise ValueError(
+                f"found {list(self.normal)}, but the standard deviation must be 0 or more"
+            )
         return self
 
     def range_of(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
@@ -330,7 +335,8 @@ class LogNormalOf(NumberDraw):
         for one in followed:
             if isinstance(one, bool) or not isinstance(one, int | float) or not one > 0:
                 raise ValueError(
-                    f"this draw follows {self.follows}, which must be above 0, but can be {one!r}"
+                    f"this draw follows {self.follows}, but {self.follows} can be {one!r}; "
+                    f"keep {self.follows} above 0"
                 )
         extremes = [
             limits.nearest(self._value_at(z, one))

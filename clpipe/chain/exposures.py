@@ -86,8 +86,8 @@ def check_exposures(chain: Chain) -> None:
     first, merging = chain.steps[0], exposures.step
     if first.context.light_changes:
         raise RequestError(
-            f"{merging.name}: each of its exposures sees another moment, but an image that "
-            f"enters at {first.name} shows one moment; start at an earlier stage, or remove "
+            f"{merging.name}: its exposures show different moments, but an image that starts "
+            f"at {first.name} shows only one moment; start at an earlier stage, or remove "
             "subframes and flicker"
         )
     for step in chain.steps[: exposures.index]:

@@ -54,8 +54,8 @@ def first_after_raw(stages: Sequence[str]) -> int:
     if not makers:
         raise KeyedError(
             "stages",
-            f"stages: found {', '.join(stages)}, but none of these makes the raw, so there is no "
-            "development to combine with another configuration's raw; add quantize",
+            f"stages: found {', '.join(stages)}, but none of these stages produces a raw. To "
+            "combine this development with another configuration's raw, add quantize",
         )
     return makers[-1] + 1
 

@@ -226,8 +226,8 @@ def _check_after_wide(wide: str, name: str, method: Method) -> None:
     if isinstance(method, LensMethod):
         raise KeyedError(
             "lens",
-            f"lens: a lens from lensfun needs a picture in perspective, but {wide} is a lens as "
-            "well; remove one of them",
+            f"lens: a lens from lensfun needs a picture in perspective, but {wide} already "
+            f"applies a wide lens; remove lens, or skip {wide}",
         )
     if "fx" in type(method).model_fields:
         raise KeyedError(
@@ -251,8 +251,9 @@ def _check_curve(chain: Chain) -> None:
             raw = maker.name
             raise KeyedError(
                 f"{step.name}.knots",
-                f"{step.name}.knots: found a curve, but {raw}.method={maker.method.method} has "
-                f"none; set {raw}.method=pwl and {raw}.knots, and remove {step.name}.knots",
+                f"{step.name}.knots: found knots, but {raw}.method={maker.method.method} "
+                f"applies no curve; set {raw}.method=pwl and {raw}.knots, and remove "
+                f"{step.name}.knots",
             )
         maker = step if step.stage.writes is Kind.RAW else maker
 
@@ -272,9 +273,9 @@ def _check_pixels(steps: list[Step]) -> None:
         if stated and step.passes:
             raise KeyedError(
                 f"{step.name}.{stated}",
-                f"{step.name}.{stated}: found {getattr(step.method, stated):g} px of the render, "
-                f"but the earlier stage {scaled.name} changes the size of pixels; list "
-                f"{step.name} before {scaled.name}",
+                f"{step.name}.{stated}: found {getattr(step.method, stated):g} px, measured in "
+                f"the render, but the earlier stage {scaled.name} changes the size of pixels; "
+                f"list {step.name} before {scaled.name}",
             )
 
 

@@ -131,7 +131,7 @@ def _load_stage(place: str, source: EntryPoint | ModuleType) -> tuple[Stage, Pat
             stage = getattr(module, "STAGE", None)
     if not isinstance(stage, Stage):
         raise RequestError(
-            f"{place}: STAGE is missing or no clpipe.stage.Stage; define STAGE = Stage(...)"
+            f"{place}: STAGE is missing or is not a clpipe.stage.Stage; define STAGE = Stage(...)"
         )
     file = Path(str(module.__file__))
     if not isinstance(stage.methods, tuple) or not stage.methods:
@@ -219,12 +219,12 @@ def _check_stage_name(place: str, name: str, existing: dict[str, Stage]) -> None
         )
     if name == NOISE:
         raise RequestError(
-            f"{place}: its stage is called '{name}', which stands for all noise under --skip; "
+            f"{place}: its stage is called '{name}', but --skip uses this name for all noise; "
             "choose another name"
         )
     if name in existing:
         owner = existing[name].folder or "clpipe itself"
         raise RequestError(
-            f"{place}: its stage is called '{name}', but that name is taken ({owner}); "
-            "choose another name"
+            f"{place}: its stage is called '{name}', but another stage has this name "
+            f"({owner}); choose another name"
         )

@@ -143,7 +143,7 @@ class Request(RecordedRequest):
         Raises:
             RequestError: the record does not have this form.
         """
-        damaged = "the request in it is damaged: "
+        damaged = "the request in this file is damaged: "
         known = {name: record[name] for name in RECORDED_FIELDS if name in record}
         for name in RECORDED_FIELDS:
             if name not in known and name != "truth_at":  # older sidecars lack it
@@ -154,7 +154,7 @@ class Request(RecordedRequest):
             fault = first_fault(error)
             raise RequestError(damaged + f"{fault.key}: {fault.text}".removeprefix(": ")) from None
         if (found.patch is None) != (found.patches_per_image == 0):
-            raise RequestError(f"{damaged}patch and patches_per_image contradict each other")
+            raise RequestError(f"{damaged}only one of patch and patches_per_image is set")
         if not set(found.formats) <= set(ALL_FORMATS):
             raise RequestError(
                 f"{damaged}formats: found {', '.join(found.formats)}; expected some of "

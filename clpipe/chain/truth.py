@@ -50,7 +50,7 @@ def noisy_mosaic(chain: Chain) -> Chain:
     ends = ends or [s for s in noisy if s.adds_noise and s.stage.writes is Kind.MOSAIC][-1:]
     if not ends:
         raise RequestError(
-            f"the first noise of this chain is added by {noisy[0].name}, after the mosaic, so the "
+            f"the first stage that adds noise, {noisy[0].name}, comes after the mosaic, so the "
             "mosaic has no noise; use --truth clean or development"
         )
     return replace(chain, steps=chain.steps[: chain.steps.index(ends[0]) + 1])

@@ -101,8 +101,9 @@ def bench(
             show_json({**machine_record(device), "batches": [b.record() for b in batches]})
             return
         click.echo(
-            f"{device.info.label}: half EXR to JPEG, {available_processors()} CPUs; "
-            "ms of CPU time an image by step, their sum, and its share of the CPUs' time"
+            f"{device.info.label}: half-float EXR to JPEG on {available_processors()} CPUs. "
+            "For each image, the table lists the CPU time of each step in ms, their sum, and "
+            "its share of the CPUs' time."
         )
         show(BATCH_HEADINGS, map(batch_row, batches), left=1)
         ask_for_report(device)

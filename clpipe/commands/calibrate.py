@@ -100,12 +100,13 @@ def calibrate(
         if inputs or disallowed:
             other = "FRAMES" if inputs else disallowed[0]
             raise RequestError(
-                f"--emva: found {other} as well, but the series names its frames; remove {other}"
+                f"--emva: found {other} as well, but the series already lists its frames; "
+                f"remove {other}"
             )
         calibrate_emva(emva, output, iso, as_json)
         return
     if not inputs:
-        raise RequestError("FRAMES: none is named; name raw frames, or a series with --emva")
+        raise RequestError("FRAMES: no frames are named; name raw frames, or a series with --emva")
     dumped = parse_dump(dump) if dump else None
     overrides = FrameOverrides(black_level, white_level, pattern, iso, dumped)
     frames, calibrations = calibrate_files(inputs, dark, overrides)

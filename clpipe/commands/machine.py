@@ -25,7 +25,8 @@ def ask_for_report(device: Device) -> None:
     """Print how to report results from a device that is not a CPU, because few are tested."""
     if device.info.type != "CPU":
         click.echo(
-            f"clpipe is developed on CPUs. To report results for this {device.info.type}, run the "
-            "same command with --json and send the output to the developers. It contains the "
-            "device, its driver, versions and these results, but none of your paths."
+            f"clpipe is developed on CPUs. To report results for this {device.info.type}, run "
+            "the same command with --json and send the output to the developers. The output "
+            "contains the device, its driver, versions and these results, but none of your "
+            "paths."
         )

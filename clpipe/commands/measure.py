@@ -72,7 +72,8 @@ def measure(
     bursts = bursts_in(images)
     if truth is not None and len(bursts) > 1:
         raise RequestError(
-            f"--truth: found {len(bursts)} bursts, but one truth; name the images of one scene"
+            f"--truth: found {len(bursts)} bursts, but one ground truth belongs to one "
+            "scene; name the images of one scene"
         )
     clean = load_picture(truth, pattern) if truth else None
     if snr:
@@ -113,8 +114,8 @@ def show_snr(curve: Sequence[SnrStep], as_json: bool) -> None:
     """
     if not curve:
         raise RequestError(
-            f"--snr: no step of half a stop has {MIN_SAMPLES} usable samples; "
-            "name more or larger images"
+            f"--snr: no half stop of brightness has {MIN_SAMPLES} usable samples; name more or "
+            "larger images"
         )
     if as_json:
         show_json({"snr": record_of(curve)})

@@ -58,7 +58,9 @@ def meter(
     if output.suffix.lower() != ".csv":
         raise RequestError(f"--output: found {output}; expected a name that ends in .csv")
     if any(os.path.realpath(frame) == os.path.realpath(output) for frame in frames):
-        raise RequestError(f"--output: found {output}, which is an input; choose another name")
+        raise RequestError(
+            f"--output: found {output}, but this file is an input; choose another name"
+        )
     metering = ("exposure.method=auto", *assignments)
     request = request_of({"assignments": metering, "until": "exposure", **options})
     loader = ImageLoader(request)

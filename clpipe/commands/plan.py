@@ -47,7 +47,8 @@ def plan(as_json: bool, as_toml: bool, source: str | None, **options: Any) -> No
     if as_toml:
         if request.start_at or request.until:
             raise RequestError(
-                "--toml: it prints a whole chain as a configuration; remove --start-at and --until"
+                "--toml: this option prints a whole chain as a configuration; remove "
+                "--start-at and --until"
             )
         click.echo(toml_text(request.chain()), nl=False)
         return

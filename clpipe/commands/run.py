@@ -76,8 +76,8 @@ def read_annotations(path: Path, images: Images) -> Annotations:
     require("--annotations", "pycocotools", "shapely")
     if not images.is_whole:
         raise RequestError(
-            "--annotations: they can only be written for all pictures of a directory; run again "
-            "without --webdataset and --shard after all parts are done"
+            "--annotations: this option applies only to all pictures of a directory; run "
+            "again without --webdataset and --shard after all parts are done"
         )
     if path.is_dir():
         return read_kitti(path)

@@ -154,16 +154,16 @@ def runs_of(counts: Any) -> list[int]:
     """
     if isinstance(counts, list):
         if not all(type(n) is int and 0 <= n <= MAX_PIXELS for n in counts):
-            raise ValueError(f"each must be a whole number from 0 to {MAX_PIXELS}")
+            raise ValueError(f"each count must be a whole number from 0 to {MAX_PIXELS}")
         return counts
     if not isinstance(counts, str):
-        raise ValueError("they must be a list or a string")
+        raise ValueError("the counts must be a list or a string")
     runs: list[int] = []
     value = shift = 0
     for letter in counts:
         bits = ord(letter) - ord("0")
         if not 0 <= bits < 64 or shift > 30:
-            raise ValueError(f"they contain the character {letter!r}")
+            raise ValueError(f"the counts contain the invalid character {letter!r}")
         value |= (bits & 31) << shift
         shift += 5
         if bits & 32:

@@ -119,8 +119,8 @@ class LayerFinder:
         expected = f"{self.path.stem}_{one_line(spec.name)}.exr"
         raise ImageError(
             f"{self.path}: --carry: there is no layer '{one_line(spec.name)}'{hint}; {where} "
-            f"{', '.join(map(one_line, names)) or 'no layers besides the picture'}, and there is "
-            f"no {expected} next to it; render the layer into one of them"
+            f"{', '.join(map(one_line, names)) or 'no layers besides the picture'}, and there "
+            f"is no {expected} next to it; render the layer into one of these files"
         )
 
     def _check_unique(self, name: str, file: Path) -> None:
@@ -205,7 +205,7 @@ def _named(file: Path, name: str, locations: Sequence[LayerLocation]) -> list[La
     if len(names) > 1 and len(exact) != 1:
         raise ImageError(
             f"{file}: --carry {name} is ambiguous: it may be {', '.join(names)}; give the full "
-            "name of one"
+            "name of one layer"
         )
     return exact or found
 

@@ -64,7 +64,7 @@ def embedded_settings(attributes: Mapping[str, str], folder: Path | None = None)
     except ValueError as error:
         raise RequestError(str(error)) from None
     if not isinstance(values, dict):
-        raise RequestError(f"they are {values!r}, but must be an object")
+        raise RequestError(f"found {values!r}, but expected an object")
     return settings_from(values, folder)
 
 

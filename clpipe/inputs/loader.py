@@ -167,7 +167,7 @@ class ImageLoader:
             raise RequestError(
                 f"{stage_in(StageRole.SHUTTER).name}.flicker_layer: found "
                 f"{shutter.light_layer}, but panoramas have no light layers; remove this "
-                "parameter, and all light flickers"
+                "parameter to make all light flicker"
             )
         return group_panoramas(exposures(jobs, self.settings), wide)
 

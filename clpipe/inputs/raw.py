@@ -212,7 +212,7 @@ def first_raw_step(settings: Settings) -> str:
         if all_stages()[name].reads is Kind.RAW and name not in settings.skip:
             return name
     raise RequestError(
-        f"no stage of the chain reads a raw; add {stage_name(StageRole.LEVELS)}, which does"
+        f"no stage of the chain reads a raw; add the stage {stage_name(StageRole.LEVELS)}"
     )
 
 

@@ -282,7 +282,7 @@ def _size(values: Mapping[str, Any], *names: str) -> tuple[int, int] | None:
     width, height = (number_array(name, values[name], ()).item() for name in names)
     if not (width == int(width) > 0 and height == int(height) > 0):
         raise ValueError(
-            f"found {width:g}x{height:g} pixels, but width and height are whole numbers above 0"
+            f"found {width:g}x{height:g} pixels, but width and height must be whole numbers above 0"
         )
     return int(width), int(height)
 

@@ -289,7 +289,7 @@ def _picture_camera(matrix: Sequence[float] | Array, mapping: PixelMapping) -> I
     before = Intrinsics(mapping.width, mapping.height, fx, fy, cx + CENTRE, cy + CENTRE)
     camera = mapping.camera(before)
     if camera is None:
-        raise ImageError("the intrinsics of the picture are not known")
+        raise ImageError("the picture's intrinsics are unknown, so its camera cannot be written")
     return replace(simplest_model(camera), cx=camera.cx - CENTRE, cy=camera.cy - CENTRE)
 
 

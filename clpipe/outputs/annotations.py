@@ -115,8 +115,10 @@ def _pictures(
     size = chain.size(*chain.margins.image_size(width, height))
     if size != (values["width"], values["height"]):
         raise ImageError(
-            f"the annotations are for a render of {width}x{height} pixels, whose picture would "
-            f"have {size[0]}x{size[1]}, but the picture has {values['width']}x{values['height']}"
+            f"the annotations state a render of {width}x{height} pixels. Its picture would "
+            f"have {size[0]}x{size[1]} pixels, but this picture has "
+            f"{values['width']}x{values['height']}; give the annotations of this picture's "
+            "render"
         )
     if "patches" not in values:
         file = picture_of(path, values)

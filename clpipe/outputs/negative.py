@@ -30,8 +30,9 @@ def negative_of(chain: Chain) -> Negative:
     is_input = chain.raw_step_name is None
     if is_input and chain.source is not Kind.RAW:
         raise RequestError(
-            "--format dng writes the raw in DN that quantize produces, but this chain starts on "
-            f"{chain.source.label} and has no quantize; add quantize, or use another format"
+            "--format dng: a DNG contains the DN that quantize produces, but this chain "
+            f"starts on {chain.source.label} and has no quantize; add quantize, or use another "
+            "format"
         )
     context, final_context = chain.raw_context, chain.context_after
     is_balanced = is_input and chain.step_in(StageRole.BALANCE) is not None
@@ -47,13 +48,13 @@ def negative_of(chain: Chain) -> Negative:
         )
     if context.knots:
         raise RequestError(
-            "--format dng: a curve compresses the DN of this raw, which converters cannot read; "
-            "use --format npy, or keep the raw as an EXR"
+            "--format dng: a curve compresses the DN of this raw, but raw converters cannot "
+            "undo this curve; use --format npy, or keep the raw as an EXR"
         )
     if white > MAX_DN:
         raise RequestError(
             f"--format dng: found a white level of {white:.0f}, but a DNG holds at most "
-            f"{MAX_DN}; use --format npy, or fewer bits"
+            f"{MAX_DN}; use --format npy, or set fewer bits"
         )
     later_matrix = (
         final_context.colours if is_input and final_context.colours != context.colours else None

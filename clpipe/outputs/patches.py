@@ -135,7 +135,7 @@ class Patches:
         width, height = chain.size(width, height)
         if self.size > min(width, height):
             raise ImageError(
-                f"its picture has {width}x{height} pixels, but patches need "
+                f"the picture of this image has {width}x{height} pixels, but patches need "
                 f"{self.size}x{self.size}; choose smaller patches, or exclude this image"
             )
         return PatchLayout(self, width, height, chain.filter_array.pattern, chain.seed)

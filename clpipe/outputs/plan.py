@@ -150,8 +150,8 @@ class OutputPlan:
         low_precision = [f for f in self.formats if f not in (DNG, NPY) and FORMATS[f].bits < 32]
         if low_precision and chain.result is Kind.RAW:
             raise RequestError(
-                f"the chain ends in DN, which {low_precision[0]} cannot hold; "
-                "end the chain with normalize or a later stage, or use --format dng, npy or exr"
+                f"the chain ends in DN, but {low_precision[0]} cannot store DN; end the chain "
+                "with normalize or a later stage, or use --format dng, npy or exr"
             )
         if DNG in self.formats:
             dng_of(chain)  # rejects a chain without a raw

@@ -55,8 +55,8 @@ class OutputWriter(OutputPlan):
         size = chain.size(*source.pixels.shape[1::-1])
         if "jpg" in self.formats and max(size) > JPEG_MAX_SIDE:
             raise ImageError(
-                f"its picture would have {size[0]}x{size[1]} pixels, but JPEG allows at most "
-                f"{JPEG_MAX_SIDE} per side; use --format png"
+                f"the picture of this image would have {size[0]}x{size[1]} pixels, but JPEG "
+                f"allows at most {JPEG_MAX_SIDE} per side; use --format png"
             )
 
     def check_folder(self) -> None:

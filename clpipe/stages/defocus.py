@@ -100,7 +100,7 @@ class ThinLens(FocalLengthMethod, DepthMethod):
     @classmethod
     def _check_blades(cls, blades: int) -> int:
         if blades in range(1, 5):
-            raise ValueError("an aperture has 5 to 9 blades, or 0 for a round one")
+            raise ValueError("expected 5 to 9 blades, or 0 for a round aperture")
         return blades
 
     @model_validator(mode="after")
@@ -131,16 +131,16 @@ class ThinLens(FocalLengthMethod, DepthMethod):
                 )
             elif resolved.fx and not resolved.pixel_pitch:
                 raise RequestError(
-                    f"defocus: the focal length is {resolved.fx:g} px, and its length in mm is not "
-                    "known; set focal_length, sensor_width (mm) or pixel_pitch (um), here or "
+                    f"defocus: the focal length is {resolved.fx:g} px, but this stage needs it "
+                    "in mm; set focal_length, sensor_width (mm) or pixel_pitch (um), here or "
                     "in render"
                 )
             resolved = resolved.with_defaults(pixel_pitch=context.camera.pixel_pitch)
             if not resolved.pixel_pitch:
                 raise RequestError(
-                    "defocus.sensor_width: the pixel size is needed, and the profile of camera "
-                    f"{context.camera.name} does not contain it; set sensor_width in mm, or "
-                    "pixel_pitch in um"
+                    "defocus.sensor_width: this stage needs the pixel size, but the profile "
+                    f"of camera {context.camera.name} does not contain it; set sensor_width in "
+                    "mm, or pixel_pitch in um"
                 )
             if resolved.fx:
                 resolved = resolved.with_defaults(

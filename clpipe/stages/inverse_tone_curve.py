@@ -34,7 +34,9 @@ def inverse_table(path: str) -> Floats:
     """
     table = load_table(path).astype(np.float64)
     if np.any(np.diff(table) < 0) or table[-1] <= table[0]:
-        raise ValueError(f"{path}: only a rising curve can be inverted")
+        raise ValueError(
+            f"{path}: this curve falls or is flat, so it cannot be inverted; use a rising curve"
+        )
     linear = tabulate(lambda x: x).astype(np.float64)
     value, first = np.unique(table, return_index=True)
     return tabulate(lambda y: np.interp(y, value, linear[first]))

@@ -63,8 +63,8 @@ class Linear(SignalMethod):
         black, white = self.black_level, self.white_level
         if black is not None and white is not None and white <= black:
             raise ValueError(
-                f"white_level must be above black_level; they are {self.white_level} and "
-                f"{self.black_level}"
+                f"white_level must be above black_level; found white_level {self.white_level} "
+                f"and black_level {self.black_level}"
             )
         return self
 

@@ -124,7 +124,7 @@ def read_psf(path: str) -> Doubles:
         )
     total = pixels.sum((0, 1), dtype=np.float64)
     if not total.all():
-        raise ValueError(f"{path}: a channel has no light")
+        raise ValueError(f"{path}: every pixel of a channel is 0; give each channel some light")
     return np.asarray(pixels / total)
 
 
@@ -253,8 +253,8 @@ class Lens(Method):
         pitch = context.optics.pixel_pitch or context.camera.pixel_pitch
         if self.f_number and not (pitch or self.pixel_pitch):
             raise ValueError(
-                "pixel_pitch: diffraction needs it, and the profile of camera "
-                f"{context.camera.name} does not contain it; set it in um"
+                "pixel_pitch: diffraction needs this parameter, but the profile of camera "
+                f"{context.camera.name} does not contain it; set pixel_pitch in um"
             )
         return self.with_defaults(sigma=0.0 if self.psf else DEFAULT_SIGMA, pixel_pitch=pitch)
 

@@ -138,7 +138,7 @@ class IndependentNoise(NoiseMatching):
         """
         if not self.measured:
             raise RequestError(
-                "picture_noise: set sigma, or measured, a report of clpipe measure --json"
+                "picture_noise: set sigma, or set measured to a report of clpipe measure --json"
             )
         by_iso = measured_noise(self.measured)
         noise = by_iso.get(iso, by_iso.get(None))
@@ -161,7 +161,7 @@ class IndependentNoise(NoiseMatching):
         if not self.measured:
             raise RequestError(
                 "picture_noise: correlated is true, but no measured noise is set; set "
-                "correlation, or measured, a report of clpipe measure --json"
+                "correlation, or set measured to a report of clpipe measure --json"
             )
         return self.with_defaults(correlation=self.noise(iso).correlation)
 

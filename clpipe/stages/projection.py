@@ -164,8 +164,9 @@ class PixelFocalLengths(WideAngle):
         """
         if not self.fx:
             raise RequestError(
-                f"projection.fx: {self.method} needs the lens's focal length in px, which is "
-                "about the image's width over the field of view in radians; set projection.fx"
+                f"projection.fx: {self.method} needs the lens's focal length in px; set "
+                "projection.fx to about the image's width divided by the field of view in "
+                "radians"
             )
         return super().resolve(context).with_defaults(fy=self.fx)
 
@@ -261,7 +262,8 @@ class FTheta(WideAngle):
         """
         if not self.k1:
             raise RequestError(
-                "projection.k1: f_theta needs it; set the focal length in px per radian"
+                "projection.k1: f_theta needs this parameter; set it to the focal length "
+                "in px per radian"
             )
         return super().resolve(context)
 

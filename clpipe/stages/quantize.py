@@ -68,8 +68,8 @@ class Linear(SignalMethod):
     def _check_levels(self) -> "Linear":
         if None not in (self.black_level, self.white_level) and self._range <= 0:
             raise ValueError(
-                f"white_level must be above black_level; they are {self.white_level} and "
-                f"{self.black_level}"
+                f"white_level must be above black_level; found white_level {self.white_level} "
+                f"and black_level {self.black_level}"
             )
         if self.bits and self.white_level and self.white_level >= 2**self.bits:
             raise ValueError(

@@ -56,9 +56,9 @@ def check_equal_noise(stack: Stack, line: Line, what: str) -> None:
     for k, share in enumerate(noise, 1):
         if abs(share - 1) > MAX_VARIANCE_DEVIATION:
             raise ImageError(
-                f"{what} {k} of {len(noise)} (in the order given, folders by name) has {share:.2f} "
-                "times the others' variance about the mean. Remove it if it has no noise, is a "
-                "mean of frames, or has another setting"
+                f"{what} {k} of {len(noise)} (in the order given, folders by name) has "
+                f"{share:.2f} times the variance of the other frames about the mean. Remove "
+                "this frame if it is clean, is a mean of frames, or has other camera settings"
             )
 
 

@@ -95,7 +95,7 @@ class CalibrationFrame:
                 mosaic = mosaic * np.float32(self.sensor.unit) + np.float32(self.sensor.black_level)
             if not np.isfinite(mosaic).all():
                 raise ImageError(
-                    f"{self.path}: it is damaged: its signal exceeds the range of floats"
+                    f"{self.path}: this file is damaged: its signal exceeds the range of floats"
                 )
             nearest = np.rint(mosaic)
             # Signal from whole DN is restored only up to float precision, so it is rounded.

@@ -61,9 +61,9 @@ def group_frames(
         for frame in scene_at_iso[1:]:
             if frame.exposure != first.exposure:
                 raise RequestError(
-                    f"ISO {iso:g}: the exposure of {frame.path} is {frame.exposure or 'unknown'}, "
-                    f"that of {first.path} {first.exposure or 'unknown'}; frames of one ISO must "
-                    "have one exposure"
+                    f"ISO {iso:g}: the exposure of {frame.path} is "
+                    f"{frame.exposure or 'unknown'}, but the exposure of {first.path} is "
+                    f"{first.exposure or 'unknown'}; use one exposure for all frames of an ISO"
                 )
         own, *longer = by_time([f for f in dark if f.iso == iso], first.seconds)
         groups.append(Group(iso, scene_at_iso, own, tuple(longer)))
@@ -146,6 +146,6 @@ def _different_sizes(
     """Return the error that two frames differ in size."""
     (height, width), (other_height, other_width) = mosaic.shape, other_mosaic.shape
     return RequestError(
-        f"{frame.path}: {width}x{height} pixels, but {other.path} has "
+        f"{frame.path}: this frame has {width}x{height} pixels, but {other.path} has "
         f"{other_width}x{other_height}; all frames must have one size"
     )

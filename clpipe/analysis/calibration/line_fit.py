@@ -161,10 +161,13 @@ def fit_line(tables: Sequence[Table]) -> Line:
     z = z / count
     total = count.sum()
     if total < 3 or np.ptp(z) == 0:
-        raise ValueError("too few pixels can be used, or all have the same brightness")
-    # The first weights are from a rising line through the darkest pixels and the mean of all
-    # pixels. Variances are at least half of the darkest pixels' variance, so that weights are
-    # bounded.
+        raise ValueError(
+            "too few pixels can be used, or all have the same brightness; use a scene with "
+            "dark and bright areas"
+        )
+    # The first weights are those of a rising line through the darkest pixels and the mean of all.
+    # Variances are at least half of the darkest pixels' variance, so that no weight grows without
+    # limit.
     order = np.argsort(z)
     darkest = order[np.cumsum(count[order]) <= max(DARKEST * total, count[order[0]], MIN_IN_BIN)]
     dark = s[darkest].sum() / count[darkest].sum()

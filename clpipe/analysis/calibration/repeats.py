@@ -225,8 +225,8 @@ def without_flicker(stack: Stack) -> tuple[Stack, Array]:
     if np.abs(brighter).max() > MAX_FLICKER:
         k = int(np.abs(brighter).argmax())
         raise ImageError(
-            f"frame {k + 1} of {len(brighter)} is {brighter[k]:+.0%} from the mean brightness of "
-            "all; frames of one ISO must have one exposure and steady light"
+            f"frame {k + 1} of {len(brighter)} is {brighter[k]:+.0%} from the mean brightness "
+            "of all frames; use one exposure and steady light for all frames of an ISO"
         )
     if not (np.abs(brighter) > 4 * errors).any():
         return stack, unchanged

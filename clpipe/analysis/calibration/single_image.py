@@ -187,7 +187,7 @@ def most_likely_line(sets: LevelSets, low: float) -> tuple[float, float, Values]
     used = (mean < 0.995) & (mean > low + 0.005 * (1 - low)) & (deviation > 0)
     mean, deviation, count = mean[used], deviation[used], count[used]
     if len(mean) < 8 or np.ptp(mean) < 0.02:
-        raise ValueError("too few smooth places of different light")
+        raise ValueError("the image has too few smooth areas of different brightness")
     dark, bright = float(mean.min()), float(mean.max())
     grid = np.linspace(min(dark, 0) - 0.05, 1.3, GRID)
     scatter = 1.35 / (count + 1.5)

@@ -107,7 +107,8 @@ def figures(moments: Moments) -> Figures:
     for name, each in (("variance", gain), ("light", responsivity)):
         if not each.significant:
             raise RequestError(
-                f"the {name} does not rise with the exposure; give the frames of one series"
+                f"the {name} does not rise with the exposure; check that all frames are of "
+                "one series"
             )
     efficiency = _quotient(responsivity, gain)
     dark2, noise_slope = _dark_variance(moments.dark, moments.dark_stack.mean_frame.size)

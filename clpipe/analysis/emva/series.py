@@ -115,7 +115,9 @@ class _Lines:
         form = FORMS.get(letter)
         if form is None:
             letters = ", ".join(FORMS)
-            raise self.error(number, f"found {one_line(line)!r}; a line begins with {letters} or #")
+            raise self.error(
+                number, f"found {one_line(line)!r}; expected a line that begins with {letters} or #"
+            )
         if only and letter != only:
             return None
         words = rest if letter == "i" else line.split()[1:]
@@ -160,19 +162,25 @@ def read_series(path: Path) -> Series:
         number, (letter, *words) = found
         if letter == "n":
             if size:
-                raise lines.error(number, "a second line n; there can be but one")
+                raise lines.error(number, "this is the second line n; keep only one")
             limits = (("bits", 1, MAX_BITS), ("side", *SIDES), ("side", *SIDES))
             size = [
                 int(lines.number(number, word, *limit, whole=True))
                 for word, limit in zip(words, limits, strict=True)
             ]
         elif letter == "i":
-            raise lines.error(number, "a frame of no exposure; a line b or d comes first")
+            raise lines.error(
+                number, "this frame belongs to no exposure; add a line b or d before it"
+            )
         elif letter in "bd":
             own = _exposure(lines, number, words, path.parent)
             key = own.time, own.photons, len(own.frames) == PAIR
             if key in exposures:
-                raise lines.error(number, f"the exposure of line {exposures[key].line} again")
+                raise lines.error(
+                    number,
+                    f"this line repeats the exposure of line {exposures[key].line}; remove one "
+                    "of the two lines",
+                )
             exposures[key] = own
     if not size:
         raise RequestError(f"{path}: the line {FORMS['n']} is missing")
@@ -191,7 +199,7 @@ def _exposure(lines: _Lines, number: int, words: Sequence[str], folder: Path) ->
     time = lines.number(number, words[0], "time", 0, 1e15)
     photons = [lines.number(number, word, "photons", 0, 1e12) for word in words[1:]]
     if photons == [0.0]:
-        raise lines.error(number, "photons: found 0; frames without light are a line d")
+        raise lines.error(number, "photons: found 0; for frames without light, use a line d")
     frames = []
     while frame := lines.next(only="i"):
         frames.append(folder / frame[1][1].replace("\\", "/"))
@@ -220,13 +228,16 @@ def _checked(path: Path, size: Sequence[int], exposures: Sequence[Exposure]) -> 
             f"{MIN_EXPOSURES} are needed, and EMVA 1288 asks for 50"
         )
     if not dark:
-        raise RequestError(f"{path}: an exposure of two frames without light (d) is missing")
+        raise RequestError(
+            f"{path}: there is no exposure of two frames without light; add a line d with two "
+            "frames"
+        )
     times = {each.time for each in dark}
     for each in bright:
         if len(dark) > 1 and each.time not in times:
             raise RequestError(
-                f"{path}, line {each.line}: two frames without light are missing that were exposed "
-                f"for {each.time:g} ns as well"
+                f"{path}, line {each.line}: this exposure of {each.time:g} ns has no "
+                "counterpart without light; add a line d with two frames of this time"
             )
     stacks: list[Exposure] = []
     for is_lit, letter in ((True, "b"), (False, "d")):
@@ -241,8 +252,8 @@ def _checked(path: Path, size: Sequence[int], exposures: Sequence[Exposure]) -> 
     lit, unlit = stacks
     if lit.time != unlit.time:
         raise RequestError(
-            f"{path}, lines {lit.line} and {unlit.line}: the stacks were exposed for {lit.time:g} "
-            f"and {unlit.time:g} ns; expected the same time"
+            f"{path}, lines {lit.line} and {unlit.line}: the stacks were exposed for "
+            f"{lit.time:g} and {unlit.time:g} ns; expose both for the same time"
         )
     bits, width, height = size
     return Series(path, bits, width, height, bright, dark, lit, unlit)

@@ -155,7 +155,7 @@ def load_scenes(frames: Sequence[str], means: Sequence[str]) -> Scenes:
         different = next(i for i, e in enumerate(encodings) if e != encodings[0])
         raise RequestError(
             f"{paths[different]} is {encoding_text(encodings[different])}, but {paths[0]} is "
-            f"{encoding_text(encodings[0])}; give pictures of one setting of the camera"
+            f"{encoding_text(encodings[0])}; give pictures taken with the same camera settings"
         )
     notes: list[str] = []
     if len(mean_paths) > 1:
@@ -263,8 +263,8 @@ def static_mask(path: Path, frame: Floats, clean: Doubles, against: str, flat: M
     energy = float((difference**2).mean())
     if energy < ROUNDING_ENERGY:
         raise RequestError(
-            f"{path} has the same pixels as {against}, so there is no noise; give pictures that "
-            "were taken separately"
+            f"{path} has the same pixels as {against}, so no noise can be measured; give "
+            "pictures that were taken separately"
         )
     sharp = difference - ndimage.gaussian_filter(difference, DRIFT)
     slopes = np.gradient(ndimage.gaussian_filter(luma(clean), 1.0))
@@ -282,8 +282,8 @@ def static_mask(path: Path, frame: Floats, clean: Doubles, against: str, flat: M
     if (share := float((wide**2).mean()) / energy) > SCENE_SHARE:
         raise RequestError(
             f"{path} does not show the same scene as {against}: averaged over "
-            f"{SCENE_BLOCK}x{SCENE_BLOCK} pixels, {share:.0%} of the difference remains, but of "
-            f"noise less than {SCENE_SHARE:.0%} would; give pictures of one scene"
+            f"{SCENE_BLOCK}x{SCENE_BLOCK} pixels, {share:.0%} of the difference remains, but "
+            f"noise would leave less than {SCENE_SHARE:.0%}; give pictures of one scene"
         )
     sigma = float(sharp[flat].std())
     moved = np.abs(block_means(sharp, MOVED_BLOCK)) > MOVED * sigma

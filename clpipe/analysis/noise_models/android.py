@@ -38,7 +38,8 @@ def parse_android(text: str, path: Path) -> SensorModel:
     highest = _number(found[1]) if found else math.inf
     if not highest > 0:
         raise RequestError(
-            f"{path}: its highest analogue ISO is {found and found[1]}, but must be above 0"
+            f"{path}: its highest analogue ISO is {found and found[1]}, but this ISO must "
+            "be above 0"
         )
     isos, range_source = _isos(text, highest)
     laws = []
@@ -77,8 +78,8 @@ def _green(text: str, key: str, path: Path) -> float:
     planes = [_number(part) for part in found[1].split(",") if part.strip()]
     if len(planes) not in (1, 4) or not all(map(math.isfinite, planes)):
         raise RequestError(
-            f"{path}: noise_model_{key} is {found[1].strip()!r}, but must be four numbers, for "
-            "R, Gr, Gb, B, or one for all"
+            f"{path}: noise_model_{key} is {found[1].strip()!r}, but expected one number for "
+            "all channels, or four numbers for R, Gr, Gb and B"
         )
     return planes[0] if len(planes) == 1 else (planes[1] + planes[2]) / 2
 

@@ -65,9 +65,9 @@ def parse_darktable(values: Any, path: Path, camera: str | None) -> SensorModel:
         raise RequestError(f"{path}: {make} {model}: profiles{fault.key}: {fault.text}") from None
     if X_TRANS.fullmatch(model):
         raise RequestError(
-            f"{path}: {make} {model} has an X-Trans pattern, whose noise darktable measured "
-            "after another demosaicing, so it cannot be converted; fujifilm-x-t3 is "
-            "built in"
+            f"{path}: {make} {model} has an X-Trans pattern. darktable measured its noise "
+            "after a different demosaicing, so clpipe cannot convert the profile; use the "
+            "built-in camera fujifilm-x-t3"
         )
     slopes: dict[float, float] = {}
     for profile in sorted(checked, key=lambda profile: profile.iso):

@@ -23,14 +23,14 @@ def read_dng(path: Path) -> SensorModel:
     tag = next(tags, None)
     if tag is None:
         raise ImageError(
-            f"{path}: this DNG has no NoiseProfile (tag 51041), which states noise; DNGs of "
-            "Android phones, Adobe's converter and clpipe have one"
+            f"{path}: this DNG has no NoiseProfile (tag 51041); give a DNG from an Android "
+            "phone, Adobe's converter or clpipe"
         )
     values = _numbers(tag)
     if len(values) not in (2, 6):
         raise ImageError(
-            f"{path}: its NoiseProfile has {len(values)} numbers, but needs a and b, once for all "
-            "colours, or for each of three"
+            f"{path}: its NoiseProfile has {len(values)} numbers; expected 2 (a and b for all "
+            "colours) or 6 (a and b for each of three colours)"
         )
     a, b = values[2:4] if len(values) == 6 else values
     if not (math.isfinite(a) and math.isfinite(b) and a > 0 and b > 0):

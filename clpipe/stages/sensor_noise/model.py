@@ -116,8 +116,8 @@ class SensorNoise(SignalMethod):
         emva, paper = self._set_names(EMVA), self._set_names(PAPER)
         if emva and paper:
             raise ValueError(
-                "set the noise in one parametrisation, EMVA 1288's or that of Bielova et al. "
-                f"2019; both are set: {', '.join(emva)} and {', '.join(paper)}"
+                f"found parameters of EMVA 1288 ({', '.join(emva)}) and of Bielova et al. 2019 "
+                f"({', '.join(paper)}); use only one of these parametrisations"
             )
         if paper and (self.chi is None or self.theta is None):
             raise ValueError(

@@ -35,8 +35,8 @@ class Poisson(SensorNoise):
         resolved = super().resolve(context)
         if not resolved.a:
             raise RequestError(
-                "sensor_noise: poisson needs an a above 0; use method gaussian for noise "
-                "without shot noise"
+                "sensor_noise: the method poisson needs the parameter a above 0; for noise "
+                "without shot noise, use the method gaussian"
             )
         return resolved
 

@@ -139,10 +139,14 @@ def parse_cube(text: str) -> Knots:
                 rows.append(values[0])
     if size is None or size != len(rows) or size < 2:
         declared = "no LUT_1D_SIZE" if size is None else f"LUT_1D_SIZE {size:g}"
-        raise ValueError(f"{declared}, but {len(rows)} rows; they must agree, and be at least 2")
+        raise ValueError(
+            f"found {declared}, but {len(rows)} rows; set LUT_1D_SIZE to the number of rows, "
+            "which must be at least 2"
+        )
     if not low < high or not np.isfinite([low, high, *rows]).all():
         raise ValueError(
-            f"its domain is {low:g} to {high:g}; it must ascend, and every number must be finite"
+            f"its domain is {low:g} to {high:g}; the domain must ascend, and every number "
+            "must be finite"
         )
     return np.stack([np.linspace(low, high, len(rows)), rows], axis=1)
 
