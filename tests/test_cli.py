@@ -288,6 +288,11 @@ def test_bench_of_methods(clpipe):
     method, strength = ("--set", "denoise.method=mean"), ("--set", "denoise.luma_strength=0.5")
     text = clpipe("bench", "--methods", "denoise", *options, *method, *strength).stdout
     assert "mean luma_strength=0.5" in text
+    small = ("--size", "64x48", "--repeat", 1)
+    mosaics = clpipe("bench", "--methods", "demosaic", *small).stdout
+    assert "malvar2004" in mosaics and "gray" not in mosaics
+    gray = ("bench", "--methods", "demosaic", "--set", "demosaic.method=gray")
+    assert "sensors of one channel" in clpipe(*gray, *small, status=2).stderr
     white = clpipe("bench", "--methods", "white_balance", "--size", "320x200", "--json").stdout
     records = json.loads(white)["methods"]
     launches = {record["method"]: record["launches"] for record in records}

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from clpipe.base.errors import RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
 from clpipe.chain.making import make_chain
@@ -160,7 +161,7 @@ def bench_methods(
     A figure is the sum of the best times of a method's launches. A first launch that only converts
     the source to planes is not counted, because the stage before does that in a chain. The
     settings' parameters of the stage apply to every method that has them. If the settings name a
-    method, only this method is timed.
+    method, only this method is timed. Otherwise, methods that do not fit the camera are skipped.
     """
     picture = scene(width, height).astype(np.float32)
     image = picture if len(stage.reads.channels) == 3 else np.ascontiguousarray(picture[..., 1])
@@ -176,7 +177,13 @@ def bench_methods(
         single_stage = replace(
             settings, stages=(stage.name,), skip=(), parameters={stage.name: parameters}
         )
-        runner = Runner(make_chain(single_stage, stage.reads), device, encode=False, final=True)
+        try:
+            chain = make_chain(single_stage, stage.reads)
+        except RequestError:
+            if "method" in stage_parameters:
+                raise
+            continue  # the method is for other sensors
+        runner = Runner(chain, device, encode=False, final=True)
         runner.run(image, "bench")
         best: list[float] = []
         for _ in range(repeat):
