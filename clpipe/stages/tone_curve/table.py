@@ -140,7 +140,7 @@ def parse_cube(text: str) -> Knots:
     if size is None or size != len(rows) or size < 2:
         declared = "no LUT_1D_SIZE" if size is None else f"LUT_1D_SIZE {size:g}"
         raise ValueError(
-            f"found {declared}, but {len(rows)} rows; set LUT_1D_SIZE to the number of rows, "
+            f"{declared}, but {len(rows)} rows; set LUT_1D_SIZE to the number of rows, "
             "which must be at least 2"
         )
     if not low < high or not np.isfinite([low, high, *rows]).all():
