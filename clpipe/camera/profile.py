@@ -83,8 +83,7 @@ class Camera(BaseModel):
     rts_share: Share = 0.0  # share of pixels with random telegraph noise
     rts_amplitude: NotNegative = 0.0  # e-; the mean distance between the two levels of such a pixel
     dark_current: NotNegative = 0.0  # e-/s
-    # deg C; the temperature at which dark_current was measured.
-    dark_current_temperature: Temperature = 20.0
+    dark_current_temperature: Temperature = 20.0  # deg C; at which dark_current was measured
     dark_current_doubling: Positive | None = None  # K; None: the same at every temperature
     dark_current_spread: Fraction = 0.0  # standard deviation over pixels, relative to the mean
     dark_shading_slope: NotNegative = 0.0  # DN per unit of ISO; standard deviation over the sensor
@@ -93,18 +92,15 @@ class Camera(BaseModel):
     dark_shading_length: Positive = 500.0  # px; the distance over which both parts change
     banding_amplitude: NotNegative = 0.0  # e-; the amplitude of a wave along the columns
     banding_period: Positive | None = None  # rows; the period of that wave
-    # For sensors with several readouts. The first value is the ratio between the sensitivities of
-    # successive readouts. The second is the read noise in DN of later readouts, relative to the
-    # first one's. The gain stages describe the first readout.
+    # Several readouts: the ratio between the sensitivities of successive ones, and the read noise
+    # in DN of later ones relative to the first. The gain stages describe the first.
     readout_ratio: Annotated[float, Field(gt=1, le=1024)] | None = None
     readout_noise: NotNegative | None = None
-    # For sensors with two photodiodes per pixel. The first value is the light of the large
-    # photodiode relative to that of the small one. The second is the charge that leaks into the
-    # small one, relative to that of the large one.
+    # Two photodiodes per pixel: the large one's light relative to the small one's, and the share of
+    # the large one's charge that leaks into the small one.
     photodiode_ratio: Annotated[float, Field(gt=1, le=10_000)] | None = None
     photodiode_crosstalk: Annotated[float, Field(ge=0, le=0.5)] | None = None
-    # um; the distance between the centres of adjacent photosites.
-    pixel_pitch: Positive | None = None
+    pixel_pitch: Positive | None = None  # um; between the centres of adjacent photosites
     iso_range: tuple[Positive, Positive]
     gain_stages: Annotated[tuple[GainStage, ...], Field(min_length=1)]
     sources: dict[str, str]

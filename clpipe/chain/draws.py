@@ -338,12 +338,8 @@ class LogNormalOf(NumberDraw):
                     f"this draw follows {self.follows}, but {self.follows} can be {one!r}; "
                     f"keep {self.follows} above 0"
                 )
-        extremes = [
-            limits.nearest(self._value_at(z, one))
-            for z in (-MAX_SIGMAS, MAX_SIGMAS)
-            for one in followed
-        ]
-        return min(extremes), max(extremes)
+        ends = [self._value_at(z, one) for z in (-MAX_SIGMAS, MAX_SIGMAS) for one in followed]
+        return limits.nearest(min(ends)), limits.nearest(max(ends))
 
     def number(self, uniform: float, limits: Limits, followed: Any) -> float:
         return self._value_at(_normal(uniform), followed)

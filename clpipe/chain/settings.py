@@ -74,7 +74,7 @@ class Settings:
     render: RenderCamera = field(default_factory=RenderCamera)
     pushed: bool = False  # the ISO was drawn, and may be outside the camera's range
     draws: Mapping[str, Draw] = field(default_factory=dict)
-    # The table that overlay() validated for each step, and the resulting model.
+    # By step: the validated table and the resulting model.
     validated: Mapping[str, tuple[Mapping[str, Any], Method]] = field(
         default_factory=dict, compare=False, repr=False
     )
@@ -286,8 +286,7 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
 
 # Replace a camera's aliases by its name, so that requests can be compared.
 CONVERSIONS: dict[str, Callable[[Any], Any]] = {
-    "iso": float,
-    **dict.fromkeys(LENS[1:], float),
+    **dict.fromkeys(("iso", *LENS[1:]), float),
     "camera": lambda name: built_in_name(name) or name,
 }
 
@@ -349,9 +348,8 @@ def _merge_table(settings: Settings, step: str, table: Mapping[str, Any]) -> dic
         KeyedError: there is no such stage, or a table inside the table is no draw.
     """
     methods = () if step in TABLES else stage_of(step).methods
-    values = {
-        k: parse_drawn(f"{step}.{k}", v) if isinstance(v, Mapping) else v for k, v in table.items()
-    }
+    drawn = {k: parse_drawn(f"{step}.{k}", v) for k, v in table.items() if isinstance(v, Mapping)}
+    values = {**table, **drawn}
     existing = settings.table(step)
     if "method" in values and values["method"] != method_name(step, existing):
         return values

@@ -24,8 +24,7 @@ from clpipe.reports.run import Blob, Run, RunPicture
 
 BUDGET = 14 << 20  # bytes of the whole page
 THUMBNAIL_SIZE = 160  # px, the longer side of a thumbnail
-# Pixels to read for the contact sheet; they take one processor about a minute.
-MAX_THUMBNAIL_PIXELS = 4e9
+MAX_THUMBNAIL_PIXELS = 4e9  # read for all thumbnails; they take one processor about a minute
 BATCH_SIZE = 64  # thumbnails in one batch
 MAX_COMPARED = 8  # the most images that can be compared
 MAX_COMPARED_PIXELS = 1_200_000  # px; larger images are reduced for the comparison
@@ -189,9 +188,7 @@ class ComparedImage:
     height: int
     reduction: int  # the reduction factor; 1 is full resolution
     places: Sequence[Crop]  # regions of interest; reduced images have these at full resolution
-    # Each has a label, an image and crops.
-    views: list[dict[str, Any]] = field(default_factory=list)
-    # Thumbnails of kept stages.
+    views: list[dict[str, Any]] = field(default_factory=list)  # each: label, image and crops
     stage_thumbnails: list[dict[str, str]] = field(default_factory=list)
 
     @classmethod
