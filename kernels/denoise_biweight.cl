@@ -21,43 +21,36 @@ INLINE rgb luma_chroma_to_light(ycbcr c, site at, float offset, float luma_range
 
 // Luma from adjacent pixels, chroma from eight on a ring: `chroma_scale` away along both axes, or
 // one more along one axis. Demosaicing has made their noise independent of the centre's. `grain` is
-// the share of luma that does not change. Pixels at the same distance share one weight, which is
-// applied last.
+// the share of luma that does not change. Pixels at the same distance share one weight of luma,
+// which is applied last.
 INLINE ycbcr biweight(site at, image planes, float grain, int chroma_scale) {
 #pragma OPENCL FP_CONTRACT ON
-    const ycbcr centre = tap_ycbcr(planes, 0, 0), none = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
-    ycbcr sums[5] = {none, none, none, none, none};  // of weighted differences, by squared distance
-    vf luma_weights[5] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
-    vf chroma_weights[5] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
+    const ycbcr centre = tap_ycbcr(planes, 0, 0);
+    vf sums[3] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};  // of weighted differences, by squared distance
+    vf weights[3] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
+    vf blue = (vf)(0.0f), red = (vf)(0.0f), chroma_weight = (vf)(1.0f);
 #pragma unroll
-    for (int dy = -2; dy <= 2; ++dy) {
+    for (int dy = -1; dy <= 1; ++dy) {
 #pragma unroll
-        for (int dx = -2; dx <= 2; ++dx) {
+        for (int dx = -1; dx <= 1; ++dx) {
             const int distance = dx * dx + dy * dy;
-            if (distance == 1 || distance == 2) {
-                const vf d = centre.y - tap_ycbcr(planes, dx, dy).y;
-                const vf near = vmax((vf)(1.0f) - d * d, (vf)(0.0f)), weight = near * near;
-                sums[distance].y += weight * d;
-                luma_weights[distance] += weight;
-            }
-            if (distance == 2 || distance == 4) {
-                const ycbcr c = distance == 2
-                                    ? tap_ycbcr(planes, dx * chroma_scale, dy * chroma_scale)
-                                    : tap_ycbcr(planes, dx / 2 * (chroma_scale + 1), dy / 2 * (chroma_scale + 1));
-                const vf db = centre.cb - c.cb, dr = centre.cr - c.cr;
-                const vf near = vmax((vf)(1.0f) - db * db - dr * dr, (vf)(0.0f));
-                const vf weight = near * near;
-                sums[distance].cb += weight * db;
-                sums[distance].cr += weight * dr;
-                chroma_weights[distance] += weight;
-            }
+            if (distance == 0) continue;
+            const vf d = centre.y - tap_ycbcr(planes, dx, dy).y;
+            const vf near = vmax((vf)(1.0f) - d * d, (vf)(0.0f)), weight = near * near;
+            sums[distance] += weight * d;
+            weights[distance] += weight;
+            const int reach = distance == 2 ? chroma_scale : chroma_scale + 1;
+            const ycbcr c = tap_ycbcr(planes, dx * reach, dy * reach);
+            const vf db = centre.cb - c.cb, dr = centre.cr - c.cr;
+            const vf alike = vmax((vf)(1.0f) - db * db - dr * dr, (vf)(0.0f)), share = alike * alike;
+            blue += share * db;
+            red += share * dr;
+            chroma_weight += share;
         }
     }
-    const vf luma_weight = (vf)(1.0f) + 0.5f * luma_weights[1] + 0.25f * luma_weights[2];
-    const vf chroma_weight = (vf)(1.0f) + 0.4f * chroma_weights[2] + 0.25f * chroma_weights[4];
+    const vf luma_weight = (vf)(1.0f) + 0.5f * weights[1] + 0.25f * weights[2];
     const vf luma = (1.0f - grain) / luma_weight, chroma = 1.0f / chroma_weight;
-    const ycbcr v = {centre.y - (0.5f * sums[1].y + 0.25f * sums[2].y) * luma,
-                     centre.cb - (0.4f * sums[2].cb + 0.25f * sums[4].cb) * chroma,
-                     centre.cr - (0.4f * sums[2].cr + 0.25f * sums[4].cr) * chroma};
+    const ycbcr v = {centre.y - (0.5f * sums[1] + 0.25f * sums[2]) * luma, centre.cb - blue * chroma,
+                     centre.cr - red * chroma};
     return v;
 }

@@ -1,21 +1,25 @@
-// The inverse of a picture style: the root of a quadratic equation for the largest colour.
-#include "lib/style.h"
+// The inverse of a picture style. Two quadratic equations give the style's mean of the colours, and
+// the mean before the curve.
+#include "lib/hue.h"
 
-INLINE rgb inverse_standard(rgb v, site at, float grey, float a, float b, float c, float d, float bright_a,
-                            float bright_b, float bright_c, float bright_d, float saturation) {
-    const extremes y = extremes_of(v);
-    const vi dark = y.high < grey;
-    const vf u = dark ? y.high : 1.0f - y.high;
-    const vf quadratic = dark ? a - c * u : bright_a - bright_c * u;
-    const vf linear = dark ? b - d * u : bright_b - bright_d * u;
-    const vf root = square_root(vmax(linear * linear + 4.0f * quadratic * u, (vf)(0.0f)));
+// The colours are t (1 + saturation (x / h - 1)), where h is the mean of the scene's colours x, and
+// t is the curve at h. The mean of x / h is 1, which is a quadratic equation in 1 / t.
+INLINE rgb inverse_standard(rgb v, site at, float a, float b, float c, float d, float saturation) {
+    const rgb y = {clipped_to_1(v.r), clipped_to_1(v.g), clipped_to_1(v.b)};
+    const float lost = 1.0f - 1.0f / saturation, gain = 1.0f / saturation;
+    const vf sum = (y.r + y.g + y.b) * gain;
+    const vf squares = (y.r * y.r + y.g * y.g + y.b * y.b) * (gain * gain);
+    const vf middle = (1.0f - 2.0f * lost) * sum;
+    const vf below = middle + square_root(vmax(middle * middle - 12.0f * lost * (lost - 1.0f) * squares, (vf)(0.0f)));
+    const vf t = clipped_to_1(2.0f * squares / vmax(below, (vf)(1e-12f)));
+    const vf quadratic = a - c * t, linear = b - d * t;
+    const vf root = square_root(vmax(linear * linear + 4.0f * quadratic * t, (vf)(0.0f)));
     // The form of the root that has no cancellation.
-    const vi sum = linear > 0.0f;
-    const vf above = sum ? 2.0f * u : root - linear, below = sum ? linear + root : 2.0f * quadratic;
-    const vf x = above / vmax(below, (vf)(1e-12f)), high = dark ? x : 1.0f - x;
-    const vf part = high / (colourfulness(high, saturation) * vmax(y.high, (vf)(1e-9f)));
-    const rgb w = {vmax(high - (y.high - y.inside.r) * part, (vf)(0.0f)),
-                   vmax(high - (y.high - y.inside.g) * part, (vf)(0.0f)),
-                   vmax(high - (y.high - y.inside.b) * part, (vf)(0.0f))};
-    return w;
+    const vi added = linear > 0.0f;
+    const vf over = added ? 2.0f * t : root - linear, under = added ? linear + root : 2.0f * quadratic;
+    const vf h = over / vmax(under, (vf)(1e-12f));
+    const vf factor = gain * (h / vmax(t, (vf)(1e-12f))), grey = lost * h;
+    const rgb x = {vmax(y.r * factor + grey, (vf)(0.0f)), vmax(y.g * factor + grey, (vf)(0.0f)),
+                   vmax(y.b * factor + grey, (vf)(0.0f))};
+    return x;
 }

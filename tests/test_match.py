@@ -355,7 +355,7 @@ def test_every_number_of_the_development_is_searched():
     names = {d.name for d in dimensions_of(make_chain(Settings()))}
     assert {"denoise.luma_strength", "denoise.grain", "sharpen.amount"} <= names
     assert "sharpen.limit" in names  # what edges get
-    assert {"tone_curve.contrast", "tone_curve.toe", "tone_curve.shoulder"} <= names
+    assert {"tone_curve.toe", "tone_curve.shoulder", "tone_curve.saturation"} <= names
     assert not {"denoise.luma_noise", "sharpen.threshold"} & names  # in units of the signal
     space = space_for(Settings(), iso_is_given=False)
     assert space.strength is not None

@@ -323,7 +323,6 @@ class Sharpen(TypedDict, total=False):
 
 class ToneCurve(TypedDict, total=False):
     method: Draw | Literal["standard", "neutral", "camera_raw", "linear", "file"]
-    contrast: Number
     toe: Number
     shoulder: Number
     saturation: Number
@@ -349,7 +348,6 @@ class InverseGamma(TypedDict, total=False):
 
 class InverseToneCurve(TypedDict, total=False):
     method: Draw | Literal["standard", "neutral", "camera_raw", "linear", "file"]
-    contrast: Number
     toe: Number
     shoulder: Number
     saturation: Number

@@ -48,20 +48,26 @@ class Standard(standard.Standard):
     kernel: ClassVar = "inverse_tone_curve_standard"
     summary: ClassVar = "undo the curve standard"
     tolerance: ClassVar = 2e-3  # near black the kernel's root is a short iteration
-    example: ClassVar = {"contrast": 1.3, "toe": 0.5, "shoulder": 0.4}
+    example: ClassVar = {"toe": 0.5, "shoulder": 0.4, "saturation": 1.2}
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("inverse_standard", arguments=(*standard.NAMES, "saturation")),)
-
-    def arguments(self, context: Context) -> Arguments:
-        return self.numbers(standard.GREY_OUT)
+        return (Pass("inverse_standard", arguments=("a", "b", "c", "d", "saturation")),)
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         inside = clip_to_unit(image)
-        to_high = inside.max(-1, keepdims=True)
-        high = self.inverse(to_high)
-        part = high / (self.colourfulness(high) * np.maximum(to_high, np.float32(1e-9)))
-        return np.maximum(high - (to_high - inside) * part, np.float32(0))
+        one, two, smallest = np.float32(1), np.float32(2), np.float32(1e-12)
+        gain = one / np.float32(self.saturation)
+        lost = one - gain
+        total, squares = standard.sums_of(inside * gain)
+        # The mean of the scene's colours over their own mean is 1: a quadratic equation in 1 / t,
+        # where t is the curve at the mean.
+        middle = (one - two * lost) * total
+        inner = middle * middle - np.float32(12) * lost * (lost - one) * squares
+        below = middle + np.sqrt(np.maximum(inner, np.float32(0)))
+        to_mean = clip_to_unit(two * squares / np.maximum(below, smallest))
+        mean = self.inverse(to_mean)
+        factor = gain * (mean / np.maximum(to_mean, smallest))
+        return np.maximum(inside * factor + lost * mean, np.float32(0))
 
 
 class Neutral(Method):
