@@ -99,7 +99,7 @@ def test_a_plan_depends_on_structure_alone():
 
 
 def test_the_border_is_as_wide_as_the_widest_stencil():
-    assert plan_of().border == 3  # of chroma, its scale and one more
+    assert plan_of().border == 4  # of chroma, its scale and one more
     assert plan_of(denoise={"chroma_scale": 4}).border == 5
     assert plan_of(skip=["denoise"]).border == 2
     assert plan_of(denoise={"method": "mean", "chroma_size": 13}).border == 6

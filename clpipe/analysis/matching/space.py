@@ -27,7 +27,7 @@ BEFORE = TONE  # a stage that the chain lacks is inserted before this one
 SHARPEN = "sharpen"
 # Cameras smooth chroma again with a wider filter, at a half or a quarter of the resolution.
 SMOOTHER = {"method": "bilateral", "luma_size": 1, "luma_strength": 0.0, "chroma_size": 7}
-COARSER = {"method": "biweight", "luma_strength": 0.0, "chroma_scale": 3}
+COARSER = {"method": "biweight", "luma_strength": 0.0, "chroma_scale": 4}
 # Units of searched numbers; numbers in signal units follow from the noise.
 SEARCHED_UNITS = ("", "px")
 ALSO = ("sharpen.limit",)  # also searched, because it sets the noise at edges

@@ -22,7 +22,7 @@ class Standard(Method):
 
     It expects a raw image with one stop of headroom, the default of ``exposure``. There, 18 % grey
     is 0.09, and it becomes 0.173. The curve is x (a x + b) / (x (c x + d) + 1). Its slopes at black
-    and white are set by ``toe`` and ``shoulder``, and its contrast at grey follows from them: 1.47
+    and white are set by ``toe`` and ``shoulder``, and its contrast at grey follows from them: 1.44
     stops per stop by default. Like in a camera, noise is weaker in shadows and highlights than in
     midtones. In roots of the light, where shot noise has the same size at all levels, the slope
     changes slowly, so the noise stays symmetric (docs/validation.md).
@@ -46,7 +46,7 @@ class Standard(Method):
     example: ClassVar = {"toe": 1.0, "shoulder": 0.4, "saturation": 1.2}
 
     toe: float = parameter(
-        0.7,
+        0.65,
         "Darkening of shadows. 0 starts with the slope of the line from black to grey, and 1 "
         "starts flat.",
         ge=0,
@@ -65,8 +65,8 @@ class Standard(Method):
     def coefficients(self) -> tuple[float, float, float, float]:
         """The curve's a, b, c and d: it has the slopes of both ends, and keeps grey and white.
 
-        In the Bernstein form (b x (1-x) + w x^2) / ((1-x)^2 + p x (1-x) + w x^2), all numbers are
-        positive and the ordinates rise, so the curve rises too.
+        The Bernstein form is (b x (1-x) + w x^2) / ((1-x)^2 + p x (1-x) + w x^2). Its numbers are
+        positive and its ordinates rise, so the curve rises too.
         """
         first = (1 - self.toe) * GREY_OUT / GREY
         last = (1 - self.shoulder) * STEEPEST_END
