@@ -38,7 +38,7 @@ from clpipe.images.read import read_image
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.reference.poisson import poisson_of
 from tools import RENDER, ROOT
-from tools.pages import real_cameras
+from tools.pages import real_cameras, skew
 from tools.pages.comparison_page import COLUMNS, markdown
 
 DOCS = ROOT / "docs"
@@ -289,6 +289,7 @@ SECTIONS: dict[str, Callable[[argparse.Namespace], bool]] = {
     "poisson": photo_electrons,
     "canon": canon,
     "cameras": cameras,
+    "skew": skew.section,
 }
 
 
