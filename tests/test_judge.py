@@ -85,9 +85,13 @@ def test_pairs_of_two_cameras_are_judged(tmp_path, monkeypatch, capsys):
     white = found["figures"]["iid, as one_iso800"]
     assert abs(white[judge.CB_RIGHT]) < 0.1 and 0.3 < white[judge.CR_COARSE] < 3
     assert found["figures"]["iid, as one_iso800"]["half"] == pytest.approx(0.25, abs=0.03)
+    assert white["chroma_sigma_96"] == pytest.approx(1, abs=0.05)
+    assert abs(white["skew_80"]) < 0.1 and np.isnan(white["weak_over_strong"])
     print(judge.table(found))
     printed = capsys.readouterr().out
     assert "one_iso800 and two_iso800: " in printed and "most different" in printed
+    assert "\nchroma rms at 96-127 over that at 64-95\n    real one_iso800 " in printed
+    assert "\nluma skew at 160-219\n" in printed and "\nsaturated colours, weak over" in printed
     (tmp_path / "one_iso800_1_mean.png").unlink()
     with pytest.raises(SystemExit, match=r"has no one_iso800_1_mean\.png"):
         judge.read_pairs(tmp_path)

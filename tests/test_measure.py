@@ -223,6 +223,48 @@ def test_the_whole_picture_and_the_covariance_of_channels(tmp_path, measured, cl
     assert re.search(r"^all, after 2x2 +0\.0", text, re.MULTILINE)
 
 
+def test_skew_chroma_and_saturated_colours_of_finished_pictures(tmp_path, measured, clpipe):
+    """Below luma 64 chroma noise is half as strong. Above 112 luma noise has a part of skew -1."""
+    random = np.random.default_rng(6)
+    clean = np.tile(np.linspace(26, 158, 512), (256, 1))[..., None].repeat(3, -1)
+    level = clean[..., 0]
+    noise = random.normal(0, 4, clean.shape) * np.where(level < 64, 0.5, 1)[..., None]
+    gamma = 3 * (4 - random.gamma(4, 1, level.shape))  # sigma 6, skew -1
+    noise += np.where(level < 112, 0, gamma)[..., None]
+    clean[:100] = 110, 25, 40
+    noise[:100] = random.normal(0, 6, noise[:100].shape) * (1, 0.5, 1)
+    noisy = png(tmp_path / "noisy.png", (clean + noise).round().clip(0, 255).astype(np.uint8))
+    truth = png(tmp_path / "clean.png", clean.round().astype(np.uint8))
+    found = measured(noisy, "--truth", truth)["finished"]
+    share = 36 / (36 + 16 * (0.299**2 + 0.587**2 + 0.114**2))  # of skewed noise in luma's variance
+    assert found["skew_80"] == pytest.approx(0, abs=0.08)
+    assert found["skew_112"] == pytest.approx(-(share**1.5), abs=0.1)
+    assert found["skew_160"] is None and found["chroma_sigma_192"] is None
+    assert found["chroma_sigma_24"] == pytest.approx(0.5, abs=0.03)
+    assert found["chroma_sigma_128"] == pytest.approx(1, abs=0.05)
+    assert found["weak_over_strong"] == pytest.approx(0.5, abs=0.03)
+    text = clpipe("measure", noisy, "--truth", truth).stdout
+    here = f"{found['chroma_sigma_128']:.2f}"
+    row = rf"^chroma rms at 128-159 over that at 64-95 +{here} +0\.83 to 1\.11"
+    assert re.search(row, text, re.MULTILINE)
+    assert "luma skew at 160-219" not in text
+
+
+def test_these_figures_against_the_mean_and_without_scipy(tmp_path, measured, clpipe, monkeypatch):
+    for folder, seed in (("a", 3), ("b", 4)):
+        burst(tmp_path / folder, "{}.png", seed, 5)
+    one, two, both = (
+        measured(*(tmp_path / name for name in names))["finished"] for names in ("a", "b", "ab")
+    )
+    name = "chroma_sigma_96"
+    assert one[name] == pytest.approx(1, abs=0.1)
+    assert both[name] == pytest.approx((one[name] + two[name]) / 2)
+    monkeypatch.setattr("clpipe.analysis.measure.is_installed", lambda _: False)
+    text = clpipe("measure", tmp_path / "a").stdout
+    assert "because scipy is missing. Run: pip install scipy" in text
+    assert "luma skew" not in text and "chroma rms" not in text
+
+
 def scene_of(seed, height=96):
     tiles = np.random.default_rng(seed).uniform(60, 190, (height // 32, 4))
     return np.kron(tiles, np.ones((32, 32)))[..., None].repeat(3, -1)

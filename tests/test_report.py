@@ -156,9 +156,13 @@ def test_the_law_is_held_against_raws(out):
     (name,) = re.findall(r"against (.*?)\.truth\.jpg in flat areas", page.shown_text)
     name = name.replace(SHOWN, HOSTILE)
     pair = (out / f"{name}.jpg", "--truth", out / f"{name}.truth.jpg")
-    channels = json.loads(clpipe("measure", *pair, "--json"))["channels"]
-    assert f"R {channels['R']['sigma'] * 255:.2f}, G" in page.shown_text
-    assert f"leaves {channels['Y']['energy_left_2x2']:.2f} of the luma" in page.shown_text
+    measured = json.loads(clpipe("measure", *pair, "--json"))
+    assert f"R {measured['channels']['R']['sigma'] * 255:.2f}, G" in page.shown_text
+    skew = measured["finished"]["skew_160"]
+    assert f"luma skew at 160-219 {skew:.2f} -0.12 to -0.01" in page.shown_text
+    assert (
+        f"leaves {measured['channels']['Y']['energy_left_2x2']:.2f} of the luma" in page.shown_text
+    )
     sidecar = out / "a.json"
     record = json.loads(sidecar.read_text())
     gain = record["noise"]["signal"]["a"]

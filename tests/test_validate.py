@@ -71,7 +71,7 @@ def test_noise_by_intensity_and_chroma_are_a_cameras(iso):
     assert 0.60 < found["sigma_24"] / middle < 0.92
     assert 0.77 < found["sigma_40"] / middle < 0.98
     assert 0.33 < found["sigma_160"] / middle < 0.78
-    assert -0.07 < found["skew_shadows"] < 0.26
+    assert -0.07 < found["skew_24"] < 0.26
     assert 3.2 < found["kurtosis"] < 5.3
     assert 0.57 < found["chroma_two_right"] < 0.77
     assert found["chroma_right_4"] > 0.14

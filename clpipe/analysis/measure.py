@@ -8,7 +8,9 @@ from itertools import combinations
 import numpy as np
 
 from clpipe.analysis.edges import slopes_of
+from clpipe.analysis.finished import finished_figures
 from clpipe.analysis.intensity import bin_edges, noise_by_intensity, pool_curves
+from clpipe.analysis.matching.columns import Figures
 from clpipe.analysis.pictures import WHOLE, Picture
 from clpipe.analysis.repeats import check_repeats
 from clpipe.analysis.report import NoiseReport
@@ -16,6 +18,7 @@ from clpipe.analysis.selection import select_unclipped
 from clpipe.analysis.spatial import count_pairs
 from clpipe.analysis.statistics import Channel, channel_statistics, correlation
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.extras import install_command, is_installed
 from clpipe.base.types import Doubles, Floats, Mask
 from clpipe.outputs.noise_areas import FLAT, HALVED, PICTURE, covariance, halved, select_flat
 from clpipe.reference.cfa import sites
@@ -74,6 +77,7 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
         notes=tuple(notes_on(images, truth, noise)),
         iso=next((image.iso for image in images if image.iso), None),
         at_edges=at_edges(clean, noise, start) if clean.ndim == 3 else math.nan,
+        finished=finished(images, truth),
         rounding=sum(picture.step**2 / 12 for picture in (first, truth) if picture),
     )
 
@@ -101,6 +105,13 @@ def at_edges(clean: Floats, noise: Floats, unclipped: Mask) -> float:
     """Return the rms of luma's noise in the steepest pixels over that in the flattest."""
     slopes = slopes_of(rgb_to_ycbcr(clean)[..., 0], np.all(unclipped, axis=-1))
     return slopes.ratio(np.stack([rgb_to_ycbcr(frame)[..., 0] for frame in noise]))
+
+
+def finished(images: Sequence[Picture], truth: Picture | None) -> Figures:
+    """Return the figures of finished pictures; {} for other images, or without SciPy."""
+    if images[0].kind != "display" or not is_installed("scipy"):
+        return {}
+    return finished_figures([image.pixels for image in images], truth.pixels if truth else None)
 
 
 def check_partners(images: Sequence[Picture], truth: Picture | None) -> None:
@@ -170,6 +181,11 @@ def notes_on(images: Sequence[Picture], truth: Picture | None, noise: Floats) ->
         notes.append(
             "display values: variance is not linear in intensity, so a and b are not fitted"
         )
+        if not is_installed("scipy"):
+            notes.append(
+                "skew and chroma noise by luma are not measured because scipy is missing. Run: "
+                + install_command("scipy")
+            )
     return notes
 
 

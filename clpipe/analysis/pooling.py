@@ -49,6 +49,7 @@ def pool(reports: Sequence[NoiseReport]) -> NoiseReport:
     )
     pairs = {pair: [r.correlations[pair] for r in reports] for pair in first.correlations}
     tables = {where: [r.covariances[where] for r in reports] for where in first.covariances}
+    finished = {name: [r.finished[name] for r in reports] for name in first.finished}
     return replace(
         first,
         images=tuple(image for report in reports for image in report.images),
@@ -63,6 +64,7 @@ def pool(reports: Sequence[NoiseReport]) -> NoiseReport:
         notes=tuple(dict.fromkeys(note for report in reports for note in report.notes)),
         bursts=len(reports),
         at_edges=float(mean([r.at_edges for r in reports], sizes)),
+        finished={name: float(mean(values, sizes)) for name, values in finished.items()},
     )
 
 

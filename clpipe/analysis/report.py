@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from clpipe.analysis.intensity import NoiseCurve
@@ -38,6 +38,7 @@ class NoiseReport:
     bursts: int = 1  # number of bursts whose noise is pooled
     # RMS of luma noise at edges relative to flat areas; only for pictures.
     at_edges: float = math.nan
+    finished: Mapping[str, float] = field(default_factory=dict)  # see clpipe.analysis.finished
     rounding: float = 0.0  # the variance that rounding in files adds to each channel
 
     def record(self) -> dict[str, Any]:
@@ -56,6 +57,7 @@ class NoiseReport:
             "notes": list(self.notes),
             "channels": {channel.name: channel_record(channel) for channel in self.channels},
             "edges_over_flat": json_number(self.at_edges),
+            "finished": {name: json_number(value) for name, value in self.finished.items()},
             "covariance": {where: table.tolist() for where, table in self.covariances.items()},
             "correlation": {f"{a}-{b}": json_number(r) for (a, b), r in self.correlations.items()},
         }

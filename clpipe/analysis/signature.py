@@ -15,6 +15,7 @@ FLAT = 60  # percentile of the gradient below which an area is flat
 BIN = 8  # levels per bin of intensity
 MIN_SAMPLES = 200  # samples that a bin needs
 DARKEST, BRIGHTEST = 30, 225  # luma of the darkest and brightest pixels that are measured
+DARK = 8  # luma of the darkest pixels in which noise is compared by intensity
 
 LUMA = np.array([0.299, 0.587, 0.114])  # weights of BT.601
 

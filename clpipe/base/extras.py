@@ -19,11 +19,20 @@ def require(purpose: str, *modules: str) -> None:
     Traceback (most recent call last):
     clpipe.base.errors.RequestError: this example needs no_module. Run: pip install no_module
     """
-    missing = [name for name in modules if find_spec(name) is None]
+    missing = [name for name in modules if not is_installed(name)]
     if missing:
         raise RequestError(
             f"{purpose} needs {' and '.join(missing)}. Run: {install_command(*missing)}"
         )
+
+
+def is_installed(module: str) -> bool:
+    """Return whether a module can be imported, without importing it.
+
+    >>> is_installed("json"), is_installed("no_module")
+    (True, False)
+    """
+    return find_spec(module) is not None
 
 
 def install_command(*packages: str) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from clpipe.analysis.bursts import bursts_in
+from clpipe.analysis.finished import finished_rows
 from clpipe.analysis.measure import measure as measure_images
 from clpipe.analysis.pictures import load_picture
 from clpipe.analysis.pooling import pool_by_iso
@@ -202,6 +203,8 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
         middle_of_bin = (report.edges[i] + report.edges[i + 1]) / 2
         values = (f"{s[i]:.4g}" if i in s else "" for s in sigmas)
         intensity_rows.append((f"{middle_of_bin:.3f}", *values))
+    finished_table: Rows = [("", "here", "real cameras")]
+    finished_table += [(t, f"{v:.2f}", real) for t, v, real in finished_rows(report.finished)]
     pairs = [f"{a}-{b}" for a, b in report.correlations]
     channel_correlations: Rows = [
         tuple(pairs),
@@ -214,9 +217,11 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
         *([("covariance of the channels", covariance_rows(report))] if report.covariances else []),
         ("tails of standardised noise", tail_rows),
         ("sigma by intensity", intensity_rows),
+        *([(FINISHED, finished_table)] if len(finished_table) > 1 else []),
     ]
 
 
+FINISHED = "finished picture, flat areas, by luma of 255"
 AREA_NAMES = {FLAT: "flat areas", PICTURE: "all", HALVED: "all, after 2x2"}
 
 

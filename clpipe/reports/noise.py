@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from clpipe.analysis.finished import finished_rows
 from clpipe.analysis.intensity import VarianceLaw
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import WHOLE, load_picture
@@ -63,6 +64,11 @@ class Noise:
     iso: float
     report: NoiseReport
     svg: str
+
+    @property
+    def finished(self) -> list[tuple[str, float, str]]:
+        """The noise by luma: texts, figures, and the ranges of real cameras."""
+        return finished_rows(self.report.finished)
 
     @property
     def channels(self) -> Mapping[str, Channel]:

@@ -27,9 +27,13 @@ from typing import Any
 
 import numpy as np
 
+from clpipe.analysis.finished import relative, text_of
 from clpipe.analysis.matching.columns import (
+    CHROMA_SIGMA,
     COLUMNS,
     MAX_LAG,
+    SKEWS,
+    WEAK,
     Noise,
     autocorrelation,
     figures_of,
@@ -54,12 +58,12 @@ from tools.compare.classifier import (
 FEWEST = 4  # patches of a camera
 COVERED = 0.6  # lowest share of a patch that is flat, and neither dark nor bright
 CONFIGS = ("default", "nikon-d800-jpeg", "canon-5d3-jpeg")
-SHOWN = ("sigma_12", "sigma_24", "sigma_40", "sigma_96", "sigma_128", "skew_shadows", "kurtosis")
+SHOWN = ("sigma_12", "sigma_24", "sigma_40", "sigma_96", "sigma_128", *SKEWS, "kurtosis")
+SHOWN += (*(f"{CHROMA_SIGMA}_{low}" for low in (12, 24, 40, 96, 128)), WEAK)
 SHOWN += ("right", "diagonal", "two_right", "right_3", "half", "chroma_right", "chroma_two_right")
 SHOWN += ("red_green", "edges")
 COARSE = 16  # px, side of the blocks for means of chroma
 CB_RIGHT, CR_COARSE = "Cb, 2 right", f"Cr after {COARSE}x{COARSE} means, over white noise's"
-RELATIVE_TO = "sigma_64"
 STEPS = 4  # iterations of the search for an ISO
 
 
@@ -174,13 +178,12 @@ def divergence(real: Sequence[Noise], made: Sequence[Noise], pairs: Sequence[Pai
 
 
 def median_figures(noises: Sequence[Noise], pairs: Sequence[Pair]) -> dict[str, float]:
-    """Return medians over pictures; sigma by luma is relative to sigma at luma 64 to 95."""
+    """Return medians over pictures; noise by luma is relative to that at luma 64 to 95."""
     rows = []
     for noise, pair in zip(noises, pairs, strict=True):
         places = pair.scene.places()
-        figures = figures_of(noise, places)
-        middle = figures[RELATIVE_TO]
-        rows.append([figures[n] / middle if n.startswith("sigma") else figures[n] for n in SHOWN])
+        figures = relative(figures_of(noise, places))
+        rows.append([figures[name] for name in SHOWN])
         _, cb, cr = noise.planes
         rows[-1].append(float(autocorrelation(cb, places)[MAX_LAG, MAX_LAG + 2]))
         rows[-1].append(over_white(cr, places.bright, COARSE))
@@ -245,9 +248,7 @@ def table(found: Mapping[str, Any]) -> str:
             lines.append(f"{name:24}{camera:18}{numbers}  {gaps}")
     lines.append("")
     for key in (*SHOWN, CB_RIGHT, CR_COARSE):
-        over = f", relative to luma {RELATIVE_TO[6:]} to 95" if key.startswith("sigma") else ""
-        text = COLUMNS[key].text.removesuffix(", levels") if key in COLUMNS else key
-        lines.append(f"{text}{over}")
+        lines.append(text_of(key) if key in COLUMNS else key)
         lines += [f"    {name:40}{values[key]:8.2f}" for name, values in found["figures"].items()]
     return "\n".join(lines)
 

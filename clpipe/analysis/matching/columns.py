@@ -1,8 +1,9 @@
 """The signature of a finished picture's noise: the columns by which developments are compared.
 
 They are the size and tails of luma noise, autocorrelations of luma and chroma, correlations of
-channels, and the power spectrum of luma in four bands. Size and skew of luma noise by intensity
-include darker shadows than the other columns.
+channels, and the power spectrum of luma in four bands. The size of luma and chroma noise and the
+skew of luma noise by intensity include darker shadows than the other columns, and so does the noise
+of saturated colours.
 """
 
 import itertools
@@ -12,9 +13,11 @@ from functools import cached_property
 
 import numpy as np
 
+from clpipe.analysis.colours import Saturated, saturated_of
 from clpipe.analysis.edges import Slopes
 from clpipe.analysis.signature import (
     BIN,
+    DARK,
     DARKEST,
     LUMA,
     MIN_SAMPLES,
@@ -36,7 +39,7 @@ BANDS = (
     0.75,
 )
 LEVELS = (12, 24, 40, 64, 96, 128, 160, 192, 226)  # edges of the luma bins
-SHADOWS, MIDTONES = (24, 48), (64, 160)  # ranges of luma in which the skew of noise is compared
+RELATIVE_TO = 64  # the luma bin to which noise by intensity is relative, between cameras
 BLOCK = 32  # px; the side of a block
 GROUPS = 8  # groups of blocks; the jackknife omits one group at a time
 # Frames that tails need, because the difference from a mean of few frames mixes their noise.
@@ -64,8 +67,10 @@ class Column:
 
 LONG_LAGS = range(3, MAX_LAG + 1)  # lags, px
 TAILS = ("kurtosis", "beyond_4_sigma")
-SKEWS = ("skew_shadows", "skew_midtones")
-EDGES = "edges"
+# The ranges of luma in which the skew of noise is compared.
+SKEWS = {f"skew_{low}": (low, high) for low, high in ((24, 48), (80, 112), (112, 160), (160, 220))}
+SIGMA, CHROMA_SIGMA = BY_LUMA = ("sigma", "chroma_sigma")  # beginnings of names; luma follows
+EDGES, WEAK = "edges", "weak_over_strong"
 COLUMNS: Mapping[str, Column] = {
     "rms": Column("luma rms, levels", 0.03, relative=True),
     "kurtosis": Column("kurtosis", 0.3),
@@ -90,14 +95,13 @@ COLUMNS: Mapping[str, Column] = {
         for k, (low, high) in enumerate(itertools.pairwise(BANDS), 1)
     },
     **{
-        f"sigma_{low}": Column(f"luma rms at {low}-{high - 1}, levels", 0.04, relative=True)
+        f"{name}_{low}": Column(f"{what} rms at {low}-{high - 1}, levels", floor, relative=True)
+        for name, what, floor in ((SIGMA, "luma", 0.04), (CHROMA_SIGMA, "chroma", 0.08))
         for low, high in itertools.pairwise(LEVELS)
     },
-    **{
-        name: Column(f"luma skew at {low}-{high}", 0.08)
-        for name, (low, high) in zip(SKEWS, (SHADOWS, MIDTONES), strict=True)
-    },
+    **{name: Column(f"luma skew at {low}-{high - 1}", 0.08) for name, (low, high) in SKEWS.items()},
     EDGES: Column("luma rms at edges over flat", 0.08, relative=True),
+    WEAK: Column("saturated colours, weak over strong channel", 0.08, relative=True),
 }
 
 
@@ -105,13 +109,15 @@ COLUMNS: Mapping[str, Column] = {
 class ValidPixels:
     """The valid pixels of a scene, and its luma, (height, width) each.
 
-    ``mask`` includes shadows, which are compared only by intensity. ``bright`` excludes them, and
-    is used for all other columns. ``slopes`` are the masks of flat areas and edges.
+    ``mask`` includes shadows, which are compared only by intensity and in saturated colours.
+    ``bright`` excludes them, and is used for all other columns. ``slopes`` are the masks of flat
+    areas and edges.
     """
 
     mask: Mask
     level: Doubles
     slopes: Slopes | None = None
+    saturated: Saturated | None = None
 
     @cached_property
     def bright(self) -> Mask:
@@ -121,7 +127,8 @@ class ValidPixels:
     def without(self, left_out: Mask) -> "ValidPixels":
         """Return the valid pixels without some of them, (height, width)."""
         slopes = self.slopes and self.slopes.within(~left_out)
-        return ValidPixels(self.mask & ~left_out, self.level, slopes)
+        saturated = self.saturated and self.saturated.within(~left_out)
+        return ValidPixels(self.mask & ~left_out, self.level, slopes, saturated)
 
     @cached_property
     def pairs(self) -> Doubles:
@@ -195,7 +202,7 @@ def figures_of(noise: Noise, places: ValidPixels) -> Figures:
         "green_blue": float(green_blue),
         "red_blue": float(red_blue),
         **bands(luma_map),
-        **by_intensity(y[:, places.mask], noise.level[places.mask]),
+        **by_intensity(noise, places),
     }
     if places.slopes:
         found[EDGES] = places.slopes.ratio(y)
@@ -208,7 +215,7 @@ def signature(picture: Array, mean: Array, mask: Mask | None = None) -> Figures:
     Args:
         picture: (height, width, 3), 0 to 255.
         mean: the same scene without noise, or the mean of many pictures of it.
-        mask: the valid pixels; None uses :func:`clpipe.analysis.signature.flat_mask`.
+        mask: the valid pixels; None uses :func:`flat_places`.
 
     >>> generator = np.random.default_rng(0)
     >>> grey = np.full((200, 200, 3), 128.0)
@@ -216,8 +223,16 @@ def signature(picture: Array, mean: Array, mask: Mask | None = None) -> Figures:
     >>> round(found["kurtosis"], 1), round(found["half"], 2), abs(found["right"]) < 0.02
     (3.0, 0.25, True)
     """
-    noise = noise_of_frames([picture], mean)
-    return figures_of(noise, ValidPixels(flat_mask(mean) if mask is None else mask, noise.level))
+    return figures_of(noise_of_frames([picture], mean), flat_places(mean, mask))
+
+
+def flat_places(mean: Array, mask: Mask | None = None) -> ValidPixels:
+    """Return the valid pixels of a picture without noise, (height, width, 3), 0 to 255.
+
+    Without ``mask``, they are the flat ones of luma 8 to 225.
+    """
+    mask = flat_mask(mean, DARK) if mask is None else mask
+    return ValidPixels(mask, luma(mean), saturated=saturated_of(mean, mask))
 
 
 LAGS = {"right": (0, 1), "below": (1, 0), "diagonal": (1, 1), "two_right": (0, 2)}
@@ -287,36 +302,53 @@ def bands(table: Doubles) -> Figures:
     return {f"band_{k}": float(v / spectrum.sum()) for k, v in enumerate(inside, 1)}
 
 
-def by_intensity(noise: Doubles, level: Doubles) -> Figures:
-    """Return rms and skew of luma by intensity, and tails relative to the sigma of each bin.
+def by_intensity(noise: Noise, places: ValidPixels) -> Figures:
+    """Return the columns that need no neighbours: those by intensity, tails, and saturated colours.
 
-    Args:
-        noise: the noise of luma, (frame, sample).
-        level: luma of the mean, (sample,).
+    Tails are relative to the sigma of each bin of luma.
     """
-    found: Figures = {}
-    for low, high in itertools.pairwise(LEVELS):
-        own = noise[:, (level >= low) & (level < high)]
-        found[f"sigma_{low}"] = (
-            float(np.sqrt((own**2).mean())) if own.size >= MIN_SAMPLES else np.nan
-        )
-    for name, (low, high) in zip(SKEWS, (SHADOWS, MIDTONES), strict=True):
-        found[name] = skewness(noise[:, (level >= low) & (level < high)])
+    y, cb, cr = (plane[:, places.mask] for plane in noise.planes)
+    level = noise.level[places.mask]
+    found = {
+        **rms_by_luma(SIGMA, y * y, level),
+        **rms_by_luma(CHROMA_SIGMA, (cb * cb + cr * cr) / 2, level),
+        **{n: skewness(y[:, (level >= a) & (level < b)]) for n, (a, b) in SKEWS.items()},
+    }
+    if places.saturated:
+        found[WEAK] = places.saturated.ratio(noise.rgb)
     bright = level >= DARKEST
-    noise, level = noise[:, bright], level[bright]
+    y, level = y[:, bright], level[bright]
     bins = (level // BIN).astype(int)
-    count = np.bincount(bins) * len(noise)
-    first = np.bincount(bins, noise.sum(0))
-    second = np.bincount(bins, (noise**2).sum(0))
+    count = np.bincount(bins) * len(y)
+    first = np.bincount(bins, y.sum(0))
+    second = np.bincount(bins, (y**2).sum(0))
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = second / count - (first / count) ** 2
         kept = (count >= MIN_SAMPLES) & (variance > 0)
-        z = (noise / np.sqrt(variance)[bins])[:, kept[bins]].ravel()
+        z = (y / np.sqrt(variance)[bins])[:, kept[bins]].ravel()
     if z.size:
         squares = z * z  # multiplying squares is much faster than a fourth power
         found["kurtosis"] = float((squares * squares).mean() / squares.mean() ** 2)
         found["beyond_4_sigma"] = float(1e4 * (np.abs(z) > 4).mean())
     return found
+
+
+def rms_by_luma(name: str, power: Doubles, level: Doubles) -> Figures:
+    """Return the rms of noise in the bins of luma; NaN for too few samples.
+
+    Args:
+        name: the beginning of the columns' names.
+        power: squared noise, (frame, sample).
+        level: luma of the mean, (sample,).
+    """
+    bins = np.digitize(level, LEVELS)
+    size = len(LEVELS) + 1
+    count = np.bincount(bins, minlength=size) * len(power)
+    total = np.bincount(bins, power.sum(0), size)
+    return {
+        f"{name}_{low}": float(np.sqrt(total[k] / count[k])) if count[k] >= MIN_SAMPLES else np.nan
+        for k, low in enumerate(LEVELS[:-1], 1)
+    }
 
 
 def skewness(noise: Doubles) -> float:

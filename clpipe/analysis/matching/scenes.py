@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from clpipe.analysis.colours import saturated_of
 from clpipe.analysis.edges import slopes_of
 from clpipe.analysis.matching.columns import (
+    LEVELS,
     MIN_FRAMES,
     TAILS,
     Noise,
@@ -18,7 +20,7 @@ from clpipe.analysis.matching.columns import (
     block_numbers,
     noise_of_frames,
 )
-from clpipe.analysis.signature import BRIGHTEST, DRIFT, flat_mask, luma
+from clpipe.analysis.signature import BRIGHTEST, DARK, DRIFT, flat_mask, luma
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_input
 from clpipe.base.types import Doubles, Floats, Mask
@@ -30,7 +32,6 @@ CROP = 512  # px; crops begin at multiples of 16, to align with the blocks of a 
 CROPS = 4
 MIN_FLAT = 4000  # px; pixels in all scenes that are neither clipped nor near an edge
 MIN_OF_EACH = 1000  # px; such pixels in each scene
-DARK = 12  # luma; noise is compared by intensity above this level
 # Squared levels of 255; the energy from rounding in a mean, which noise exceeds.
 ROUNDING_ENERGY = 1e-9
 HOLDOUT = 3  # one of this many crops or blocks is held out of the search
@@ -72,7 +73,8 @@ class Scene:
     def places(self, part: Mask | None = None) -> ValidPixels:
         """Return the pixels in which noise is compared, in a part of the picture or everywhere."""
         slopes = slopes_of(luma(self.mean), self.counted)
-        places = ValidPixels(self.flat, self.noise.level, slopes)
+        saturated = saturated_of(self.mean, self.flat)
+        places = ValidPixels(self.flat, self.noise.level, slopes, saturated)
         return places if part is None else places.without(~part)
 
     @cached_property
@@ -245,7 +247,7 @@ def checked_scene(
     if mean is not None:
         reject_noisy_mean(paths[0], frames[0], mean, against)
     level, holdout = luma(clean), np.zeros_like(mask)
-    counted = still & (level >= DARK) & (level <= BRIGHTEST)
+    counted = still & (level >= LEVELS[0]) & (level <= BRIGHTEST)
     return Scene(paths[0].stem, tuple(frames), clean, own, counted, mask & still, holdout, jpeg)
 
 
