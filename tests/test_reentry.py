@@ -185,9 +185,9 @@ def test_a_kept_mosaic_is_no_render(kept, tmp_path):
             (),
             ("white level is 1 here", "its CFA pattern", "its ISO", "are clipped"),
         ),
-        (0.2, "white_balance", ("--set", "mosaic.pattern=RGGB", "--iso", 800), ()),
+        (0.1, "white_balance", ("--set", "mosaic.pattern=RGGB", "--iso", 800), ()),
         (
-            0.2,
+            0.1,
             "white_balance",
             ("--set", "mosaic.pattern=RGGB"),
             ("state its ISO; clpipe assumes 100",),

@@ -61,6 +61,48 @@ def test_denoisers_are_compared_on_real_pictures(tool, real, tmp_path):
     assert np.mean(scores["clpipe"]["psnr"]) > np.mean(scores["noisy"]["psnr"])
 
 
+def test_networks_share_a_table(tool, real, tmp_path):
+    words = ("--steps", 2, "--seeds", 1, "--regimes", "clpipe", "awgn", "-o", "out")
+    networks = ("--network", "unet", "resnet")
+    tool("train_on_real", "renders/a.exr", "--real", real, *words, *networks)
+    heading, _, *rows = (tmp_path / "out/table.md").read_text().splitlines()
+    assert heading.startswith("| network | trained on | PSNR, dB |")
+    regimes = ["noisy", "clpipe", "awgn"]
+    expected = [[network, regime] for network in networks[1:] for regime in regimes]
+    assert [row.split(" | ")[:2] for row in (row[2:] for row in rows)] == expected
+    assert len({row.count("|") for row in (heading, *rows)}) == 1
+    files = [json.loads((tmp_path / f"out/scores_{n}.json").read_text()) for n in networks[1:]]
+    assert [list(each["regimes"]) for each in files] == [regimes, regimes]
+    assert files[0]["regimes"]["noisy"] == files[1]["regimes"]["noisy"]
+    assert files[0]["regimes"]["clpipe"] != files[1]["regimes"]["clpipe"]
+    with Image.open(tmp_path / "out/crops.png") as crops:
+        assert crops.size[0] == 6 * 320
+
+
+@pytest.mark.parametrize("kind", ["unet", "resnet"])
+def test_a_network_begins_as_the_identity_and_learns(kind):
+    from tools.training.figures import psnr
+    from tools.training.networks import NETWORKS, denoised, train
+    from tools.training.patches import BATCH
+
+    assert sorted(NETWORKS) == ["resnet", "unet"]
+    size = sum(weights.numel() for weights in NETWORKS[kind](3).parameters())
+    assert 100_000 < size < 130_000
+    image = torch.rand(3, 37, 50, generator=torch.Generator().manual_seed(3))
+    assert torch.equal(denoised(NETWORKS[kind](3), image), image)
+
+    def batch(generator, sides=(32, 32)):
+        """Noisy and clean ramps of light."""
+        slope = torch.linspace(0, 1, sides[1])
+        ends = torch.rand(2, BATCH, 3, 1, 1, generator=generator)
+        clean = (ends[0] + (ends[1] - ends[0]) * slope).expand(BATCH, 3, *sides)
+        return clean + 0.05 * torch.randn(clean.shape, generator=generator), clean
+
+    network = train(batch, 3, 80, 1, kind=kind)
+    noisy, clean = (both[0] for both in batch(torch.Generator().manual_seed(9), (37, 50)))
+    assert psnr(denoised(network, noisy), clean) > psnr(noisy.clamp(0, 1), clean) + 1
+
+
 def _other(real):
     """A folder with the first pair under another name, so training does not use the test pair."""
     other = real.parent / "other"

@@ -58,6 +58,18 @@ def table(found: Mapping[str, Score], more: Mapping[str, Mapping[str, str]]) -> 
     return "\n".join(lines)
 
 
+def joined(tables: Mapping[str, str]) -> str:
+    """Join the tables of several networks, by name, into one with a column for the network."""
+    if len(tables) == 1:
+        return next(iter(tables.values()))
+    lines: list[str] = []
+    for network, text in tables.items():
+        heading, rule, *rows = text.splitlines()
+        lines = lines or [f"| network {heading}", f"|---{rule}"]
+        lines += [f"| {network} {row}" for row in rows]
+    return "\n".join(lines)
+
+
 def psnr(image: Tensor, truth: Tensor) -> float:
     """Return the peak signal-to-noise ratio in dB, with a peak of 1."""
     return -10 * torch.log10((image - truth).square().mean()).item()

@@ -33,8 +33,8 @@ from clpipe.images.read import ReadOptions, read_source
 from clpipe.stage import Kind
 from clpipe.torch import RawNoise
 from tools.training.figures import NOISY, scores, table
+from tools.training.networks import denoised, train
 from tools.training.patches import BATCH, PATCH, Batch, augmented, random_below
-from tools.training.unet import denoised, train
 
 REGIMES = ("full", "poisson-gaussian", "iid")
 PLAIN = ("prnu", "defect_pixels", "dark_current", "random_telegraph", "dsnu")

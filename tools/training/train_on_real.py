@@ -2,8 +2,8 @@
 
     sh tools/train_on_real RENDER|PHOTO... --real FOLDER [-c LOOK]... [--iso LOW HIGH] [-o OUT]
 
-All regimes use the same network (a U-Net of 118,000 parameters, Ronneberger et al. 2015), steps,
-content, and batches of 16 patches of 64x64. They differ in the noise:
+All regimes use the same networks, steps, content, and batches of 16 patches of 64x64. They differ
+in the noise:
 
 - clpipe: pictures that clpipe develops, with their development without noise.
 - awgn: Gaussian noise with a sigma of 0 to 55 levels on that development.
@@ -11,6 +11,11 @@ content, and batches of 16 patches of 64x64. They differ in the noise:
 - intensity: Gaussian noise with the strength of clpipe's noise at each intensity.
 - test: Gaussian noise with the sigma of the test pictures, which is unknown in practice.
 - real: the pictures of --pairs, with the real noise of another camera.
+
+--network selects the networks. Each is trained on all regimes:
+
+- unet: a U-Net of 118,000 parameters (Ronneberger et al. 2015). It is the default.
+- resnet: three residual blocks on pixels folded 2x2, with 115,000 parameters.
 
 FOLDER contains pictures of a real camera and means of many pictures of the same scene:
 NAME_real.png and NAME_mean.png, or JPEG. RENDERs are linear (EXR). clpipe first converts a PHOTO
@@ -24,7 +29,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +41,10 @@ import clpipe
 from clpipe.camera.profile import load_camera
 from clpipe.chain.files import load_settings
 from clpipe.chain.settings import Settings
-from tools.training.figures import NOISY, Score, draw_crops, scores, table
+from tools.training.figures import NOISY, Score, draw_crops, joined, scores, table
+from tools.training.networks import NETWORKS, denoised, train
 from tools.training.patches import Batch, from_pairs, gaussian, read, with_noise
 from tools.training.real_pairs import find_pairs
-from tools.training.unet import denoised, train
 
 DRAWS = 6  # pictures of each render and look, each with its own ISO
 PHOTOS = (".png", ".jpg", ".jpeg")
@@ -67,6 +72,9 @@ def main() -> None:
         "--pairs", nargs="+", type=Path, metavar="FOLDER", help="pairs for the regime real"
     )
     parser.add_argument("--regimes", nargs="+", choices=REGIMES, default=list(USUAL))
+    parser.add_argument(
+        "--network", nargs="+", choices=list(NETWORKS), default=["unet"], help="[unet]"
+    )
     parser.add_argument("--steps", type=int, default=2000, help="steps of training [2000]")
     parser.add_argument("--seeds", type=int, default=2, help="number of trainings [2]")
     parser.add_argument("-o", "--output", type=Path, default=Path("trained"), help="[trained]")
@@ -89,33 +97,54 @@ def main() -> None:
     tests = [(read(pair.real), read(pair.mean)) for pair in pairs]
     print(f"{len(made[CLPIPE])} pictures to train on, {len(tests)} real ones to test on")
     report_levels(made[CLPIPE], tests)
-    noisy, truths = ([one[k] / 255 for one in tests] for k in (0, 1))
-    found = {NOISY: scores([noisy], truths)}
-    shown = {NOISY: noisy}
-    for regime, batch in batches_of(options, made, tests):
-        start, of_seeds = time.monotonic(), []
-        for seed in range(1, options.seeds + 1):
-            network = train(batch, 3, options.steps, seed)
-            of_seeds.append([denoised(network, image) for image in noisy])
-        found[regime], shown[regime] = scores(of_seeds, truths), of_seeds[0]
-        seconds = time.monotonic() - start
-        print(f"{regime}: {found[regime].psnr.mean():.2f} dB, {seconds:.0f} s", flush=True)
-    text = table(found, by_camera(found, [pair.camera for pair in pairs]))
+    found, shown = train_all(options, batches_of(options, made, tests), tests)
+    cameras = [pair.camera for pair in pairs]
+    text = joined({network: table(own, by_camera(own, cameras)) for network, own in found.items()})
     print(f"\n{text}\n")
     (options.output / "table.md").write_text(f"{text}\n", "utf-8")
-    each = {regime: score.record() for regime, score in found.items()}
-    report = {"pictures": [pair.name for pair in pairs], "steps": options.steps, "regimes": each}
-    (options.output / "scores.json").write_text(json.dumps(report, indent=2), "utf-8")
-    chosen = {pair.camera: number for number, pair in enumerate(pairs)}.values()
+    for network, own in found.items():
+        each = {regime: score.record() for regime, score in own.items()}
+        report = {"pictures": [pair.name for pair in pairs], "steps": options.steps}
+        report |= {"network": network, "regimes": each}
+        file = "scores.json" if len(found) == 1 else f"scores_{network}.json"
+        (options.output / file).write_text(json.dumps(report, indent=2), "utf-8")
+    chosen = {camera: number for number, camera in enumerate(cameras)}.values()
     rows = []
     for number in list(chosen)[:SHOWN]:
         row = [
-            (f"{regime} {found[regime].psnr[0, number]:.2f} dB", images[number])
-            for regime, images in shown.items()
+            (f"{name} {score.psnr[0, number]:.2f} dB", images[number])
+            for name, score, images in shown
         ]
-        rows.append([*row, ("mean of many", truths[number])])
+        rows.append([*row, ("mean of many", tests[number][1] / 255)])
     draw_crops(rows, options.output / "crops.png")
-    print(f"{options.output}: table.md, scores.json, crops.png")
+    print(f"{options.output}: table.md, scores of each picture (JSON), crops.png")
+
+
+def train_all(
+    options: argparse.Namespace, batches: Iterable[tuple[str, Batch]], tests: Pairs
+) -> tuple[dict[str, dict[str, Score]], list[tuple[str, Score, list[Tensor]]]]:
+    """Train each network on each regime, and denoise the test pictures.
+
+    Returns:
+        the scores by network and regime, and for each row of the table its name, its scores and the
+        pictures of the first seed. The noisy pictures come first.
+    """
+    noisy, truths = ([one[k] / 255 for one in tests] for k in (0, 1))
+    unchanged = scores([noisy], truths)
+    found = {network: {NOISY: unchanged} for network in options.network}
+    shown = [(NOISY, unchanged, noisy)]
+    for regime, batch in batches:
+        for network, own in found.items():
+            start, of_seeds = time.monotonic(), []
+            for seed in range(1, options.seeds + 1):
+                trained = train(batch, 3, options.steps, seed, kind=network)
+                of_seeds.append([denoised(trained, image) for image in noisy])
+            own[regime] = scores(of_seeds, truths)
+            name = regime if len(found) == 1 else f"{network}, {regime}"
+            shown.append((name, own[regime], of_seeds[0]))
+            seconds = time.monotonic() - start
+            print(f"{name}: {own[regime].psnr.mean():.2f} dB, {seconds:.0f} s", flush=True)
+    return found, shown
 
 
 def make_pairs(options: argparse.Namespace, folder: Path) -> Mapping[str, Pairs]:

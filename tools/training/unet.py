@@ -1,6 +1,5 @@
-"""A small denoising network, and its training."""
+"""A small denoising network with three levels of resolution."""
 
-from collections.abc import Callable
 from itertools import pairwise
 
 import torch
@@ -10,7 +9,6 @@ from torch.nn import functional
 WIDTHS = (16, 32, 64)  # channels at each level
 MULTIPLE = 2 ** (len(WIDTHS) - 1)
 SCALE = 16  # noise is a few hundredths; networks learn faster from numbers near 1
-RATE = 2e-3  # Adam's highest learning rate
 
 
 class UNet(nn.Module):
@@ -42,43 +40,3 @@ def _block(inputs: int, outputs: int) -> nn.Module:
     first = nn.Conv2d(inputs, outputs, 3, padding=1)
     second = nn.Conv2d(outputs, outputs, 3, padding=1)
     return nn.Sequential(first, nn.ReLU(), second, nn.ReLU())
-
-
-def train(
-    batch: Callable[[torch.Generator], tuple[Tensor, Tensor]],
-    channels: int,
-    steps: int,
-    seed: int,
-    loss_of: Callable[[Tensor, Tensor], Tensor] = functional.l1_loss,
-) -> UNet:
-    """Train a network.
-
-    Args:
-        batch: returns noisy and clean images, (n, channels, h, w), from a random generator.
-        channels: the channels of an image.
-        steps: the number of batches.
-        seed: the seed of the initial weights and the batches.
-        loss_of: the loss, from denoised and clean images.
-    """
-    torch.manual_seed(seed)
-    generator = torch.Generator().manual_seed(seed)
-    network = UNet(channels)
-    optimizer = torch.optim.Adam(network.parameters())
-    rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, steps)
-    for _ in range(steps):
-        noisy, clean = batch(generator)
-        loss = loss_of(network(noisy), clean)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        rate.step()
-    return network
-
-
-@torch.no_grad()
-def denoised(network: nn.Module, noisy: Tensor) -> Tensor:
-    """Denoise an image, (channels, height, width), of any size."""
-    height, width = noisy.shape[-2:]
-    edge = (0, -width % MULTIPLE, 0, -height % MULTIPLE)
-    result: Tensor = network(functional.pad(noisy[None], edge, mode="replicate"))
-    return result[0, :, :height, :width].clamp(0, 1)

@@ -1,0 +1,171 @@
+"""Compare what feature detectors find in real pictures and in pictures with modelled noise.
+
+    sh tools/run compare matching FOLDER [--config NAME]... [--json]
+
+FOLDER contains pairs of a camera's picture and the mean of many pictures of the same scene:
+NAME_real.png and NAME_mean.png. The tool adds noise of several models to each mean:
+
+- clpipe's noise for each configuration, at the ISO at which its luma noise is as strong as the
+  picture's (see tools/judge);
+- independent Gaussian noise (iid), or with the picture's variance at each luma
+  (intensity-dependent). Both are scaled to the picture's luma noise, because detectors see luma.
+
+SIFT and ORB, with the default settings of OpenCV, detect keypoints in the mean and in each noisy
+picture. The figures are:
+
+- repeated: the share of the mean's keypoints that are detected again within 2 px;
+- matched: the share of mutually nearest descriptors whose keypoints are within 2 px;
+- error: the absolute difference from the same figure of the real picture, a mean over pictures. A
+  good noise model has a small error.
+
+It needs the extra "compare" (.venv/bin/pip install -e '.[compare]').
+"""
+
+import argparse
+import importlib.util
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from clpipe.analysis.matching.columns import Noise, figures_of
+from clpipe.analysis.matching.scenes import Scene
+from clpipe.analysis.matching.simulation import Simulator
+from clpipe.base.types import Array, Doubles
+from clpipe.engine.device import open_device
+from tools.compare.judge import CONFIGS, iid, intensity_dependent, read_pairs, simulated_by
+
+RADIUS = 2.0  # px
+REAL = "real"
+DETECTORS = ("SIFT", "ORB")
+
+
+class Matching(NamedTuple):
+    """Shares of keypoints that are detected again, and of matches that are right, 0 to 1."""
+
+    repeated: float
+    matched: float
+
+
+def strength(noise: Noise, scene: Scene) -> float:
+    """Return the rms of luma noise in flat areas of a scene, in levels of 255."""
+    return figures_of(noise, scene.places())["rms"]
+
+
+def as_strong(noise_of: Callable[[Scene], Noise]) -> Callable[[Scene], Noise]:
+    """Return a function whose noise is scaled to the luma strength of the real noise."""
+
+    def scaled(scene: Scene) -> Noise:
+        noise = noise_of(scene)
+        return Noise(noise.rgb * strength(scene.noise, scene) / strength(noise, scene), noise.level)
+
+    return scaled
+
+
+def grey(picture: Array) -> Array:
+    """Return the luma of a picture, (height, width, 3) from 0 to 255, rounded to uint8."""
+    import cv2
+
+    return cv2.cvtColor(np.rint(picture).clip(0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
+
+
+def compared(detector: str, clean: Array, noisy: Array) -> Matching:
+    """Compare the keypoints of two grey pictures of a scene, (height, width) uint8.
+
+    Raises:
+        SystemExit: the clean picture has no keypoint.
+    """
+    import cv2
+
+    found, norm = {
+        "SIFT": (cv2.SIFT_create(), cv2.NORM_L2),
+        "ORB": (cv2.ORB_create(), cv2.NORM_HAMMING),
+    }[detector]
+    (first, described), (second, described_again) = (
+        found.detectAndCompute(picture, None) for picture in (clean, noisy)
+    )
+    if not first:
+        raise SystemExit(
+            f"error: {detector} detects nothing in a mean; use scenes with more detail"
+        )
+    if not second:
+        return Matching(0.0, 0.0)
+    places, places_again = (cv2.KeyPoint.convert(points) for points in (first, second))
+    near = np.linalg.norm(places[:, None] - places_again, axis=2) <= RADIUS
+    matches = cv2.BFMatcher(norm, crossCheck=True).match(described, described_again)
+    right = [near[match.queryIdx, match.trainIdx] for match in matches]
+    return Matching(float(near.any(1).mean()), float(np.mean(right)))
+
+
+def report(folder: Path, configs: Sequence[str]) -> dict[str, Any]:
+    """Return all results as JSON values."""
+    pairs = read_pairs(folder)
+    simulator = Simulator(open_device(None))
+    sources: dict[str, Callable[[Scene], Noise]] = {REAL: lambda scene: scene.noise}
+    sources |= {config: simulated_by(config, simulator) for config in configs}
+    sources |= {"iid": as_strong(iid), "intensity-dependent": as_strong(intensity_dependent)}
+    figures: dict[str, Doubles] = {}  # (picture, detector, figure)
+    strengths = {}
+    for source, noise_of in sources.items():
+        rows, levels = [], []
+        for scene in (pair.scene for pair in pairs):
+            noise = noise_of(scene)
+            noisy = scene.frames[0] if source == REAL else scene.mean + noise.rgb[0]
+            both = grey(scene.mean), grey(noisy)
+            rows.append([compared(detector, *both) for detector in DETECTORS])
+            levels.append(strength(noise, scene))
+        figures[source], strengths[source] = np.array(rows), float(np.mean(levels))
+    models = {
+        source: {
+            "luma_rms": strengths[source],
+            **{
+                detector: {
+                    name: {
+                        "mean": float(own[:, d, k].mean()),
+                        "error": float(abs(own - figures[REAL])[:, d, k].mean()),
+                        "each": own[:, d, k].tolist(),
+                    }
+                    for k, name in enumerate(Matching._fields)
+                }
+                for d, detector in enumerate(DETECTORS)
+            },
+        }
+        for source, own in figures.items()
+    }
+    return {"pictures": [pair.scene.name for pair in pairs], "models": models}
+
+
+def table(found: Mapping[str, Any]) -> str:
+    """Format the report as text."""
+    columns = [(detector, name) for detector in DETECTORS for name in Matching._fields]
+    headings = "".join(f"{f'{d} {name}':>15}{'error':>8}" for d, name in columns)
+    lines = [f"{len(found['pictures'])} pictures", "", f"{'noise':22}{'luma rms':>8}{headings}"]
+    for source, own in found["models"].items():
+        cells = ""
+        for detector, name in columns:
+            figure = own[detector][name]
+            error = "" if source == REAL else f"{figure['error']:.3f}"
+            cells += f"{figure['mean']:15.3f}{error:>8}"
+        lines.append(f"{source:22}{own['luma_rms']:8.2f}{cells}")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Compare the noise models, and print the table."""
+    formatter = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=formatter)
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    text = "a configuration to compare; may be repeated"
+    parser.add_argument("--config", action="append", help=text)
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    if not importlib.util.find_spec("cv2"):
+        parser.error("OpenCV is missing; .venv/bin/pip install -e '.[compare]'")
+    found = report(options.folder, options.config or CONFIGS)
+    print(json.dumps(found, indent=2) if options.json else table(found))
+
+
+if __name__ == "__main__":
+    main()
