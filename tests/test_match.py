@@ -445,6 +445,7 @@ def test_every_number_of_the_development_is_searched():
     assert space.strength is not None
     methods = {choice.text for choice in space.choices["demosaic"]}
     assert {"demosaic bilinear", "demosaic menon2007"} <= methods
+    assert "demosaic gray" not in methods  # which is for sensors of one channel
     assert not any("file" in choice.text for choice in space.choices["tone_curve"])
     chain = make_chain(space.choices["chroma"][-1].over(Settings()))
     assert [s.method.method for s in chain.steps if "matrix" in s.name] == ["none", "as_shot"]

@@ -171,6 +171,7 @@ def space_for(settings: Settings, iso_is_given: bool) -> Space:
             for m in stage.methods
             if usable(m)
         ]
+        own = [choice for choice in own if fits(choice, settings)]
         without = [Choice(f"no {name}")] if added else []
         choices[name] = (*without, *own)
     low, high = settings.isos().low, settings.isos().high
@@ -207,6 +208,15 @@ def usable(method: type[Method]) -> bool:
     return not any(extra["file"] for extra in fields)
 
 
+def fits(choice: Choice, settings: Settings) -> bool:
+    """Return whether settings allow a choice; a method may be for other sensors, for example."""
+    try:
+        make_chain(choice.over(settings))
+    except ClpipeError:
+        return False
+    return True
+
+
 def variants_of(settings: Settings, step: str) -> Iterator[Choice]:
     """Yield a step's method with one structural parameter a step up or down, or another choice.
 
@@ -228,8 +238,5 @@ def variants_of(settings: Settings, step: str) -> Iterator[Choice]:
             values = [float(f"{own * factor:.3g}") for factor in (0.5, 0.7, 1.4, 2.0)]
         for value in values:
             choice = Choice(f"{step}.{name} {value}", {step: {**table, name: value}})
-            try:
-                make_chain(choice.over(settings))
-            except ClpipeError:
-                continue
-            yield choice
+            if fits(choice, settings):
+                yield choice
