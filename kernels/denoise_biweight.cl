@@ -21,9 +21,9 @@ INLINE rgb luma_chroma_to_light(ycbcr c, site at, float offset, float luma_range
 
 // Luma from adjacent pixels, chroma from eight on a ring: `chroma_scale` away along both axes, or
 // one more along one axis. Demosaicing has made their noise independent of the centre's. `grain` is
-// the share of luma that does not change. Pixels at the same distance share one weight of luma,
-// which is applied last.
-INLINE ycbcr biweight(site at, image planes, float grain, int chroma_scale) {
+// the share of luma that does not change, and `guide` the weight of luma in the distance of colours.
+// Pixels at the same distance share one weight of luma, which is applied last.
+INLINE ycbcr biweight(site at, image planes, float grain, float guide, int chroma_scale) {
 #pragma OPENCL FP_CONTRACT ON
     const ycbcr centre = tap_ycbcr(planes, 0, 0);
     vf sums[3] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};  // of weighted differences, by squared distance
@@ -41,8 +41,9 @@ INLINE ycbcr biweight(site at, image planes, float grain, int chroma_scale) {
             weights[distance] += weight;
             const int reach = distance == 2 ? chroma_scale : chroma_scale + 1;
             const ycbcr c = tap_ycbcr(planes, dx * reach, dy * reach);
-            const vf db = centre.cb - c.cb, dr = centre.cr - c.cr;
-            const vf alike = vmax((vf)(1.0f) - db * db - dr * dr, (vf)(0.0f)), share = alike * alike;
+            const vf dl = centre.y - c.y, db = centre.cb - c.cb, dr = centre.cr - c.cr;
+            const vf alike = vmax((vf)(1.0f) - guide * (dl * dl) - db * db - dr * dr, (vf)(0.0f));
+            const vf share = alike * alike;
             blue += share * db;
             red += share * dr;
             chroma_weight += share;
