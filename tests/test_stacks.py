@@ -104,8 +104,8 @@ def test_patches_of_one_image_and_of_others_go_together(on, launches):
 def test_the_check_of_a_device_tries_them(on, launches):
     result = check_stack(on)
     assert result.passed and result.difference.differing == 0 and result.cases == 7
-    # Two images are too small to run in bands.
-    assert {size[2:] for size in launches} == ({(5,), (2,), (1,)} if on.info.cpu else {(7,), (1,)})
+    # Only one image is large enough to run in bands.
+    assert {size[2:] for size in launches} == ({(6,), (1,)} if on.info.cpu else {(7,), (1,)})
 
 
 @pytest.mark.parametrize("sizes", [[(1, 7), (1, 40), (1, 1)], [(9, 1), (2, 1), (30, 1)]])

@@ -15,8 +15,8 @@ It takes its parameters from clpipe's own chain. These functions replace the sta
   neighbours in luma and 12 in each chroma; ``biweight`` has 8 in each. cv2.bilateralFilter on three
   channels would cost twice as much.
 - sharpen: an unsharp mask with the same sigma, amount and limit.
-- tone_curve: tables of the largest colour, with cv2.LUT. gamma and quantization to eight bits:
-  another table.
+- tone_curve: a table of the contraharmonic mean of the colours, with cv2.LUT. gamma and
+  quantization to eight bits: another table.
 
 It does less than clpipe:
 
@@ -96,11 +96,9 @@ class OpenCVChain:
         self.limit = np.float32(sharpen.limit / root_of_top)
         light = np.clip((np.arange(CODES) / TOP * root_of_top) ** 2 - offset, 0, 1)
         self.light, style = np.float32(light), of["tone_curve"]
-        # As functions of the largest colour: the factor and the offset of all colours.
-        to_high = style.curve(self.light)
-        self.part = style.colourfulness(self.light) * to_high / np.maximum(self.light, 1e-9)
-        self.part = np.float32(self.part)
-        self.base = np.float32(to_high - self.light * self.part)
+        # The factor of all colours, by their contraharmonic mean.
+        mean = np.float32(np.maximum(np.arange(CODES), 1) / TOP)
+        self.factor = np.float32(style.curve(mean) / mean)
         self.display = to_8_bit(np.float32(srgb_curve(np.arange(CODES) / TOP)))
         self.to_colours = cv2.COLOR_YCrCb2BGR if bgr else cv2.COLOR_YCrCb2RGB
 
@@ -148,16 +146,15 @@ class OpenCVChain:
         self._sharpen(y)
         merged = cv2.merge([self._codes(plane) for plane in (y, cr, cb)])
         cv2.cvtColor(merged, self.to_colours, merged)
-        colours = cv2.split(merged)
-        high = cv2.max(cv2.max(colours[0], colours[1]), colours[2])
-        part, base = cv2.LUT(high, self.part), cv2.LUT(high, self.base)
-        styled = []
-        for codes in colours:
-            light = cv2.LUT(codes, self.light)
-            light *= part
-            light += base
-            styled.append(cv2.LUT(self._codes(light), self.display))
-        return cv2.merge(styled)
+        colours = [cv2.LUT(codes, self.light) for codes in cv2.split(merged)]
+        total = colours[0] + colours[1]
+        total += colours[2]
+        squares = colours[0] * colours[0]
+        cv2.accumulateSquare(colours[1], squares)
+        cv2.accumulateSquare(colours[2], squares)
+        factor = cv2.LUT(self._codes(cv2.divide(squares, total)), self.factor)
+        styled = (cv2.multiply(light, factor, light) for light in colours)
+        return cv2.merge([cv2.LUT(self._codes(light), self.display) for light in styled])
 
     def _sharpen(self, y: Floats) -> None:
         detail = cv2.GaussianBlur(y, (9, 9), self.radius)

@@ -114,6 +114,9 @@ class Biweight(Denoiser):
     luma_strength: float = parameter(
         0.5, "Strength on luma, relative to luma_noise; 0 disables it.", ge=0, le=100
     )
+    chroma_strength: float = parameter(
+        2.3, "Strength on chroma, relative to chroma_noise; 0 disables it.", ge=0, le=100
+    )
     grain: float | None = parameter(
         None,
         "Share of luma's noise that is kept.",

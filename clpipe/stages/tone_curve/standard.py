@@ -22,7 +22,7 @@ class Standard(Method):
 
     It expects a raw image with one stop of headroom, the default of ``exposure``. There, 18 % grey
     is 0.09, and it becomes 0.173. The curve is x (a x + b) / (x (c x + d) + 1). Its slopes at black
-    and white are set by ``toe`` and ``shoulder``, and its contrast at grey follows from them: 1.41
+    and white are set by ``toe`` and ``shoulder``, and its contrast at grey follows from them: 1.46
     stops per stop by default. Like in a camera, noise is weaker in shadows and highlights than in
     midtones. In roots of the light, where shot noise has the same size at all levels, the slope
     changes slowly, so the noise stays symmetric (docs/validation.md).
@@ -36,7 +36,7 @@ class Standard(Method):
     >>> from clpipe.stage import run_reference
     >>> greys = np.float32([0, 0.01, 0.09, 0.5, 1])[:, None, None].repeat(3, 2)
     >>> run_reference(Standard(), greys)[:, 0, 0].astype(float).round(3).tolist()
-    [0.0, 0.009, 0.173, 0.872, 1.0]
+    [0.0, 0.006, 0.173, 0.854, 1.0]
     """
 
     method: ClassVar = "standard"
@@ -46,14 +46,14 @@ class Standard(Method):
     example: ClassVar = {"toe": 1.0, "shoulder": 0.4, "saturation": 1.2}
 
     toe: float = parameter(
-        0.6,
+        0.78,
         "Darkening of shadows. 0 starts with the slope of the line from black to grey, and 1 "
         "starts flat.",
         ge=0,
         le=1,
     )
     shoulder: float = parameter(
-        0.8,
+        0.72,
         "Brightening of highlights before they level off. 0.05 ends with a slope of 0.45, and 1 "
         "ends flat.",
         ge=0.05,
