@@ -17,7 +17,8 @@ INLINE rgb inverse_standard(rgb v, site at, float a, float b, float c, float d, 
     // The form of the root that has no cancellation.
     const vi added = linear > 0.0f;
     const vf over = added ? 2.0f * t : root - linear, under = added ? linear + root : 2.0f * quadratic;
-    const vf h = over / vmax(under, (vf)(1e-12f));
+    // White stays white, although the roots are short iterations and the curve is nearly flat there.
+    const vf h = t > 0.9999f ? (vf)(1.0f) : over / vmax(under, (vf)(1e-12f));
     const vf factor = gain * (h / vmax(t, (vf)(1e-12f))), grey = lost * h;
     const rgb x = {vmax(y.r * factor + grey, (vf)(0.0f)), vmax(y.g * factor + grey, (vf)(0.0f)),
                    vmax(y.b * factor + grey, (vf)(0.0f))};

@@ -65,7 +65,8 @@ class Standard(standard.Standard):
         inner = middle * middle - np.float32(12) * lost * (lost - one) * squares
         below = middle + np.sqrt(np.maximum(inner, np.float32(0)))
         to_mean = clip_to_unit(two * squares / np.maximum(below, smallest))
-        mean = self.inverse(to_mean)
+        # White stays white, where the curve is nearly flat.
+        mean = np.where(to_mean > np.float32(0.9999), one, self.inverse(to_mean))
         factor = gain * (mean / np.maximum(to_mean, smallest))
         return np.maximum(inside * factor + lost * mean, np.float32(0))
 
