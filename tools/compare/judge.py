@@ -253,15 +253,20 @@ def table(found: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    """Compare the noise, and print the report."""
+def parser_of(description: str) -> argparse.ArgumentParser:
+    """Return the parser of a tool that compares configurations with a folder of pairs."""
     formatter = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=formatter)
+    parser = argparse.ArgumentParser(description=description, formatter_class=formatter)
     parser.add_argument("folder", type=Path, metavar="FOLDER")
     text = "a configuration to compare; may be repeated"
     parser.add_argument("--config", action="append", help=text)
     parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    """Compare the noise, and print the report."""
+    options = parser_of(__doc__ or "").parse_args()
     found = report(options.folder, options.config or CONFIGS)
     print(json.dumps(found, indent=2) if options.json else table(found))
 

@@ -21,7 +21,6 @@ picture. The figures are:
 It needs the extra "compare" (.venv/bin/pip install -e '.[compare]').
 """
 
-import argparse
 import importlib.util
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +34,14 @@ from clpipe.analysis.matching.scenes import Scene
 from clpipe.analysis.matching.simulation import Simulator
 from clpipe.base.types import Array, Doubles
 from clpipe.engine.device import open_device
-from tools.compare.judge import CONFIGS, iid, intensity_dependent, read_pairs, simulated_by
+from tools.compare.judge import (
+    CONFIGS,
+    iid,
+    intensity_dependent,
+    parser_of,
+    read_pairs,
+    simulated_by,
+)
 
 RADIUS = 2.0  # px
 REAL = "real"
@@ -154,12 +160,7 @@ def table(found: Mapping[str, Any]) -> str:
 
 def main() -> None:
     """Compare the noise models, and print the table."""
-    formatter = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=formatter)
-    parser.add_argument("folder", type=Path, metavar="FOLDER")
-    text = "a configuration to compare; may be repeated"
-    parser.add_argument("--config", action="append", help=text)
-    parser.add_argument("--json", action="store_true")
+    parser = parser_of(__doc__ or "")
     options = parser.parse_args()
     if not importlib.util.find_spec("cv2"):
         parser.error("OpenCV is missing; .venv/bin/pip install -e '.[compare]'")
