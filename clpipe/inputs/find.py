@@ -39,6 +39,23 @@ FINISHED = (
 
 
 @dataclass(frozen=True)
+class Place:
+    """The place of a frame in a sequence; see :mod:`clpipe.inputs.sequences`.
+
+    Args:
+        key: the name of the sequence among the inputs. Its random draws depend on it.
+        sequence: its path in the output directory, without extension.
+        index: the place of the frame in temporal order, from 0. Missing frames are counted.
+        count: the number of places.
+    """
+
+    key: str
+    sequence: str
+    index: int
+    count: int
+
+
+@dataclass(frozen=True)
 class Job:
     """One image to process.
 
@@ -56,6 +73,7 @@ class Job:
         size: the width and height in px that the image must have; None allows any.
         problem: why it cannot be processed, if that is known before it is read.
         is_panorama: whether its files are views of a panorama and not sub-frames.
+        place: its place in a sequence; None if it is a single image.
     """
 
     path: Path
@@ -71,6 +89,7 @@ class Job:
     size: tuple[int, int] | None = None
     problem: str = ""
     is_panorama: bool = False
+    place: Place | None = None
 
     def check(self) -> None:
         """Raise the known problem of this job, if there is one.
