@@ -1,0 +1,382 @@
+"""Video files through PyAV: H.264, H.265 and lossless FFV1, in MP4 and Matroska.
+
+Samples are sRGB, with the primaries of BT.709. Files state the curve as IEC 61966-2-1, which
+players with colour management show like a JPEG. Other players ignore the curve and send the samples
+to an sRGB display, which is also right. With the curve of BT.709, some players brighten the
+shadows.
+
+The same frames give the same bytes: the number of threads is fixed, and files have no times and no
+random numbers. Another version of an encoder may give other bytes.
+"""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+import numpy as np
+
+from clpipe.base.about import __version__
+from clpipe.base.cpu_time import CpuTimer
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.extras import require
+from clpipe.base.files import atomic_file
+from clpipe.base.types import Array
+from clpipe.images.pixels import DEFAULT_MAX_PIXELS, check_size
+from clpipe.images.ycbcr import BT709, WEIGHTS, decode, encode_420
+
+if TYPE_CHECKING:
+    import av
+
+Codec = Literal["h264", "h265", "ffv1"]
+
+VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov", ".webm", ".avi")  # files that are read as videos
+CONTAINERS = {".mp4": "mp4", ".mkv": "matroska"}  # files that are written, with FFmpeg's names
+
+DEFAULT_CRF = 18  # noise looks like in the frames
+THREADS = 4  # of an encoder; their number changes the bytes of H.264
+
+# Codes of ITU-T H.273 (2024), tables 2 to 4.
+BT709_PRIMARIES, SRGB_CURVE, RGB_MATRIX = 1, 13, 0
+LIMITED, FULL = 1, 2  # FFmpeg's numbers of ranges
+
+# The encoder and pixel format of each codec and depth.
+ENCODERS: dict[tuple[str, int], tuple[str, str]] = {
+    ("h264", 8): ("libx264", "yuv420p"),
+    ("h264", 10): ("libx264", "yuv420p10le"),
+    ("h265", 8): ("libx265", "yuv420p"),
+    ("h265", 10): ("libx265", "yuv420p10le"),
+    ("ffv1", 8): ("ffv1", "bgr0"),
+    ("ffv1", 10): ("ffv1", "gbrp10le"),
+}
+
+
+@dataclass(frozen=True)
+class VideoOptions:
+    """How a video is encoded.
+
+    Args:
+        codec: h264, h265, or ffv1, which is lossless.
+        bits: bits per sample, 8 or 10.
+        crf: the constant rate factor, 0 to 51. Smaller is better. None is :data:`DEFAULT_CRF`.
+        bit_rate: the mean bit rate in bits per second, instead of ``crf``.
+        rate: frames per second.
+
+    Raises:
+        RequestError: the values do not fit together.
+
+    >>> VideoOptions("ffv1", crf=20)
+    Traceback (most recent call last):
+    clpipe.base.errors.RequestError: found crf 20, but ffv1 is lossless; remove crf and bit_rate
+    """
+
+    codec: Codec = "h264"
+    bits: int = 8
+    crf: int | None = None
+    bit_rate: int | None = None
+    rate: Fraction = Fraction(24)
+
+    def __post_init__(self) -> None:
+        if (self.codec, self.bits) not in ENCODERS:
+            allowed = ", ".join(f"{codec} with {bits} bits" for codec, bits in ENCODERS)
+            raise RequestError(f"found {self.codec} with {self.bits} bits; expected {allowed}")
+        if self.rate <= 0:
+            raise RequestError(f"found a frame rate of {self.rate}; expected one above 0")
+        if self.crf is not None and self.bit_rate is not None:
+            raise RequestError(
+                f"found crf {self.crf} and bit_rate {self.bit_rate}; remove one of them"
+            )
+        for name in ("crf", "bit_rate"):
+            value = getattr(self, name)
+            if self.is_lossless and value is not None:
+                raise RequestError(
+                    f"found {name} {value}, but ffv1 is lossless; remove crf and bit_rate"
+                )
+
+    @property
+    def is_lossless(self) -> bool:
+        """Whether decoded frames equal the encoded ones, up to rounding to ``bits``."""
+        return self.codec == "ffv1"
+
+    def check_suffix(self, suffix: str) -> None:
+        """Check that files with an extension, such as ".mp4", may contain the codec.
+
+        Raises:
+            RequestError: they may not.
+        """
+        allowed = (".mkv",) if self.is_lossless else tuple(CONTAINERS)
+        if suffix not in allowed:
+            raise RequestError(
+                f"found a {suffix} file for {self.codec}; expected {' or '.join(allowed)}"
+            )
+
+    def check_size(self, width: int, height: int) -> None:
+        """Check that the codec can store frames of a size in px.
+
+        Raises:
+            ImageError: the width or height is odd, but chroma has half the resolution.
+        """
+        if not self.is_lossless and (width % 2 or height % 2):
+            raise ImageError(
+                f"the picture has {width}x{height} px, but {self.codec} needs an even width and "
+                "height; resize it, or use the codec ffv1"
+            )
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """What a video file states. Codes of colours are those of ITU-T H.273.
+
+    Args:
+        codec: FFmpeg's name of the codec, such as "hevc" for H.265.
+        tag: the container's code of the codec, such as "hvc1".
+        width, height: size in px.
+        pixels: FFmpeg's name of the pixel format.
+        bits: bits per sample.
+        rate: frames per second.
+        frames: the number of frames.
+        primaries, curve, matrix: codes of colours; 2 is unknown.
+        is_full: whether samples have full range.
+    """
+
+    codec: str
+    tag: str
+    width: int
+    height: int
+    pixels: str
+    bits: int
+    rate: Fraction
+    frames: int
+    primaries: int
+    curve: int
+    matrix: int
+    is_full: bool
+
+
+class VideoWriter:
+    """Writes a video. The file appears when the context ends without an error.
+
+    >>> import tempfile
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> path = Path(folder.name, "clip.mkv")
+    >>> with VideoWriter(path, VideoOptions("ffv1")) as video:
+    ...     for level in (10, 20):
+    ...         video.add(np.full((24, 32, 3), level, np.uint8))
+    >>> [int(frame[0, 0, 0]) for frame in read_video(path)]
+    [10, 20]
+    >>> folder.cleanup()
+
+    Args:
+        path: the file, .mp4 or .mkv.
+        options: how it is encoded.
+
+    Raises:
+        RequestError: the container does not fit the codec, or PyAV is missing.
+        ImageError: on leaving the context, the file cannot be written, or there are no frames.
+    """
+
+    def __init__(self, path: Path, options: VideoOptions) -> None:
+        options.check_suffix(path.suffix)
+        require("a video", "av")
+        self.path = path
+        self.options = options
+        self.count = 0
+        self._size = (0, 0)
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        import av
+
+        with ExitStack() as stack:
+            stack.enter_context(_errors(self.path, "written"))
+            file = stack.enter_context(atomic_file(self.path))
+            self._container = stack.enter_context(
+                av.open(file, "w", CONTAINERS[self.path.suffix], {"fflags": "+bitexact"})
+            )
+            self._container.metadata["comment"] = f"clpipe {__version__}"
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        with self._stack:
+            if error[1]:
+                raise error[1]  # the file is then removed
+            if not self.count:
+                raise ImageError(f"{self.path}: there are no frames for this video")
+            self._container.mux(self._stream.encode(None))
+
+    @CpuTimer("encode")
+    def add(self, frame: Array) -> None:
+        """Add the next frame.
+
+        Args:
+            frame: (height, width, 3) sRGB, uint8 for 8 bits, or uint16 in full range for 10 bits.
+
+        Raises:
+            ImageError: its size differs from that of the first frame, or is odd; or the file
+                cannot be written.
+        """
+        options = self.options
+        assert frame.dtype == (np.uint8 if options.bits == 8 else np.uint16)
+        height, width = frame.shape[:2]
+        if not self.count:
+            options.check_size(width, height)
+            self._size = (width, height)
+            self._stream = self._new_stream(width, height)
+        elif (width, height) != self._size:
+            first = "x".join(map(str, self._size))
+            raise ImageError(
+                f"{self.path}: frame {self.count} has {width}x{height} px, but the frames before "
+                f"it have {first} px; frames of one video have one size"
+            )
+        encoded = self._frame(frame)
+        encoded.pts = self.count
+        encoded.time_base = 1 / options.rate
+        self._container.mux(self._stream.encode(encoded))
+        self.count += 1
+
+    def _new_stream(self, width: int, height: int) -> "av.VideoStream":
+        """Return a new stream for frames of a size in px."""
+        options = self.options
+        name, pixels = ENCODERS[options.codec, options.bits]
+        stream = self._container.add_stream(name, rate=options.rate)
+        stream.width, stream.height, stream.pix_fmt = width, height, pixels
+        stream.time_base = 1 / options.rate
+        context = stream.codec_context
+        context.thread_count = THREADS
+        context.color_primaries, context.color_trc = BT709_PRIMARIES, SRGB_CURVE
+        context.colorspace = RGB_MATRIX if options.is_lossless else BT709
+        context.color_range = FULL if options.is_lossless else LIMITED
+        if options.is_lossless:
+            context.options = {"level": "3", "slices": "4", "slicecrc": "1"}
+            context.gop_size = 1
+            return stream
+        if options.bit_rate is not None:
+            stream.bit_rate = options.bit_rate
+        else:
+            context.options = {"crf": str(DEFAULT_CRF if options.crf is None else options.crf)}
+        if options.codec == "h265":
+            # FFmpeg's thread count does not fix the threads of x265.
+            x265 = f"log-level=error:pools={THREADS}:frame-threads=2"
+            context.options = {**context.options, "x265-params": x265}
+            if self.path.suffix == ".mp4":
+                context.codec_tag = "hvc1"  # required by Apple's players
+        return stream
+
+    def _frame(self, frame: Array) -> "av.VideoFrame":
+        """Return PyAV's frame of an array, in the pixel format of the stream."""
+        import av
+
+        bits = self.options.bits
+        height, width = frame.shape[:2]
+        if self.options.is_lossless:
+            if bits == 8:
+                return av.VideoFrame.from_ndarray(frame, "rgb24").reformat(format="bgr0")
+            levels = np.rint(frame * np.float32(1023 / 65535)).astype(np.uint16)
+            return av.VideoFrame.from_ndarray(levels, "gbrp10le")
+        planes = encode_420(frame, bits)
+        encoded = av.VideoFrame(width, height, ENCODERS[self.options.codec, bits][1])
+        for plane, samples in zip(encoded.planes, planes, strict=True):
+            line = np.zeros((plane.height, plane.line_size // samples.itemsize), samples.dtype)
+            line[:, : plane.width] = samples
+            plane.update(line)
+        return encoded
+
+
+def video_info(path: Path) -> VideoInfo:
+    """Return what a video file states.
+
+    Raises:
+        RequestError: PyAV is missing.
+        ImageError: the file cannot be read, or contains no video.
+    """
+    with _opened(path) as (container, stream):
+        context = stream.codec_context
+        pixels = context.format
+        assert pixels
+        return VideoInfo(
+            codec=context.name,
+            tag=context.codec_tag.strip("\0"),
+            width=context.width,
+            height=context.height,
+            pixels=pixels.name,
+            bits=pixels.components[0].bits,
+            rate=stream.average_rate or Fraction(0),
+            frames=stream.frames or sum(packet.size > 0 for packet in container.demux(stream)),
+            primaries=context.color_primaries,
+            curve=context.color_trc,
+            matrix=context.colorspace,
+            is_full=context.color_range == FULL,
+        )
+
+
+def read_video(path: Path) -> Iterator[Array]:
+    """Yield the frames of a video as RGB. Only one of them is in memory at a time.
+
+    Chroma is interpolated linearly. The file's matrix and range are used. A file without a matrix
+    has BT.709 if its height is at least 720 px, else BT.601.
+
+    Returns:
+        Frames, (height, width, 3) uint8 for 8 bits, else uint16; full range.
+
+    Raises:
+        RequestError: PyAV is missing.
+        ImageError: the file cannot be read, or contains no video.
+    """
+    with _opened(path) as (container, stream):
+        stream.thread_type = "AUTO"
+        for frame in container.decode(stream):
+            yield _rgb(frame)
+
+
+def _rgb(frame: "av.VideoFrame") -> Array:
+    """Return a decoded frame as RGB, see :func:`read_video`."""
+    bits = frame.format.components[0].bits
+    if frame.format.is_rgb:
+        if bits == 8:
+            return frame.to_ndarray(format="rgb24")
+        if frame.format.name.startswith("gbrp"):
+            levels = frame.to_ndarray()
+            return np.rint(levels * np.float32(65535 / (2**bits - 1))).astype(np.uint16)
+        return frame.to_ndarray(format="rgb48le")
+    is_full = frame.color_range == FULL or frame.format.name.startswith("yuvj")
+    matrix = frame.colorspace
+    if matrix not in WEIGHTS:
+        matrix = BT709 if frame.height >= 720 else 6
+    if frame.format.name not in ("yuv420p", "yuvj420p", "yuv420p10le"):
+        # A conversion without another matrix and range copies luma, and interpolates chroma.
+        bits = 8 if bits == 8 else 10
+        frame = frame.reformat(format="yuv444p" if bits == 8 else "yuv444p10le")
+    dtype = np.uint8 if bits == 8 else np.uint16
+    planes = [
+        np.frombuffer(plane, dtype).reshape(plane.height, -1)[:, : plane.width]
+        for plane in frame.planes
+    ]
+    return decode(planes, bits, matrix, is_full)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+    """Open a video file for reading, and yield its container and first video stream."""
+    require(f"{path}: reading a video", "av")
+    import av
+
+    with _errors(path, "read"), av.open(path) as container:
+        if not container.streams.video:
+            raise ImageError(f"{path}: this file contains no video")
+        stream = container.streams.video[0]
+        check_size(path, stream.width, stream.height, DEFAULT_MAX_PIXELS)
+        yield container, stream
+
+
+@contextmanager
+def _errors(path: Path, done: str) -> Iterator[None]:
+    """Convert FFmpeg's errors to an ImageError about a file."""
+    from av.error import FFmpegError
+
+    try:
+        yield
+    except FFmpegError as error:
+        raise ImageError(f"{path}: this video cannot be {done}: {error.strerror}") from None
