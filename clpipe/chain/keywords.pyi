@@ -392,6 +392,14 @@ class RenderCamera(TypedDict, total=False):
     translation: Several
     motion: Several
 
+class Control(TypedDict, total=False):
+    delay: Whole
+    smoothing: Number
+    speed: Number
+    hysteresis: Number
+    iso_max: Number
+    iso_min: Number
+
 class Keywords(TypedDict, total=False):
     camera: Text
     iso: Number
@@ -446,3 +454,4 @@ class Keywords(TypedDict, total=False):
     restore_highlights: RestoreHighlights
     output: Encoding
     render: RenderCamera
+    control: Control
