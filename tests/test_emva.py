@@ -14,7 +14,7 @@ from clpipe.analysis.emva.sensor import before_rounding, full_well, noisiest_lig
 from clpipe.analysis.emva.series import Exposure, Series, read_series, series_text
 from clpipe.analysis.emva.simulation import saturation_of
 from clpipe.camera.profile import load_camera, parse_camera
-from clpipe.images.write import write_grey_png
+from clpipe.images.write import write_png
 
 GAIN, EFFICIENCY, READ, DSNU, PRNU = 0.25, 0.6, 8.0, 3.0, 0.01  # DN/e-, 1, e-, e-, 1
 BITS, BLACK, WIDTH, HEIGHT, STACK = 10, 40.0, 160, 128, 24
@@ -66,7 +66,7 @@ def write_series(folder, sensor, steps=25):
         frames = [folder / "images" / f"{name}_{i}.png" for i in range(count)]
         for frame in frames:
             frame.parent.mkdir(exist_ok=True)
-            write_grey_png(frame, sensor.frame(photons))
+            write_png(frame, sensor.frame(photons))
         return Exposure(time, photons, tuple(frames))
 
     numbers = range(1, steps + 4)
@@ -208,9 +208,9 @@ def test_frames_that_do_not_fit_are_named(series, clpipe):
         assert f"{frame}: no such file" in error()
         frame.write_bytes(b"text")
         assert str(frame) in error()
-        write_grey_png(frame, np.zeros((HEIGHT, 20), np.uint16))
+        write_png(frame, np.zeros((HEIGHT, 20), np.uint16))
         assert f"{frame}: found 20x128 pixels, but {series.path} states 160x128" in error()
-        write_grey_png(frame, np.full((HEIGHT, WIDTH), 1024, np.uint16))
+        write_png(frame, np.full((HEIGHT, WIDTH), 1024, np.uint16))
         assert f"found 1024 DN, but {series.path} states 10 bits, so at most 1023" in error()
     finally:
         frame.write_bytes(whole)
@@ -225,7 +225,7 @@ def test_a_series_without_saturation_or_noise_in_the_dark_is_refused(series, clp
     dark = series.dark_stack.frames[0]
     frame = f"i {dark}"
     black = tmp_path / "black.png"
-    write_grey_png(black, np.zeros((HEIGHT, WIDTH), np.uint16))
+    write_png(black, np.zeros((HEIGHT, WIDTH), np.uint16))
     Path("a.txt").write_text(text.replace(frame, f"i {black}"))
     error = clpipe("calibrate", "--emva", "a.txt", "-o", "c.toml", status=2).stderr
     assert "4.2% of the samples without light are 0 DN" in error

@@ -12,7 +12,7 @@ import pytest
 from clpipe.base import system
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.processors import available_processors
-from clpipe.images.write import write_grey_png
+from clpipe.images.write import write_png
 from clpipe.inputs.find import Shard
 from clpipe.outputs import folder as output_folders
 from clpipe.outputs.folder import LOCK, output_folder, write_problem
@@ -187,10 +187,10 @@ def test_a_full_disk_is_noticed_without_posix_fallocate(tmp_path, monkeypatch):
 @pytest.mark.usefixtures("_full_disk")
 def test_a_full_disk_is_noticed_before_an_encoder_meets_it(tmp_path, monkeypatch):
     pixels = np.zeros((8, 8), np.uint8)
-    write_grey_png(tmp_path / "a.png", pixels)
+    write_png(tmp_path / "a.png", pixels)
     monkeypatch.delattr(os, "memfd_create")
     with pytest.raises(ImageError, match=r"b\.png: cannot be written: No space left on device"):
-        write_grey_png(tmp_path / "b.png", pixels)
+        write_png(tmp_path / "b.png", pixels)
     assert os.listdir(tmp_path) == ["a.png"]
 
 

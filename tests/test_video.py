@@ -142,7 +142,7 @@ def test_a_file_appears_when_it_is_complete(tmp_path):
 def test_a_full_disk(tmp_path, monkeypatch):
     from clpipe.base import files
 
-    monkeypatch.setattr(files, "_create_temporary", lambda _: Path("/dev/full").open("wb"))
+    monkeypatch.setattr(files, "_create_temporary", lambda _: Path("/dev/full").open("wb"))  # noqa: SIM115
     with pytest.raises(ImageError, match=r"a\.mp4: .*No space left on device"):
         write(tmp_path / "a.mp4", [patches(8)])
 

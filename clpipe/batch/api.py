@@ -11,12 +11,14 @@ from clpipe.base.text import as_texts
 from clpipe.base.types import plain
 from clpipe.base.urls import path_of
 from clpipe.base.validation import check_argument_types
+from clpipe.batch.clips import parse_bit_rate, parse_rate, take_clip_options
 from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.session import Images, Run
 from clpipe.chain.formats import format_named
 from clpipe.chain.options import DEFAULT_PATCHES, OPTIONS, Moments, RedoName, Transfer, check_option
 from clpipe.chain.rendition import parse_bracket
 from clpipe.chain.request import Request
+from clpipe.images.video import Codec
 from clpipe.inputs.find import parse_shard
 from clpipe.inputs.series import split_series
 from clpipe.outputs.existing import Redo
@@ -27,6 +29,8 @@ CONVERTERS: dict[str, Callable[[Any], Any]] = {
     "output": lambda output: path_of(str(output)),
     "format": lambda names: tuple(map(format_named, names)),
     "bracket": parse_bracket,
+    "bit_rate": lambda rate: parse_bit_rate(str(rate)),
+    "fps": lambda rate: parse_rate(str(rate)),
     "poses": Path,
     "redo": Redo,
     "shard": parse_shard,
@@ -56,6 +60,12 @@ def run(
     truth: Texts | None = None,
     truth_at: Moments | None = None,
     sequence: bool | None = None,
+    codec: Codec | None = None,
+    bit_depth: int | None = None,
+    crf: int | None = None,
+    bit_rate: float | str | None = None,
+    fps: float | str | None = None,
+    decoded: bool | None = None,
     frames: int | None = None,
     bracket: Sequence[float] | None = None,
     patch: int | Patches | None = None,
@@ -98,7 +108,8 @@ def run(
 
     Args:
         inputs: files, directories, globs, URLs and manifests (.csv, .jsonl).
-        output: the output directory. It is created if it does not exist.
+        output: the output directory. It is created if it does not exist. NAME.mp4 or NAME.mkv
+            writes the frames of one sequence as a clip.
         config: a built-in configuration or a TOML file. The built-in ones are brooks2019,
             canon-5d2-jpeg, canon-5d3-jpeg, default, nikon-d800-jpeg, paper, syb3r, training,
             unprocess. If you name several, each overrides those before it, and one with stages
@@ -112,9 +123,10 @@ def run(
         until: the last stage to run.
         stage_files: a Python file that defines further stages.
         format: the format of the pictures, or dng for the raw that quantize makes. npy holds
-            float16, and DN as uint16; it also makes the images of ``keep`` .npy. The choices are
-            "jpg", "png", "png16", "tif", "tif16", "tif32", "exr", "exr16", "npy", "dng". None is
-            jpg; exr, or npy for patches, if ``until`` ends the chain earlier.
+            float16, and DN as uint16. It also makes the images of ``keep`` .npy. mp4 and mkv write
+            each sequence as a clip. The choices are "jpg", "png", "png16", "tif", "tif16", "tif32",
+            "exr", "exr16", "npy", "dng", "mp4", "mkv". None is jpg; exr, or npy for patches, if
+            ``until`` ends the chain earlier.
         keep: a stage whose image is also written, or all. It is a float EXR.
         carry: a layer to warp with the picture. It has depth, normals, flow or object numbers, in
             the image's own file or in one next to it, and is written to OUT/NAME.carried.exr. KIND
@@ -135,6 +147,13 @@ def run(
             their names. A draw has one value for each sequence, unless it is a drift.
             exposure.method=auto and estimated white balance follow the frames with the loops of
             [control]. OUT/run.csv is a manifest with the settings of each frame.
+        codec: the codec of clips. ffv1 is lossless, and needs mkv. The choices are "h264", "h265",
+            "ffv1". None is h264.
+        bit_depth: the bits per sample of clips, 8 or 10. None is 8.
+        crf: the constant rate factor of clips. Smaller is better, and 51 is worst. None is 18.
+        bit_rate: the mean bit rate of clips in bits per second, such as 8M, instead of ``crf``.
+        fps: the frames per second of clips, such as 30000/1001. None is 24.
+        decoded: also decode each clip, and write its frames to OUT/SEQUENCE.decoded/NAME.png.
         frames: the number of frames of a burst. Each frame has its own noise, and the burst its
             ground truth.
         bracket: the exposures of a bracket, in EV relative to the exposure that is set. Each
@@ -222,10 +241,11 @@ def run_of(
         raise RequestError(
             f"--{ignored[0].replace('_', '-')}: this option needs patches; add --patch SIZE"
         )
+    clips = take_clip_options(set_options)
     dask = set_options.pop("dask", None)
     set_options = {FIELD_NAMES.get(name, name): value for name, value in set_options.items()}
     execution = ExecutionOptions(**_fields_of(ExecutionOptions, set_options))
-    images = Images(**_fields_of(Images, set_options), series=series)
+    images = Images(**_fields_of(Images, set_options), series=series, clips=clips)
     return Run(
         Request.from_options(values=values, **set_options), images, execution, dask, arguments, echo
     )

@@ -14,9 +14,17 @@ from pathlib import Path
 
 from clpipe.base.about import full_version
 from clpipe.base.errors import OutputError, RequestError
-from clpipe.base.files import check_folder, discard
+from clpipe.base.files import discard
 from clpipe.base.processors import available_processors
 from clpipe.base.urls import upload, url_of
+from clpipe.batch.checks import (
+    check_clip_chain,
+    check_output,
+    check_processes,
+    check_render_options,
+)
+from clpipe.batch.clip_sink import Clips
+from clpipe.batch.clips import ClipOptions
 from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.processes import Processes, default_processes
@@ -32,7 +40,6 @@ from clpipe.batch.work import ImageWorker
 from clpipe.chain.isos import draw_note
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_devices
-from clpipe.images.read import PICTURE_SUFFIXES
 from clpipe.inputs.find import Job, Shard, find_jobs
 from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
@@ -43,7 +50,6 @@ from clpipe.inputs.series import Series
 from clpipe.outputs.existing import pictures_without_input
 from clpipe.outputs.folder import output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
-from clpipe.stage import Kind
 
 log = logging.getLogger(__name__)
 
@@ -60,6 +66,7 @@ class Images:
         shard: the part of the images to make.
         per_tar: the number of images per tar. None writes no tars.
         sequence: whether the images are frames of sequences.
+        clips: the clips that the frames of sequences go into. None writes no clips.
         known_jobs: jobs that are known already, instead of inputs.
     """
 
@@ -70,12 +77,13 @@ class Images:
     shard: Shard = field(default_factory=Shard)
     per_tar: int | None = None
     sequence: bool = False
+    clips: ClipOptions | None = None
     known_jobs: Sequence[Job] = ()
 
     @property
     def is_whole(self) -> bool:
         """Whether the output directory will hold all pictures, as files, when the run ends."""
-        return bool(self.inputs) and not self.per_tar and self.shard.of == 1
+        return bool(self.inputs) and not self.per_tar and not self.clips and self.shard.of == 1
 
     def jobs(self, loader: ImageLoader, output: Path) -> tuple[list[Job], list[Tar]]:
         """Return the jobs of this part of the run, and the tars that they go into.
@@ -157,7 +165,7 @@ class Run:
         # here.
         threading.Thread(target=full_version, daemon=True).start()
         check_output(execution.output, images.per_tar)
-        check_processes(execution, dask, images.per_tar)
+        check_processes(execution, dask, bool(images.per_tar), bool(images.clips))
         self.execution = execution
         self.notes: list[str] = []
         self.images = images
@@ -181,6 +189,9 @@ class Run:
         self._request = request.with_outputs(self._chain)
         self.writer = OutputWriter(execution.output, self._request)
         self.writer.check(self._chain, self.jobs)
+        if images.clips:
+            check_clip_chain(self._chain)
+            self.sink()  # raises an error if two clips would have one name
         if execution.trace:
             check_trace(execution.trace)
         if self._tars and dask is not None:
@@ -230,7 +241,8 @@ class Run:
                 for folder in folders:
                     check_camera_files(folder)
             trace = stack.enter_context(Trace(execution.trace)) if execution.trace else None
-            remove_unfinished(execution.output, self.jobs, self._request.patch is not None)
+            if not images.clips:
+                remove_unfinished(execution.output, self.jobs, self._request.patch is not None)
             if url := url_of(execution.output):
                 stack.callback(discard, execution.output)
                 stack.callback(self._send_log, url)
@@ -313,12 +325,14 @@ class Run:
             )
 
     def sink(self) -> Folder:
-        """Return the sink of the pictures: the output directory, tars in it, or tars at a URL.
+        """Return the sink of the pictures: the output directory, clips or tars in it, or a URL.
 
         Raises:
-            RequestError: clpipe did not write the tars at the URL.
+            RequestError: clpipe did not write the tars at the URL, or two clips have one name.
         """
         execution = self.execution
+        if self.images.clips:
+            return Clips(self.writer, execution.redo, self.jobs, self.images.clips)
         if not self._tars:
             return Folder(self.writer, execution.redo)
         kind = RemoteTars if url_of(execution.output) else Tars
@@ -356,50 +370,3 @@ class Run:
         ]
         worker = ImageWorker(self._loader, sink, self._chain, execution.trace is not None)
         return nullcontext(Batch(worker, devices, execution.threads))
-
-
-def check_processes(execution: ExecutionOptions, dask: str | None, per_tar: int | None) -> None:
-    """Check that the number of processes fits the way the run is done.
-
-    Raises:
-        RequestError: a cluster does the work, or tars are packed.
-    """
-    if execution.processes is None or execution.processes == 1:
-        return
-    if dask is not None:
-        raise RequestError("--processes: with --dask the cluster's workers are the processes")
-    if per_tar:
-        raise RequestError(
-            "--processes: a tar is packed by one process; run several, each with a --shard"
-        )
-
-
-def check_output(folder: Path, per_tar: int | None = None) -> None:
-    """Check that the output is a directory, not a picture, and that a URL gets tars.
-
-    Raises:
-        RequestError: it is not.
-    """
-    if (url := url_of(folder)) and not per_tar:
-        raise RequestError(
-            f"--output: found {url}; only tars are written to a URL, so add --webdataset N"
-        )
-    if folder.suffix.lower() in (*PICTURE_SUFFIXES, ".dng") and not folder.is_dir():
-        raise RequestError(
-            f"--output: found {folder}, the name of a picture; name the folder to write to: "
-            "-o FOLDER"
-        )
-    check_folder(folder)
-
-
-def check_render_options(request: Request, source: Kind) -> None:
-    """Check that options for renders are only set for renders.
-
-    Raises:
-        RequestError: one is set for another kind of image.
-    """
-    for option, value in (("--layer", request.layer), ("--transfer", request.transfer)):
-        if value is not None and source is not Kind.RGB:
-            raise RequestError(
-                f"{option}: this option is only for renders, but the chain reads {source.label}"
-            )

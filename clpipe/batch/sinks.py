@@ -2,9 +2,10 @@
 
 There are three executors: :class:`clpipe.batch.threads.Batch` (threads of this process),
 :class:`clpipe.batch.processes.Processes` (processes of this machine) and
-:class:`clpipe.batch.dask_client.Cluster` (workers of a Dask scheduler). There are three sinks: the
-output directory (:class:`Folder`), tars in it (:class:`clpipe.batch.tar_sink.Tars`), and tars at a
-URL (:class:`clpipe.batch.remote_tars.RemoteTars`).
+:class:`clpipe.batch.dask_client.Cluster` (workers of a Dask scheduler). There are four sinks: the
+output directory (:class:`Folder`), clips (:class:`clpipe.batch.clip_sink.Clips`) or tars in it
+(:class:`clpipe.batch.tar_sink.Tars`), and tars at a URL
+(:class:`clpipe.batch.remote_tars.RemoteTars`).
 """
 
 from collections.abc import Generator, Iterable, Mapping

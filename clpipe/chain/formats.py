@@ -29,6 +29,8 @@ DNG = "dng"  # contains the raw instead of the picture
 
 ALL_FORMATS = (*FORMATS, DNG)
 
+CLIP_FORMATS = ("mp4", "mkv")  # contain the pictures of a sequence; only clpipe run writes them
+
 # Aliases of formats.
 ALIASES = {"jpeg": "jpg", "tiff": "tif", "tiff16": "tif16", "tiff32": "tif32"}
 
@@ -40,7 +42,7 @@ def format_named(text: str) -> str:
     ('jpg', 'tif16', 'webp')
     """
     name = text.lower().removeprefix(".")
-    return ALIASES.get(name, name if name in ALL_FORMATS else text)
+    return ALIASES.get(name, name if name in (*ALL_FORMATS, *CLIP_FORMATS) else text)
 
 
 def extension_of(format_: str) -> str:

@@ -10,11 +10,12 @@ from typing import Any, Literal, get_args
 from clpipe.base.errors import RequestError
 from clpipe.base.text import unknown_name
 from clpipe.chain.files import built_in_configs
-from clpipe.chain.formats import ALL_FORMATS
+from clpipe.chain.formats import ALL_FORMATS, CLIP_FORMATS
 from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.keys import CODE, KEYS, Key
 from clpipe.chain.rendition import BASELINES, CLEAN, TRUTHS
 from clpipe.images.pixels import DEFAULT_MAX_PIXELS, MAX_PIXELS
+from clpipe.images.video import DEFAULT_CRF, Codec
 from clpipe.reference.carried import RESAMPLING
 
 Moments = Literal["start", "middle", "end", "all"]
@@ -41,9 +42,24 @@ TRUTH = Key(
     choices=TRUTHS,
 )
 
+FORMAT = Key(
+    "format",
+    list,
+    "The format of the pictures, or dng for the raw that quantize makes. npy holds float16, and DN "
+    "as uint16. It also makes the images of --keep .npy.",
+    default_text="jpg; exr, or npy for patches, if --until ends the chain earlier",
+    choices=ALL_FORMATS,
+)
+
 _ALL = (
     Key("inputs", list, "Files, directories, globs, URLs and manifests (.csv, .jsonl).", "INPUT"),
-    Key("output", Path, "The output directory. It is created if it does not exist.", "OUT"),
+    Key(
+        "output",
+        Path,
+        "The output directory. It is created if it does not exist. NAME.mp4 or NAME.mkv writes the "
+        "frames of one sequence as a clip.",
+        "OUT",
+    ),
     Key(
         "config",
         list,
@@ -71,13 +87,9 @@ _ALL = (
     ),
     Key("until", str, "The last stage to run.", "STAGE"),
     KEYS[CODE],
-    Key(
-        "format",
-        list,
-        "The format of the pictures, or dng for the raw that quantize makes. npy holds float16, "
-        "and DN as uint16; it also makes the images of --keep .npy.",
-        default_text="jpg; exr, or npy for patches, if --until ends the chain earlier",
-        choices=ALL_FORMATS,
+    FORMAT._replace(
+        text=f"{FORMAT.text} mp4 and mkv write each sequence as a clip.",
+        choices=(*ALL_FORMATS, *CLIP_FORMATS),
     ),
     Key(
         "keep", list, "A stage whose image is also written, or all. It is a float EXR.", "STAGE|all"
@@ -118,6 +130,35 @@ _ALL = (
         "names. A draw has one value for each sequence, unless it is a drift. exposure.method=auto "
         "and estimated white balance follow the frames with the loops of [control]. OUT/run.csv is "
         "a manifest with the settings of each frame.",
+    ),
+    Key(
+        "codec",
+        str,
+        "The codec of clips. ffv1 is lossless, and needs mkv.",
+        default_text="h264",
+        choices=get_args(Codec),
+    ),
+    Key("bit_depth", int, "The bits per sample of clips, 8 or 10.", "BITS", "8", above=7, most=10),
+    Key(
+        "crf",
+        int,
+        "The constant rate factor of clips. Smaller is better, and 51 is worst.",
+        "N",
+        f"{DEFAULT_CRF}",
+        above=-1,
+        most=51,
+    ),
+    Key(
+        "bit_rate",
+        str,
+        "The mean bit rate of clips in bits per second, such as 8M, instead of --crf.",
+        "RATE",
+    ),
+    Key("fps", str, "The frames per second of clips, such as 30000/1001.", "RATE", "24"),
+    Key(
+        "decoded",
+        bool,
+        "Also decode each clip, and write its frames to OUT/SEQUENCE.decoded/NAME.png.",
     ),
     Key(
         "frames",

@@ -45,7 +45,6 @@ def patch_count(text: str) -> int | str:
 FLAGS = {"config": ("-c", "--config"), CODE: ("--stage-file",)}
 TYPES: dict[str, Any] = {
     "stages": lambda text: [name.strip() for name in text.split(",") if name.strip()],
-    "format": FormatName(OPTIONS["format"].choices),
     "patches_per_image": patch_count,
     "memory": parse_size,
     "poses": EXISTING,
@@ -63,7 +62,8 @@ def option(key: Key, parameter: str = "", **others: Any) -> Callable[[F], F]:
     """
     type_: Any = {int: int, float: float}.get(key.type_)
     if key.choices:
-        type_ = click.Choice(key.choices, case_sensitive=False)
+        choice = FormatName if key.name == "format" else click.Choice
+        type_ = choice(key.choices, case_sensitive=False)
     elif key.type_ is int and key.above > -math.inf:
         type_ = click.IntRange(int(key.above) + 1, None if key.most == math.inf else int(key.most))
     multiple = key.type_ is list and key.name != "stages"

@@ -16,7 +16,7 @@ from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.run_log import Summary
 from clpipe.batch.session import Images, Run
 from clpipe.chain.keys import CODE
-from clpipe.chain.options import OPTIONS, TRUTH
+from clpipe.chain.options import FORMAT, TRUTH
 from clpipe.chain.panorama import projection_of
 from clpipe.chain.registry import stage_in
 from clpipe.chain.request import Request
@@ -122,7 +122,7 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
 @options("config", "camera", "iso", *SETTINGS, "start_at", "until", CODE, "carry", "poses")
 @set_option
 @option(TRUTH, default=(TRUTH.default_text,))
-@option(OPTIONS["format"], "formats")
+@option(FORMAT, "formats")
 @click.option(
     "--licence",
     metavar="TEXT",

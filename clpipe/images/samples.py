@@ -97,8 +97,13 @@ def read_part(
     return pixels if len(channels) > 1 else np.ascontiguousarray(pixels[..., 0])
 
 
-def read_whole_numbers(path: Path, max_pixels: int = DEFAULT_MAX_PIXELS) -> Array:
-    """Return the first channel of a picture as it is stored: (height, width), uint8 or uint16.
+def read_whole_numbers(
+    path: Path, max_pixels: int = DEFAULT_MAX_PIXELS, colours: bool = False
+) -> Array:
+    """Return the samples of a picture as they are stored, uint8 or uint16.
+
+    They are its first channel, (height, width), or with ``colours`` its first three channels,
+    (height, width, 3).
 
     Raises:
         ImageError: the file cannot be read, holds other samples, or is too large.
@@ -111,7 +116,8 @@ def read_whole_numbers(path: Path, max_pixels: int = DEFAULT_MAX_PIXELS) -> Arra
                 "bits are expected. Convert it to an 8- or 16-bit PNG or TIFF"
             )
         check_size(path, spec.width, spec.height, max_pixels)
-        return read_samples(path, file, 0, (0,), spec.format.basetype)[..., 0]
+        samples = read_samples(path, file, 0, range(3 if colours else 1), spec.format.basetype)
+        return samples if colours else samples[..., 0]
 
 
 def photograph_info(path: Path) -> tuple[float | None, int]:

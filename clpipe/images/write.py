@@ -150,16 +150,18 @@ def write_planes(path: Path, planes: Mapping[str, Array], attributes: Mapping[st
     return _stored(path, sum(plane.nbytes for plane in planes.values()), encode)
 
 
-def write_grey_png(path: Path, pixels: Array) -> Stored:
-    """Write integers of 8 or 16 bits, (height, width), as PNG.
+def write_png(path: Path, pixels: Array) -> Stored:
+    """Write integers of 8 or 16 bits, (height, width[, 3]), as PNG without EXIF.
 
     Raises:
         ImageError: the file cannot be written.
     """
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 1, pixels.dtype.name)
+    samples = pixels if pixels.ndim == 3 else pixels[..., np.newaxis]
+    height, width, channels = samples.shape
+    spec = oiio.ImageSpec(width, height, channels, samples.dtype.name)
     spec.attribute("png:compressionLevel", Encoding().png_compression)
     spec.attribute("Software", f"clpipe {__version__}")
-    return _write(path, spec, pixels[..., np.newaxis])
+    return _write(path, spec, samples)
 
 
 def _write(path: Path, spec: Any, pixels: Array) -> Stored:

@@ -11,7 +11,7 @@ from clpipe.base.errors import ImageError
 from clpipe.base.files import write_new
 from clpipe.base.types import Array, Doubles
 from clpipe.images.openimageio import read_grey
-from clpipe.images.write import write_grey_png
+from clpipe.images.write import write_png
 from clpipe.inputs.annotations import AnnotatedRender, Annotations, Record
 from clpipe.inputs.bop import BOXES, CAMERAS, COUNTS, DIGITS, INFOS, MASKS, POSES, Bop, BopObject
 from clpipe.inputs.coco import Coco
@@ -205,7 +205,7 @@ class BopWriter:
                 for kind, mask in each.masks.items():
                     name = f"{image:0{DIGITS}d}_{index:0{DIGITS}d}.png"
                     (folder / kind).mkdir(parents=True, exist_ok=True)
-                    write_grey_png(folder / kind / name, np.where(mask, 255, 0).astype(np.uint8))
+                    write_png(folder / kind / name, np.where(mask, 255, 0).astype(np.uint8))
         for name, values in written.items():
             write_new(folder / name, json_text(values).encode())
         kinds = dict.fromkeys(

@@ -11,7 +11,7 @@ from clpipe.base.files import Stored
 from clpipe.base.types import Array
 from clpipe.chain.carry import VALID
 from clpipe.images.attributes import PREFIX
-from clpipe.images.write import write_grey_png, write_planes
+from clpipe.images.write import write_planes, write_png
 from clpipe.inputs.carry import CarriedLayers
 from clpipe.inputs.companions import CARRIED
 from clpipe.outputs.sidecar import output_entries
@@ -36,7 +36,7 @@ def write_carried(path: Path, carried: CarriedLayers, layer: str = "") -> Stored
         pixels = carried.arrays()[layer][..., 0]
         kind = next(each.kind for each in carried.layers if each.name == layer)
         is_label = kind == "label"
-        return write_grey_png(
+        return write_png(
             path, to_label_samples(path, pixels) if is_label else to_millimetres(pixels)
         )
     planes = {

@@ -17,7 +17,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
-from clpipe.images.write import write_grey_png
+from clpipe.images.write import write_png
 
 FIRST, LAST = "crosstalk", "quantize"  # the stages between the clean mosaic and the raw
 BEYOND = 0.1  # number of exposures above saturation, relative to the number below it
@@ -93,7 +93,7 @@ def simulate(
         for frame in exposure.frames:
             key = noise_key(settings, image_key(frame.relative_to(folder).as_posix(), ""))
             create_parents(frame)
-            write_grey_png(frame, runner.run(light, key).image.astype(samples))
+            write_png(frame, runner.run(light, key).image.astype(samples))
             done += 1
             watch(done, total)
     comment = f"A series of the camera {sensor.name} at ISO {settings.iso:g}, made by clpipe emva."

@@ -1,0 +1,254 @@
+"""Clips: video files of sequences, their records, and resuming."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import clpipe as api
+from clpipe.base.errors import RequestError
+from clpipe.batch import clip_sink
+from clpipe.batch.clips import parse_bit_rate, parse_rate
+from clpipe.images.video import read_video, video_info
+from tests.conftest import statuses, written
+
+pytest.importorskip("av", reason="needs PyAV: pip install av")
+
+RUN = ("-o", "out", "--format", "mkv", "--codec", "ffv1", "--iso", 3200, "--device", "numpy")
+OUT = Path("out")
+
+
+@pytest.fixture
+def frames(write_exr, clpipe):
+    """Small renders of sequences that differ in each frame."""
+
+    def write(*folders, numbers=range(5), size=(16, 24)):
+        rng = np.random.default_rng(0)
+        for folder in folders or ["in/cam0"]:
+            for n in numbers:
+                write_exr(f"{folder}/f{n}.exr", rng.random((*size, 3)).astype(np.float32))
+        return "in"
+
+    return write
+
+
+def records(path):
+    return [json.loads(line) for line in Path(path).read_text().splitlines()]
+
+
+def stamps():
+    return {name: (OUT / name).stat().st_mtime_ns for name in written(OUT) if "run." not in name}
+
+
+def test_a_clip_contains_the_pictures_in_temporal_order(clpipe, frames):
+    frames("in/cam0", numbers=[8, 9, 10])
+    clpipe("run", "in", *RUN, "--truth", "clean")
+    clpipe(
+        "run", "in", "-o", "plain", "--sequence", "--format", "png", *RUN[6:], "--truth", "clean"
+    )
+    names = ["cam0.jsonl", "cam0.mkv", "cam0.truth_clean.jsonl", "cam0.truth_clean.mkv", "run.csv"]
+    assert written(OUT) == names
+    for suffix in ("", ".truth_clean"):
+        found = list(read_video(OUT / f"cam0{suffix}.mkv"))
+        assert len(found) == 3
+        for n, frame in zip((8, 9, 10), found, strict=True):
+            assert np.array_equal(frame, Image.open(f"plain/cam0/f{n}{suffix}.png"))
+
+
+def test_records_contain_the_sidecar_of_each_frame(clpipe, frames):
+    clpipe("run", frames(numbers=[1, 2, 4]), *RUN, "--fps", "30000/1001")
+    clpipe("run", "in", "-o", "plain", "--sequence", "--format", "png", *RUN[6:])
+    found = records("out/cam0.jsonl")
+    assert [record["index"] for record in found] == [0, 1, 3]  # frame 3 is missing
+    for n, record in zip((1, 2, 4), found, strict=True):
+        sidecar = json.loads(Path(f"plain/cam0/f{n}.json").read_text())
+        del sidecar["sidecar_sha256"]
+        assert {name: record[name] for name in sidecar} == sidecar
+        assert record["clip"]["encoding"]["rate"] == "30000/1001"
+    assert video_info(OUT / "cam0.mkv").frames == 3
+
+
+def test_a_named_clip_is_one_sequence(clpipe, frames):
+    frames("in")
+    clpipe("run", "in", "-o", "clip.mp4", *RUN[6:], "--bit-depth", 10, "--codec", "h265")
+    assert written(Path()) == [
+        "clip.jsonl",
+        "clip.mp4",
+        *(f"in/f{n}.exr" for n in range(5)),
+        "run.csv",
+    ]
+    found = video_info(Path("clip.mp4"))
+    assert (found.codec, found.bits, found.frames) == ("hevc", 10, 5)
+    frames("both/a", "both/b")
+    result = clpipe("run", "both", "-o", "b.mp4", status=2)
+    assert "found b.mp4 for 2 sequences (a, b); use -o OUT --format mp4" in result.output
+
+
+def test_finished_clips_are_skipped(clpipe, frames):
+    clpipe("run", frames("in/a", "in/b"), *RUN)
+    before = stamps()
+    clpipe("run", "in", *RUN)
+    assert stamps() == before
+    assert set(statuses(OUT).values()) == {"skipped"}
+
+
+@pytest.mark.parametrize("change", [("--seed", 1), ("--fps", 25)])
+def test_a_changed_request_makes_clips_again(clpipe, frames, change):
+    clpipe("run", frames(), *RUN)
+    before = (OUT / "cam0.mkv").read_bytes()
+    clpipe("run", "in", *RUN, *change)
+    assert (OUT / "cam0.mkv").read_bytes() != before
+    assert set(statuses(OUT).values()) == {"done"}
+
+
+def test_one_changed_frame_makes_its_clip_again(clpipe, frames, write_exr):
+    clpipe("run", frames("in/a", "in/b"), *RUN)
+    before = stamps()
+    write_exr("in/b/f3.exr", np.full((16, 24, 3), 0.2, np.float32))
+    clpipe("run", "in", *RUN)
+    changed = {name for name, stamp in stamps().items() if stamp != before[name]}
+    assert changed == {"b.mkv", "b.jsonl"}
+    assert list(statuses(OUT).values()).count("skipped") == 5
+    assert len(list(read_video(OUT / "b.mkv"))) == 5
+
+
+def test_a_damaged_clip_is_made_again(clpipe, frames):
+    clpipe("run", frames(), *RUN)
+    whole = (OUT / "cam0.mkv").read_bytes()
+    (OUT / "cam0.mkv").write_bytes(whole[:-9])
+    clpipe("run", "in", *RUN)
+    assert (OUT / "cam0.mkv").read_bytes() == whole
+
+
+def test_a_failed_frame_fails_its_sequence_only(clpipe, frames, caplog):
+    frames("in/a", "in/b")
+    broken = Path("in/a/f2.exr")
+    whole = broken.read_bytes()
+    broken.write_bytes(whole[:200])
+    clpipe("run", "in", *RUN, status=1)
+    assert not (OUT / "a.mkv").exists()
+    assert len(list(read_video(OUT / "b.mkv"))) == 5
+    assert "out/a.mkv: no clip is written, because the frame in/a/f2.exr failed" in caplog.text
+    # The same command resumes with this frame.
+    broken.write_bytes(whole)
+    clpipe("run", "in", *RUN)
+    assert [name for name, status in statuses(OUT).items() if status == "done"] == ["a/f2.exr"]
+    assert len(list(read_video(OUT / "a.mkv"))) == 5
+    assert not [path for path in OUT.iterdir() if path.name.startswith(".clpipe")]
+
+
+def test_a_run_that_was_killed_before_encoding_resumes(clpipe, frames, monkeypatch):
+    clpipe("run", frames(), *RUN)
+    whole = (OUT / "cam0.mkv").read_bytes()
+    shutil.rmtree(OUT)
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    run = api.run("in", "out", format="mkv", codec="ffv1", iso=3200, device="numpy")
+    with monkeypatch.context() as patch:
+        patch.setattr(clip_sink.Clips, "_encode", killed)
+        with pytest.raises(KeyboardInterrupt):
+            list(run)
+    (OUT / ".clpipe.cam0/cam0/f1.png").unlink()
+    clpipe("run", "in", *RUN)
+    made = [name for name, status in statuses(OUT).items() if status == "done"]
+    assert "cam0/f1.exr" in made
+    assert len(made) <= 2  # the last frame's outcome names the clip
+    assert (OUT / "cam0.mkv").read_bytes() == whole
+
+
+def test_frames_of_several_sizes_fail(clpipe, frames, write_exr):
+    frames("in/a", "in/b")
+    write_exr("in/a/f3.exr", np.full((16, 26, 3), 0.2, np.float32))
+    result = clpipe("run", "in", *RUN, status=1)
+    assert "frame 3 has 26x16 px, but the frames before it have 24x16 px" in result.output
+    assert [path.name for path in sorted(OUT.glob("*.mkv"))] == ["b.mkv"]
+
+
+def test_an_odd_size_fails_before_frames_are_made(clpipe, frames):
+    result = clpipe("run", frames(size=(16, 25)), "-o", "out", "--format", "mp4", status=1)
+    assert "25x16 px, but h264 needs an even width and height" in result.output
+    assert not list(OUT.glob("*.mp4"))
+
+
+def test_decoded_frames_show_what_the_codec_did(clpipe, frames):
+    lossy = ("-o", "out", "--format", "mp4", "--crf", 40, *RUN[6:])
+    clpipe("run", frames(), *lossy)
+    before = stamps()
+    clpipe("run", "in", *lossy, "--decoded")
+    assert stamps().items() >= before.items()  # the clip is decoded, but not made again
+    for n, frame in enumerate(read_video(OUT / "cam0.mp4")):
+        assert np.array_equal(frame, Image.open(f"out/cam0.decoded/f{n}.png"))
+
+
+def test_new_clips_replace_decoded_frames(clpipe, frames):
+    options = ("-o", "out", "--format", "mp4", *RUN[6:])
+    clpipe("run", frames(), *options, "--crf", 40, "--decoded")
+    clpipe("run", "in", *options, "--crf", 10)
+    assert not list(OUT.glob("*.decoded/*"))
+
+
+def test_files_of_other_programs_are_not_overwritten(clpipe, frames):
+    frames()
+    OUT.mkdir()
+    for name in ("cam0.mkv", "cam0.jsonl"):
+        (OUT / name).write_text("mine")
+        result = clpipe("run", "in", *RUN, status=2)
+        assert f"{name}: clpipe did not write this file" in result.output
+        assert (OUT / name).read_text() == "mine"
+        (OUT / name).unlink()
+    (OUT / "cam0.mkv").write_text("mine")
+    clpipe("run", "in", *RUN, "--redo", "all")
+    assert len(list(read_video(OUT / "cam0.mkv"))) == 5
+
+
+def test_shards_are_whole_sequences(clpipe, frames):
+    frames("in/a", "in/b", "in/c")
+    clpipe("run", "in", *RUN)
+    whole = {path.name: path.read_bytes() for path in OUT.glob("*.mkv")}
+    shutil.rmtree(OUT)
+    for part in ("2/2", "1/2"):
+        clpipe("run", "in", *RUN, "--shard", part, "--jobs", 3)
+    assert {path.name: path.read_bytes() for path in OUT.glob("*.mkv")} == whole
+    assert len(whole) == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"format": ["mp4", "jpg"]}, "found mp4, jpg, but a run writes either clips"),
+        ({"format": "mp4", "keep": "all"}, "--keep: a clip contains only pictures"),
+        ({"format": "mp4", "patch": 8}, "--patch: a clip contains only pictures"),
+        ({"format": "mp4", "webdataset": 8}, "--webdataset: a clip contains only pictures"),
+        ({"format": "mp4", "truth": "mosaic"}, "--truth: found mosaic, but a clip contains only"),
+        ({"format": "mp4", "codec": "ffv1"}, r"found a \.mp4 file for ffv1; expected \.mkv"),
+        ({"format": "mp4", "until": "mosaic"}, "--until: the chain ends in mosaic, but a clip"),
+        ({"format": "mp4", "processes": 2}, "--processes: a clip is encoded by one process"),
+        ({"format": "mp4", "bit_depth": 9}, "found h264 with 9 bits; expected h264 with 8 bits"),
+        ({"format": "mp4", "crf": 60}, "found crf 60; expected"),
+        ({"fps": 25}, "--fps: this option needs a clip; use -o NAME.mp4, or --format mp4"),
+        ({"decoded": True}, "--decoded: this option needs a clip"),
+    ],
+)
+def test_options_that_contradict_each_other(frames, options, message):
+    with pytest.raises(RequestError, match=message):
+        api.run(frames(), "out", **options)
+
+
+def test_the_log_keeps_its_name(frames):
+    with pytest.raises(RequestError, match=r"run\.jsonl: the log of the run and the sequence run"):
+        api.run(frames("in/run"), "out", format="mp4")
+
+
+def test_rates():
+    assert parse_rate(str(23.976)) == pytest.approx(23.976, abs=1e-6)
+    assert parse_bit_rate(str(2.5e6)) == 2_500_000
+    for text in ("x", "0", "-1", "1/0", "inf"):
+        with pytest.raises(RequestError, match="--fps: found"):
+            parse_rate(text)
+        with pytest.raises(RequestError, match="--bit-rate: found"):
+            parse_bit_rate(text)
