@@ -116,6 +116,19 @@ def test_the_same_frames_give_the_same_bytes(tmp_path, codec, bits):
         assert first.read_bytes() == second.read_bytes()
 
 
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("codec", ["h264", "h265"])
+def test_short_videos(tmp_path, codec, count):
+    import av
+
+    frames = np.random.default_rng(0).integers(0, 255, (count, 48, 64, 3)).astype(np.uint8)
+    files = {write(tmp_path / "a.mp4", frames, codec).read_bytes() for _ in range(10)}
+    assert len(files) == 1  # x265 leaves decoding times undefined
+    with av.open(tmp_path / "a.mp4") as container:
+        times = [frame.time for frame in container.decode(video=0)]
+    assert times == pytest.approx([n / 24 for n in range(count)])
+
+
 def test_a_lower_bit_rate_gives_a_smaller_file(tmp_path):
     rng = np.random.default_rng(0)
     frames = rng.integers(0, 255, (12, 96, 96, 3)).astype(np.uint8)

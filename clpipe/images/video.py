@@ -36,6 +36,7 @@ VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov", ".webm", ".avi")  # files that are rea
 CONTAINERS = {".mp4": "mp4", ".mkv": "matroska"}  # files that are written, with FFmpeg's names
 
 DEFAULT_CRF = 18  # noise looks like in the frames
+REORDERED = 2  # the most frames that x265 waits for before it knows decoding times
 THREADS = 4  # of an encoder; their number changes the bytes of H.264
 
 # Codes of ITU-T H.273 (2024), tables 2 to 4.
@@ -205,7 +206,11 @@ class VideoWriter:
                 raise error[1]  # the file is then removed
             if not self.count:
                 raise ImageError(f"{self.path}: there are no frames for this video")
-            self._container.mux(self._stream.encode(None))
+            packets = self._stream.encode(None)
+            if self.count <= REORDERED:
+                for packet in packets:  # x265 leaves their decoding times undefined
+                    packet.dts = packet.pts
+            self._container.mux(packets)
 
     @CpuTimer("encode")
     def add(self, frame: Array) -> None:
