@@ -37,6 +37,7 @@ class Picture:
     balance: str = ""
     iso: float | None = None  # None if the file does not state it
     step: float = 0.0  # rounding step of a finished picture
+    is_coded: bool = False  # whether it is a frame of a video, from which a codec removes noise
 
     @property
     def what(self) -> str:

@@ -40,6 +40,9 @@ class NoiseReport:
     at_edges: float = math.nan
     finished: Mapping[str, float] = field(default_factory=dict)  # see clpipe.analysis.finished
     rounding: float = 0.0  # the variance that rounding in files adds to each channel
+    frames: int = 0  # the number of frames of a clip; 0 for images
+    # The correlation with frames 1, 2 and more later, by channel; only for clips.
+    temporal: Mapping[str, Doubles] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """Return the report as JSON values; unknown values are null."""
@@ -60,6 +63,10 @@ class NoiseReport:
             "finished": {name: json_number(value) for name, value in self.finished.items()},
             "covariance": {where: table.tolist() for where, table in self.covariances.items()},
             "correlation": {f"{a}-{b}": json_number(r) for (a, b), r in self.correlations.items()},
+            "frames": self.frames,
+            "temporal_correlation": {
+                name: list(map(json_number, values)) for name, values in self.temporal.items()
+            },
         }
 
 

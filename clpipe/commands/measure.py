@@ -15,10 +15,12 @@ from clpipe.analysis.report import UNITS, NoiseReport
 from clpipe.analysis.snr import MIN_SAMPLES, SnrStep, record_of, snr_curve
 from clpipe.analysis.spatial import LAGS, LineNoise
 from clpipe.analysis.statistics import SIGMAS, gaussian_beyond
+from clpipe.analysis.temporal import measure_clip
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
 from clpipe.commands.options import EXISTING, Command, json_option
 from clpipe.commands.printing import Rows, number, show, show_json
+from clpipe.images.video import VIDEO_SUFFIXES
 from clpipe.outputs.noise_areas import FLAT, HALVED, PICTURE
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.stage import Kind
@@ -61,6 +63,9 @@ def measure(
     the difference from --truth, or from the mean of two or more frames of one scene. Name several
     bursts (NAME.frame0.png and so on), or directories of bursts, to get one report per ISO.
 
+    IMAGE may also be one clip of a static scene (MP4, MKV and others). Its report has the
+    correlation of noise with that of later frames.
+
     \b
     clpipe run render.exr -o noisy --iso 3200 --until quantize
     clpipe run render.exr -o clean --iso 3200 --until quantize --skip noise
@@ -70,6 +75,7 @@ def measure(
         raise RequestError(f"--plot: found {plot}; expected a name that ends in .png")
     if plot is not None:
         require("--plot", "matplotlib")
+    clip = clip_in(images, alone=truth is None and not snr)
     bursts = bursts_in(images)
     if truth is not None and len(bursts) > 1:
         raise RequestError(
@@ -86,7 +92,9 @@ def measure(
         show_snr(snr_curve([load_picture(p, pattern) for p in bursts[0]], clean), as_json)
         return
     reports = pool_by_iso(
-        [measure_images([load_picture(p, pattern) for p in burst], clean) for burst in bursts]
+        [measure_clip(clip)]
+        if clip
+        else [measure_images([load_picture(p, pattern) for p in burst], clean) for burst in bursts]
     )
     if plot is not None and len(reports) > 1:
         raise RequestError(
@@ -105,6 +113,21 @@ def measure(
         for title, (headings, *rows) in measure_tables(report):
             click.echo(f"\n{title}")
             show(headings, rows, left=0 if headings[0] else 1)
+
+
+def clip_in(images: Sequence[Path], alone: bool) -> Path | None:
+    """Return the clip among images; None if there is none.
+
+    Raises:
+        RequestError: there are other images, or other options that do not apply to clips.
+    """
+    clip = next((path for path in images if path.suffix.lower() in VIDEO_SUFFIXES), None)
+    if clip and (len(images) > 1 or not alone):
+        raise RequestError(
+            f"{clip}: a clip is measured against the mean of its frames; name one clip, without "
+            "--truth and --snr"
+        )
+    return clip
 
 
 def show_snr(curve: Sequence[SnrStep], as_json: bool) -> None:
@@ -145,9 +168,9 @@ def measure_heading(report: NoiseReport) -> str:
     of = f" in {report.bursts} bursts" if report.bursts > 1 else ""
     at = f", ISO {report.iso:g}" if report.iso else ""
     unit_text = "samples" if report.kind in ("mosaic", "values") else "pixels (flat, not clipped)"
+    count = report.frames or len(report.images)
     lines = [
-        f"{len(report.images)} x {report.kind}{of}, {report.width}x{report.height}{at}, "
-        f"against {against}; "
+        f"{count} x {report.kind}{of}, {report.width}x{report.height}{at}, against {against}; "
         f"unit: {UNITS[report.kind]}",
         f"{report.share:.1%} of the {unit_text} are used; sigma (all) uses every one",
         *edges_text(report),
@@ -213,6 +236,7 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
     return [
         ("noise" + ("; variance = a * intensity + b" if laws else ""), noise_rows),
         ("autocorrelation (independent noise: 0; left after 2x2: 0.25)", correlation_rows),
+        *([(TEMPORAL, temporal_rows(report))] if report.temporal else []),
         *([("correlation between channels", channel_correlations)] if pairs else []),
         *([("covariance of the channels", covariance_rows(report))] if report.covariances else []),
         ("tails of standardised noise", tail_rows),
@@ -222,6 +246,7 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
 
 
 FINISHED = "finished picture, flat areas, by luma of 255"
+TEMPORAL = "correlation with later frames, flat areas (independent noise: 0)"
 AREA_NAMES = {FLAT: "flat areas", PICTURE: "all", HALVED: "all, after 2x2"}
 
 
@@ -233,4 +258,13 @@ def covariance_rows(report: NoiseReport) -> Rows:
     rows: Rows = [("", *(f"{names[i]}-{names[j]}" for i, j in places))]
     for where, table in report.covariances.items():
         rows.append((AREA_NAMES[where], *(number(float(table[at]), ".4g") for at in places)))
+    return rows
+
+
+def temporal_rows(report: NoiseReport) -> Rows:
+    """Return the correlations with later frames, one row for each channel."""
+    lags = len(next(iter(report.temporal.values())))
+    rows: Rows = [("frames later", *map(str, range(1, lags + 1)))]
+    for name, values in report.temporal.items():
+        rows.append((name, *(number(float(value), ".3f") for value in values)))
     return rows
