@@ -17,7 +17,7 @@ from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.stage import Kind
 
 MAX_FRAMES = 64
-MAX_PIXELS = 12_000_000  # of all frames together, which take 1 GB to measure
+MAX_PIXELS = 6_000_000  # of all frames together, which take 1 GB to measure
 LAGS = 3  # the most frames between correlated samples
 
 
