@@ -239,6 +239,12 @@ def test_options_that_contradict_each_other(frames, options, message):
         api.run(frames(), "out", **options)
 
 
+def test_a_missing_library_is_noticed_early(frames, monkeypatch):
+    monkeypatch.setattr("clpipe.base.extras.is_installed", lambda name: name != "av")
+    with pytest.raises(RequestError, match="a clip needs av. Run: pip install av"):
+        api.run(frames(), "clip.mp4")
+
+
 def test_the_log_keeps_its_name(frames):
     with pytest.raises(RequestError, match=r"run\.jsonl: the log of the run and the sequence run"):
         api.run(frames("in/run"), "out", format="mp4")

@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.base.errors import RequestError
+from clpipe.base.extras import require
 from clpipe.base.files import sha256_of, write_atomic
 from clpipe.base.reading import check_regular
 from clpipe.batch.outcome import FAILED, Outcome
@@ -111,7 +112,7 @@ def take_clip_options(options: dict[str, Any]) -> ClipOptions | None:
         The clips, or None if the run writes no clips.
 
     Raises:
-        RequestError: options contradict each other.
+        RequestError: options contradict each other, or PyAV is missing.
     """
     video = {to: options.pop(name) for name, to in VIDEO_FIELDS.items() if name in options}
     decoded = options.pop("decoded", False)
@@ -150,6 +151,7 @@ def take_clip_options(options: dict[str, Any]) -> ClipOptions | None:
         output.stem if is_file else "",
     )
     clips.video.check_suffix(clips.suffix)
+    require("a clip", "av")
     options["output"] = output.parent if is_file else output
     options["format"] = ("png" if clips.video.bits == 8 else "png16",)
     options["sequence"] = True
