@@ -55,6 +55,7 @@ def run(
     carry: Texts | None = None,
     truth: Texts | None = None,
     truth_at: Moments | None = None,
+    sequence: bool | None = None,
     frames: int | None = None,
     bracket: Sequence[float] | None = None,
     patch: int | Patches | None = None,
@@ -130,6 +131,10 @@ def run(
         truth_at: the moment of an exposure of several files whose pose and layers are written with
             the picture. all also writes the layers of its start and end. The choices are "start",
             "middle", "end", "all". None is middle.
+        sequence: process the frames of each directory as a sequence, in the order of the numbers in
+            their names. A draw has one value for each sequence, unless it is a drift.
+            exposure.method=auto and estimated white balance follow the frames with the loops of
+            [control]. OUT/run.csv is a manifest with the settings of each frame.
         frames: the number of frames of a burst. Each frame has its own noise, and the burst its
             ground truth.
         bracket: the exposures of a bracket, in EV relative to the exposure that is set. Each

@@ -36,7 +36,9 @@ from clpipe.images.read import PICTURE_SUFFIXES
 from clpipe.inputs.find import Job, Shard, find_jobs
 from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
+from clpipe.inputs.metering import metered_jobs, write_exposures
 from clpipe.inputs.poses import assign_views
+from clpipe.inputs.sequences import in_sequences, sequence_of
 from clpipe.inputs.series import Series
 from clpipe.outputs.existing import pictures_without_input
 from clpipe.outputs.folder import output_folder, remove_unfinished
@@ -57,7 +59,8 @@ class Images:
         series: several cameras and ISOs, whose pictures go to directories of their own.
         shard: the part of the images to make.
         per_tar: the number of images per tar. None writes no tars.
-        found: jobs that are known already, instead of inputs.
+        sequence: whether the images are frames of sequences.
+        known_jobs: jobs that are known already, instead of inputs.
     """
 
     inputs: Sequence[str] = ()
@@ -66,6 +69,7 @@ class Images:
     series: Series = field(default_factory=Series)
     shard: Shard = field(default_factory=Shard)
     per_tar: int | None = None
+    sequence: bool = False
     known_jobs: Sequence[Job] = ()
 
     @property
@@ -85,6 +89,16 @@ class Images:
             jobs = loader.exposures(known_jobs)
         jobs = assign_views(jobs, self.poses, loader.settings.render, loader.request.truth_at)
         jobs = self.series.jobs(jobs, loader.settings)
+        if self.sequence:
+            if self.per_tar and self.shard.of > 1:
+                raise RequestError(
+                    "--shard: a tar may hold frames of two sequences, so --sequence with "
+                    "--webdataset has no shards; remove one of the three options"
+                )
+            jobs = in_sequences(jobs)
+            names = self.shard.select(list(dict.fromkeys(map(sequence_of, jobs))))
+            if not self.per_tar:
+                return [job for job in jobs if sequence_of(job) in names], []
         if self.per_tar:
             tars = self.shard.select(split_into_tars(jobs, self.per_tar, output))
             return [job for tar in tars for job in tar.jobs], tars
@@ -195,6 +209,9 @@ class Run:
         if not self.jobs:
             return
         images, execution = self.images, self.execution
+        frames: list[Job] = []
+        if images.sequence:
+            jobs = self._metered(jobs, frames)
         start = {"arguments": list(self._arguments), "images": len(self.jobs)}
         with ExitStack() as stack:
             sink = self.sink()
@@ -223,6 +240,21 @@ class Run:
             self.summary.began = time.perf_counter()
             yield from self._log_outcomes(running, run_log, trace)
             self._finish_folders(folders)
+            if frames and not self.summary.interrupted:
+                name = Path(log_name(images.shard)).with_suffix(".csv")
+                write_exposures(execution.output / name, frames)
+
+    def _metered(self, jobs: Iterable[Job], frames: list[Job]) -> Iterator[Job]:
+        """Yield frames with the settings of their sequence, and append them to a list."""
+        execution = self.execution
+
+        def open_device() -> Device | None:
+            opened = open_devices(execution.devices[:1], execution.memory)
+            return opened[0] if opened else None
+
+        for job, _ in metered_jobs(self._loader, jobs, open_device):
+            frames.append(job)
+            yield job
 
     def _send_log(self, url: str) -> None:
         """Upload the log next to the tars, under a unique name."""

@@ -9,7 +9,7 @@ from typing import Any
 
 from clpipe.base.errors import KeyedError
 from clpipe.base.text import unknown_name
-from clpipe.chain.draws import Choice, Draw, Limits, parse_draw
+from clpipe.chain.draws import Choice, Draw, Drift, Limits, parse_draw
 from clpipe.chain.keys import KEYS
 from clpipe.reference.random import philox_rounds, stream_of
 
@@ -96,7 +96,11 @@ def draw_extremes(
 
 
 def draw_values(
-    draws: Mapping[str, Draw], constants: Mapping[str, Any], limits: LimitsOf, seed_text: str
+    draws: Mapping[str, Draw],
+    constants: Mapping[str, Any],
+    limits: LimitsOf,
+    seed_text: str,
+    frame: int = 0,
 ) -> dict[str, Any]:
     """Return a value for each draw, by name.
 
@@ -105,12 +109,18 @@ def draw_values(
         constants: as for :func:`draw_order`.
         limits: returns the limits of a value by its dotted name.
         seed_text: the text that seeds the draws, made of the seed and the image key.
+        frame: the place of the frame in its sequence.
 
     Raises:
         KeyedError: as for :func:`draw_extremes`.
     """
     values = dict(constants)
     numbers = uniform_numbers(seed_text, draws)
+    for key, draw in draws.items():
+        if isinstance(draw, Drift):
+            knots = draw.knots(frame)
+            uniforms = uniform_numbers(seed_text, [f"{key}@{knot}" for knot in knots])
+            numbers[key] = draw.between(frame, *uniforms.values())
     for key in draw_order(draws, constants):
         draw = draws[key]
         values[key] = draw.value(numbers[key], limits(key), values.get(draw.follows))

@@ -211,6 +211,50 @@ class Uniform(NumberDraw):
         return min(max(low * (1 - uniform) + high * uniform, low), high)
 
 
+class Drift(NumberDraw):
+    """A number that drifts slowly through the frames of a sequence, uniform in its range.
+
+    A standard Gaussian is drawn every ``frames`` frames. Between two of them, a frame has
+    ``cos(pi t / 2) z0 + sin(pi t / 2) z1``, which is a standard Gaussian as well, and its CDF is a
+    uniform number. Frames that are ``frames`` apart are therefore correlated by 0.32 on average,
+    and those twice as far apart are independent. A single image has the value of the first frame.
+
+    >>> drift = Drift(drift=(10, 20), frames=100)
+    >>> drift.knots(250), drift.between(250, 0.5, 0.5)
+    ((2, 3), 0.5)
+    """
+
+    drift: Ends
+    frames: Annotated[float, Field(ge=1)] = 100.0
+
+    @model_validator(mode="after")
+    def _check_order(self) -> "Drift":
+        _check_ascending(*self.drift)
+        return self
+
+    def knots(self, frame: int) -> tuple[int, int]:
+        """Return the numbers of the two draws that a frame is between."""
+        first = math.floor(frame / self.frames)
+        return first, first + 1
+
+    def between(self, frame: int, first: float, second: float) -> float:
+        """Return the uniform number of a frame from those of its two draws."""
+        angle = (frame / self.frames % 1) * math.pi / 2
+        normal = math.cos(angle) * _normal(first) + math.sin(angle) * _normal(second)
+        return NormalDist().cdf(normal)
+
+    def range_of(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
+        return self.drift
+
+    def truncated(self, limits: Limits) -> "Drift | None":
+        ends = limits.overlap(*self.drift)
+        return Drift(drift=ends, frames=self.frames) if ends else None
+
+    def number(self, uniform: float, limits: Limits, followed: Any) -> float:
+        low, high = self.drift
+        return min(max(low * (1 - uniform) + high * uniform, low), high)
+
+
 class LogUniform(NumberDraw):
     """A number whose logarithm is uniform: each octave of the range is as likely as the others.
 
@@ -348,6 +392,7 @@ class LogNormalOf(NumberDraw):
 DISTRIBUTIONS: dict[str, type[Draw]] = {
     "choice": Choice,
     "uniform": Uniform,
+    "drift": Drift,
     "log_uniform": LogUniform,
     "normal": Normal,
     "same_as": SameAs,

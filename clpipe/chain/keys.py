@@ -13,8 +13,9 @@ from clpipe.images.dump import TYPES
 
 CODE = "stage_files"  # the key that only a configuration file may have
 
-OUTPUT, RENDER = "output", "render"  # names of tables that do not belong to a stage
-TABLES = (OUTPUT, RENDER)
+# Names of tables that do not belong to a stage.
+OUTPUT, RENDER, CONTROL = "output", "render", "control"
+TABLES = (OUTPUT, RENDER, CONTROL)
 
 NOISE = "noise"  # an item of "skip": the noise of every stage
 

@@ -398,6 +398,14 @@ class RenderCamera(TypedDict, total=False):
     translation: Several
     motion: Several
 
+class Control(TypedDict, total=False):
+    delay: Whole
+    smoothing: Number
+    speed: Number
+    hysteresis: Number
+    iso_max: Number
+    iso_min: Number
+
 class Keywords(TypedDict, total=False):
     camera: Text
     iso: Number
@@ -453,3 +461,4 @@ class Keywords(TypedDict, total=False):
     temporal_denoise: TemporalDenoise
     output: Encoding
     render: RenderCamera
+    control: Control

@@ -11,7 +11,8 @@ from pydantic import BaseModel, ValidationError
 from clpipe.base.errors import KeyedError
 from clpipe.base.text import unknown_name
 from clpipe.base.validation import first_fault
-from clpipe.chain.keys import OUTPUT, RENDER
+from clpipe.camera.control import Control
+from clpipe.chain.keys import CONTROL, OUTPUT, RENDER
 from clpipe.chain.registry import all_stages
 from clpipe.chain.render_camera import RenderCamera
 from clpipe.images.encoding import Encoding
@@ -141,7 +142,11 @@ def method_named(stage: Stage, name: str, chosen: Any) -> type[Method]:
 
 
 # Models of the tables that do not belong to a stage.
-TABLE_MODELS: dict[str, type[BaseModel]] = {OUTPUT: Encoding, RENDER: RenderCamera}
+TABLE_MODELS: dict[str, type[BaseModel]] = {
+    OUTPUT: Encoding,
+    RENDER: RenderCamera,
+    CONTROL: Control,
+}
 
 
 @contextmanager

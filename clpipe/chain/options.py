@@ -112,6 +112,14 @@ _ALL = (
         choices=get_args(Moments),
     ),
     Key(
+        "sequence",
+        bool,
+        "Process the frames of each directory as a sequence, in the order of the numbers in their "
+        "names. A draw has one value for each sequence, unless it is a drift. exposure.method=auto "
+        "and estimated white balance follow the frames with the loops of [control]. OUT/run.csv is "
+        "a manifest with the settings of each frame.",
+    ),
+    Key(
         "frames",
         int,
         "The number of frames of a burst. Each frame has its own noise, and the burst its ground "

@@ -16,6 +16,7 @@ from pydantic import BaseModel
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import quote_alternatives, unknown_name
 from clpipe.base.tracing import with_changes
+from clpipe.camera.control import Control
 from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_name, load_camera
 from clpipe.chain.drawing import draw_extremes, draw_values, parse_drawn
 from clpipe.chain.draws import SMALLEST_FLOAT, Choice, Draw, Limits, field_limits
@@ -72,6 +73,7 @@ class Settings:
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     output: Encoding = field(default_factory=Encoding)
     render: RenderCamera = field(default_factory=RenderCamera)
+    control: Control = field(default_factory=Control)
     pushed: bool = False  # the ISO was drawn, and may be outside the camera's range
     draws: Mapping[str, Draw] = field(default_factory=dict)
     # By step: the validated table and the resulting model.
@@ -97,11 +99,13 @@ class Settings:
             (record.setdefault(table, {}) if table else record)[name] = draw.record()
         return record
 
-    def drawn(self, name: str) -> "Settings":
+    def drawn(self, name: str, frame: int = 0) -> "Settings":
         """Return the settings with a value for each draw; the same object if there are no draws.
 
         The values depend only on the seed and the image's name (see :mod:`clpipe.chain.draws`).
-        Frames of a burst share the name, and therefore the values, of their image.
+        Frames of a burst share the name, and therefore the values, of their image. For a frame of a
+        sequence, ``name`` is the name of the sequence, and ``frame`` its place, on which only
+        values that drift depend.
 
         Raises:
             RequestError: the values are not allowed together, or a camera cannot be loaded.
@@ -118,7 +122,7 @@ class Settings:
             draws["iso"] = draws["iso"].truncated(isos) or draws["iso"]
         limits = partial(self.limits, isos=isos)
         values: dict[str, Any] = {}
-        for key, value in draw_values(draws, self.constants(), limits, owner).items():
+        for key, value in draw_values(draws, self.constants(), limits, owner, frame).items():
             step, _, name = key.rpartition(".")
             if step:
                 values.setdefault(step, dict(self.parameters.get(step, {})))[name] = value

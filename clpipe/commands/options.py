@@ -30,7 +30,7 @@ GROUPS = {
     "Pictures": "+output +format +keep bracket +patch patches_per_image augment webdataset licence "
     "author",
     "Truth": "+truth +carry truth_at",
-    "Inputs": "+poses +annotations +exclude layer transfer dump max_pixels",
+    "Inputs": "+sequence +poses +annotations +exclude layer transfer dump max_pixels",
     "Batches": "+device +redo jobs processes memory shard dask quiet json_lines trace +help "
     "+help_all",
 }

@@ -36,10 +36,11 @@ def in_sequences(jobs: Sequence[Job]) -> list[Job]:
     """Return jobs with their places in sequences, one sequence after the other, in temporal order.
 
     Files of one directory are a sequence if their names differ in one number. If they differ in
-    several, the number with the most values counts the frames, and each value of the others is a
-    sequence, such as a camera of a rig. A sequence has the name of its directory, or of its files if
-    the directory has several. Gaps are logged. Missing frames keep their places, so that the time
-    between the other frames is right.
+    several, the number with the most values counts the frames. Each value of the others is then a
+    sequence, such as a camera of a rig. Names without numbers keep the order of the jobs.
+
+    A sequence has the name of its directory, or of its files if the directory has several. Gaps are
+    logged. Missing frames keep their places, so that the time between the other frames is right.
 
     >>> jobs = [Job(Path(name), name) for name in ("f.10.exr", "f.9.exr", "f.12.exr")]
     >>> [(job.key, job.place.index) for job in in_sequences(jobs)]
@@ -51,13 +52,15 @@ def in_sequences(jobs: Sequence[Job]) -> list[Job]:
     by_pattern: dict[str, list[Named]] = {}
     for job in jobs:
         pattern, numbers = split_numbers(job.key)
+        if not numbers:
+            pattern = str(PurePosixPath(pattern).with_name("frames"))
         by_pattern.setdefault(pattern, []).append((numbers, job))
     sequences: dict[str, list[tuple[int, Job]]] = {}
     for pattern, members in by_pattern.items():
         frame = _frame_column([numbers for numbers, _ in members])
-        for numbers, job in members:
+        for place, (numbers, job) in enumerate(members):
             name = _name(pattern, numbers, frame)
-            number = int(numbers[frame]) if numbers else 0
+            number = int(numbers[frame]) if numbers else place
             sequences.setdefault(name, []).append((number, job))
     folders = [PurePosixPath(name).parent for name in sequences]
     placed: list[Job] = []
@@ -79,7 +82,7 @@ def sequence_of(job: Job) -> str:
 def _frame_column(names: Sequence[Sequence[str]]) -> int:
     """Return which of the numbers of names counts frames.
 
-    It has the most values. Of several such, it has the most digits, or is the last one.
+    It has the most values. If several have, it has the most digits, or is the last one.
 
     >>> _frame_column([["0001", "0"], ["0001", "1"], ["0002", "0"], ["0002", "1"]])
     0

@@ -1,0 +1,103 @@
+"""Control loops of a camera: auto exposure, auto ISO and auto white balance over time."""
+
+import math
+from collections import deque
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+ISO_STEPS = 3  # steps of auto ISO for each factor of two
+
+Iso = Annotated[float, Field(gt=0, le=10**9, allow_inf_nan=False)]
+Ev = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
+
+
+class Control(BaseModel):
+    """How a camera's control loops follow what they meter: the ``[control]`` table.
+
+    The loops follow ``exposure.method=auto`` and an estimated white balance. Gains of white balance
+    are in stops as well, so all loops have the same parameters.
+
+    Attributes:
+        delay: the frames from metering to the frame that uses the result.
+        smoothing: the time constant in frames, after which 1/e of a change is left. 0 is none.
+        speed: the most that a loop changes, in EV per frame. 0 is no limit.
+        hysteresis: the smallest change of the metered value that a loop follows, in EV.
+        iso_max: the highest ISO of auto ISO; None is no auto ISO. Auto ISO multiplies the ISO that
+            is set by the exposure's gain, in thirds of a stop.
+        iso_min: the lowest ISO of auto ISO; None is the ISO that is set.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    delay: Annotated[int, Field(ge=0, le=1000)] = 2
+    smoothing: Ev = 4.0
+    speed: Ev = 0.5
+    hysteresis: Ev = 0.1
+    iso_max: Iso | None = None
+    iso_min: Iso | None = None
+
+
+class ControlLoop:
+    """Follows a metered value in EV. It starts with the first one, as if it had always been so.
+
+    A value is followed once it differs from the last one that was followed by more than the
+    hysteresis. The loop then approaches it exponentially, at its highest speed at most.
+
+    >>> loop = ControlLoop(Control(delay=1, smoothing=0.0, speed=0.5, hysteresis=0.0))
+    >>> [loop.next(metered) for metered in (0.0, 0.8, 0.8, 0.8, 0.8)]
+    [0.0, 0.0, 0.5, 0.8, 0.8]
+    """
+
+    def __init__(self, control: Control) -> None:
+        self._control = control
+        self._share = -math.expm1(-1 / control.smoothing) if control.smoothing else 1.0
+        self._metered: deque[float] = deque(maxlen=control.delay + 1)
+        self._target = self._value = math.nan
+
+    def next(self, metered: float) -> float:
+        """Return the value of the next frame, whose metered value is ``metered``."""
+        control = self._control
+        if not self._metered:
+            self._target = self._value = metered
+            self._metered.extend([metered] * control.delay)
+        self._metered.append(metered)
+        seen = self._metered[0]
+        if abs(seen - self._target) > control.hysteresis:
+            self._target = seen
+        step = self._share * (self._target - self._value)
+        if control.speed:
+            step = min(max(step, -control.speed), control.speed)
+        self._value += step
+        return self._value
+
+    def hold(self, frames: int) -> None:
+        """Let frames pass that are missing, as if each had the last metered value."""
+        for _ in range(frames if self._metered else 0):
+            self.next(self._metered[-1])
+
+
+class AutoIso:
+    """Chooses the ISO of each frame, in thirds of a stop.
+
+    The ISO stays until the exposure asks for one that is more than a step away. The conversion gain
+    of a camera therefore does not switch to and fro.
+
+    >>> auto = AutoIso(100.0, Control(iso_max=800.0))
+    >>> [round(auto.next(ev)) for ev in (0.0, 0.2, 1.0, 0.8, 5.0, -1.0)]
+    [100, 100, 200, 200, 800, 100]
+    """
+
+    def __init__(self, iso: float, control: Control) -> None:
+        assert control.iso_max is not None
+        self._iso = iso
+        self._ends = control.iso_min or iso, control.iso_max
+        self._step: int | None = None
+
+    def next(self, ev: float) -> float:
+        """Return the ISO of the next frame, whose exposure has a gain of ``ev`` EV."""
+        asked = ev * ISO_STEPS
+        if self._step is None or abs(asked - self._step) > 1:
+            self._step = round(asked)
+        low, high = self._ends
+        return min(max(self._iso * 2 ** (self._step / ISO_STEPS), low), high)

@@ -1,0 +1,202 @@
+"""Sequences: the order of frames, draws and drifts, control loops, and runs of them."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clpipe
+from clpipe.base.errors import RequestError
+from clpipe.camera.control import AutoIso, Control, ControlLoop
+from clpipe.chain.drawing import draw_values
+from clpipe.chain.draws import Drift, Limits
+from clpipe.inputs.find import Job
+from clpipe.inputs.sequences import in_sequences
+
+LOOPS = {"exposure": {"method": "auto"}, "white_balance": {"method": "gray_world"}}
+
+
+def placed(*names):
+    """The sequences of files, each with the keys and places of its frames."""
+    found = {}
+    for job in in_sequences([Job(Path(name), name) for name in names]):
+        found.setdefault(job.place.sequence, []).append((job.key, job.place.index))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        # Numbers are sorted as numbers, with their sign.
+        (["f.10.exr", "f.9.exr"], {"f": [("f.9.exr", 0), ("f.10.exr", 1)]}),
+        (["f_-1.exr", "f_0.exr", "f_-2.exr"], {"f": [(f"f_{n}.exr", n + 2) for n in (-2, -1, 0)]}),
+        (["f-1.exr", "f-2.exr"], {"f": [("f-1.exr", 0), ("f-2.exr", 1)]}),
+        # Every second frame is a sequence without gaps.
+        (["1.exr", "5.exr", "3.exr"], {"frames": [("1.exr", 0), ("3.exr", 1), ("5.exr", 2)]}),
+        (["1.exr", "4.exr", "2.exr"], {"frames": [("1.exr", 0), ("2.exr", 1), ("4.exr", 3)]}),
+        # A directory gives its name to its only sequence.
+        (["a/x1.exr", "b/x1.exr"], {"a": [("a/x1.exr", 0)], "b": [("b/x1.exr", 0)]}),
+        (
+            ["a/l1.exr", "a/r1.exr", "a/l2.exr"],
+            {"a/l": [("a/l1.exr", 0), ("a/l2.exr", 1)], "a/r": [("a/r1.exr", 0)]},
+        ),
+        # The number with the most values counts frames, or else the one with the most digits.
+        (
+            ["t1_cam0.exr", "t2_cam0.exr", "t3_cam0.exr", "t1_cam1.exr"],
+            {
+                "t_cam0": [("t1_cam0.exr", 0), ("t2_cam0.exr", 1), ("t3_cam0.exr", 2)],
+                "t_cam1": [("t1_cam1.exr", 0)],
+            },
+        ),
+        (
+            [f"f{n:04}_c{c}.exr" for n in (1, 2) for c in (0, 1)],
+            {f"f_c{c}": [(f"f000{n}_c{c}.exr", n - 1) for n in (1, 2)] for c in (0, 1)},
+        ),
+        (["b.exr", "a.exr"], {"frames": [("b.exr", 0), ("a.exr", 1)]}),
+    ],
+)
+def test_names_give_frames_their_places(names, expected):
+    assert placed(*names) == expected
+
+
+def test_two_frames_of_one_number_are_rejected():
+    with pytest.raises(RequestError, match=r"f_1.exr and f_01.exr are both frame 1 of .* f; rem"):
+        placed("f_1.exr", "f_01.exr")
+
+
+def test_gaps_are_reported(caplog):
+    placed(*(f"f{n}.exr" for n in (1, 2, 4, 5, 9)))
+    assert "f: 4 of 9 frames are missing: 3, 6 to 8" in caplog.text
+
+
+def test_a_loop_follows_with_delay_smoothing_and_limit():
+    step = [0.0] * 3 + [4.0] * 200
+    loop = ControlLoop(Control(delay=3, smoothing=5.0, speed=0.0, hysteresis=0.0))
+    found = [loop.next(value) for value in step]
+    expected = [0.0] * 6 + [4 * (1 - math.exp(-n / 5)) for n in range(1, 198)]
+    assert found == pytest.approx(expected)
+    loop = ControlLoop(Control(delay=0, smoothing=0.0, speed=0.25, hysteresis=0.0))
+    assert max(np.diff([loop.next(value) for value in step])) == pytest.approx(0.25)
+
+
+def test_a_loop_ignores_changes_within_its_hysteresis():
+    loop = ControlLoop(Control(delay=0, smoothing=0.0, speed=0.0, hysteresis=0.2))
+    assert [loop.next(v) for v in (1.0, 1.15, 0.85, 1.25, 1.1)] == [1.0, 1.0, 1.0, 1.25, 1.25]
+
+
+def test_auto_iso_is_in_thirds_of_a_stop_and_does_not_flutter():
+    auto = AutoIso(200.0, Control(iso_max=3200.0, iso_min=100.0))
+    isos = [auto.next(ev) for ev in np.linspace(-3, 6, 400)]
+    assert (min(isos), max(isos)) == (100, 3200)
+    assert {round(3 * math.log2(iso / 100), 9) % 1 for iso in isos} == {0}
+    auto = AutoIso(200.0, Control(iso_max=3200.0))
+    assert len({auto.next(0.5 + 0.08 * (-1) ** n) for n in range(20)}) == 1
+
+
+def test_a_drift_is_uniform_and_slow():
+    draws = {"iso": Drift(drift=(100, 200), frames=20)}
+    drawn = np.array(
+        [
+            [draw_values(draws, {}, lambda _: Limits(), f"draw:{s}", n)["iso"] for n in range(61)]
+            for s in range(300)
+        ]
+    )
+    assert np.histogram(drawn[:, ::20], 4, (100, 200))[0] == pytest.approx(300, abs=60)
+    assert np.histogram(drawn[:, 10], 4, (100, 200))[0] == pytest.approx(75, abs=30)
+    assert abs(np.diff(drawn)).max() < 20
+    assert abs(np.corrcoef(drawn[:, 0], drawn[:, 60])[0, 1]) < 0.2
+
+
+@pytest.fixture
+def frames(write_exr):
+    """Ten frames of two cameras, which become brighter, without one."""
+    scene = np.random.default_rng(0).uniform(0.01, 0.2, (24, 32, 3))
+    for camera in "ab":
+        for number in {*range(10)} - {6}:
+            light = 4 if number > 2 else 1
+            colour = np.float32([1, 1, 1 + 0.1 * number])
+            write_exr(f"frames/{camera}/{number}.exr", scene * light * colour)
+
+
+def run(tmp_path, out, **options):
+    made = clpipe.run(tmp_path / "frames", tmp_path / out, device="numpy", **options)
+    statuses = [outcome.status for outcome in made]
+    assert not made.summary.counts["failed"]
+    return statuses
+
+
+def chain_of(sidecar):
+    return {step["name"]: step for step in json.loads(sidecar.read_text())["stages"]}
+
+
+def pictures(folder):
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*.jpg"))}
+
+
+def test_without_loops_and_draws_frames_are_those_of_single_images(frames, tmp_path):
+    run(tmp_path, "one", iso=800)
+    run(tmp_path, "two", iso=800, sequence=True)
+    assert pictures(tmp_path / "one") == pictures(tmp_path / "two")
+
+
+def test_the_loops_of_a_run_are_those_of_the_formula(frames, tmp_path):
+    control = {"delay": 1, "smoothing": 2.0, "speed": 0.0, "hysteresis": 0.0, "iso_max": 800.0}
+    run(tmp_path, "single", **LOOPS)
+    run(tmp_path, "out", sequence=True, control=control, iso=400, **LOOPS)
+    loop = ControlLoop(Control(**control))
+    for number in range(10):
+        # Frame 6 is missing, and counts like frame 5.
+        single = chain_of(tmp_path / f"single/a/{5 if number == 6 else number}.json")
+        expected = loop.next(single["exposure"]["estimates"]["metered_ev"])
+        if number != 6:
+            own = chain_of(tmp_path / f"out/a/{number}.json")
+            assert own["exposure"]["parameters"]["ev"] == pytest.approx(expected, abs=1e-4)
+            assert own["white_balance"]["method"] == "gains"
+    assert expected < -1  # the loop has moved
+
+
+def test_a_run_is_resumed_and_its_manifest_has_its_settings(frames, tmp_path):
+    drawn = {"dark_current": {"temperature": {"drift": [20, 60], "frames": 3}}}
+    options = {"sequence": True, "iso": {"choice": [200, 800, 3200]}, **LOOPS, **drawn}
+    run(tmp_path, "out", **options)
+    first = pictures(tmp_path / "out")
+    assert len(first) == 18
+    for name in ("a/4", "b/9", "b/0"):
+        (tmp_path / f"out/{name}.jpg").unlink()
+    assert sorted(run(tmp_path, "out", **options)) == ["done"] * 3 + ["skipped"] * 15
+    assert pictures(tmp_path / "out") == first
+    list(clpipe.run(tmp_path / "out/run.csv", tmp_path / "again", device="numpy"))
+    for name in ("a/4", "b/9", "b/0"):
+        assert chain_of(tmp_path / f"again/{name}.json") == chain_of(tmp_path / f"out/{name}.json")
+
+
+def test_draws_are_of_a_sequence_and_drifts_of_a_frame(frames, tmp_path):
+    temperature = {"drift": [20, 60], "frames": 3}
+    run(
+        tmp_path,
+        "out",
+        sequence=True,
+        iso={"log_uniform": [100, 6400]},
+        dark_current={"temperature": temperature},
+    )
+    rows = [line.split(",") for line in (tmp_path / "out/run.csv").read_text().splitlines()]
+    column = {name: [row[n] for row in rows[1:]] for n, name in enumerate(rows[0])}
+    assert len(set(column["iso"])) == 2
+    assert len(set(column["dark_current.temperature"])) == 18
+
+
+def test_shards_are_whole_sequences(frames, tmp_path):
+    assert len(run(tmp_path, "out", sequence=True, shard="2/2")) == 9
+    assert {name[0] for name in pictures(tmp_path / "out")} == {"b"}
+    with pytest.raises(RequestError, match="--shard: a tar may hold frames of two sequences"):
+        run(tmp_path, "tars", sequence=True, shard="1/2", webdataset=4)
+
+
+def test_a_frame_that_cannot_be_read_fails_alone(frames, tmp_path):
+    (tmp_path / "frames/a/4.exr").write_bytes(b"no picture")
+    made = clpipe.run(tmp_path / "frames", tmp_path / "out", device="numpy", sequence=True, **LOOPS)
+    failed = [outcome.job.key for outcome in made if outcome.status == "failed"]
+    assert failed == ["a/4.exr"]
+    assert len(pictures(tmp_path / "out")) == 17
