@@ -12,7 +12,7 @@ from clpipe.base.errors import RequestError
 from clpipe.batch.frames import Turns
 from clpipe.inputs.find import Job, Place
 from clpipe.inputs.loader import ImageLoader
-from tests.conftest import contents
+from tests.conftest import cli_output, contents
 
 STAGES = ["exposure", "mosaic", "sensor_noise", "demosaic", "temporal_denoise", "tone_curve"]
 OPTIONS = {"sequence": True, "iso": 6400, "stages": [*STAGES, "gamma"], "format": "png"}
@@ -91,6 +91,25 @@ def test_a_missing_frame_recomputes_its_sequence_and_no_other(frames):
     assert {status for key, status in statuses.items() if key[0] == "a"} == {"done"}
     assert {status for key, status in statuses.items() if key[0] == "b"} == {"skipped"}
     assert pictures(frames / "out") == first
+
+
+def test_an_edited_picture_is_kept_when_its_sequence_is_recomputed(frames):
+    run(frames, "out")
+    edited = frames / "out/a/3.png"
+    edited.write_bytes((frames / "out/b/0.png").read_bytes())
+    before = pictures(frames / "out")
+    outcomes = run(frames, "out")
+    assert {outcome.status for key, outcome in outcomes.items() if key != "a/3.exr"} == {"skipped"}
+    assert outcomes["a/3.exr"].status == "failed"
+    (frames / "out/a/1.png").unlink()
+    assert run(frames, "out")["a/3.exr"].status == "failed"
+    assert edited.read_bytes() == before["a/3.png"]
+
+
+def test_a_frame_cannot_be_replayed_without_those_before(frames):
+    run(frames, "out")
+    text = cli_output("replay", frames / "out/a/3.json", "-o", frames / "again", status=2)
+    assert "depends on the frames before it" in text
 
 
 def test_a_frame_that_cannot_be_read_is_like_a_missing_one(frames):

@@ -88,7 +88,7 @@ class Frames:
 
     Args:
         chain: the chain of the first image.
-        is_done: returns whether all pictures of a frame exist and are kept.
+        is_done: returns whether nothing of a frame is made, because its pictures are kept.
     """
 
     def __init__(self, chain: Chain, is_done: Callable[[Job], bool]) -> None:
@@ -111,7 +111,7 @@ class Frames:
         return state
 
     def is_recomputed(self, job: Job) -> bool:
-        """Return whether a frame is recomputed even if its pictures exist."""
+        """Return whether a frame is recomputed, even if its pictures exist."""
         return job.place is not None and job.place.sequence in self._recomputed
 
     def whole_sequences(self, jobs: Iterable[Job]) -> Iterator[Job]:

@@ -151,23 +151,24 @@ class ImageWorker:
         return self.writer.request.record()
 
     def _is_done(self, job: Job) -> bool:
-        """Return whether all pictures of a job exist and are kept."""
+        """Return whether nothing of a job is made: its pictures are kept, or it will fail."""
         try:
             return not self._missing(JobState(job, self.loader, request=self._request_of(job)))
         except (ImageError, RequestError):
-            return False
+            return True
 
     def _missing(self, state: JobState) -> Sequence[Rendition]:
         """Return the renditions of a job that must be made."""
         renditions, redo = self.writer.renditions_of(state.job), self._sink.redo
-        if redo is Redo.ALL or self.frames.is_recomputed(state.job):
+        if redo is Redo.ALL:
             return self.writer.needed(state.job, renditions)
         found = {
             each: self._sink.found(state.job, each, self.writer.request_record(state.request, each))
             for each in renditions
         }
         state.old = sum(existing is ExistingFiles.OLD for existing in found.values())
-        missing = [each for each, existing in found.items() if not redo.keeps(existing)]
+        is_recomputed = self.frames.is_recomputed(state.job)
+        missing = [e for e, existing in found.items() if is_recomputed or not redo.keeps(existing)]
         return self.writer.needed(state.job, missing)
 
     def _load(self, state: JobState, job: Job, renditions: Sequence[Rendition]) -> None:
