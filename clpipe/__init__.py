@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from clpipe.dataset.streaming import StreamingDataset
     from clpipe.engine.runner import Result
     from clpipe.pipeline import Pipeline
+    from clpipe.stream import Shot, Stream
 
 _MODULES = {
     "Camera": "clpipe.camera.profile",
@@ -34,6 +35,8 @@ _MODULES = {
     "RequestError": "clpipe.base.errors",
     "Result": "clpipe.engine.runner",
     "Run": "clpipe.batch.session",
+    "Shot": "clpipe.stream",
+    "Stream": "clpipe.stream",
     "StreamingDataset": "clpipe.dataset.streaming",
     "built_in_cameras": "clpipe.camera.profile",
     "load_camera": "clpipe.camera.profile",
@@ -54,6 +57,8 @@ __all__ = [
     "RequestError",
     "Result",
     "Run",
+    "Shot",
+    "Stream",
     "StreamingDataset",
     "__version__",
     "built_in_cameras",

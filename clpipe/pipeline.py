@@ -24,7 +24,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.overscan import margins_of_array
 from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.clipping import WARNING_SHARE, clipped_share, clipping_text
-from clpipe.engine.device import open_device
+from clpipe.engine.device import Device, open_device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.arrays import as_array, as_image
 from clpipe.images.kinds import MIN_CHANNELS, flow_vectors
@@ -97,6 +97,16 @@ class Pipeline(ReadOnly):
         return f"Pipeline({self._settings.label}, {self.chain.label}, on {device_name})"
 
     @property
+    def settings(self) -> Settings:
+        """The settings of all images, with draws that are not drawn yet."""
+        return self._settings
+
+    @property
+    def device(self) -> Device | None:
+        """The device; None is NumPy."""
+        return self._runner.device
+
+    @property
     def chain(self) -> Chain:
         """The steps of the chain, each with its resolved parameters."""
         return self._runner.chain
@@ -151,6 +161,37 @@ class Pipeline(ReadOnly):
             ImageError: the image has a wrong shape or type, is not finite, or is too large.
             RequestError: a name or value is not allowed.
         """
+        return self.develop(*self.prepare(image, key, depth, overscan, settings), key)
+
+    def develop(self, runner: Runner, pixels: Array, own_key: str, key: str) -> Result:
+        """Return the result of an image that :meth:`prepare` has prepared.
+
+        Raises:
+            ImageError: the image is too large.
+        """
+        chain = runner.chain
+        with self._lock:
+            result = runner.run(pixels, noise_key(chain.settings, own_key))
+        share = clipped_share(result, chain) or 0.0
+        # Photographs are already clipped.
+        if share >= WARNING_SHARE and chain.source is not Kind.DISPLAY:
+            warnings.warn(f"{key}: {clipping_text(share)}", stacklevel=3)
+        return result
+
+    def prepare(
+        self,
+        image: Array,
+        key: str,
+        depth: Array | None,
+        overscan: tuple[int, int, int, int],
+        settings: Mapping[str, Any],
+        is_checked: bool = False,
+    ) -> tuple[Runner, Array, str]:
+        """Return what runs the chain on an image: its runner, its pixels, and its image key.
+
+        Arguments and errors are those of :meth:`process`. If an image was prepared before, with
+        other settings, ``is_checked`` saves time. It is then not checked, and has no image key.
+        """
         runner = self._runner_for(key, settings)
         for name in runner.chain.light_layer_steps:
             raise RequestError(
@@ -158,7 +199,7 @@ class Pipeline(ReadOnly):
                 "Use clpipe run, which reads the layer from the render's file"
             )
         try:
-            checked = as_image(image, runner.chain.source)
+            checked = image if is_checked else as_image(image, runner.chain.source)
         except ImageError as error:
             raise ImageError(f"{key}: {error}") from None
         margins = margins_of_array(overscan, checked)
@@ -171,19 +212,13 @@ class Pipeline(ReadOnly):
         entered = prepare_image(runner.chain, checked, margins, depth_of)
         if depth is not None and entered.depth is None:
             message = "no step reads the depth. Set defocus.method=thin_lens to use it"
-            warnings.warn(f"{key}: {message}", stacklevel=2)
+            warnings.warn(f"{key}: {message}", stacklevel=3)
         for warning in entered.warnings:
-            warnings.warn(f"{key}: {warning}", stacklevel=2)
+            warnings.warn(f"{key}: {warning}", stacklevel=3)
         chain, pixels = entered.chain, entered.pixels
         runner = runner if chain is runner.chain else runner.for_chain(chain)
-        own_key = image_key(key, "" if chain.settings.noise_key else digest_of(pixels))
-        with self._lock:
-            result = runner.run(pixels, noise_key(chain.settings, own_key))
-        share = clipped_share(result, chain) or 0.0
-        # Photographs are already clipped.
-        if share >= WARNING_SHARE and chain.source is not Kind.DISPLAY:
-            warnings.warn(f"{key}: {clipping_text(share)}", stacklevel=2)
-        return result
+        digest = "" if is_checked or chain.settings.noise_key else digest_of(pixels)
+        return runner, pixels, image_key(key, digest)
 
     __call__ = process
 

@@ -132,6 +132,15 @@ class Settings:
         drawn = overlay(self, values)
         return with_changes(drawn, {"pushed": True}) if pushed else drawn
 
+    def drawn_values(self, name: str, frame: int) -> dict[str, Any]:
+        """Return the values of :meth:`drawn` that are drawn, nested like a configuration."""
+        constants = self.drawn(name, frame).constants() if self.draws else {}
+        values: dict[str, Any] = {}
+        for key in self.draws:
+            table, _, name = key.rpartition(".")
+            (values.setdefault(table, {}) if table else values)[name] = constants[key]
+        return values
+
     def constants(self) -> dict[str, Any]:
         """Return the values that are set and not drawn, by dotted name."""
         tables = self.tables.items()

@@ -19,6 +19,8 @@ from clpipe.camera.control import AutoIso, ControlLoop
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.identity import noise_key
 from clpipe.engine.device import Device
+from clpipe.engine.extents import Box
+from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Runner
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
@@ -27,6 +29,8 @@ from clpipe.inputs.sequences import sequence_of
 from clpipe.stage import StageRole
 from clpipe.stages.exposure.auto import Auto
 from clpipe.stages.white_balance.gains import EstimatedGains
+
+CORNER = Box(0, 0, 1, 1)
 
 DIGITS = 4  # decimal places of an EV and of a gain
 
@@ -131,7 +135,8 @@ class Meter:
         if self._runner is None:
             self._runner = Runner(part, self._open_device())
         self._runner = self._runner.for_chain(part)
-        result = self._runner.run(image, noise_key(chain.settings, image_key))
+        options = RunOptions(boxes=[CORNER])  # the picture itself is not needed
+        result = self._runner.run(image, noise_key(chain.settings, image_key), options)
         return result.estimates[step.name]
 
 
@@ -183,7 +188,9 @@ def read_job(loader: ImageLoader, job: Job, meter: Meter) -> Reading:
     assert loaded  # None is possible only with --start-at
 
     def chain_of(values: Mapping[str, Any]) -> Chain:
-        other = replace(loader, request=loader.request.for_image(job.key, {**job.values, **values}))
+        other = replace(
+            loader, request=loader.request.for_image(job.key, merged(job.values, values))
+        )
         entered = other.enter(job, source)
         assert entered
         return entered.chain
@@ -202,26 +209,22 @@ def with_drawn(loader: ImageLoader, job: Job) -> Job:
     place = job.place
     assert place
     settings = loader.request.for_image("", job.values).settings()
-    if not settings.draws:
-        return job
-    constants = settings.drawn(place.key, place.index).constants()
-    values: dict[str, Any] = {}
-    for key in settings.draws:
-        table, _, name = key.rpartition(".")
-        (values.setdefault(table, {}) if table else values)[name] = constants[key]
-    return with_values(job, values)
+    return with_values(job, settings.drawn_values(place.key, place.index))
 
 
 def with_values(job: Job, values: Mapping[str, Any]) -> Job:
-    """Return a job with further settings. A table with another method replaces the job's."""
-    if not values:
-        return job
-    merged = dict(job.values)
-    for key, value in values.items():
-        old = merged.get(key)
+    """Return a job with further settings."""
+    return replace(job, values=merged(job.values, values)) if values else job
+
+
+def merged(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings that others override. A table with a method replaces a table."""
+    result = dict(values)
+    for key, value in others.items():
+        old = result.get(key)
         both = isinstance(value, Mapping) and isinstance(old, Mapping) and "method" not in value
-        merged[key] = {**(old or {}), **value} if both else value
-    return replace(job, values=merged)
+        result[key] = {**(old or {}), **value} if both else value
+    return result
 
 
 def write_exposures(path: Path, jobs: Sequence[Job]) -> None:

@@ -1,0 +1,260 @@
+"""Frames of a simulator that is running: each is developed like a frame of a sequence."""
+
+import queue
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Self, Unpack
+
+import numpy as np
+
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.types import Array
+from clpipe.base.validation import check_argument_types
+from clpipe.engine.runner import Result, Runner
+from clpipe.images.arrays import as_array
+from clpipe.inputs.metering import Meter, merged
+from clpipe.pipeline import Pipeline
+from clpipe.reference.geometry import NO_MARGINS
+from clpipe.reference.transfer import inverse_srgb_curve
+from clpipe.stage import Kind
+
+if TYPE_CHECKING:
+    from clpipe.chain.keywords import Keywords
+
+SRGB = inverse_srgb_curve(np.arange(256) / 255).astype(np.float32)  # the light of 8-bit codes
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A frame of a :class:`Stream`.
+
+    Attributes:
+        index: the number of the frame, from 0. Frames that were dropped are counted.
+        image: the picture, (height, width, 3) uint8; the raw, (height, width) uint16, if the chain
+            ends with it; else float32.
+        settings: what the sequence's draws and control loops set, nested like a configuration.
+        metered: what was metered for this frame only, by name.
+        result: the kept images, and the numbers that stages estimated.
+    """
+
+    index: int
+    image: Array
+    settings: Mapping[str, Any]
+    metered: Mapping[str, float]
+    result: Result
+
+
+class Stream:
+    """A camera for a running simulation. Call it with each frame, or put and get frames.
+
+    Exposure and white balance follow the frames like in ``clpipe run --sequence``, and so do draws.
+    A frame has the same bits as with :meth:`Pipeline.process` and the settings in :class:`Shot`.
+
+    >>> import numpy as np
+    >>> import clpipe
+    >>> render = np.full((24, 32, 3), 0.05, np.float32)  # linear light
+    >>> with clpipe.Stream(device="numpy", exposure={"method": "auto"}) as stream:
+    ...     shots = [stream(render * light) for light in (1, 1, 2, 2, 2)]
+    >>> [round(shot.settings["exposure"]["ev"], 2) for shot in shots]
+    [1.85, 1.85, 1.85, 1.85, 1.62]
+
+    A simulation that must not wait uses :meth:`put` and :meth:`get`, which develop in a thread:
+
+    >>> with clpipe.Stream(device="numpy", drop=True) as stream:
+    ...     sent = [stream.put(render) for _ in range(9)]
+    ...     shots = list(stream.finish())
+    >>> len(shots) == sum(sent) == 9 - stream.dropped
+    True
+
+    Args:
+        config: as for :class:`Pipeline`.
+        name: the name of the sequence. Noise depends on it and on the number of the frame.
+        device: as for :class:`Pipeline`.
+        until: the last step to run. ``until="quantize"`` ends with the raw.
+        keep: steps whose images are also returned, or "all".
+        transfer: "srgb" if frames are finished pictures of sRGB in eight bits, as most simulators
+            render them. They are converted to light.
+        drop: whether :meth:`put` drops a frame instead of waiting, if the one before it has not
+            begun yet.
+        **settings: as for :class:`Pipeline`.
+
+    Attributes:
+        dropped: the number of frames that were dropped.
+
+    Raises:
+        RequestError: a name or value is not allowed.
+        DeviceError: there is no usable device.
+    """
+
+    @check_argument_types
+    def __init__(
+        self,
+        config: str | Path | Sequence[str | Path] = "default",
+        *,
+        name: str = "stream",
+        device: str | int | None = None,
+        until: str | None = None,
+        keep: str | Sequence[str] | None = None,
+        transfer: Literal["linear", "srgb"] = "linear",
+        drop: bool = False,
+        **settings: "Unpack[Keywords]",
+    ) -> None:
+        self.dropped = 0
+        self._pipeline = Pipeline(config, device=device, until=until, keep=keep, **settings)
+        self._name = name
+        self._is_srgb = transfer == "srgb"
+        self._drop = drop
+        self._meter = Meter(lambda: self._pipeline.device)
+        self._count = 0
+        # One frame waits while another is developed, so a picture is at most two frames late.
+        self._is_free = threading.Semaphore(1)
+        self._frames: queue.SimpleQueue[tuple[int, Array, Array | None] | None]
+        self._frames = queue.SimpleQueue()
+        self._shots: queue.Queue[Shot | Exception | None] = queue.Queue(1)
+        self._thread: threading.Thread | None = None
+        self._is_closed = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __call__(self, frame: Array, depth: Array | None = None) -> Shot:
+        """Develop the next frame, and return its picture.
+
+        Args:
+            frame: (height, width, 3) linear light as for :meth:`Pipeline.process`, or with
+                ``transfer="srgb"`` uint8. An array in shared memory is not copied.
+            depth: as for :meth:`Pipeline.process`.
+
+        Raises:
+            ImageError, RequestError: as for :meth:`Pipeline.process`. The next frame can still be
+                developed.
+        """
+        if self._thread:
+            raise RequestError("this stream develops the frames of put; use get, not a call")
+        return self._develop(self._next_index(), as_array(frame, "frame"), depth)
+
+    def put(self, frame: Array, depth: Array | None = None) -> bool:
+        """Pass the next frame to the stream's thread. The frame is copied.
+
+        This waits until the frame before it begins, or with ``drop`` drops the frame in this case.
+        Somebody must :meth:`get` pictures, or the stream stops taking frames.
+
+        Returns:
+            Whether the frame was taken.
+
+        Raises:
+            ImageError: this is no array.
+            RequestError: the stream is closed.
+        """
+        if self._is_closed:
+            raise RequestError("this stream is closed; make another one")
+        index = self._next_index()
+        self._start()
+        if not self._is_free.acquire(blocking=not self._drop):
+            self.dropped += 1
+            return False
+        copied = None if depth is None else np.array(as_array(depth, "depth"))
+        self._frames.put((index, np.array(as_array(frame, "frame")), copied))
+        return True
+
+    def get(self, timeout: float | None = None) -> Shot | None:
+        """Return the next picture, in the order of the frames. None if there will be no more.
+
+        Args:
+            timeout: the longest time to wait, in s; None waits.
+
+        Raises:
+            TimeoutError: there is no picture yet.
+            ImageError, RequestError: this frame failed. The next one can still be developed.
+        """
+        self._start()
+        try:
+            shot = self._shots.get(timeout=timeout)
+        except queue.Empty:
+            raise TimeoutError("no picture yet") from None
+        if shot is None:
+            self._shots.put(None)  # for the next call
+        if isinstance(shot, Exception):
+            raise shot
+        return shot
+
+    def end(self) -> None:
+        """Say that no more frames follow. Pictures of earlier frames can still be got."""
+        if not self._is_closed:
+            self._is_closed = True
+            self._frames.put(None)
+
+    def finish(self) -> Iterator[Shot]:
+        """Yield the pictures of all frames that were put; none can be put any more."""
+        self.end()
+        while shot := self.get():
+            yield shot
+
+    def close(self) -> None:
+        """Stop the stream. Pictures that nobody got are lost."""
+        self.end()
+        is_over = self._thread is None
+        while not is_over:
+            with suppress(ImageError, RequestError):
+                is_over = self.get() is None
+
+    def _next_index(self) -> int:
+        self._count += 1
+        return self._count - 1
+
+    def _start(self) -> None:
+        """Start the thread that develops frames."""
+        if not self._thread:
+            self._thread = threading.Thread(target=self._develop_all, name="stream", daemon=True)
+            self._thread.start()
+
+    def _develop_all(self) -> None:
+        while item := self._frames.get():
+            self._is_free.release()
+            try:
+                self._shots.put(self._develop(*item))
+            except Exception as error:
+                self._shots.put(error)
+        self._shots.put(None)
+
+    def _light(self, frame: Array) -> Array:
+        """Return the light of a frame.
+
+        Raises:
+            ImageError: it has a wrong type.
+        """
+        if not self._is_srgb:
+            return frame
+        if frame.dtype != np.uint8:
+            raise ImageError(
+                f"the frame has samples of type {frame.dtype}, but transfer='srgb' expects uint8; "
+                "for linear light, use transfer='linear'"
+            )
+        return SRGB.take(frame, mode="clip")
+
+    def _develop(self, index: int, frame: Array, depth: Array | None) -> Shot:
+        """Develop one frame: meter it, and run the chain with its settings."""
+        pipeline, key = self._pipeline, f"{self._name}/{index:06}"
+        drawn = pipeline.settings.drawn_values(self._name, index)
+        runner, prepared, own_key = pipeline.prepare(
+            self._light(frame), key, depth, NO_MARGINS, drawn
+        )
+
+        def runner_of(values: Mapping[str, Any]) -> Runner:
+            settings = merged(drawn, values)
+            return pipeline.prepare(prepared, key, depth, NO_MARGINS, settings, is_checked=True)[0]
+
+        reading = self._meter.read(
+            runner.chain, prepared, own_key, index, lambda values: runner_of(values).chain
+        )
+        runner = runner_of(reading.values) if reading.values else runner
+        result = pipeline.develop(runner, prepared, own_key, key)
+        is_raw = runner.chain.result is Kind.RAW
+        image = result.image.astype(np.uint16) if is_raw else result.image
+        return Shot(index, image, merged(drawn, reading.values), reading.metered, result)

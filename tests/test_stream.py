@@ -1,0 +1,209 @@
+"""Live frames: clpipe.Stream and the command clpipe stream."""
+
+import io
+import json
+import subprocess
+import sys
+import threading
+from multiprocessing import shared_memory
+
+import numpy as np
+import pytest
+
+import clpipe
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.camera.control import Control, ControlLoop
+
+LIGHT = (1, 1, 4, 4, 4, 4, 0.5, 0.5)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    scene = np.random.default_rng(0).uniform(0.01, 0.2, (24, 32, 3))
+    return [(scene * light).astype(np.float32) for light in LIGHT]
+
+
+def stream(**options):
+    return clpipe.Stream(device="numpy", iso=800, **options)
+
+
+def test_a_picture_has_the_bits_of_a_single_one_with_its_settings(frames):
+    loops = {"exposure": {"method": "auto"}, "white_balance": {"method": "gray_world"}}
+    control = {"iso_max": 3200.0}
+    with clpipe.Stream(device="numpy", iso=400, control=control, **loops) as camera:
+        shots = [camera(frame) for frame in frames]
+    single = clpipe.Pipeline(device="numpy", iso=400)
+    for number, (frame, shot) in enumerate(zip(frames, shots, strict=True)):
+        assert shot.settings.keys() == {"exposure", "iso", "white_balance"}
+        expected = single(frame, f"stream/{number:06}", **shot.settings).image
+        assert np.array_equal(shot.image, expected)
+    assert len({shot.settings["iso"] for shot in shots}) > 1
+
+
+def test_exposure_follows_the_loop(frames):
+    control = {"delay": 1, "smoothing": 1.5, "speed": 0.7, "hysteresis": 0.2}
+    with stream(exposure={"method": "auto", "ev": -1.0}, control=control) as camera:
+        shots = [camera(frame) for frame in frames]
+    loop = ControlLoop(Control(**control))
+    assert [shot.settings["exposure"]["ev"] for shot in shots] == pytest.approx(
+        [loop.next(shot.metered["metered_ev"]) - 1 for shot in shots], abs=1e-4
+    )
+    first, _, third, *_ = (shot.metered["metered_ev"] for shot in shots)
+    assert first - third == pytest.approx(2, abs=0.01)
+
+
+def test_noise_is_of_the_frame_and_of_the_stream(frames):
+    with stream() as one, stream() as two, stream(name="other") as other:
+        first = [one(frames[0]).image for _ in range(2)]
+        assert np.array_equal(first[0], two(frames[0]).image)
+        assert not np.array_equal(*first)
+        assert not np.array_equal(first[0], other(frames[0]).image)
+
+
+def test_put_and_get_give_the_pictures_of_calls(frames):
+    with stream() as one:
+        expected = [one(frame).image for frame in frames]
+    got = []
+    with stream() as two:
+        pictures = threading.Thread(target=lambda: [got.append(two.get()) for _ in frames])
+        pictures.start()
+        assert all(two.put(frame) for frame in frames)
+        pictures.join(120)
+        assert two.dropped == 0
+    assert [shot.index for shot in got] == list(range(len(frames)))
+    assert all(np.array_equal(shot.image, e) for shot, e in zip(got, expected, strict=True))
+
+
+def test_a_frame_may_change_after_it_was_put(frames):
+    frame = frames[0].copy()
+    with stream() as camera:
+        camera.put(frame)
+        frame[:] = 0
+        (shot,) = camera.finish()
+    with stream() as camera:
+        assert np.array_equal(shot.image, camera(frames[0]).image)
+
+
+def test_frames_are_dropped_and_counted(frames):
+    with stream(drop=True) as camera:
+        taken = [camera.put(frame) for frame in frames]
+        shots = list(camera.finish())
+        # Nobody got pictures: one waits for that, one is developed or done, and one waits.
+        assert taken[0] and len(shots) == sum(taken) <= 4
+        assert camera.dropped == len(frames) - len(shots)
+        assert [shot.index for shot in shots] == [n for n, each in enumerate(taken) if each]
+        with pytest.raises(RequestError, match="this stream is closed"):
+            camera.put(frames[0])
+        assert camera.get() is None
+
+
+def test_a_wrong_frame_fails_alone(frames):
+    with stream() as camera:
+        with pytest.raises(ImageError, match="NaN"):
+            camera(frames[0] * np.nan)
+        assert camera(frames[1]).index == 1
+    with stream() as camera:
+        camera.put(frames[0][..., :2])
+        with pytest.raises(ImageError, match=r"stream/000000: .*shape"):
+            camera.get()
+        camera.put(frames[1])
+        assert [shot.index for shot in camera.finish()] == [1]
+    with stream(transfer="srgb") as camera, pytest.raises(ImageError, match="expects uint8"):
+        camera(frames[0])
+    with pytest.raises(TimeoutError), stream() as camera:
+        camera.get(timeout=0.01)
+
+
+def test_finished_frames_are_converted_to_light(frames):
+    codes = np.random.default_rng(1).integers(0, 256, (24, 32, 3), dtype=np.uint8)
+    x = codes / 255
+    light = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    with stream(transfer="srgb", keep="exposure") as one, stream(keep="exposure") as two:
+        found, expected = one(codes).result.kept["exposure"], two(light).result.kept["exposure"]
+    assert found == pytest.approx(expected, rel=1e-4, abs=1e-6)
+
+
+def test_raws_and_frames_in_shared_memory(frames):
+    memory = shared_memory.SharedMemory(create=True, size=frames[0].nbytes)
+    try:
+        shared = np.ndarray(frames[0].shape, np.float32, memory.buf)
+        with stream(until="quantize") as camera, stream(until="quantize") as other:
+            for frame in frames[:3]:
+                shared[:] = frame
+                shot = camera(shared)
+                assert (shot.image.shape, shot.image.dtype) == ((24, 32), np.uint16)
+                assert np.array_equal(shot.image, other(frame).image)
+            del shared
+    finally:
+        memory.close()
+        memory.unlink()
+
+
+def test_a_drawn_value_is_of_the_stream_and_a_drift_of_the_frame(frames):
+    temperature = {"drift": [20, 60], "frames": 3}
+    with clpipe.Stream(
+        device="numpy",
+        iso={"log_uniform": [100, 6400]},
+        dark_current={"temperature": temperature},
+    ) as camera:
+        settings = [camera(frames[0]).settings for _ in range(6)]
+    assert len({each["iso"] for each in settings}) == 1
+    assert len({each["dark_current"]["temperature"] for each in settings}) == 6
+
+
+def piped(data, *options):
+    command = [sys.executable, "-m", "clpipe", "stream", "--device", "numpy", *options]
+    return subprocess.run(command, input=data, capture_output=True, timeout=300)
+
+
+def arrays(data):
+    file = io.BytesIO(data)
+    found = []
+    while file.tell() < len(data):
+        found.append(np.load(file))
+    return found
+
+
+def npy(*frames):
+    file = io.BytesIO()
+    for frame in frames:
+        np.save(file, frame)
+    return file.getvalue()
+
+
+@pytest.mark.slow
+def test_the_command_develops_standard_input(frames, tmp_path):
+    options = ["--iso", "800", "--set", "exposure.method=auto", "--log", tmp_path / "log.jsonl"]
+    data = npy(frames[0], frames[1] * np.nan, *frames[2:])
+    found = piped(data, *options)
+    assert found.returncode == 1
+    assert b"stream/000001: the image has 2304 samples that are NaN" in found.stderr
+    assert b"7 pictures in " in found.stderr and b"0 frames dropped, 1 failed" in found.stderr
+    with stream(exposure={"method": "auto"}) as camera:
+        expected = []
+        for number, frame in enumerate(frames):
+            if number == 1:
+                with pytest.raises(ImageError):
+                    camera(frame * np.nan)
+            else:
+                expected.append(camera(frame))
+    assert np.array_equal(arrays(found.stdout), [shot.image for shot in expected])
+    log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [(line["frame"], line["settings"]) for line in log] == [
+        (shot.index, shot.settings) for shot in expected
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"hello", "frame 0 of standard input: this is no .npy"),
+        (npy(np.zeros((2, 2, 3), np.float32))[:-5], "the input ends after 43 of 48 bytes"),
+        (npy(np.array(["text"])).replace(b"'<U4'", b"'|O' "), "expected an image of numbers"),
+    ],
+)
+def test_the_command_says_what_is_wrong_with_its_input(data, message):
+    found = piped(data)
+    assert found.returncode != 0 and message in found.stderr.decode()
+    assert "Traceback" not in found.stderr.decode()
