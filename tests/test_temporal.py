@@ -1,9 +1,12 @@
 """Denoising over time: a stage with state, on frames of a sequence."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyopencl as cl
 import pytest
 
+import clpipe
 from clpipe.base.errors import DeviceFailedError, ImageError
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
@@ -63,13 +66,15 @@ def test_kernel_and_numpy_agree_on_every_frame(device, method):
     assert not np.array_equal(on_device[1].final, frames[1])
 
 
-def test_one_lane_gives_the_same_bits(device, scalar_device):
-    frames = moving((37, 53))
-    one, two = (
-        results(Runner(chain_of(method="block_matching"), each, encode=False, final=True), frames)
-        for each in (device, scalar_device)
-    )
-    np.testing.assert_array_equal(one[-1].final, two[-1].final)
+@pytest.mark.parametrize("changes", [{"lanes": 1}, {"type": "GPU"}])
+def test_devices_with_one_lane_or_their_own_memory_give_the_same_bits(device, changes):
+    other = Device(replace(device.info, **changes))
+    chain, frames = chain_of(method="block_matching"), moving((37, 53), 5)
+    expected = results(Runner(chain, device, encode=False, final=True), frames)
+    runner, state = Runner(chain, other, encode=False, final=True), State()
+    waits = [runner.submit(each, "", RunOptions(state=state)) for each in frames]  # all in flight
+    for wait, result in zip(waits, expected, strict=True):
+        np.testing.assert_array_equal(wait().final, result.final)
 
 
 def test_bands_kept_images_and_patches_give_the_same_bits(device):
@@ -115,6 +120,14 @@ def test_two_sequences_do_not_mix(device):
         runner.run(frame[::-1].copy(), "", RunOptions(state=two))
         found = runner.run(frame, "", RunOptions(state=one))
         np.testing.assert_array_equal(found.final, expected[number].final)
+
+
+def test_a_stream_averages_its_frames(device):
+    image = np.full((40, 60, 3), 0.2, np.float32)
+    options = {"device": device.info.index, "iso": 6400, "stages": LONG}
+    with clpipe.Stream(**options) as stream:
+        shots = [stream(image) for _ in range(6)]
+    assert shots[-1].image.std() < 0.8 * shots[0].image.std()
 
 
 def test_plans_of_single_images_have_no_trace_of_the_stage():

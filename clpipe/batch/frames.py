@@ -47,7 +47,7 @@ class Turns:
     """Lets frames pass a point in the order of their jobs. Jobs outside sequences do not wait."""
 
     def __init__(self) -> None:
-        self._changed = threading.Condition()
+        self._changed = threading.Condition()  # guards all attributes
         self._tickets: dict[Place, int] = {}
         self._ended: set[int] = set()
         self._next = 0
