@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from clpipe.base.errors import RequestError
 from clpipe.outputs.existing import Redo
 
 
@@ -31,3 +32,19 @@ class ExecutionOptions:
     redo: Redo = Redo.OLD
     trace: Path | None = None
     processes: int | None = None
+
+
+def check_processes(execution: ExecutionOptions, dask: str | None, per_tar: int | None) -> None:
+    """Check that the number of processes fits the way the run is done.
+
+    Raises:
+        RequestError: a cluster does the work, or tars are packed.
+    """
+    if execution.processes is None or execution.processes == 1:
+        return
+    if dask is not None:
+        raise RequestError("--processes: with --dask the cluster's workers are the processes")
+    if per_tar:
+        raise RequestError(
+            "--processes: a tar is packed by one process; run several, each with a --shard"
+        )

@@ -17,7 +17,8 @@ from clpipe.base.errors import OutputError, RequestError
 from clpipe.base.files import check_folder, discard
 from clpipe.base.processors import available_processors
 from clpipe.base.urls import upload, url_of
-from clpipe.batch.execution import ExecutionOptions
+from clpipe.batch.execution import ExecutionOptions, check_processes
+from clpipe.batch.frames import check_frames
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.processes import Processes, default_processes
 from clpipe.batch.remote_tars import RemoteTars
@@ -32,6 +33,7 @@ from clpipe.batch.work import ImageWorker
 from clpipe.chain.isos import draw_note
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_devices
+from clpipe.engine.state import has_state
 from clpipe.images.read import PICTURE_SUFFIXES
 from clpipe.inputs.find import Job, Shard, find_jobs
 from clpipe.inputs.lenses import lens_notes
@@ -177,6 +179,7 @@ class Run:
         self._chain = self._loader.first_chain(self.jobs)
         for note in lens_notes(self._loader.settings, self.jobs):
             log.warning("%s", note)
+        check_frames(self._chain, images.sequence, execution, dask)
         check_render_options(request, self._chain.source)
         self._request = request.with_outputs(self._chain)
         self.writer = OutputWriter(execution.output, self._request)
@@ -354,24 +357,10 @@ class Run:
         devices: list[Device | None] = [*open_devices(execution.devices, execution.memory)] or [
             None
         ]
+        if self.images.sequence and has_state(self._chain):
+            del devices[1:]
         worker = ImageWorker(self._loader, sink, self._chain, execution.trace is not None)
         return nullcontext(Batch(worker, devices, execution.threads))
-
-
-def check_processes(execution: ExecutionOptions, dask: str | None, per_tar: int | None) -> None:
-    """Check that the number of processes fits the way the run is done.
-
-    Raises:
-        RequestError: a cluster does the work, or tars are packed.
-    """
-    if execution.processes is None or execution.processes == 1:
-        return
-    if dask is not None:
-        raise RequestError("--processes: with --dask the cluster's workers are the processes")
-    if per_tar:
-        raise RequestError(
-            "--processes: a tar is packed by one process; run several, each with a --shard"
-        )
 
 
 def check_output(folder: Path, per_tar: int | None = None) -> None:
