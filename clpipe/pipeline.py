@@ -25,7 +25,9 @@ from clpipe.chain.overscan import margins_of_array
 from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.clipping import WARNING_SHARE, clipped_share, clipping_text
 from clpipe.engine.device import Device, open_device
+from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result, Runner
+from clpipe.engine.state import State, has_state
 from clpipe.images.arrays import as_array, as_image
 from clpipe.images.kinds import MIN_CHANNELS, flow_vectors
 from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
@@ -163,15 +165,20 @@ class Pipeline(ReadOnly):
         """
         return self.develop(*self.prepare(image, key, depth, overscan, settings), key)
 
-    def develop(self, runner: Runner, pixels: Array, own_key: str, key: str) -> Result:
+    def develop(
+        self, runner: Runner, pixels: Array, own_key: str, key: str, state: State | None = None
+    ) -> Result:
         """Return the result of an image that :meth:`prepare` has prepared.
+
+        ``state`` is the state of the sequence that the image is a frame of.
 
         Raises:
             ImageError: the image is too large.
         """
         chain = runner.chain
+        options = RunOptions(state=state if has_state(chain) else None)
         with self._lock:
-            result = runner.run(pixels, noise_key(chain.settings, own_key))
+            result = runner.run(pixels, noise_key(chain.settings, own_key), options)
         share = clipped_share(result, chain) or 0.0
         # Photographs are already clipped.
         if share >= WARNING_SHARE and chain.source is not Kind.DISPLAY:

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any, Literal, Self, Unpack
 
 import numpy as np
 
-from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.errors import DeviceFailedError, ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.base.validation import check_argument_types
 from clpipe.engine.runner import Result, Runner
+from clpipe.engine.state import State
 from clpipe.images.arrays import as_array
 from clpipe.inputs.metering import Meter, merged
 from clpipe.pipeline import Pipeline
@@ -108,6 +109,7 @@ class Stream:
         self._is_srgb = transfer == "srgb"
         self._drop = drop
         self._meter = Meter(lambda: self._pipeline.device)
+        self._state = State()
         self._count = 0
         # One frame waits while another is developed, so a picture is at most two frames late.
         self._is_free = threading.Semaphore(1)
@@ -254,7 +256,11 @@ class Stream:
             runner.chain, prepared, own_key, index, lambda values: runner_of(values).chain
         )
         runner = runner_of(reading.values) if reading.values else runner
-        result = pipeline.develop(runner, prepared, own_key, key)
+        try:
+            result = pipeline.develop(runner, prepared, own_key, key, self._state)
+        except DeviceFailedError:
+            self._state = State()  # the next frame starts again
+            raise
         is_raw = runner.chain.result is Kind.RAW
         image = result.image.astype(np.uint16) if is_raw else result.image
         return Shot(index, image, merged(drawn, reading.values), reading.metered, result)

@@ -11,12 +11,13 @@ from itertools import chain
 
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.errors import DeviceError, OutputError
-from clpipe.batch.job_state import JobState, failure_text
+from clpipe.batch.job_state import JobState, Written, failure_text
 from clpipe.batch.memory_budget import MemoryBudget
 from clpipe.batch.runners import Runners
-from clpipe.batch.work import ImageWorker, Written
+from clpipe.batch.work import ImageWorker
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
+from clpipe.engine.state import has_state
 from clpipe.outputs.recipes import Recipe
 
 MAX_STACK = 16  # the most small images that share launches
@@ -112,12 +113,19 @@ class Developers:
         self._encoders.shutdown()
 
     def is_small(self, state: JobState) -> bool:
-        """Return whether a job's image is small enough to share launches with others."""
+        """Return whether a small image may share launches with others. With state, it may not."""
+        if any(has_state(recipe.chain) for recipe in state.recipes):
+            return False
         size = state.source.pixels.shape[1::-1] if state.source else (0, 0)
         return all(each is not None and each.can_stack(*size) for each in self.devices)
 
-    def develop(self, states: Sequence[JobState]) -> list[list[RenditionTask]]:
-        """Compute all renditions of jobs, some at a time, and return them by job when finished."""
+    def develop(
+        self, states: Sequence[JobState], queued: Callable[[], None]
+    ) -> list[list[RenditionTask]]:
+        """Compute all renditions of jobs, some at a time, and return them by job when finished.
+
+        ``queued`` is called when all renditions are queued.
+        """
         tasks_by_state: list[list[RenditionTask]] = [[] for _ in states]
         pending: deque[RenditionTask] = deque()
         small: list[RenditionTask] = []
@@ -137,6 +145,7 @@ class Developers:
                 if not is_small:
                     self._put(small)
         self._put(small)
+        queued()
         # Waits for the last task first, so that the others are usually finished.
         for task in reversed(pending):
             task.written.exception()

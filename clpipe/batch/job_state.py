@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.errors import ClpipeError
+from clpipe.base.files import FileGroup
 from clpipe.batch.outcome import DONE, FAILED, Outcome, Span
 from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import CarriedLayers
@@ -83,6 +84,19 @@ class JobState:
             self.source.layer if self.source else "",
             self.source.part if self.source else 0,
         )
+
+
+@dataclass(frozen=True)
+class Written:
+    """The files of a rendition, still under temporary names.
+
+    Args:
+        group: renames them into place.
+        files: their final names, relative to the output directory.
+    """
+
+    group: FileGroup
+    files: Sequence[str]
 
 
 def failure_text(job: Job, error: BaseException) -> str:

@@ -15,6 +15,7 @@ from clpipe.chain.rendition import BASELINES, TRUTHS, Rendition
 from clpipe.chain.request import Request
 from clpipe.inputs.find import Job
 from clpipe.inputs.manifest import check_output_name
+from clpipe.outputs.record import PLACE
 from clpipe.outputs.sidecar import SidecarError, input_entries, output_entries, read_sidecar
 
 CODE = (".py", ".cl")  # extensions of code files
@@ -138,7 +139,8 @@ def _values(path: Path) -> Mapping[str, Any]:
     """Return the values of a sidecar of this version.
 
     Raises:
-        RequestError: the file is not a sidecar, or was written by another version.
+        RequestError: the file is not a sidecar, or was written by another version. The picture
+            depends on the frames before it.
     """
     try:
         values = read_sidecar(path)
@@ -155,6 +157,11 @@ def _values(path: Path) -> Mapping[str, Any]:
         raise RequestError(
             f"{path}: it is of clpipe {values['clpipe']}, and this is {__version__}, which "
             "may make other bytes; install that version, or run it anew"
+        )
+    if PLACE in values:
+        raise RequestError(
+            f"{path}: this picture depends on the frames before it, which clpipe replay does not "
+            "make; run the sequence again with clpipe run --sequence"
         )
     return values
 

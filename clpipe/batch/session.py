@@ -26,6 +26,7 @@ from clpipe.batch.checks import (
 from clpipe.batch.clip_sink import Clips
 from clpipe.batch.clips import ClipOptions
 from clpipe.batch.execution import ExecutionOptions
+from clpipe.batch.frames import check_frames
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.processes import Processes, default_processes
 from clpipe.batch.remote_tars import RemoteTars
@@ -40,6 +41,7 @@ from clpipe.batch.work import ImageWorker
 from clpipe.chain.isos import draw_note
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_devices
+from clpipe.engine.state import has_state
 from clpipe.inputs.find import Job, Shard, find_jobs
 from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
@@ -185,6 +187,7 @@ class Run:
         self._chain = self._loader.first_chain(self.jobs)
         for note in lens_notes(self._loader.settings, self.jobs):
             log.warning("%s", note)
+        check_frames(self._chain, images.sequence, execution, dask)
         check_render_options(request, self._chain.source)
         self._request = request.with_outputs(self._chain)
         self.writer = OutputWriter(execution.output, self._request)
@@ -368,5 +371,7 @@ class Run:
         devices: list[Device | None] = [*open_devices(execution.devices, execution.memory)] or [
             None
         ]
+        if self.images.sequence and has_state(self._chain):
+            del devices[1:]
         worker = ImageWorker(self._loader, sink, self._chain, execution.trace is not None)
         return nullcontext(Batch(worker, devices, execution.threads))

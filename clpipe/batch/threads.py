@@ -21,10 +21,11 @@ from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.errors import OutputError, RequestError
 from clpipe.base.processors import available_processors
 from clpipe.batch.developing import MAX_STACK, Developers, depth_of
-from clpipe.batch.job_state import JobState, failure_text
+from clpipe.batch.frames import Turns
+from clpipe.batch.job_state import JobState, Written, failure_text
 from clpipe.batch.memory_budget import MemoryBudget, default_budget
 from clpipe.batch.outcome import Outcome
-from clpipe.batch.work import ImageWorker, Written
+from clpipe.batch.work import ImageWorker
 from clpipe.engine.device import Device
 from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.find import Job
@@ -75,6 +76,8 @@ class Batch:
             worker, self.devices, self.threads, self._budget, compiled, self._fail
         )
         self._jobs: Jobs = queue.SimpleQueue()
+        # Frames of sequences get memory, and then their device, in the order of the jobs.
+        self._admitting, self._developing = self._turns = Turns(), Turns()
         # None means that one of the threads has ended.
         self._made: queue.Queue[Made | None] = queue.Queue(MAX_COMMIT)
         self._outcomes: queue.Queue[Outcome | None] = queue.Queue(MAX_COMMIT)
@@ -157,9 +160,11 @@ class Batch:
     def _queue(self, jobs: Iterable[Job]) -> None:
         """Queue all jobs, until the run stops."""
         try:
-            for job in jobs:
+            for job in self._worker.frames.whole_sequences(jobs):
                 if self.is_stopping:
                     break
+                for turns in self._turns:
+                    turns.expect(job)
                 self._jobs.put(job)
         except Exception as error:
             self._jobs.put(error)
@@ -170,6 +175,8 @@ class Batch:
         exception = error if isinstance(error, Exception) else RuntimeError(repr(error))
         self._failure = self._failure or exception
         self.stop()
+        for turns in self._turns:
+            turns.close()
 
     def _next(self, is_waiting: bool) -> Job | None:
         """Return the next job. None is the end, or an empty queue if ``is_waiting`` is False."""
@@ -179,8 +186,11 @@ class Batch:
             return None
         if isinstance(job, Exception):
             self._fail(job)
-        if isinstance(job, Job) and not self.is_stopping:
-            return job
+        if isinstance(job, Job):
+            if not self.is_stopping:
+                return job
+            for turns in self._turns:
+                turns.end(job)
         self._jobs.put(None)  # ends the other threads
         return None
 
@@ -223,6 +233,8 @@ class Batch:
             self._fail(error)
         except BaseException as error:  # an error of an image must not end the thread
             state.error = failure_text(job, error)
+        finally:
+            self._admitting.end(job)
         state.spans = [  # subtracts the wait for memory
             replace(span, start=span.start + sum(waits), seconds=span.seconds - sum(waits))
             for span in state.spans
@@ -242,9 +254,11 @@ class Batch:
         developers.begin()
         size = worker.bytes_of(job, developers.max_in_flight, None in self.devices)
         start = time.perf_counter()
+        self._admitting.wait(job)
         if waiting_states and not self._budget.fits(size):
             self._make(waiting_states)  # frees the memory of the waiting images
         self._budget.acquire(job.stem, size)
+        self._admitting.end(job)
         waits.append(time.perf_counter() - start)
 
     def _make(self, decoded: list[JobState]) -> None:
@@ -254,7 +268,19 @@ class Batch:
             DeviceError, RequestError: no device is left to make them.
         """
         failure: Exception | None = None
-        for state, orders in zip(decoded, self._developers.develop(decoded), strict=True):
+
+        def end_turns() -> None:
+            for state in decoded:
+                self._developing.end(state.job)
+
+        if not self._developing.wait(decoded[0].job):
+            for state in decoded:
+                state.error = f"{state.job.display_name}: the run ended before it was developed"
+        try:
+            developed = self._developers.develop(decoded, end_turns)
+        finally:
+            end_turns()
+        for state, orders in zip(decoded, developed, strict=True):
             state.drop_pixels()
             self._budget.release(state.job.stem)
             try:

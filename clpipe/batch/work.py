@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any, TypeVar
 
@@ -12,7 +12,8 @@ from clpipe.base.errors import DeviceError, ImageError, NoPictureError, OutputEr
 from clpipe.base.files import FileGroup, deferred_files
 from clpipe.base.types import Array
 from clpipe.base.urls import fetched_files
-from clpipe.batch.job_state import JobState
+from clpipe.batch.frames import Frames
+from clpipe.batch.job_state import JobState, Written
 from clpipe.batch.memory_budget import host_bytes
 from clpipe.batch.outcome import LEFT_OUT, SKIPPED, Span
 from clpipe.batch.runners import Runners, SpareArrays
@@ -39,19 +40,6 @@ from clpipe.stage import Kind
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class Written:
-    """The files of a rendition, still under temporary names.
-
-    Args:
-        group: renames them into place.
-        files: their final names, relative to the output directory.
-    """
-
-    group: FileGroup
-    files: Sequence[str]
-
-
 class ImageWorker:
     """Does the work on images. Several threads call it at the same time, each for its own image.
 
@@ -75,6 +63,7 @@ class ImageWorker:
         self.chain = chain
         self._trace = trace
         self._spare = SpareArrays(0)
+        self.frames = Frames(chain, self._is_done)
 
     def reserve(self, count: int) -> None:
         """Set how many arrays of results are kept for later images."""
@@ -161,6 +150,13 @@ class ImageWorker:
     def _general_request(self) -> Mapping[str, Any]:
         return self.writer.request.record()
 
+    def _is_done(self, job: Job) -> bool:
+        """Return whether nothing of a job is made: its pictures are kept, or it will fail."""
+        try:
+            return not self._missing(JobState(job, self.loader, request=self._request_of(job)))
+        except (ImageError, RequestError):
+            return True
+
     def _missing(self, state: JobState) -> Sequence[Rendition]:
         """Return the renditions of a job that must be made."""
         renditions, redo = self.writer.renditions_of(state.job), self._sink.redo
@@ -171,7 +167,8 @@ class ImageWorker:
             for each in renditions
         }
         state.old = sum(existing is ExistingFiles.OLD for existing in found.values())
-        missing = [each for each, existing in found.items() if not redo.keeps(existing)]
+        is_recomputed = self.frames.is_recomputed(state.job)
+        missing = [e for e, existing in found.items() if is_recomputed or not redo.keeps(existing)]
         return self.writer.needed(state.job, missing)
 
     def _load(self, state: JobState, job: Job, renditions: Sequence[Rendition]) -> None:
@@ -267,7 +264,12 @@ class ImageWorker:
         reused = self._spare.take((height, width, *pixels.shape[2:])) if is_used_again else None
         timings: list[Timing] | None = [] if self._trace and device else None
         options = RunOptions(
-            timings, into=reused, unchanged=True, boxes=boxes, later_exposures=source.later
+            timings,
+            into=reused,
+            unchanged=True,
+            boxes=boxes,
+            later_exposures=source.later,
+            state=self.frames.state(state.job, recipe),
         )
         return runner, pixels, recipe.noise_key, options
 

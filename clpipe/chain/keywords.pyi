@@ -373,6 +373,12 @@ class RestoreHighlights(TypedDict, total=False):
     red_gain: Number
     blue_gain: Number
 
+class TemporalDenoise(TypedDict, total=False):
+    method: Draw | Literal["recursive", "block_matching"]
+    frames: Number
+    threshold: Number
+    radius: Whole
+
 class Encoding(TypedDict, total=False):
     jpeg_quality: Whole
     jpeg_subsampling: Draw | Literal["4:4:4", "4:2:2", "4:2:0"]
@@ -452,6 +458,7 @@ class Keywords(TypedDict, total=False):
     remosaic: Remosaic
     resize: Resize
     restore_highlights: RestoreHighlights
+    temporal_denoise: TemporalDenoise
     output: Encoding
     render: RenderCamera
     control: Control

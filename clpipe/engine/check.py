@@ -12,8 +12,9 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
-from clpipe.engine.options import DEFAULTS
+from clpipe.engine.options import DEFAULTS, RunOptions
 from clpipe.engine.runner import Runner, submit_batch
+from clpipe.engine.state import State, has_state
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.stage import PERIOD, Kind, Method, Stage, variant_label, variants
 
@@ -98,15 +99,31 @@ def compare(
 ) -> Difference:
     """Return the difference of a chain's float results on the device and in NumPy.
 
-    ``sizes`` are the (height, width) of the test images.
+    For a stage with state, each image is the second frame of a sequence, after a noisier one.
+
+    Args:
+        device: the device.
+        chain: the chain.
+        sizes: the (height, width) of the test images.
+        half: whether the images are float16, not float32.
     """
     on_device, in_numpy = (Runner(chain, d, encode=False, final=True) for d in (device, None))
     total = Difference()
     for seed, size in enumerate(sizes):
         image = example(chain.source, size, half, seed)
-        result, expected = (runner.run(image, "check").final for runner in (on_device, in_numpy))
+        result, expected = (last_frame(runner, image) for runner in (on_device, in_numpy))
         total += difference(result, expected)
     return total
+
+
+def last_frame(runner: Runner, image: Array) -> Array | None:
+    """Return the float result of an image; with state, that of the second of two frames."""
+    if not has_state(runner.chain):
+        return runner.run(image, "check").final
+    state = State()
+    noise = np.random.default_rng(0).normal(0, 0.01, image.shape)
+    runner.run((image + noise).astype(image.dtype), "check", RunOptions(state=state))
+    return runner.run(image, "check", RunOptions(state=state)).final
 
 
 # Filter arrays that are not Bayer patterns: odd and even periods, with and without clear pixels.

@@ -156,8 +156,16 @@ class Flow:
     def start(self, flight: Flight, stack: Stack, sizes: Mapping[str, int], memory: int) -> None:
         """Enqueue a stack that needs buffers of these sizes; all take at most ``memory`` bytes."""
         self.reset_launch_cache()
-        self.reserve(sizes, memory)
+        member = stack.members[0]
+        if not (state := member.work.options.state):
+            self.reserve(sizes, memory)
+            self._submit(flight, stack)
+            return
+        state.begin_frame(self, member.work.plan, member.extents)
+        others = {name: size for name, size in sizes.items() if name not in state.buffers}
+        self.reserve(others, memory - state.bytes)
         self._submit(flight, stack)
+        state.end_frame()
 
     def reset_launch_cache(self) -> LaunchCache:
         """Return the launch cache, and start an empty one, because buffers will be overwritten."""
@@ -215,6 +223,11 @@ class Flow:
         flight.events += [("upload", event) for event in sent[1]]
         return sent
 
+    def _buffers(self, stack: Stack, io_buffers: Mapping[str, Any]) -> dict[str, Any]:
+        """Return all buffers that a stack uses, by name."""
+        state = stack.members[0].work.options.state
+        return {**self.pool.buffers, **(state.buffers if state else {}), **io_buffers}
+
     def _launch(
         self, flight: Flight, stack: Stack, io_buffers: Mapping[str, Any], wait: list[Any]
     ) -> list[Any]:
@@ -223,7 +236,7 @@ class Flow:
         Returns:
             The event of the last kernel; ``wait`` if there is none.
         """
-        buffers = {**self.pool.buffers, **io_buffers}
+        buffers = self._buffers(stack, io_buffers)
         launches = list(stack.launches())
         if not launches:
             return wait
@@ -283,7 +296,7 @@ class Flow:
         """
         members = stack.members
         plan, output = members[0].work.plan, members[0].work.output
-        buffers = {**self.pool.buffers, **io_buffers}
+        buffers = self._buffers(stack, io_buffers)
 
         def parts(name: str, sizes: Sequence[int]) -> list[Array]:
             stride = stack.strides.get(name, 0)

@@ -212,6 +212,8 @@ class Plan:
         encoded: the kind of the eight-bit pixels, if requested.
         border: the width of the planes' borders in pixels.
         incremental: whether all images stay on the device, so that launches can be skipped.
+        states: each step with state, with its results for the frame before and for this frame. None
+            stands for the former in a plan of a first frame.
         resamplings: the resampling from each level to the next.
     """
 
@@ -226,6 +228,7 @@ class Plan:
     encoded: Kind | None = None
     border: int = 0
     incremental: bool = False
+    states: tuple[tuple[str, Image | None, Image], ...] = ()
     resamplings: tuple[Resampler, ...] = ()
 
     def __hash__(self) -> int:
@@ -287,6 +290,7 @@ class Plan:
     def levels_of_slots(self) -> tuple[frozenset[int], ...]:
         """For each slot, the levels of the images whose planes occupy it."""
         images = [x.writes for x in self.launches if isinstance(x, Launch) and x.writes]
+        images += [previous for _, previous, _ in self.states if previous]
         return tuple(
             frozenset(image.level for image in images if slot in self.slots[image.number])
             for slot in range(self.slot_count)

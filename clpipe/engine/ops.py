@@ -2,11 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 
 from clpipe.chain.chain import Chain, Step
 from clpipe.stage import (
+    PREVIOUS,
     Argument,
     CompileTime,
     Kind,
@@ -17,6 +19,14 @@ from clpipe.stage import (
     Stencil,
     bytes_of,
 )
+
+
+class Frame(Enum):
+    """Which frame of a sequence an image is."""
+
+    SINGLE = "it belongs to no sequence"
+    FIRST = "there is no frame before"
+    LATER = "stages with state read what they wrote for the frame before"
 
 
 @dataclass(frozen=True)
@@ -43,6 +53,11 @@ class Op:
         return isinstance(access, Pointwise) and access.inline_at_taps
 
     @property
+    def has_state(self) -> bool:
+        """Whether the pass reads its stage's result for the frame before."""
+        return PREVIOUS in self.pass_.reads
+
+    @property
     def radius(self) -> int:
         """The largest distance, in pixels, at which the pass reads."""
         access = self.pass_.access
@@ -56,19 +71,22 @@ class Op:
 
 
 def chain_ops(
-    chain: Chain, arguments: Mapping[str, Mapping[str, Argument]]
+    chain: Chain, arguments: Mapping[str, Mapping[str, Argument]], frame: Frame = Frame.SINGLE
 ) -> tuple[tuple[str, tuple[Op, ...]], ...]:
     """Return each step's name and passes. Chains with the same passes share a plan.
 
     Args:
         chain: the chain.
         arguments: the arguments of the steps' methods, by step.
+        frame: whether there is a frame before. If not, steps with state have no passes.
     """
     steps: list[tuple[str, tuple[Op, ...]]] = []
     last: Op | None = None
     for step in chain.steps:
         step_arguments = arguments[step.name]
         ops = ops_of(step, step_arguments)
+        if frame is not Frame.LATER and any(op.has_state for op in ops):
+            ops = ()
         if ops:
             if last and undoes(ops[0].pass_, step_arguments, last.pass_, arguments[last.step]):
                 ops = (replace(ops[0], undoes_previous=True), *ops[1:])

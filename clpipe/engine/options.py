@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from clpipe.base.types import Array
 from clpipe.engine.extents import Box
+from clpipe.engine.state import State
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,8 @@ class RunOptions:
             then stacks of patches. () computes whole images.
         later_exposures: the images of all exposures but the first; see
             :mod:`clpipe.chain.exposures`. () uses the same image.
+        state: the state of the sequence that the image is a frame of. Without one, stages with
+            state return their input.
     """
 
     timings: list[Timing] | None = None
@@ -46,6 +49,7 @@ class RunOptions:
     unchanged: bool = False
     boxes: Sequence[Box] = ()
     later_exposures: Sequence[Array] = ()
+    state: State | None = None
 
 
 DEFAULTS = RunOptions()

@@ -47,6 +47,22 @@ def with_patches(
     return replace(tiling, phases=phases, sizes=sizes, patches=patches)
 
 
+def check_sizes(plan: Plan, width: int, height: int) -> None:
+    """Check that all images of a result have one size, which patches need.
+
+    Raises:
+        ImageError: the sizes differ.
+    """
+    *_, last = sizes = plan.sizes(width, height)
+    for name, kept in plan.kept:
+        size = sizes[kept.level]
+        if size != last:
+            raise ImageError(
+                f"the image after {name} has {size[0]}x{size[1]} pixels, but the last image has "
+                f"{last[0]}x{last[1]}. Patches need images of one size. Do not keep {name}."
+            )
+
+
 def check_memory(sizes: Mapping[str, int], memory: int) -> None:
     """Check that the buffers of a patch (bytes by name) fit into ``memory`` bytes.
 

@@ -23,10 +23,19 @@ from clpipe.engine.ir import (
     Read,
     Reduce,
 )
-from clpipe.engine.ops import Op, chain_ops
+from clpipe.engine.ops import Frame, Op, chain_ops
 from clpipe.engine.slots import assign_slots
 from clpipe.reference.resample import Resampler
-from clpipe.stage import Kind, LineTable, Pointwise, Reduction, Resample, Stencil, TableLookup
+from clpipe.stage import (
+    PREVIOUS,
+    Kind,
+    LineTable,
+    Pointwise,
+    Reduction,
+    Resample,
+    Stencil,
+    TableLookup,
+)
 
 # In incremental plans, borders are multiples of this width. Plans whose widest stencils differ a
 # little then have the same plane layout. The default chain's border is 4 pixels; with 8 it takes
@@ -43,6 +52,7 @@ class _Planner:
         self.lines: dict[int, list[Op]] = {}  # by level
         self.resamplings: list[Resampler] = []
         self.images: list[Image] = []
+        self.previous: dict[str, Image] = {}  # results for the frame before, by step
         self.group: Launch | None = Launch("load", ())  # the open group, not yet stored
         self.stored: Image | None = None  # the current image, if no group is open
         # If the current image is kept: the read with which a stencil can still fold it. And the
@@ -140,6 +150,11 @@ class _Planner:
     def add_step(self, ops: Sequence[Op]) -> None:
         """Add the passes of a step."""
         local: dict[str, Read] = {}
+        if any(op.has_state for op in ops):
+            previous = Image(len(self.images), ops[-1].kind, self.level)
+            self.images.append(previous)
+            self.previous[ops[0].step] = previous
+            local[PREVIOUS] = Read(previous)
         over_pixels = [op for op in ops if not isinstance(op.pass_.access, LineTable)]
         if any(isinstance(op.pass_.access, Stencil) and "src" in op.pass_.reads for op in ops):
             # A pass before the stencil continues from the stored image, not from recomputed taps.
@@ -184,6 +199,7 @@ def make_plan(
     planar: bool = False,
     incremental: bool = False,
     cpu: Cpu | None = None,
+    frame: Frame = Frame.SINGLE,
 ) -> Plan:
     """Return the plan of a chain.
 
@@ -200,6 +216,8 @@ def make_plan(
         incremental: whether images share no slots, so that a launch can be skipped if its results
             are still on the device.
         cpu: the CPU on whose cores launches run in bands. None runs each over the whole image.
+        frame: which frame of a sequence the image is. For any but a single image, the results of
+            steps with state are kept for the next frame.
 
     Raises:
         RequestError: the chain lacks a step to keep.
@@ -213,11 +231,16 @@ def make_plan(
     planner = _Planner(chain.source, fold)
     arrays = {step.name: step.context.array for step in chain.steps}
     kept: dict[str, Image] = {}
+    states: list[tuple[str, Image | None, Image]] = []
     arguments = chain.arguments
-    for name, ops in chain_ops(chain, arguments):
+    later = chain_ops(chain, arguments, Frame.LATER)
+    with_state = {name for name, ops in later if any(op.has_state for op in ops)}
+    for name, ops in chain_ops(chain, arguments, frame):
         array = arrays[name]
         planner.period = array.period if array and array.needs_border else None
         planner.add_step(ops)
+        if name in with_state and frame is not Frame.SINGLE:
+            states.append((name, planner.previous.get(name), planner.keep()))
         if name in keep and name != last:
             kept[name] = planner.keep()
     group = planner.group or Launch("encode", (), (Read(planner.close()),))
@@ -230,11 +253,16 @@ def make_plan(
     launches = list(planner.launches)
     launches[:0] = [Lines(tuple(ops), level=level) for level, ops in planner.lines.items()]
     results = [*kept.values(), final_image] if final_image else kept.values()
+    before = [*planner.previous.values()]
+    results = [*results, *before, *(after for *_, after in states)]
     pinned = {image.number for image in (planner.images if incremental else results)}
     if cpu and not incremental:
         launches = in_bands(launches, pinned, cpu)
-    slots, count = assign_slots(launches, planner.images, pinned)
-    border = max((op.radius for x in launches if isinstance(x, Launch) for op in x.ops), default=0)
+    slots, count = assign_slots(launches, planner.images, pinned, before)
+    stencils = [op for x in launches if isinstance(x, Launch) for op in x.ops]
+    # The frames of a sequence have planes of the same layout.
+    stencils += [op for _, ops in later for op in ops if frame is Frame.FIRST]
+    border = max((op.radius for op in stencils), default=0)
     return Plan(
         source=chain.source,
         half=half,
@@ -247,5 +275,6 @@ def make_plan(
         encoded=chain.result if encode else None,
         border=-(-border // INCREMENTAL_BORDER) * INCREMENTAL_BORDER if incremental else border,
         incremental=incremental,
+        states=tuple(states),
         resamplings=tuple(planner.resamplings),
     )

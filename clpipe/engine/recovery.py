@@ -47,17 +47,22 @@ class Recovery:
         If the device runs out of memory below the limit, the buffers of earlier images are released
         first. Then the image is retried with smaller tiles. If a kernel fails, the image is retried
         once, in a new context if the old one is broken. Images that fail together are retried one
-        by one, and only these failures count.
+        by one, and only these failures count. Frames of a sequence with state are not retried,
+        because a later frame may have replaced the state.
 
         Raises:
             ImageError: the memory is too small even for the smallest tiles.
-            DeviceFailedError: the device failed twice.
+            DeviceFailedError: the device failed twice, or for a frame of a sequence with state.
             DeviceError: the device failed for :data:`MAX_FAILURES` images in a row.
         """
         cl, device = self._cl, self._device
         memory = device.memory
         full: Exception | None = None  # the error when the device's memory was full
         failed = False
+        if state := work.options.state:
+            if generation != self.generation:  # its commands, or those of a frame before, are lost
+                state.lose()
+            state.check()
         while True:
             if generation != self.generation:  # the enqueued commands are lost
                 try:
@@ -76,11 +81,14 @@ class Recovery:
                 device.flow.finish(flight)
             except (cl.Error, MemoryError) as error:
                 is_full = isinstance(error, cl.MemoryError | MemoryError)
-                if self._context_survives() and is_full:
+                survives = self._context_survives()
+                if state:
+                    state.lose()
+                elif survives and is_full:
                     memory = memory if full is None else device.tiling(work, memory).bytes // 2
                     full = error
                     continue
-                if not failed:
+                if not (failed or state):
                     failed = True
                     continue
                 self._count_failure(error)

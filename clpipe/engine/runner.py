@@ -1,7 +1,7 @@
 """Runs a chain on images, on a device or in NumPy."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -9,20 +9,22 @@ import numpy as np
 from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array, Floats
-from clpipe.chain.chain import Chain, cached_by_structure
+from clpipe.chain.chain import Chain
 from clpipe.chain.exposures import exposures_of
 from clpipe.chain.registry import user_code_errors
 from clpipe.engine.buffers import HostImages, allocate_results, crop_patches, is_planar
 from clpipe.engine.device import Device
-from clpipe.engine.extents import Box
+from clpipe.engine.extents import Box, whole_image
 from clpipe.engine.ir import Plan
-from clpipe.engine.ops import chain_ops
+from clpipe.engine.ops import Frame, chain_ops
 from clpipe.engine.options import DEFAULTS, RunOptions
+from clpipe.engine.patches import check_sizes
 from clpipe.engine.plan import make_plan
-from clpipe.engine.values import binding
+from clpipe.engine.state import State
+from clpipe.engine.values import binding, size_estimates
 from clpipe.engine.work import Work
 from clpipe.reference.curve import to_8_bit
-from clpipe.stage import Method, NoiseScope, ReferenceContext, Resample
+from clpipe.stage import NoiseScope, ReferenceContext
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,15 @@ class Result:
         assert image is not None
         return image
 
+    def cropped(self, boxes: Sequence[Box]) -> "Result":
+        """Return the parts of the images in boxes, all of one size, as patches."""
+        final, encoded = (
+            None if image is None else crop_patches(image, boxes)
+            for image in (self.final, self.encoded)
+        )
+        kept = {name: crop_patches(image, boxes) for name, image in self.kept.items()}
+        return Result(final, encoded, kept, self.estimates)
+
     def __repr__(self) -> str:
         shapes = {"final": self.final, "encoded": self.encoded, **self.kept}
         parts = [f"{k}: {v.shape} {v.dtype}" for k, v in shapes.items() if v is not None]
@@ -70,28 +81,6 @@ class Result:
         from clpipe.images.preview import png_bytes
 
         return None if self.final is None and self.encoded is None else png_bytes(self.image)
-
-
-@cached_by_structure
-def has_size_estimates(chain: Chain) -> bool:
-    """Return whether a stage derives numbers from the size of the image."""
-    return any(type(s.method).estimates_for is not Method.estimates_for for s in chain.steps)
-
-
-def check_sizes(plan: Plan, width: int, height: int) -> None:
-    """Check that all images of a result have one size, which patches need.
-
-    Raises:
-        ImageError: the sizes differ.
-    """
-    *_, last = sizes = plan.sizes(width, height)
-    for name, kept in plan.kept:
-        size = sizes[kept.level]
-        if size != last:
-            raise ImageError(
-                f"the image after {name} has {size[0]}x{size[1]} pixels, but the last image has "
-                f"{last[0]}x{last[1]}. Patches need images of one size. Do not keep {name}."
-            )
 
 
 class Runner:
@@ -152,7 +141,12 @@ class Runner:
         return runners
 
     def plan(
-        self, half: bool = True, fold: bool = True, planar: bool = False, bands: bool = True
+        self,
+        half: bool = True,
+        fold: bool = True,
+        planar: bool = False,
+        bands: bool = True,
+        frame: Frame = Frame.SINGLE,
     ) -> Plan:
         """Return the plan for a float16 or float32 source, interleaved or in planes.
 
@@ -160,25 +154,34 @@ class Runner:
         """
         bands &= self.bands and not self.incremental
         cpu = self.device.info.cpu if self.device and bands else None
-        chain, key = self.chain, (half, fold, planar, cpu)
+        chain, key = self.chain, (half, fold, planar, cpu, frame)
 
         def plan() -> Plan:
-            ops = chain_ops(chain, self._arguments)
+            ops = chain_ops(chain, self._arguments, Frame.LATER)
             structure = (*key, chain.source, chain.result, ops)
             results = self.keep, self.encode, self.final
-            options = chain, half, *results, fold, planar, self.incremental, cpu
+            options = chain, half, *results, fold, planar, self.incremental, cpu, frame
             return self._plans.get(structure, lambda: make_plan(*options))
 
         return self._plans.get(
             (*key, Identity(chain if chain.structure is None else chain.structure)), plan
         )
 
-    def plan_for(self, image: Array) -> Plan:
+    def plan_for(self, image: Array, frame: Frame = Frame.SINGLE) -> Plan:
         """Return the plan for an image."""
         size = image.shape[1::-1]
         options = image.dtype == np.float16, min(self.chain.size(*size)) > 1, is_planar(image)
-        plan = self.plan(*options)
-        return self.plan(*options, bands=False) if plan.is_tiny(*size) else plan
+        plan = self.plan(*options, frame=frame)
+        return self.plan(*options, bands=False, frame=frame) if plan.is_tiny(*size) else plan
+
+    def _plan_for_frame(self, image: Array, state: State) -> Plan:
+        """Return the plan for the next frame of a sequence."""
+        assert self.device and not self.incremental
+        plan = self.plan_for(image, Frame.LATER)
+        width, height = image.shape[1::-1]
+        extents = whole_image(plan, width, height, self.device.info.lanes)
+        is_first = state.is_first(plan, extents)
+        return self.plan_for(image, Frame.FIRST) if is_first else plan
 
     def compile(self, half: bool = True) -> None:
         """Compile all kernels, so that the first image does not wait for the compiler.
@@ -255,24 +258,32 @@ class Runner:
             if options.boxes:
                 check_sizes(runner.plan_for(image), *image.shape[1::-1])
             pixels = np.asarray(image, np.float32)
-            return partial(runner._run_numpy, pixels, noise_key, options.boxes)
-        plan = runner.plan_for(image)
+            return partial(runner._run_numpy, pixels, noise_key, options)
+        state = options.state
+        plan = runner._plan_for_frame(image, state) if state else runner.plan_for(image)
         plan.check_resamplings(*image.shape[1::-1])
         if options.boxes:
             check_sizes(plan, *image.shape[1::-1])
-        return runner._work(plan, image, noise_key, options)
+        if not state:
+            return runner._work(plan, image, noise_key, options)
+        # A frame is processed whole. Without steps with state, it is like any other image.
+        whole = replace(options, boxes=(), state=state if plan.states else None)
+        work = runner._work(plan, image, noise_key, whole)
+        if not options.boxes:
+            return work
+        finish = work.finish
+        return replace(work, finish=lambda output: finish(output).cropped(options.boxes))
 
     def _work(self, plan: Plan, image: Array, noise_key: str, options: RunOptions) -> Work[Result]:
         """Return the work of one image whose other exposures are done. See :meth:`work`."""
         width, height = image.shape[1::-1]
-        estimates = self._estimates_for(width, height) if has_size_estimates(self.chain) else {}
         return Work(
             plan,
             image,
             binding(self.chain, plan, (width, height), noise_key, self._tables),
             allocate_results(plan, width, height, options.into, options.boxes),
             options,
-            partial(self._result, plan, estimates),
+            partial(self._result, plan, size_estimates(self.chain, width, height)),
         )
 
     def _with_exposures(
@@ -316,17 +327,6 @@ class Runner:
                 f"{self.chain.source.label}, {axes}"
             )
 
-    def _estimates_for(self, width: int, height: int) -> dict[str, dict[str, float]]:
-        """Return the numbers that each step derives from the size of its image."""
-        found = {}
-        for step in self.chain.steps:
-            if values := step.method.estimates_for(width, height):
-                found[step.name] = dict(values)
-            for pass_ in step.passes:
-                if isinstance(pass_.access, Resample):
-                    width, height = pass_.access.resampler.resized(width, height)
-        return found
-
     @staticmethod
     def _result(plan: Plan, from_size: dict[str, dict[str, float]], output: HostImages) -> Result:
         """Return the results of an image, from the device's output."""
@@ -342,30 +342,32 @@ class Runner:
             },
         )
 
-    def _run_numpy(self, image: Floats, noise_key: str, boxes: Sequence[Box]) -> Result:
+    def _run_numpy(self, image: Floats, noise_key: str, options: RunOptions) -> Result:
         kept: dict[str, Floats] = {}
         estimates: dict[str, dict[str, float]] = {}
+        state = options.state
         whole = self.encode or self.final
         steps = (self.chain if whole else self.chain.up_to(self.keep)).steps
         for step in steps:
             from_size = dict(step.method.estimates_for(*image.shape[1::-1]))
             streams = {s: self.chain.stream(step.name, s, noise_key) for s in NoiseScope}
-            context = ReferenceContext(step.context, streams, from_size)
+            previous = state.array(step, image.shape) if state else None
+            context = ReferenceContext(step.context, streams, from_size, previous)
             with user_code_errors(f"stage {step.name}", step.stage.folder):
                 image = step.method.reference(image, context)
+            if state:
+                state.keep_array(step, image)
             if step.name in self.keep:
                 kept[step.name] = image
             if context.estimates:
                 estimates[step.name] = context.estimates
-        if boxes:
-            image, *parts = (crop_patches(each, boxes) for each in (image, *kept.values()))
-            kept = dict(zip(kept, parts, strict=True))
-        return Result(
+        result = Result(
             final=image if self.final or steps[-1].name in self.keep else None,
             encoded=to_8_bit(image) if self.encode else None,
             kept=kept,
             estimates=estimates,
         )
+        return result.cropped(options.boxes) if options.boxes else result
 
 
 def submit_batch(

@@ -6,7 +6,10 @@ from clpipe.engine.ir import AnyLaunch, Image, Launch, reads_of
 
 
 def assign_slots(
-    launches: Sequence[AnyLaunch], images: Sequence[Image], pinned: set[int]
+    launches: Sequence[AnyLaunch],
+    images: Sequence[Image],
+    pinned: set[int],
+    stored: Sequence[Image] = (),
 ) -> tuple[tuple[tuple[int, ...], ...], int]:
     """Assign slots to the planes of every image, by liveness.
 
@@ -15,6 +18,7 @@ def assign_slots(
         images: the images that the launches write.
         pinned: the numbers of images whose slots are never reused: results, and images that stay on
             the device.
+        stored: pinned images that no launch writes, because they are on the device already.
 
     Returns:
         The slots of each image, by its number, and the number of slots.
@@ -25,6 +29,9 @@ def assign_slots(
     slots: dict[int, tuple[int, ...]] = {}
     free: list[int] = []
     count = 0
+    for image in stored:
+        slots[image.number] = tuple(range(count, count + len(image.kind.channels)))
+        count += len(image.kind.channels)
     for i, launch in enumerate(launches):
         if isinstance(launch, Launch) and launch.writes:
             planes = len(launch.writes.kind.channels)

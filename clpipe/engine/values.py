@@ -7,7 +7,7 @@ import numpy as np
 
 from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.types import Array
-from clpipe.chain.chain import Chain
+from clpipe.chain.chain import Chain, cached_by_structure
 from clpipe.engine.bindings import (
     ArgumentValue,
     Bind,
@@ -19,7 +19,7 @@ from clpipe.engine.bindings import (
 from clpipe.engine.ir import Plan
 from clpipe.reference.curve import compose, to_8_bit
 from clpipe.reference.random import Stream
-from clpipe.stage import NoiseScope
+from clpipe.stage import Method, NoiseScope, Resample
 
 
 def binding(
@@ -60,6 +60,27 @@ def binding(
         ]
 
     return bind
+
+
+@cached_by_structure
+def has_size_estimates(chain: Chain) -> bool:
+    """Return whether a stage derives numbers from the size of the image."""
+    return any(type(s.method).estimates_for is not Method.estimates_for for s in chain.steps)
+
+
+def size_estimates(chain: Chain, width: int, height: int) -> dict[str, dict[str, float]]:
+    """Return the numbers that steps derive from the size of their image, by step and name.
+
+    ``width`` and ``height`` are those of the source in pixels.
+    """
+    found: dict[str, dict[str, float]] = {}
+    for step in chain.steps if has_size_estimates(chain) else ():
+        if values := step.method.estimates_for(width, height):
+            found[step.name] = dict(values)
+        for pass_ in step.passes:
+            if isinstance(pass_.access, Resample):
+                width, height = pass_.access.resampler.resized(width, height)
+    return found
 
 
 def encoding_table(curves: Sequence[Array], tables: BoundedCache[Array]) -> Array:

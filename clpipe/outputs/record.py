@@ -13,6 +13,7 @@ from clpipe.chain.photometry import photometry_of
 from clpipe.chain.render_camera import POSE
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
+from clpipe.engine.state import has_state
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import FLIPS, orientation_of
 from clpipe.inputs.carry import CarriedLayers
@@ -57,6 +58,9 @@ def subframe_records(
         {"file": name, "size": size, "modified": modified, "sha256": digest}
         for (name, digest), (size, modified) in zip(source.subframes, stamps, strict=True)
     ]
+
+
+PLACE = "place"  # the entry of a picture that depends on the frames before, with its place
 
 
 def picture_record(
@@ -112,6 +116,7 @@ def picture_record(
         "height": height,
         "camera": chain.camera.name,
         "iso": chain.iso,
+        **({PLACE: asdict(job.place)} if job.place and has_state(chain) else {}),
         **({"lens": lens.name} if (lens := chain.optics.calibration) else {}),
         "output": chain.settings.output.model_dump()
         | chain.settings.render.with_defaults(source.shot).model_dump(exclude=POSE),

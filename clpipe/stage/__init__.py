@@ -26,6 +26,7 @@ from clpipe.stage.checking import run_reference, variant_label, variants
 from clpipe.stage.context import Context, ReferenceContext
 from clpipe.stage.method import Method, Stage, StageRole, parameter
 from clpipe.stage.passes import (
+    PREVIOUS,
     Argument,
     Arguments,
     CompileTime,
@@ -45,6 +46,7 @@ from clpipe.stage.signal import Backend, Numbers, Signal, SignalMethod, sensor_b
 
 __all__ = [
     "PERIOD",
+    "PREVIOUS",
     "Argument",
     "Arguments",
     "Array",

@@ -6,6 +6,7 @@ from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
 
+from clpipe.base.types import Floats
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.optics import Optics
 from clpipe.camera.profile import IDENTITY, Camera, Matrix
@@ -91,9 +92,11 @@ class ReferenceContext:
     """Inputs of a reference besides the image and its parameters.
 
     ``stream`` contains the random streams by scope. A reference stores the numbers that it
-    estimates from the image, for example gains, in ``estimates``.
+    estimates from the image, for example gains, in ``estimates``. ``previous`` is the stage's
+    result for the frame before, of the image's shape; None if there is none.
     """
 
     context: Context
     stream: Mapping[NoiseScope, Stream]
     estimates: dict[str, float]
+    previous: Floats | None = None

@@ -115,6 +115,10 @@ class Reduction:
 Access = Pointwise | TableLookup | Stencil | Resample | LineTable | Reduction
 
 
+# What a stage with state calls its result for the frame before, see :class:`Pass`.
+PREVIOUS = "previous"
+
+
 @dataclass(frozen=True)
 class Pass:
     """One function of a method's kernel file, and how the planner may use it.
@@ -125,7 +129,8 @@ class Pass:
         arguments: those after the pixel, in order. Their names are from :meth:`Method.arguments`,
             the estimates of an earlier :class:`Reduction`, or the table of an earlier
             :class:`LineTable`.
-        reads: images of the stage: "src" is its input, any other name an image between its passes.
+        reads: images of the stage: "src" is its input, "previous" its result for the frame before,
+            any other name an image between its passes. A stage without a frame before does nothing.
         writes: another such name, or "dst", the stage's output.
         kind: kind of the image it writes; None is the kind that the stage writes.
         random: scope of the noise, for a function whose first argument is a random stream.

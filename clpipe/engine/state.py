@@ -1,0 +1,138 @@
+"""State: what the frames of a sequence leave on a device, or in NumPy, for the next frame."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from clpipe.base.errors import DeviceFailedError
+from clpipe.base.types import Floats
+from clpipe.chain.chain import Chain, Step, cached_by_structure
+from clpipe.engine.bindings import slot_buffer
+from clpipe.engine.extents import Extent, Extents
+from clpipe.engine.ir import Image, Plan
+from clpipe.stage import PREVIOUS
+
+if TYPE_CHECKING:
+    from clpipe.engine.flow import Flow
+
+Layout = tuple[tuple[str, Extent], ...]
+
+
+def keeps_state(step: Step) -> bool:
+    """Return whether a step reads its result for the frame before."""
+    return any(PREVIOUS in pass_.reads for pass_ in step.passes)
+
+
+@cached_by_structure
+def has_state(chain: Chain) -> bool:
+    """Return whether a step of a chain reads its result for the frame before."""
+    return any(keeps_state(step) for step in chain.steps)
+
+
+def layout_of(plan: Plan, extents: Extents) -> Layout:
+    """Return the steps with state, each with the extent of its result."""
+    return tuple((step, extents[after.level]) for step, _, after in plan.states)
+
+
+class State:
+    """The last results of the stages with state, for one sequence and one rendition of its frames.
+
+    Run the frames one by one, in temporal order, on one device. A frame whose results differ in
+    size from those of the frame before starts again, like the first one. If the device fails for a
+    frame, the later ones fail as well, because their results depend on it.
+
+    >>> import numpy as np
+    >>> from clpipe.chain.making import make_chain
+    >>> from clpipe.chain.settings import Settings
+    >>> from clpipe.engine.options import RunOptions
+    >>> from clpipe.engine.runner import Runner
+    >>> chain = make_chain(Settings(iso=3200, stages=("temporal_denoise",)))
+    >>> runner, state = Runner(chain, None, encode=False, final=True), State()
+    >>> frames = 0.2 + 0.005 * np.random.default_rng(0).normal(size=(20, 24, 32, 3))
+    >>> results = [runner.run(frame, "", RunOptions(state=state)).image for frame in frames]
+    >>> bool(results[-1].std() < 0.5 * frames.std())
+    True
+
+    Attributes:
+        buffers: the buffers of the frame that is enqueued, by their names in its plan.
+        is_lost: whether the device failed for a frame.
+    """
+
+    def __init__(self) -> None:
+        self.buffers: Mapping[str, Any] = {}
+        self.is_lost = False
+        self._arrays: dict[str, Floats] = {}  # in NumPy, by step
+        self._flow: Flow | None = None
+        # The layout of the planes, which is () before the first frame.
+        self._layout: Layout = ()
+        self._next_layout: Layout = ()
+        # A frame reads one set of planes and writes the other, because a stencil reads neighbours.
+        self._read: dict[str, Any] = {}
+        self._written: dict[str, Any] = {}
+
+    @property
+    def bytes(self) -> int:
+        """The bytes of all planes on the device."""
+        return sum(plane.size for each in (self._read, self._written) for plane in each.values())
+
+    def array(self, step: Step, shape: tuple[int, ...]) -> Floats | None:
+        """Return a step's result for the frame before, in NumPy; None if none has this shape."""
+        found = self._arrays.get(step.name)
+        return found if found is not None and found.shape == shape else None
+
+    def keep_array(self, step: Step, image: Floats) -> None:
+        """Keep a step's result in NumPy, if the step has state."""
+        if keeps_state(step):
+            self._arrays[step.name] = image
+
+    def is_first(self, plan: Plan, extents: Extents) -> bool:
+        """Return whether the next frame is the first one, or differs in layout from the last."""
+        return self._layout != layout_of(plan, extents)
+
+    def begin_frame(self, flow: "Flow", plan: Plan, extents: Extents) -> None:
+        """Set :attr:`buffers` for a frame that is to be enqueued.
+
+        Raises:
+            DeviceFailedError: the frame before is lost.
+        """
+        if self._flow not in (None, flow):
+            self.lose()
+        self.check()
+        layout, is_first = layout_of(plan, extents), self.is_first(plan, extents)
+        if is_first:
+            flow.drain()  # no command may use a buffer that is released
+            self._read, self._written = {}, {}
+        buffers: dict[str, Any] = {}
+
+        def add(step: str, image: Image, planes: dict[str, Any]) -> None:
+            for channel, slot in enumerate(plan.slots[image.number]):
+                name = f"{step} {channel}"
+                if name not in planes:
+                    planes[name] = flow.new_buffer(extents[image.level].plane_bytes)
+                buffers[slot_buffer(slot)] = planes[name]
+
+        for step, before, after in plan.states:
+            assert is_first == (before is None), "frames are planned one by one"
+            if before:
+                add(step, before, self._read)
+            add(step, after, self._written)
+        self.buffers, self._next_layout, self._flow = buffers, layout, flow
+
+    def end_frame(self) -> None:
+        """Let the next frame read what the enqueued one writes."""
+        self._read, self._written, self._layout = self._written, self._read, self._next_layout
+
+    def lose(self) -> None:
+        """Let all later frames fail."""
+        self.is_lost = True
+
+    def check(self) -> None:
+        """Check that the frame before is on the device.
+
+        Raises:
+            DeviceFailedError: it is not.
+        """
+        if self.is_lost:
+            raise DeviceFailedError(
+                "the device failed for an earlier frame of this sequence, whose result this frame "
+                "needs. Run the sequence again"
+            )

@@ -1,0 +1,195 @@
+"""Denoising over time: a mean over the frames of a sequence, where nothing else has changed."""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+
+from clpipe.base.types import Floats
+from clpipe.reference.image import tap
+from clpipe.stage import (
+    PREVIOUS,
+    Arguments,
+    CompileTime,
+    Context,
+    Kind,
+    Method,
+    Noiseless,
+    Pass,
+    ReferenceContext,
+    Stage,
+    Stencil,
+    parameter,
+    typed_arguments,
+)
+from clpipe.stages.denoise.strength import noise_of_colours
+
+COLOURS = "red", "green", "blue"
+PATCH = [(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+# What a move costs in units of the squared difference that noise explains, and what each pixel of
+# it costs. Found by experiment: with less, noise chooses moves in static areas.
+MOVE, MOVE_BY = 0.5, 0.05
+SMALLEST = 1e-12  # of variances, so that images without noise have a weight, too
+
+
+class Recursive(Method):
+    """A recursive mean: result = image + (1 - alpha) * g * (previous result - image).
+
+    Here alpha = 2 / (frames + 1). In static areas, g is 1. White noise of the variance s then
+    settles at s / ``frames``, and the results of two successive frames correlate by 1 - alpha.
+
+    g depends on the squared difference between the image and the previous result, averaged over 3x3
+    pixels and three colours. The unit of this difference is twice the variance a*y + b that
+    ``denoise`` expects. Static areas have a difference of 1 in the second frame, and less later. g
+    is 1 for differences up to half of ``threshold`` squared. From there to ``threshold`` squared,
+    it falls to 0 like Tukey's biweight.
+
+    An edge that moves by whole pixels leaves less than 2 % of its contrast at its former place.
+    This holds for contrasts of six times the noise of the brighter side, and more.
+
+    The stage needs a sequence. It returns a single image and a first frame unchanged.
+    """
+
+    method: ClassVar = "recursive"
+    kernel: ClassVar = "temporal_denoise"
+    summary: ClassVar = "recursive mean over frames where the image is static"
+    tolerance: ClassVar = 1e-5
+
+    frames: float = parameter(
+        6.0,
+        "Number of frames whose mean has the noise of static areas; 1 disables the stage.",
+        "",
+        ge=1,
+        le=1000,
+    )
+    threshold: float = parameter(
+        2.0,
+        "Difference from the frame before above which a pixel keeps all of its noise, relative to "
+        "the difference that noise causes.",
+        gt=0,
+        le=100,
+    )
+
+    @property
+    def search_radius(self) -> int:
+        """The radius of the search for motion, in px; 0 searches for none."""
+        return 0
+
+    def noise_free(self, context: Context) -> Method:
+        return Noiseless()
+
+    def passes(self) -> tuple[Pass, ...]:
+        if self.frames == 1:
+            return ()
+        colours = [f"{colour}_{item}" for colour in COLOURS for item in ("slope", "offset")]
+        names = ("radius", "kept", "limit", *colours)
+        reach = self.search_radius + 1
+        return (Pass("blend", Stencil(reach), names, reads=("src", PREVIOUS)),)
+
+    def arguments(self, context: Context) -> Arguments:
+        return {
+            "radius": CompileTime(str(self.search_radius)),
+            "kept": (self.frames - 1) / (self.frames + 1),
+            "limit": 2 / self.threshold**2,
+            **expected_differences(context),
+        }
+
+    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
+        previous = inputs.previous
+        if previous is None or self.frames == 1:
+            return image
+        numbers: dict[str, Any] = typed_arguments(self.arguments(inputs.context))
+        slope, offset = (
+            np.array([numbers[f"{colour}_{item}"] for colour in COLOURS])
+            for item in ("slope", "offset")
+        )
+        level = np.zeros_like(image)
+        for dx, dy in PATCH:
+            level += tap(image, dx, dy)
+        weights = np.float32(1) / (np.maximum(level, np.float32(0)) * slope + offset)
+        difference, before = best_match(image, previous, weights, self.search_radius)
+        alike = np.clip(np.float32(2) - difference * numbers["limit"], np.float32(0), np.float32(1))
+        share = numbers["kept"] * (alike * alike)
+        return np.asarray(image + share[..., None] * (before - image))
+
+
+class BlockMatching(Recursive):
+    """The recursive mean along the motion since the frame before.
+
+    Each pixel is compared with those of the previous result in a square around it. The one whose
+    3x3 pixels differ least takes the place of the previous result. Noise alone rarely causes a
+    move, because a move must reduce the difference by more than 0.5, and by 0.05 for each pixel.
+    """
+
+    method: ClassVar = "block_matching"
+    summary: ClassVar = "recursive mean over frames along the motion, by whole pixels; slow"
+
+    radius: int = parameter(
+        3, "Largest motion between two frames, along each axis.", "px", structural=True, ge=1, le=7
+    )
+
+    @property
+    def search_radius(self) -> int:
+        return self.radius
+
+
+def expected_differences(context: Context) -> Mapping[str, float]:
+    """Return the squared difference that noise explains, summed over 3x3 pixels and three colours.
+
+    It is linear in the sum of 3x3 pixels of a colour, so each colour has a slope and an offset.
+    """
+    found: dict[str, float] = {}
+    for colour, variance in zip(COLOURS, noise_of_colours(context), strict=True):
+        # Twice the variance, because both images have it.
+        found[f"{colour}_slope"] = variance.slope * (2 * len(COLOURS))
+        found[f"{colour}_offset"] = (variance.offset + SMALLEST) * (2 * len(COLOURS) * len(PATCH))
+    return found
+
+
+def best_match(
+    image: Floats, previous: Floats, weights: Floats, radius: int
+) -> tuple[Floats, Floats]:
+    """Return the pixels of the previous result that fit an image best.
+
+    >>> before, now = (np.float32(np.arange(9) >= edge) for edge in (3, 5))
+    >>> before, now = (np.broadcast_to(row[:, None], (4, 9, 3)) for row in (before, now))
+    >>> difference, found = best_match(now, before, np.ones_like(now), 2)
+    >>> bool((found == now).all()), float(difference.max())
+    (True, 0.0)
+
+    Args:
+        image: (height, width, colour).
+        previous: the previous result, of that shape.
+        weights: the inverse of the squared difference that noise explains, of that shape.
+        radius: the largest move along each axis, px.
+
+    Returns:
+        The squared differences over what noise explains, (height, width), and the pixels.
+    """
+
+    def difference(x: int, y: int) -> Floats:
+        total = np.zeros_like(image)
+        for dx, dy in PATCH:
+            total += np.square(tap(image, dx, dy) - tap(previous, x + dx, y + dy))
+        parts = total * weights
+        return np.asarray(parts[..., 0] + parts[..., 1] + parts[..., 2])
+
+    before, best = previous, difference(0, 0)
+    least = best
+    offsets = range(-radius, radius + 1)
+    for x, y in ((x, y) for y in offsets for x in offsets if (x, y) != (0, 0)):
+        other = difference(x, y)
+        cost = other + np.float32(MOVE + MOVE_BY * (abs(x) + abs(y)))
+        is_better = cost < least
+        before = np.where(is_better[..., None], tap(previous, x, y), before)
+        best, least = np.where(is_better, other, best), np.minimum(cost, least)
+    return best, before
+
+
+STAGE = Stage(
+    "temporal_denoise",
+    "Reduce noise with the frames before, in a sequence.",
+    Kind.RGB,
+    Kind.RGB,
+    (Recursive, BlockMatching),
+)

@@ -1,0 +1,78 @@
+"""Time clpipe.Stream at the rate of a camera: pictures per second, latency, dropped frames.
+
+sh tools/run pages live --seconds 60
+"""
+
+import argparse
+import threading
+import time
+
+import numpy as np
+
+import clpipe
+
+LOOPS = {"exposure": {"method": "auto"}, "control": {"iso_max": 3200.0}}
+BALANCE = {"white_balance": {"method": "gray_world"}}
+CHAINS = {
+    "default": {},
+    "auto exposure and ISO": LOOPS,
+    "auto exposure, ISO and white balance": {**LOOPS, **BALANCE},
+    "eight-bit sRGB frames": {"transfer": "srgb"},
+    "raw": {"until": "quantize"},
+}
+
+
+def frames_of(count: int, width: int, height: int, is_srgb: bool) -> list[np.ndarray]:
+    """Return frames of smooth random light, or of its codes."""
+    rng = np.random.default_rng(0)
+    coarse = rng.uniform(0, 0.5, (count, -(-height // 40), -(-width // 40), 3))
+    light = coarse.repeat(40, 1).repeat(40, 2)[:, :height, :width]
+    return list((light * 255).astype(np.uint8) if is_srgb else light.astype(np.float32))
+
+
+def measure(
+    options: dict, rate: float, seconds: float, width: int, height: int
+) -> tuple[float, float, float, int]:
+    """Return pictures per second, median and largest latency in frames, and dropped frames."""
+    frames = frames_of(8, width, height, options.get("transfer") == "srgb")
+    sent: dict[int, float] = {}
+    late: list[float] = []
+    with clpipe.Stream(iso=800, drop=True, **options) as stream:
+
+        def read() -> None:
+            for shot in iter(stream.get, None):
+                late.append((time.perf_counter() - sent[shot.index]) * rate)
+
+        reader = threading.Thread(target=read)
+        reader.start()
+        count = int(rate * seconds)
+        start = time.perf_counter() + 1
+        for number in range(-int(rate), count):  # the first second compiles
+            time.sleep(max(0.0, start + number / rate - time.perf_counter()))
+            sent[number + int(rate)] = time.perf_counter()
+            stream.put(frames[number % len(frames)])
+            if number == 0:
+                began, dropped, done = time.perf_counter(), stream.dropped, len(late)
+        stream.end()
+        reader.join()
+        elapsed = time.perf_counter() - began
+        late = late[done:]
+        return len(late) / elapsed, float(np.median(late)), max(late), stream.dropped - dropped
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--size", default="1280x720", help="the size of frames in px")
+    parser.add_argument("--rate", type=float, default=30, help="frames per second")
+    parser.add_argument("--seconds", type=float, default=30, help="the time for each chain")
+    arguments = parser.parse_args()
+    width, height = map(int, arguments.size.split("x"))
+    print("| chain | pictures per second | latency in frames, median and largest | dropped |")
+    print("|---|---|---|---|")
+    for name, options in CHAINS.items():
+        found = measure(options, arguments.rate, arguments.seconds, width, height)
+        print("| {} | {:.1f} | {:.2f}, {:.2f} | {} |".format(name, *found))
+
+
+if __name__ == "__main__":
+    main()
