@@ -13,6 +13,7 @@ from clpipe.base.errors import RequestError
 from clpipe.batch import clip_sink
 from clpipe.batch.clips import parse_bit_rate, parse_rate
 from clpipe.images.video import read_video, video_info
+from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import statuses, written
 
 pytest.importorskip("av", reason="needs PyAV: pip install av")
@@ -158,6 +159,25 @@ def test_a_run_that_was_killed_before_encoding_resumes(clpipe, frames, monkeypat
     made = [name for name, status in statuses(OUT).items() if status == "done"]
     assert "cam0/f1.exr" in made
     assert len(made) <= 2  # the last frame's outcome names the clip
+    assert (OUT / "cam0.mkv").read_bytes() == whole
+
+
+def test_frames_that_depend_on_earlier_ones_are_all_made_again(clpipe, frames):
+    stages = [*DEFAULT_CHAIN]
+    stages.insert(stages.index("denoise"), "temporal_denoise")
+    options = (*RUN, "--stages", ",".join(stages))
+    clpipe("run", frames(), *options)
+    whole = (OUT / "cam0.mkv").read_bytes()
+    before = stamps()
+    clpipe("run", "in", *options)
+    assert stamps() == before
+    shutil.rmtree(OUT)
+    broken = Path("in/cam0/f2.exr")
+    picture = broken.read_bytes()
+    broken.write_bytes(picture[:200])
+    clpipe("run", "in", *options, status=1)
+    broken.write_bytes(picture)
+    clpipe("run", "in", *options)
     assert (OUT / "cam0.mkv").read_bytes() == whole
 
 
