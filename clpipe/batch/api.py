@@ -132,9 +132,9 @@ def run(
             the picture. all also writes the layers of its start and end. The choices are "start",
             "middle", "end", "all". None is middle.
         sequence: process the frames of each directory as a sequence, in the order of the numbers in
-            their names. A draw has one value for each sequence, unless it is a drift.
-            exposure.method=auto and estimated white balance follow the frames with the loops of
-            [control]. OUT/run.csv is a manifest with the settings of each frame.
+            their names. A draw has one value for each sequence, unless it is a drift. Automatic
+            exposure and white balance follow the frames with the loops of [control]. OUT/run.csv
+            lists the settings of all frames.
         frames: the number of frames of a burst. Each frame has its own noise, and the burst its
             ground truth.
         bracket: the exposures of a bracket, in EV relative to the exposure that is set. Each
