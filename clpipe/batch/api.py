@@ -144,9 +144,9 @@ def run(
             the picture. all also writes the layers of its start and end. The choices are "start",
             "middle", "end", "all". None is middle.
         sequence: process the frames of each directory as a sequence, in the order of the numbers in
-            their names. A draw has one value for each sequence, unless it is a drift.
-            exposure.method=auto and estimated white balance follow the frames with the loops of
-            [control]. OUT/run.csv is a manifest with the settings of each frame.
+            their names. A draw has one value for each sequence, unless it is a drift. Automatic
+            exposure and white balance follow the frames with the loops of [control]. OUT/run.csv
+            lists the settings of all frames.
         codec: the codec of clips. ffv1 is lossless, and needs mkv. The choices are "h264", "h265",
             "ffv1". None is h264.
         bit_depth: the bits per sample of clips, 8 or 10. None is 8.

@@ -127,9 +127,9 @@ _ALL = (
         "sequence",
         bool,
         "Process the frames of each directory as a sequence, in the order of the numbers in their "
-        "names. A draw has one value for each sequence, unless it is a drift. exposure.method=auto "
-        "and estimated white balance follow the frames with the loops of [control]. OUT/run.csv is "
-        "a manifest with the settings of each frame.",
+        "names. A draw has one value for each sequence, unless it is a drift. Automatic exposure "
+        "and white balance follow the frames with the loops of [control]. OUT/run.csv lists the "
+        "settings of all frames.",
     ),
     Key(
         "codec",

@@ -61,6 +61,7 @@ def measure(
 
 
 def main() -> None:
+    """Print a table with a row for each chain."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", default="1280x720", help="the size of frames in px")
     parser.add_argument("--rate", type=float, default=30, help="frames per second")
