@@ -121,7 +121,8 @@ def _placed(key: str, frames: Sequence[tuple[int, Job]]) -> Iterator[Job]:
         is_folder = folder.name == PurePosixPath(key).name
         sequence = str(folder if is_folder else folder / PurePosixPath(key).name)
         place = Place(key, sequence, (number - numbers[0]) // step, count)
-        if place in by_place:
+        # The run itself rejects two jobs with the same outputs.
+        if place in by_place and by_place[place].stem != job.stem:
             raise RequestError(
                 f"{by_place[place].label} and {job.label} are both frame {number} of the sequence "
                 f"{sequence}; remove or rename one of them"
