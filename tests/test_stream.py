@@ -199,8 +199,8 @@ def test_the_command_develops_standard_input(frames, tmp_path):
     ("data", "message"),
     [
         (b"hello", "frame 0 of standard input: this is no .npy"),
-        (npy(np.zeros((2, 2, 3), np.float32))[:-5], "the input ends after 43 of 48 bytes"),
-        (npy(np.array(["text"])).replace(b"'<U4'", b"'|O' "), "expected an image of numbers"),
+        (npy(np.zeros((2, 2, 3), np.float32))[:-5], "this is no .npy of numbers: EOF"),
+        (npy(np.array(["text"])).replace(b"'<U4'", b"'|O' "), "no .npy of numbers: Object arrays"),
     ],
 )
 def test_the_command_says_what_is_wrong_with_its_input(data, message):

@@ -6,11 +6,9 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import nullcontext
-from io import BytesIO
-from itertools import count
-from math import prod
+from io import BufferedIOBase, BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO, TextIO
+from typing import Any, TextIO, cast
 
 import click
 import numpy as np
@@ -20,13 +18,7 @@ from clpipe.base.types import Array
 from clpipe.chain.keys import KEYS
 from clpipe.commands.chain_options import SETTINGS, device_option, options, set_option, settings_in
 from clpipe.commands.options import Command, OutputPath
-from clpipe.images.pixels import MAX_PIXELS
 from clpipe.stream import Shot, Stream
-
-HEADERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
 
 
 @click.command("stream", cls=Command)
@@ -84,31 +76,26 @@ def stream(
     simulator | clpipe stream --iso 800 --set exposure.method=auto | viewer
     """
     settings = settings_in(others)
-    if sys.stdin.isatty():
+    if sys.stdin.isatty() or sys.stdout.isatty():
         raise RequestError(
-            "standard input is a terminal, but frames are expected; pipe a program's output into "
-            "clpipe stream"
-        )
-    if sys.stdout.isatty():
-        raise RequestError(
-            "standard output is a terminal, but pictures are written there; pipe it into a program "
-            "or a file"
+            "clpipe stream reads frames and writes pictures, but standard input or output is a "
+            "terminal; use pipes: simulator | clpipe stream | viewer"
         )
     camera = Stream(
         config or "default",
         name=name,
         device=selector,
         until=until,
-        transfer=transfer,  # type: ignore[arg-type]
+        transfer=transfer,
         drop=drop,
         **settings,
     )
     with open(log_path, "w", encoding="utf-8") if log_path else nullcontext() as log:
-        writer = Writer(camera, sys.stdout.buffer, log)
+        writer = Writer(camera, cast(BufferedIOBase, sys.stdout.buffer), log)
         writer.start()
         began = time.perf_counter()
         try:
-            for frame in frames_in(sys.stdin.buffer):
+            for frame in frames_in(cast(BufferedReader, sys.stdin.buffer)):
                 if writer.error:
                     break
                 camera.put(frame)
@@ -140,7 +127,7 @@ class Writer(threading.Thread):
         error: why no more can be written.
     """
 
-    def __init__(self, stream: Stream, output: BinaryIO, log: TextIO | None) -> None:
+    def __init__(self, stream: Stream, output: BufferedIOBase, log: TextIO | None) -> None:
         super().__init__(name="pictures", daemon=True)
         self._stream = stream
         self._output = output
@@ -164,9 +151,7 @@ class Writer(threading.Thread):
                 self.error = error
 
     def _write(self, shot: Shot) -> None:
-        header = np.lib.format.header_data_from_array_1_0(shot.image)
-        np.lib.format.write_array_header_1_0(self._output, header)
-        self._output.write(np.ascontiguousarray(shot.image).data)
+        np.lib.format.write_array(Pipe(self._output), shot.image)
         self._output.flush()
         self.count += 1
         if self._log:
@@ -176,35 +161,32 @@ class Writer(threading.Thread):
             self._log.flush()
 
 
-def frames_in(file: BinaryIO) -> Iterator[Array]:
+class Pipe:
+    """A file that NumPy only reads and writes. Of other files, it asks their position."""
+
+    def __init__(self, file: BufferedIOBase) -> None:
+        self.read = file.read
+        self.write = file.write
+
+
+def frames_in(file: BufferedReader) -> Iterator[Array]:
     """Yield arrays from a file with one .npy after the other, which need not be seekable.
 
     >>> import io
     >>> file = io.BytesIO()
     >>> np.save(file, np.zeros((2, 3), np.float32)); np.save(file, np.ones((1, 2), np.uint8))
-    >>> [frame.shape for frame in frames_in(io.BytesIO(file.getvalue()))]
+    >>> [frame.shape for frame in frames_in(io.BufferedReader(io.BytesIO(file.getvalue())))]
     [(2, 3), (1, 2)]
 
     Raises:
-        ImageError: the bytes are no .npy, end early, or claim an image that is too large.
+        ImageError: the bytes are no .npy of numbers, end early, or do not fit into memory.
     """
-    for number in count():
-        where = f"frame {number} of standard input"
-        if not (magic := file.read(np.lib.format.MAGIC_LEN)):
-            return
+    number = 0
+    while file.peek(1):
         try:
-            version = np.lib.format.read_magic(BytesIO(magic))
-            shape, is_fortran, dtype = HEADERS[version](file)
-        except (ValueError, KeyError) as error:
-            raise ImageError(f"{where}: this is no .npy of version 1 or 2: {error}") from None
-        size = prod(shape)
-        if dtype.hasobject or is_fortran or not 0 < size <= 3 * MAX_PIXELS:
+            yield np.lib.format.read_array(Pipe(file), allow_pickle=False)
+        except (ValueError, MemoryError) as error:
             raise ImageError(
-                f"{where}: found {shape} of {dtype}; expected an image of numbers in C order"
-            )
-        data = file.read(size * dtype.itemsize)
-        if len(data) < size * dtype.itemsize:
-            raise ImageError(
-                f"{where}: the input ends after {len(data)} of {size * dtype.itemsize} bytes"
-            )
-        yield np.frombuffer(data, dtype).reshape(shape)
+                f"frame {number} of standard input: this is no .npy of numbers: {error}"
+            ) from None
+        number += 1
