@@ -86,7 +86,7 @@ def stream(
         name=name,
         device=selector,
         until=until,
-        transfer=transfer,
+        transfer=transfer,  # type: ignore[arg-type]
         drop=drop,
         **settings,
     )
