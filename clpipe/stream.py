@@ -32,6 +32,13 @@ SRGB = inverse_srgb_curve(np.arange(256) / 255).astype(np.float32)  # the light 
 class Shot:
     """A frame of a :class:`Stream`.
 
+    >>> import numpy as np
+    >>> import clpipe
+    >>> with clpipe.Stream(iso=800, device="numpy", until="quantize") as stream:
+    ...     shot = stream(np.full((24, 32, 3), 0.05, np.float32))
+    >>> shot.index, shot.image.shape, shot.image.dtype
+    (0, (24, 32), dtype('uint16'))
+
     Attributes:
         index: the number of the frame, from 0. Frames that were dropped are counted.
         image: the picture, (height, width, 3) uint8; the raw, (height, width) uint16, if the chain

@@ -186,8 +186,8 @@ def test_every_command_has_a_form_for_programs():
     for name in COMMANDS:
         command = main.get_command(click.Context(main), name)
         options = {option for each in command.params for option in each.opts}
-        expected = "--json-lines" if name in {"run", "dataset"} else "--json"
-        assert expected in options, name
+        lines = {"run": "--json-lines", "dataset": "--json-lines", "stream": "--log"}
+        assert lines.get(name, "--json") in options, name
 
 
 def test_answers_are_json(clpipe, folder):
