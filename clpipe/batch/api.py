@@ -112,8 +112,8 @@ def run(
             writes the frames of one sequence as a clip.
         config: a built-in configuration or a TOML file. The built-in ones are brooks2019,
             canon-5d2-jpeg, canon-5d3-jpeg, default, nikon-d800-jpeg, paper, syb3r, training,
-            unprocess. If you name several, each overrides those before it, and one with stages
-            replaces their development.
+            unprocess, video. If you name several, each overrides those before it, and one with
+            stages replaces their development.
         camera: a built-in camera, by name or model, or a profile (.toml). With several, each
             camera's pictures go to OUT/CAMERA. None is sony-a7r2.
         iso: the ISO. Noise and denoising depend on it. With several, each ISO's pictures go to a

@@ -253,6 +253,7 @@ class BlackLevelError(TypedDict, total=False):
     method: Draw | Literal["offsets"]
     sigma: Number
     bias: Several
+    offset: Number
 
 class Quantize(TypedDict, total=False):
     method: Draw | Literal["linear", "pwl"]

@@ -27,11 +27,12 @@ Bias = tuple[float, float, float, float]
 
 
 class Offsets(SignalMethod):
-    """y + bias + sigma * n: one offset per position in the filter array and frame.
+    """y + bias + offset + sigma * n: one offset per position in the filter array and frame.
 
     The bias is fixed for a camera and ISO: one number for R, for G in the rows of R, for G in the
     rows of B, and for B. It is the colour bias of Wei et al., TPAMI 2021, sec. 3.3. n is a standard
-    normal of that colour, new in each frame. Both are in signal units.
+    normal of that colour, new in each frame. ``offset`` is the same for all colours; let it drift
+    through a sequence for a black level that moves with temperature. All are in signal units.
 
     >>> from clpipe.stage import run_reference
     >>> black = np.zeros((4, 4), np.float32)
@@ -62,12 +63,14 @@ class Offsets(SignalMethod):
         "from the camera and ISO",
     )
 
+    offset: float = parameter(0.0, "Offset of all colours.", "signal", ge=-1, le=1)
+
     def resolve(self, context: Context) -> "Offsets":
         camera, iso = context.camera, context.iso
         return self.with_defaults(sigma=camera.black_level_error(iso), bias=camera.color_bias(iso))
 
     def passes(self) -> tuple[Pass, ...]:
-        if not self.sigma and not any(self.bias or ()):
+        if not (self.sigma or self.offset or any(self.bias or ())):
             return ()
         rows, image = LineTable("rows"), NoiseScope.IMAGE
         even = ("column_0", "bias_00", "bias_01", "sigma")
@@ -80,7 +83,8 @@ class Offsets(SignalMethod):
 
     def _bias_by_site(self, pattern: str) -> dict[tuple[int, int], np.float32]:
         """Return the fixed offset at a column and row of the filter array."""
-        red, with_red, with_blue, blue = map(float32, self.bias or (0.0,) * 4)
+        offsets = (float32(bias + self.offset) for bias in self.bias or (0.0,) * 4)
+        red, with_red, with_blue, blue = offsets
         green = with_red if "R" in pattern[:2] else with_blue
         other_green = with_blue if "R" in pattern[:2] else with_red
         by_colour = {"R": (red, red), "B": (blue, blue), "G": (green, other_green)}
