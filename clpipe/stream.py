@@ -13,11 +13,11 @@ import numpy as np
 from clpipe.base.errors import DeviceFailedError, ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.base.validation import check_argument_types
-from clpipe.engine.runner import Result, Runner
+from clpipe.engine.runner import Result
 from clpipe.engine.state import State
 from clpipe.images.arrays import as_array
 from clpipe.inputs.metering import Meter, merged
-from clpipe.pipeline import Pipeline
+from clpipe.pipeline import Pipeline, Prepared
 from clpipe.reference.geometry import NO_MARGINS
 from clpipe.reference.transfer import inverse_srgb_curve
 from clpipe.stage import Kind
@@ -244,23 +244,26 @@ class Stream:
         """Develop one frame: meter it, and run the chain with its settings."""
         pipeline, key = self._pipeline, f"{self._name}/{index:06}"
         drawn = pipeline.settings.drawn_values(self._name, index)
-        runner, prepared, own_key = pipeline.prepare(
-            self._light(frame), key, depth, NO_MARGINS, drawn
-        )
+        arrays = {} if depth is None else {"depth": depth}
+        first = pipeline.prepare(self._light(frame), key, arrays, NO_MARGINS, drawn)
 
-        def runner_of(values: Mapping[str, Any]) -> Runner:
+        def prepared_with(values: Mapping[str, Any]) -> Prepared:
             settings = merged(drawn, values)
-            return pipeline.prepare(prepared, key, depth, NO_MARGINS, settings, is_checked=True)[0]
+            return pipeline.prepare(first.pixels, key, arrays, NO_MARGINS, settings, first)
 
         reading = self._meter.read(
-            runner.chain, prepared, own_key, index, lambda values: runner_of(values).chain
+            first.runner.chain,
+            first.pixels,
+            first.own_key,
+            index,
+            lambda values: prepared_with(values).runner.chain,
         )
-        runner = runner_of(reading.values) if reading.values else runner
+        prepared = prepared_with(reading.values) if reading.values else first
         try:
-            result = pipeline.develop(runner, prepared, own_key, key, self._state)
+            result = pipeline.develop(prepared, key, self._state)
         except DeviceFailedError:
             self._state = State()  # the next frame starts again
             raise
-        is_raw = runner.chain.result is Kind.RAW
+        is_raw = prepared.runner.chain.result is Kind.RAW
         image = result.image.astype(np.uint16) if is_raw else result.image
         return Shot(index, image, merged(drawn, reading.values), reading.metered, result)
