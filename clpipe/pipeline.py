@@ -37,7 +37,8 @@ from clpipe.stage import ImageLayer, Kind
 if TYPE_CHECKING:
     from clpipe.chain.keywords import Keywords
 
-READERS = {"depth": "defocus.method=thin_lens"}  # a setting that reads a layer, by its kind
+# A setting that reads a layer, by its kind.
+READERS = {"depth": "defocus.method=thin_lens", "flow": "temporal_denoise.method=flow"}
 
 
 class Prepared(NamedTuple):

@@ -10,7 +10,15 @@ import numpy as np
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, cached_by_structure
+from clpipe.images.kinds import flow_vectors
+from clpipe.reference.carried import Layer, warp
 from clpipe.stage import ImageLayer, LayerMethod
+
+# The axes of an array of each kind, and the call that takes one.
+ARRAYS = {
+    "depth": ("(height, width)", "process(image, key, depth=depth)"),
+    "flow": ("(height, width, 2)", "stream(frame, flow=flow) of a clpipe.Stream"),
+}
 
 
 def layer_steps(chain: Chain) -> dict[str, LayerMethod]:
@@ -35,17 +43,24 @@ def layer_of(
         pixels: the layer, (height, width, channel), of the size of the image.
         record: its source, for a sidecar.
 
+    Returns:
+        The layer. If earlier steps move pixels, flow is warped like the image.
+
     Raises:
         ImageError: the layer has values that the step cannot use.
-        RequestError: an earlier step moves pixels, which would misalign the layer.
+        RequestError: an earlier step moves pixels, which would misalign depth.
     """
-    method = layer_steps(chain)[step]
-    for each in chain.up_to([step]).steps:
-        if each.method.geometry():
-            raise RequestError(
-                f"stages: {each.name} moves pixels before {step}, but does not move the "
-                f"{method.layer_kind} that {step} needs; list {each.name} after {step}"
-            )
+    method, before = layer_steps(chain)[step], chain.up_to([step])
+    if before.geometry and method.layer_kind == "depth":
+        name = next(each.name for each in before.steps if each.method.geometry())
+        raise RequestError(
+            f"stages: {name} moves pixels before {step}, but does not move the depth that {step} "
+            f"needs; list {name} after {step}"
+        )
+    if before.geometry:
+        layer = Layer(method.layer_kind, pixels, vectors=flow_vectors("", ("X", "Y")))
+        (warped,), valid = warp([layer], before.geometry, *pixels.shape[1::-1])
+        pixels = np.where(valid[..., None] > 0, warped, np.nan)
     return ImageLayer(method.layer_kind, method.parse_layer(pixels), record or {})
 
 
@@ -83,7 +98,7 @@ def layer_of_array(
     Args:
         chain: the chain.
         step: the name of the step.
-        pixels: the layer, (height, width).
+        pixels: the layer, (height, width), or for flow (height, width, 2).
         width, height: of the image in px.
 
     Raises:
@@ -91,14 +106,12 @@ def layer_of_array(
         RequestError: as for :func:`layer_of`.
     """
     kind = layer_steps(chain)[step].layer_kind
+    axes, call = ARRAYS[kind]
     if pixels is None:
-        raise ImageError(
-            f"{step} needs {kind}, (height, width), but none was passed; call "
-            f"process(image, key, {kind}={kind})"
-        )
-    if np.shape(pixels) != (height, width):
+        raise ImageError(f"{step} needs {kind}, {axes}, but none was passed; call {call}")
+    if np.shape(pixels) != (height, width, 2)[: axes.count(",") + 1]:
         raise ImageError(
             f"found {kind} of shape {np.shape(pixels)}, but the image has {(height, width)}; pass "
-            f"{kind} of the image's height and width"
+            f"{kind}, {axes}, of the image's height and width"
         )
     return layer_of(chain, step, np.reshape(pixels, (height, width, -1)))

@@ -45,8 +45,11 @@ def read_step_layer(
     found = _find(path, chain, step, [each.pattern for each in carried if each.pattern])
     pixels, (x, y) = read_layer_samples(found, path, margins.frame_size(width, height), max_pixels)
     place = x + margins.left, y + margins.top
-    samples = pixels[..., :1].astype(np.float32)
-    window = display_window(samples, *place, width, height, outside=np.inf)
+    # The first vector is that to the frame before.
+    channels, signs = found.vectors[0] if found.vectors else ((0,), (1,))
+    samples = pixels[..., list(channels)] * np.array(signs, np.float32)
+    outside = np.nan if found.vectors else np.inf
+    window = display_window(samples, *place, width, height, outside)
     record = {"layer": found.name, **file_record(path, found.file)}
     try:
         return layer_of(chain, step, window, record)
@@ -66,8 +69,10 @@ def _find(path: Path, chain: Chain, step: str, patterns: Sequence[str]) -> Layer
         except ImageError as error:
             errors.append(str(error))
     others = "" if name else ", ".join(method.usual_layers[1:])
-    searched = f" ({others} were looked for as well)" if others else ""
-    message = errors[0].replace("--carry", f"{step} needs {method.layer_kind}")
+    searched = f" (clpipe also looked for {others})" if others else ""
+    message = errors[0].partition("; choose another kind")[0]
+    message = message.replace("--carry:", f"{step} needs {method.layer_kind}:")
+    message = message.replace("--carry ", f"{step}.layer=")
     plain = chain.step_named(step).stage.methods[0].method
     raise ImageError(
         f"{message}{searched}; to use another layer, set {step}.layer; to use none, set "

@@ -1,13 +1,12 @@
 """Base classes that several methods share."""
 
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Array, Floats
 from clpipe.camera.lens import LensCalibration
-from clpipe.reference.carried import LayerKind
 from clpipe.reference.curve import curve_index
 from clpipe.stage.context import Context, ImageLayer, ReferenceContext
 from clpipe.stage.method import Method, parameter
@@ -111,7 +110,7 @@ class LayerMethod(Method):
         no_layer: the layer of a chain that has no image yet.
     """
 
-    layer_kind: ClassVar[LayerKind]
+    layer_kind: ClassVar[Literal["depth", "flow"]]
     usual_layers: ClassVar[tuple[str, ...]]
     no_layer: ClassVar[ImageLayer]
 

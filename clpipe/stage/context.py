@@ -4,14 +4,13 @@ import weakref
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from clpipe.base.cache import BoundedCache
 from clpipe.base.types import Floats
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.optics import Optics
 from clpipe.camera.profile import IDENTITY, Camera, Matrix
-from clpipe.reference.carried import LayerKind
 from clpipe.reference.cfa import Pattern, red_site
 from clpipe.reference.companding import Knots
 from clpipe.reference.filter_array import FilterArray, parse_array
@@ -30,7 +29,7 @@ class ImageLayer:
         derived: values derived from it, by their parameters; renditions share them.
     """
 
-    kind: LayerKind
+    kind: Literal["depth", "flow"]
     pixels: Floats
     record: Mapping[str, Any] = field(default_factory=dict)
     derived: BoundedCache[Any] = field(default_factory=lambda: BoundedCache(2))

@@ -1,14 +1,13 @@
 """Depth of field: points in front of or beyond the focus distance become discs."""
 
 from collections.abc import Mapping
-from typing import ClassVar, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import field_validator, model_validator
 
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Array, Floats
-from clpipe.reference.carried import LayerKind
 from clpipe.reference.defocus import aperture_taps, defocus, disc_reach, parse_depth
 from clpipe.stage import (
     Arguments,
@@ -56,7 +55,7 @@ class ThinLens(FocalLengthMethod, LayerMethod):
     tolerance: ClassVar = 1e-5
     example: ClassVar = {"max_radius": 3}
     alternatives: ClassVar = frozenset({"sensor_width", "pixel_pitch"})
-    layer_kind: ClassVar[LayerKind] = "depth"
+    layer_kind: ClassVar[Literal["depth"]] = "depth"
     usual_layers: ClassVar = ("Depth", "Z", "ZDepth", "Distance")
     no_layer: ClassVar = NO_SURFACE
 
