@@ -5,7 +5,7 @@ import threading
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, Unpack
 
 import numpy as np
 from xxhash import xxh3_64_hexdigest
@@ -16,10 +16,10 @@ from clpipe.base.text import as_texts, unknown_name
 from clpipe.base.types import Array, plain
 from clpipe.base.validation import check_argument_types
 from clpipe.chain.chain import Chain
-from clpipe.chain.depth import depth_of_array
 from clpipe.chain.entering import prepare_image
 from clpipe.chain.files import load_settings
 from clpipe.chain.identity import image_key, noise_key
+from clpipe.chain.layers import layer_of_array, layer_steps
 from clpipe.chain.making import make_chain
 from clpipe.chain.overscan import margins_of_array
 from clpipe.chain.settings import Settings, overlay
@@ -31,12 +31,30 @@ from clpipe.engine.state import State, has_state
 from clpipe.images.arrays import as_array, as_image
 from clpipe.images.kinds import MIN_CHANNELS, flow_vectors
 from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
-from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import NO_MARGINS, Margins
-from clpipe.stage import Kind
+from clpipe.stage import ImageLayer, Kind
 
 if TYPE_CHECKING:
     from clpipe.chain.keywords import Keywords
+
+# A setting that reads a layer, by its kind.
+READERS = {"depth": "defocus.method=thin_lens", "flow": "temporal_denoise.method=flow"}
+
+
+class Prepared(NamedTuple):
+    """An image that :meth:`Pipeline.prepare` has prepared.
+
+    Args:
+        runner: runs its chain, which holds only weak references to ``layers``.
+        pixels: its pixels.
+        own_key: its image key.
+        layers: the layers that steps read, by step.
+    """
+
+    runner: Runner
+    pixels: Array
+    own_key: str
+    layers: Mapping[str, ImageLayer]
 
 
 class Pipeline(ReadOnly):
@@ -163,11 +181,10 @@ class Pipeline(ReadOnly):
             ImageError: the image has a wrong shape or type, is not finite, or is too large.
             RequestError: a name or value is not allowed.
         """
-        return self.develop(*self.prepare(image, key, depth, overscan, settings), key)
+        arrays = {} if depth is None else {"depth": depth}
+        return self.develop(self.prepare(image, key, arrays, overscan, settings), key)
 
-    def develop(
-        self, runner: Runner, pixels: Array, own_key: str, key: str, state: State | None = None
-    ) -> Result:
+    def develop(self, prepared: Prepared, key: str, state: State | None = None) -> Result:
         """Return the result of an image that :meth:`prepare` has prepared.
 
         ``state`` is the state of the sequence that the image is a frame of.
@@ -175,10 +192,11 @@ class Pipeline(ReadOnly):
         Raises:
             ImageError: the image is too large.
         """
-        chain = runner.chain
+        chain = prepared.runner.chain
         options = RunOptions(state=state if has_state(chain) else None)
         with self._lock:
-            result = runner.run(pixels, noise_key(chain.settings, own_key), options)
+            seed = noise_key(chain.settings, prepared.own_key)
+            result = prepared.runner.run(prepared.pixels, seed, options)
         share = clipped_share(result, chain) or 0.0
         # Photographs are already clipped.
         if share >= WARNING_SHARE and chain.source is not Kind.DISPLAY:
@@ -189,15 +207,15 @@ class Pipeline(ReadOnly):
         self,
         image: Array,
         key: str,
-        depth: Array | None,
+        arrays: Mapping[str, Array],
         overscan: tuple[int, int, int, int],
         settings: Mapping[str, Any],
-        is_checked: bool = False,
-    ) -> tuple[Runner, Array, str]:
-        """Return what runs the chain on an image: its runner, its pixels, and its image key.
+        earlier: Prepared | None = None,
+    ) -> Prepared:
+        """Return an image with what runs the chain on it.
 
-        Arguments and errors are those of :meth:`process`. If an image was prepared before, with
-        other settings, ``is_checked`` saves time. It is then not checked, and has no image key.
+        Arguments and errors are those of :meth:`process`. ``arrays`` are its layers, by kind. If
+        the image was prepared before, with other settings, ``earlier`` saves time.
         """
         runner = self._runner_for(key, settings)
         for name in runner.chain.light_layer_steps:
@@ -206,26 +224,31 @@ class Pipeline(ReadOnly):
                 "Use clpipe run, which reads the layer from the render's file"
             )
         try:
-            checked = image if is_checked else as_image(image, runner.chain.source)
+            checked = earlier.pixels if earlier else as_image(image, runner.chain.source)
         except ImageError as error:
             raise ImageError(f"{key}: {error}") from None
         margins = margins_of_array(overscan, checked)
 
-        def depth_of(chain: Chain, width: int, height: int, kept: Margins) -> Depth:
-            depth_map = None if depth is None else as_array(depth, "depth")
-            cropped = depth_map if depth_map is None or kept else margins.cropped(depth_map)
-            return depth_of_array(cropped, width, height)
+        def layer(chain: Chain, step: str, width: int, height: int, kept: Margins) -> ImageLayer:
+            if earlier:
+                return earlier.layers[step]
+            kind = layer_steps(chain)[step].layer_kind
+            array = as_array(arrays[kind], kind) if kind in arrays else None
+            cropped = array if array is None or kept else margins.cropped(array)
+            return layer_of_array(chain, step, cropped, width, height)
 
-        entered = prepare_image(runner.chain, checked, margins, depth_of)
-        if depth is not None and entered.depth is None:
-            message = "no step reads the depth. Set defocus.method=thin_lens to use it"
+        entered = prepare_image(runner.chain, checked, margins, layer)
+        for kind in arrays.keys() - {each.kind for each in entered.layers.values()}:
+            message = f"no step reads the {kind}. Set {READERS[kind]} to use it"
             warnings.warn(f"{key}: {message}", stacklevel=3)
         for warning in entered.warnings:
             warnings.warn(f"{key}: {warning}", stacklevel=3)
         chain, pixels = entered.chain, entered.pixels
         runner = runner if chain is runner.chain else runner.for_chain(chain)
-        digest = "" if is_checked or chain.settings.noise_key else digest_of(pixels)
-        return runner, pixels, image_key(key, digest)
+        if earlier:
+            return Prepared(runner, pixels, earlier.own_key, entered.layers)
+        digest = "" if chain.settings.noise_key else digest_of(pixels)
+        return Prepared(runner, pixels, image_key(key, digest), entered.layers)
 
     __call__ = process
 

@@ -13,11 +13,11 @@ import numpy as np
 from clpipe.base.errors import DeviceFailedError, ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.base.validation import check_argument_types
-from clpipe.engine.runner import Result, Runner
+from clpipe.engine.runner import Result
 from clpipe.engine.state import State
 from clpipe.images.arrays import as_array
 from clpipe.inputs.metering import Meter, merged
-from clpipe.pipeline import Pipeline
+from clpipe.pipeline import Pipeline, Prepared
 from clpipe.reference.geometry import NO_MARGINS
 from clpipe.reference.transfer import inverse_srgb_curve
 from clpipe.stage import Kind
@@ -120,7 +120,7 @@ class Stream:
         self._count = 0
         # One frame waits while another is developed, so a picture is at most two frames late.
         self._is_free = threading.Semaphore(1)
-        self._frames: queue.SimpleQueue[tuple[int, Array, Array | None] | None]
+        self._frames: queue.SimpleQueue[tuple[int, Array, Mapping[str, Array]] | None]
         self._frames = queue.SimpleQueue()
         self._shots: queue.Queue[Shot | Exception | None] = queue.Queue(1)
         self._thread: threading.Thread | None = None
@@ -132,13 +132,16 @@ class Stream:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def __call__(self, frame: Array, depth: Array | None = None) -> Shot:
+    def __call__(self, frame: Array, depth: Array | None = None, flow: Array | None = None) -> Shot:
         """Develop the next frame, and return its picture.
 
         Args:
             frame: (height, width, 3) linear light as for :meth:`Pipeline.process`, or with
                 ``transfer="srgb"`` uint8. An array in shared memory is not copied.
             depth: as for :meth:`Pipeline.process`.
+            flow: (height, width, 2), for temporal_denoise with the method flow: from each pixel to
+                the place of its surface in the frame before, in px to the right and down. Pixels
+                whose surface that frame does not show are NaN. All of the first frame may be NaN.
 
         Raises:
             ImageError, RequestError: as for :meth:`Pipeline.process`. The next frame can still be
@@ -146,9 +149,9 @@ class Stream:
         """
         if self._thread:
             raise RequestError("this stream develops the frames of put; use get, not a call")
-        return self._develop(self._next_index(), as_array(frame, "frame"), depth)
+        return self._develop(self._next_index(), as_array(frame, "frame"), _by_kind(depth, flow))
 
-    def put(self, frame: Array, depth: Array | None = None) -> bool:
+    def put(self, frame: Array, depth: Array | None = None, flow: Array | None = None) -> bool:
         """Pass the next frame to the stream's thread. The frame is copied.
 
         This waits until the frame before it begins, or with ``drop`` drops the frame in this case.
@@ -168,7 +171,8 @@ class Stream:
         if not self._is_free.acquire(blocking=not self._drop):
             self.dropped += 1
             return False
-        copied = None if depth is None else np.array(as_array(depth, "depth"))
+        layers = _by_kind(depth, flow).items()
+        copied = {kind: np.array(as_array(layer, kind)) for kind, layer in layers}
         self._frames.put((index, np.array(as_array(frame, "frame")), copied))
         return True
 
@@ -247,27 +251,35 @@ class Stream:
             )
         return SRGB.take(frame, mode="clip")
 
-    def _develop(self, index: int, frame: Array, depth: Array | None) -> Shot:
+    def _develop(self, index: int, frame: Array, arrays: Mapping[str, Array]) -> Shot:
         """Develop one frame: meter it, and run the chain with its settings."""
         pipeline, key = self._pipeline, f"{self._name}/{index:06}"
         drawn = pipeline.settings.drawn_values(self._name, index)
-        runner, prepared, own_key = pipeline.prepare(
-            self._light(frame), key, depth, NO_MARGINS, drawn
-        )
+        first = pipeline.prepare(self._light(frame), key, arrays, NO_MARGINS, drawn)
 
-        def runner_of(values: Mapping[str, Any]) -> Runner:
+        def prepared_with(values: Mapping[str, Any]) -> Prepared:
             settings = merged(drawn, values)
-            return pipeline.prepare(prepared, key, depth, NO_MARGINS, settings, is_checked=True)[0]
+            return pipeline.prepare(first.pixels, key, arrays, NO_MARGINS, settings, first)
 
         reading = self._meter.read(
-            runner.chain, prepared, own_key, index, lambda values: runner_of(values).chain
+            first.runner.chain,
+            first.pixels,
+            first.own_key,
+            index,
+            lambda values: prepared_with(values).runner.chain,
         )
-        runner = runner_of(reading.values) if reading.values else runner
+        prepared = prepared_with(reading.values) if reading.values else first
         try:
-            result = pipeline.develop(runner, prepared, own_key, key, self._state)
+            result = pipeline.develop(prepared, key, self._state)
         except DeviceFailedError:
             self._state = State()  # the next frame starts again
             raise
-        is_raw = runner.chain.result is Kind.RAW
+        is_raw = prepared.runner.chain.result is Kind.RAW
         image = result.image.astype(np.uint16) if is_raw else result.image
         return Shot(index, image, merged(drawn, reading.values), reading.metered, result)
+
+
+def _by_kind(depth: Array | None, flow: Array | None) -> dict[str, Array]:
+    """Return the layers that were passed, by kind."""
+    layers = {"depth": depth, "flow": flow}
+    return {kind: layer for kind, layer in layers.items() if layer is not None}

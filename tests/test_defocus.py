@@ -9,7 +9,7 @@ import pytest
 
 import clpipe as clpipe_api
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.chain.depth import depth_of_array, with_depth
+from clpipe.chain.layers import layer_of_array, with_layers
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.runner import Runner
@@ -34,8 +34,8 @@ def at_radius(radius):
 def runner_for(image, depth, device, **lens):
     lens = {"method": "thin_lens", **LENS, **lens}
     chain = make_chain(settings_from({"stages": ["defocus"], "defocus": lens}))
-    held = depth_of_array(np.float32(depth), *image.shape[1::-1])
-    return Runner(with_depth(chain, held), device, encode=False, final=True), held
+    held = {"defocus": layer_of_array(chain, "defocus", np.float32(depth), *image.shape[1::-1])}
+    return Runner(with_layers(chain, held), device, encode=False, final=True), held
 
 
 def blurred(image, depth, device, **lens):
@@ -233,3 +233,31 @@ def test_in_python():
         pipeline.process(image, "a")
     with pytest.raises(ImageError, match=r"shape \(9, 13\)"):
         pipeline.process(image, "a", depth=depth[:, 1:])
+
+
+METERED = {
+    "iso": 800,
+    "stages": ["exposure", "defocus", "mosaic", "white_balance", "demosaic"],
+    "exposure": {"method": "auto"},
+    "defocus": {"method": "thin_lens", "max_radius": 3, **LENS},
+    "white_balance": {"method": "gray_world"},
+    "device": "numpy",
+}
+
+
+def test_frames_that_are_metered_keep_their_depth(render):
+    """White balance is metered from frames that the lens has blurred."""
+    image, depth = scene(9, 14)
+    Path("frames").mkdir()
+    for number in range(3):
+        render(f"frames/{number}.exr", **colours(image), Z=depth)
+    files = {"format": "exr", "sequence": True}
+    outcomes = list(clpipe_api.run("frames", "out", **METERED, **files))
+    assert [outcome.status for outcome in outcomes] == ["done"] * 3
+    values = [outcome.job.values for outcome in outcomes]
+    with clpipe_api.Stream(**METERED) as stream, pytest.warns(UserWarning, match="radii"):
+        shots = [stream(image, depth) for _ in range(3)]
+    for number, (shot, frame) in enumerate(zip(shots, values, strict=True)):
+        assert shot.settings == frame
+        made = read_image(Path(f"out/{number}.exr")).pixels
+        assert made == pytest.approx(shot.image, abs=2e-3)

@@ -14,7 +14,7 @@ from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.camera import lens as by_name
 from clpipe.camera.optics import Optics
-from clpipe.chain.depth import depth_of_array, with_depth
+from clpipe.chain.layers import layer_of_array, layer_steps, with_layers
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import overlay, settings_from
 from clpipe.images.read import read_image
@@ -96,8 +96,10 @@ def others_for(fact):
 
 def arguments(settings):
     """The arguments of all kernels for an image, and where they gather it."""
-    depth = depth_of_array(np.linspace(1, 9, SIZE[0] * SIZE[1]).reshape(SIZE[::-1]), *SIZE)
-    chain = with_depth(make_chain(settings), depth)
+    chain = make_chain(settings)
+    depth = np.linspace(1, 9, SIZE[0] * SIZE[1]).reshape(SIZE[::-1])
+    layers = {name: layer_of_array(chain, name, depth, *SIZE) for name in layer_steps(chain)}
+    chain = with_layers(chain, layers)
     found = {}
     for step in chain.steps:
         found |= {(step.name, k): v for k, v in step.method.arguments(step.context).items()}

@@ -10,7 +10,7 @@ import pytest
 
 import clpipe as clpipe_api
 from clpipe.base.errors import ImageError
-from clpipe.chain.depth import depth_of_array, with_depth
+from clpipe.chain.layers import layer_of_array, with_layers
 from clpipe.chain.making import make_chain
 from clpipe.chain.overscan import overscan_step_count, with_overscan
 from clpipe.chain.settings import settings_from
@@ -134,8 +134,8 @@ def test_stages_before_the_lens_see_the_overscan():
 
     def made(margins, image, depth):
         chain = chain_of(margins, **own)
-        held = depth_of_array(depth, *image.shape[1::-1])
-        runner = Runner(with_depth(chain, held), None, ("shutter", "defocus", "motion_blur"))
+        held = {"defocus": layer_of_array(chain, "defocus", depth, *image.shape[1::-1])}
+        runner = Runner(with_layers(chain, held), None, ("shutter", "defocus", "motion_blur"))
         return runner.run(image, "k").kept
 
     wide = made(AROUND, image, depth)

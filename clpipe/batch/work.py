@@ -20,9 +20,9 @@ from clpipe.batch.runners import Runners, SpareArrays
 from clpipe.batch.sinks import Folder
 from clpipe.chain.baseline import with_noise
 from clpipe.chain.chain import Chain
-from clpipe.chain.depth import depth_steps
 from clpipe.chain.exposures import exposures_of
 from clpipe.chain.formats import DNG
+from clpipe.chain.layers import layer_steps
 from clpipe.chain.rendition import Rendition
 from clpipe.engine.clipping import clipped_share
 from clpipe.engine.device import Device
@@ -71,8 +71,8 @@ class ImageWorker:
 
     @property
     def layer_count(self) -> int:
-        """The number of layers that are read with an image: carried layers, and its depth."""
-        return len(self.writer.request.carry) + bool(depth_steps(self.chain))
+        """The number of layers that are read with an image: carried layers, and those of steps."""
+        return len(self.writer.request.carry) + len(layer_steps(self.chain))
 
     @property
     def later_exposures(self) -> int:

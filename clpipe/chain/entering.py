@@ -1,23 +1,23 @@
-"""Prepare a chain for one image: its camera, its overscan and its depth."""
+"""Prepare a chain for one image: its camera, its overscan and its layers."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
 
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
-from clpipe.chain.depth import depth_warnings, needs_depth, with_depth
 from clpipe.chain.keys import RENDER
+from clpipe.chain.layers import layer_steps, layer_warnings, reads_layers, with_layers
 from clpipe.chain.making import make_chain
 from clpipe.chain.overscan import overscan_step_count, with_overscan
 from clpipe.chain.panorama import with_panorama
 from clpipe.chain.settings import overlay
 from clpipe.chain.void import black_area_warning
-from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.panorama import Panorama
+from clpipe.stage import ImageLayer
 from clpipe.stage.method import optics_names
 
 
@@ -25,13 +25,14 @@ from clpipe.stage.method import optics_names
 class PreparedImage:
     """An image with the chain prepared for it, and the pixels that enter the chain.
 
-    ``margins`` are the overscan of ``pixels`` and of the depth.
+    ``margins`` are the overscan of ``pixels`` and of the layers. ``layers``
+    are those that steps read, by step, and the chain needs them to stay alive.
     """
 
     chain: Chain
     pixels: Array
     margins: Margins = NO_MARGINS
-    depth: Depth | None = None
+    layers: Mapping[str, ImageLayer] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
 
 
@@ -39,7 +40,7 @@ def prepare_image(
     chain: Chain,
     pixels: Array,
     margins: Margins = NO_MARGINS,
-    depth: Callable[[Chain, int, int, Margins], Depth] | None = None,
+    layer: Callable[[Chain, str, int, int, Margins], ImageLayer] | None = None,
     shot: Mapping[str, float] | None = None,
     panorama: Panorama | None = None,
 ) -> PreparedImage:
@@ -49,14 +50,14 @@ def prepare_image(
         chain: the chain for images of this kind.
         pixels: the image, (height, width[, channel]).
         margins: the overscan of ``pixels``. It is cropped if the chain cannot use it.
-        depth: returns the image's depth, for a chain, a width and height in px, and margins. It is
-            called only if the chain needs depth. None skips depth.
+        layer: returns a layer of the image, for a chain, the name of the step that reads it, a
+            width and height in px, and margins. None skips layers.
         shot: the camera values in the image's file. Settings override them.
         panorama: the panorama, if the image is the atlas of one.
 
     Raises:
-        ImageError: ``depth`` raises it.
-        RequestError: the camera's values contradict each other, or a step cannot use the depth.
+        ImageError: ``layer`` raises it.
+        RequestError: the camera's values contradict each other, or a step cannot use its layer.
     """
     if chain.step_names[0] == chain.names[0] and pixels.ndim == 3:
         width, height = margins.frame_size(*pixels.shape[1::-1])
@@ -75,11 +76,11 @@ def prepare_image(
         chain = with_overscan(chain, margins)
     height, width = pixels.shape[:2]
     warnings = tuple(filter(None, [black_area_warning(chain, width, height)]))
-    if depth is None or pixels.ndim != 3 or not needs_depth(chain):
+    if layer is None or pixels.ndim != 3 or not reads_layers(chain):
         return PreparedImage(chain, pixels, margins, warnings=warnings)
-    image_depth = depth(chain, width, height, margins)
-    warnings += tuple(depth_warnings(chain, image_depth))
-    return PreparedImage(with_depth(chain, image_depth), pixels, margins, image_depth, warnings)
+    layers = {step: layer(chain, step, width, height, margins) for step in layer_steps(chain)}
+    warnings += tuple(layer_warnings(chain, layers))
+    return PreparedImage(with_layers(chain, layers), pixels, margins, layers, warnings)
 
 
 @lru_cache(maxsize=64)

@@ -375,10 +375,11 @@ class RestoreHighlights(TypedDict, total=False):
     blue_gain: Number
 
 class TemporalDenoise(TypedDict, total=False):
-    method: Draw | Literal["recursive", "block_matching"]
+    method: Draw | Literal["recursive", "block_matching", "flow"]
     frames: Number
     threshold: Number
     radius: Whole
+    layer: Text
 
 class Encoding(TypedDict, total=False):
     jpeg_quality: Whole

@@ -27,11 +27,10 @@ from clpipe.images.pixels import (
 )
 from clpipe.images.samples import digest_of, read_part, read_samples, with_digest
 from clpipe.images.statements import Statements, over_black, read_statements
-from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.panorama import Panorama
 from clpipe.reference.transfer import inverse_srgb_curve
-from clpipe.stage import Kind
+from clpipe.stage import ImageLayer, Kind
 
 RENDER_SUFFIXES = (".exr", ".hdr", ".pfm", ".tif", ".tiff")
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".bmp", ".tga", ".webp")
@@ -53,8 +52,8 @@ class SourceImage:
         shot: exposure_time (s), focal_length and sensor_width (mm), as far as the file states them.
         subframes: the names and digests of the files that were averaged.
         later: the images of further exposures, shaped like ``pixels``.
-        depth: the depth, if the chain needs it.
-        margins: the overscan of ``pixels`` and depth.
+        layers: the layers that steps of the chain read, by step.
+        margins: the overscan of ``pixels`` and layers.
         envmap: OpenImageIO's name of the environment map that the file states; otherwise "".
         panorama: the panorama, if ``pixels`` is an atlas of several views.
         part: the number of the layer's part in the file, from 0.
@@ -68,7 +67,7 @@ class SourceImage:
     shot: Mapping[str, float] = field(default_factory=dict)
     subframes: tuple[tuple[str, str], ...] = ()
     later: tuple[Array, ...] = ()
-    depth: Depth | None = None
+    layers: Mapping[str, ImageLayer] = field(default_factory=dict)
     margins: Margins = NO_MARGINS
     envmap: str = ""
     panorama: Panorama | None = None

@@ -35,16 +35,15 @@ from clpipe.images.read import (
 )
 from clpipe.inputs.carry import CarriedLayers, carry, merge_moments
 from clpipe.inputs.carry_panorama import carry_panorama
-from clpipe.inputs.depth import read_depth
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import KeptLoader, kind_message
+from clpipe.inputs.layers import read_step_layer
 from clpipe.inputs.manifest import check_rows
 from clpipe.inputs.panoramas import CUBE_MAP, group_panoramas, read_panorama, wide_lens_of
 from clpipe.inputs.raw import RawImage, RawLoader, may_be_dump
 from clpipe.inputs.subframes import average, exposures, shutter_of
-from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import Margins
-from clpipe.stage import Kind, Span, StageRole
+from clpipe.stage import ImageLayer, Kind, Span, StageRole
 from clpipe.stages.shutter import Rows
 
 
@@ -266,27 +265,30 @@ class ImageLoader:
     def enter(self, job: Job, source: SourceImage) -> LoadedImage | None:
         """Return an image with the chain for it.
 
-        Return None for a kept image from a folder that was not kept right before ``start_at``.
+        A source that was entered before keeps the layers that steps read. Return None for a kept
+        image from a folder that was not kept right before ``start_at``.
 
         Raises:
-            ImageError: the image cannot enter the chain, or lacks depth that the chain needs.
+            ImageError: the image cannot enter the chain, or lacks a layer that a step reads.
             RequestError: the chain cannot be made.
         """
-        loaded = self._enter_without_depth(job, source)
+        loaded = self._enter_without_layers(job, source)
         if loaded is None:
             return None
         source, request = loaded.source, self.request
         carried, max_pixels = request.aov_specs(), request.max_pixels or DEFAULT_MAX_PIXELS
 
-        def depth(chain: Chain, width: int, height: int, margins: Margins) -> Depth:
-            return read_depth(job.at("middle"), chain, width, height, margins, carried, max_pixels)
+        def layer(chain: Chain, step: str, width: int, height: int, margins: Margins) -> ImageLayer:
+            return source.layers.get(step) or read_step_layer(
+                job.at("middle"), chain, step, width, height, margins, carried, max_pixels
+            )
 
         around = source.panorama
         entry_ = prepare_image(
-            loaded.chain, source.pixels, source.margins, depth, source.shot, around
+            loaded.chain, source.pixels, source.margins, layer, source.shot, around
         )
         if entry_.pixels is source.pixels and not (
-            entry_.margins or entry_.depth or entry_.warnings
+            entry_.margins or entry_.layers or entry_.warnings
         ):
             return LoadedImage(entry_.chain, source, loaded.key)
         later = source.later
@@ -297,13 +299,13 @@ class ImageLoader:
             pixels=entry_.pixels,
             later=later,
             margins=entry_.margins,
-            depth=entry_.depth,
+            layers=entry_.layers,
             warnings=(*source.warnings, *entry_.warnings),
         )
         return LoadedImage(entry_.chain, source, loaded.key)
 
-    def _enter_without_depth(self, job: Job, source: SourceImage) -> LoadedImage | None:
-        """Return an image with its chain like :meth:`enter`, but without reading depth."""
+    def _enter_without_layers(self, job: Job, source: SourceImage) -> LoadedImage | None:
+        """Return an image with its chain like :meth:`enter`, but without reading layers."""
         key = image_key(job.key, source.sha256)
         if isinstance(source, RawImage):
             chain, source = self.raw.enter(job.path, source)

@@ -191,7 +191,7 @@ def read_job(loader: ImageLoader, job: Job, meter: Meter) -> Reading:
         other = replace(
             loader, request=loader.request.for_image(job.key, merged(job.values, values))
         )
-        entered = other.enter(job, source)
+        entered = other.enter(job, loaded.source)  # it has the layers of the frame
         assert entered
         return entered.chain
 

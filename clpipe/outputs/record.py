@@ -1,6 +1,6 @@
 """Makes the contents of a sidecar: everything that is needed to recompute its picture."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -25,6 +25,7 @@ from clpipe.outputs.program import all_versions, device_record, program_digest
 from clpipe.outputs.recipes import Recipe
 from clpipe.outputs.sidecar import VERSION_KEY, CachedJson, sidecar_bytes
 from clpipe.reference.intrinsics import Intrinsics
+from clpipe.stage import ImageLayer
 
 METADATA, PATCHES = "facts", "patches"  # keys of a sidecar of patches
 
@@ -58,6 +59,14 @@ def subframe_records(
         {"file": name, "size": size, "modified": modified, "sha256": digest}
         for (name, digest), (size, modified) in zip(source.subframes, stamps, strict=True)
     ]
+
+
+def layer_records(layers: Iterable[ImageLayer]) -> dict[str, list[Mapping[str, Any]]]:
+    """Return the sources of the layers that steps have read, by kind."""
+    records: dict[str, list[Mapping[str, Any]]] = {}
+    for layer in layers:
+        records.setdefault(layer.kind, []).append(layer.record)
+    return records
 
 
 PLACE = "place"  # the entry of a picture that depends on the frames before, with its place
@@ -140,7 +149,7 @@ def picture_record(
             for path, file in outputs.items()
         ],
         **({"carried": [layer.record for layer in carried.layers]} if carried else {}),
-        **({"depth": [source.depth.record]} if source.depth else {}),
+        **layer_records(source.layers.values()),
         **({"overscan": source.margins._asdict()} if source.margins else {}),
         "warnings": list(source.warnings),
         "device": device_record(device),

@@ -195,7 +195,7 @@ def input_entries(
         KeyError, TypeError, ValueError: the values are damaged, or list another number of files.
     """
     image_entry = {"size": values["input_size"], "modified": values["input_modified"]}
-    layers = (*values.get("carried", ()), *values.get("depth", ()))
+    layers = (*values.get("carried", ()), *values.get("depth", ()), *values.get("flow", ()))
     return [
         *zip(
             paths,

@@ -1,37 +1,15 @@
 """Depth of field from the distance to the focus: the counterpart of ``kernels/defocus.cl``."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
-from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.reference.image import tap
 
 HIDDEN_WEIGHT = 1.0  # see aperture_taps
 FAR = 1e9  # distance from which a surface counts as infinitely far; Blender's sky is at 1e10
-
-
-@dataclass(frozen=True, eq=False)
-class Depth:
-    """The distance of the surface in each pixel from the camera.
-
-    Args:
-        pixels: (height, width), above 0, in any unit; infinite without a surface.
-        record: its source, for a sidecar.
-        derived: values derived from it, by their parameters; renditions share them.
-    """
-
-    pixels: Floats
-    record: Mapping[str, Any] = field(default_factory=dict)
-    derived: BoundedCache[Any] = field(default_factory=lambda: BoundedCache(2))
-
-
-NO_SURFACE = Depth(np.full((1, 1), np.inf, np.float32))
 
 
 def parse_depth(pixels: Array) -> Floats:

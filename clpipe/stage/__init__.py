@@ -12,9 +12,9 @@ from clpipe.base.types import Array, Floats
 from clpipe.stage.arrays import PERIOD, levels_table, period_of
 from clpipe.stage.bases import (
     Curve,
-    DepthMethod,
     FocalLengthMethod,
     GaussianNoise,
+    LayerMethod,
     LensMethod,
     Noiseless,
     PrincipalPointMethod,
@@ -23,7 +23,7 @@ from clpipe.stage.bases import (
     odd_size,
 )
 from clpipe.stage.checking import run_reference, variant_label, variants
-from clpipe.stage.context import Context, ReferenceContext
+from clpipe.stage.context import Context, ImageLayer, ReferenceContext
 from clpipe.stage.method import Method, Stage, StageRole, parameter
 from clpipe.stage.passes import (
     PREVIOUS,
@@ -54,11 +54,12 @@ __all__ = [
     "CompileTime",
     "Context",
     "Curve",
-    "DepthMethod",
     "Floats",
     "FocalLengthMethod",
     "GaussianNoise",
+    "ImageLayer",
     "Kind",
+    "LayerMethod",
     "LensMethod",
     "LineTable",
     "Method",

@@ -1,15 +1,14 @@
 """Base classes that several methods share."""
 
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from clpipe.base.errors import RequestError
-from clpipe.base.types import Floats
+from clpipe.base.types import Array, Floats
 from clpipe.camera.lens import LensCalibration
 from clpipe.reference.curve import curve_index
-from clpipe.reference.defocus import Depth
-from clpipe.stage.context import Context, ReferenceContext
+from clpipe.stage.context import Context, ImageLayer, ReferenceContext
 from clpipe.stage.method import Method, parameter
 from clpipe.stage.passes import Arguments, Pass, TableLookup
 from clpipe.stage.signal import SignalMethod
@@ -102,18 +101,46 @@ class FocalLengthMethod(Method):
             )
 
 
-class DepthMethod(Method):
-    """A method that needs the depth of its image, from :attr:`Context.depth`."""
+class LayerMethod(Method):
+    """A method that reads a layer of its image, such as its depth.
 
-    layer: str = parameter("", "Depth layer; by default one with a usual name.")
+    Attributes:
+        layer_kind: the kind of the layer.
+        usual_layers: the names of layers that are looked for, in order of preference.
+        no_layer: the layer of a chain that has no image yet.
+    """
 
-    def check_depth(self, depth: Depth) -> str:
-        """Check that this (resolved) method can use a depth. Returns a warning, or "".
+    layer_kind: ClassVar[Literal["depth", "flow"]]
+    usual_layers: ClassVar[tuple[str, ...]]
+    no_layer: ClassVar[ImageLayer]
+
+    layer: str = parameter(
+        "",
+        "Layer of the render to read, as LAYER or LAYER=../path/{name}.exr; by default one with a "
+        "usual name.",
+    )
+
+    def parse_layer(self, pixels: Array) -> Floats:
+        """Return the values of :class:`ImageLayer`, from a layer, (height, width, channel).
+
+        Raises:
+            ImageError: the layer has values that are not allowed.
+        """
+        raise NotImplementedError(type(self).__name__)
+
+    def check_layer(self, layer: ImageLayer) -> str:
+        """Check that this (resolved) method can use a layer. Returns a warning, or "".
 
         Raises:
             RequestError: it cannot.
         """
-        raise NotImplementedError(type(self).__name__)
+        return ""
+
+    def layer_in(self, context: Context) -> ImageLayer:
+        """Return the layer of the image. Without an image, it is :attr:`no_layer`."""
+        layer = context.layer() if context.layer else self.no_layer
+        assert layer is not None, "the image is still there"
+        return layer
 
 
 class Span(NamedTuple):

@@ -4,18 +4,35 @@ import weakref
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
+from clpipe.base.cache import BoundedCache
 from clpipe.base.types import Floats
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.optics import Optics
 from clpipe.camera.profile import IDENTITY, Camera, Matrix
 from clpipe.reference.cfa import Pattern, red_site
 from clpipe.reference.companding import Knots
-from clpipe.reference.defocus import Depth
 from clpipe.reference.filter_array import FilterArray, parse_array
 from clpipe.reference.random import Stream
 from clpipe.stage.passes import CompileTime, NoiseScope
+
+
+@dataclass(frozen=True, eq=False)
+class ImageLayer:
+    """A layer of an image that a step reads, such as its depth.
+
+    Args:
+        kind: the kind of its values.
+        pixels: its values, as :meth:`LayerMethod.parse_layer` returns them.
+        record: its source, for a sidecar.
+        derived: values derived from it, by their parameters; renditions share them.
+    """
+
+    kind: Literal["depth", "flow"]
+    pixels: Floats
+    record: Mapping[str, Any] = field(default_factory=dict)
+    derived: BoundedCache[Any] = field(default_factory=lambda: BoundedCache(2))
 
 
 @dataclass(frozen=True)
@@ -44,9 +61,9 @@ class Context:
     clean: bool = False
     black_level: float | None = None  # DN, used by quantize
     white_level: float | None = None
-    # A weak reference, because the image holds the depth and chains live longer. It is not
+    # A weak reference, because the image holds the layer and chains live longer. It is not
     # compared, so that chains of the same structure are equal.
-    depth: weakref.ref[Depth] | None = field(default=None, compare=False, repr=False)
+    layer: weakref.ref[ImageLayer] | None = field(default=None, compare=False, repr=False)
 
     def replace(self, **changes: Any) -> "Context":
         """Return a copy with other facts: ``dataclasses.replace`` in a fifth of its time."""

@@ -1,20 +1,21 @@
 """Depth of field: points in front of or beyond the focus distance become discs."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import field_validator, model_validator
 
 from clpipe.base.errors import RequestError
-from clpipe.base.types import Floats
-from clpipe.reference.defocus import NO_SURFACE, Depth, aperture_taps, defocus, disc_reach
+from clpipe.base.types import Array, Floats
+from clpipe.reference.defocus import aperture_taps, defocus, disc_reach, parse_depth
 from clpipe.stage import (
     Arguments,
     Context,
-    DepthMethod,
     FocalLengthMethod,
+    ImageLayer,
     Kind,
+    LayerMethod,
     Pass,
     ReferenceContext,
     Stage,
@@ -25,6 +26,7 @@ from clpipe.stage import (
 
 MAX_RADIUS = 31  # px, radius of a disc
 MAX_LANES = 16  # lanes at most
+NO_SURFACE = ImageLayer("depth", np.full((1, 1), np.inf, np.float32))
 
 
 class InFocus(Unchanged):
@@ -34,7 +36,7 @@ class InFocus(Unchanged):
     summary: ClassVar = "everything is in focus"
 
 
-class ThinLens(FocalLengthMethod, DepthMethod):
+class ThinLens(FocalLengthMethod, LayerMethod):
     """A thin lens: a point at distance z becomes a disc of diameter c.
 
     c = f^2 |z - zf| / (N z (zf - f)), with focal length f, f-number N and focus distance zf
@@ -53,6 +55,9 @@ class ThinLens(FocalLengthMethod, DepthMethod):
     tolerance: ClassVar = 1e-5
     example: ClassVar = {"max_radius": 3}
     alternatives: ClassVar = frozenset({"sensor_width", "pixel_pitch"})
+    layer_kind: ClassVar[Literal["depth"]] = "depth"
+    usual_layers: ClassVar = ("Depth", "Z", "ZDepth", "Distance")
+    no_layer: ClassVar = NO_SURFACE
 
     focal_length: float | None = parameter(
         None,
@@ -169,15 +174,18 @@ class ThinLens(FocalLengthMethod, DepthMethod):
                 f"be more than the focal length of {focal_length:g} mm. Check depth_scale"
             )
 
-    def check_depth(self, depth: Depth) -> str:
+    def parse_layer(self, pixels: Array) -> Floats:
+        return parse_depth(pixels[..., 0])
+
+    def check_layer(self, layer: ImageLayer) -> str:
         """Return a warning with the number of discs that exceed the largest radius, or "".
 
         Raises:
             RequestError: the focus distance is less than the focal length.
         """
-        height, width = depth.pixels.shape
+        height, width = layer.pixels.shape
         self.check_focus(self.camera(width, height)[0])
-        radii = abs(self.radii(depth.pixels))
+        radii = abs(self.radii(layer.pixels))
         if not (count := np.count_nonzero(radii > self.max_radius)):
             return ""
         return (
@@ -212,8 +220,8 @@ class ThinLens(FocalLengthMethod, DepthMethod):
         return np.clip(self.radii(depth), -self.max_radius, self.max_radius)
 
     def arguments(self, context: Context) -> Arguments:
-        depth = _depth_of(context)
-        radii, reach, taps = depth.derived.get(self, lambda: self._tables(depth.pixels))
+        layer = self.layer_in(context)
+        radii, reach, taps = layer.derived.get(self, lambda: self._tables(layer.pixels))
         return {
             "radii": radii,
             "columns": np.int32(radii.shape[1]),
@@ -234,19 +242,10 @@ class ThinLens(FocalLengthMethod, DepthMethod):
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         taps = self.arguments(inputs.context)["taps"]
-        depth = np.broadcast_to(_depth_of(inputs.context).pixels, image.shape[:2])
+        depth = np.broadcast_to(self.layer_in(inputs.context).pixels, image.shape[:2])
         radii = self.limited_radii(depth)
         assert isinstance(taps, np.ndarray)
         return defocus(image, radii, taps)
-
-
-def _depth_of(context: Context) -> Depth:
-    """Return the depth of the image. Without an image, everything is infinitely far."""
-    if context.depth is None:
-        return NO_SURFACE
-    depth: Any = context.depth()
-    assert depth is not None, "the image is still there"
-    return depth
 
 
 STAGE = Stage(

@@ -1,18 +1,21 @@
 """Denoising over time: a mean over the frames of a sequence, where nothing else has changed."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from dataclasses import replace
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from clpipe.base.types import Floats
+from clpipe.base.types import Array, Floats
 from clpipe.reference.image import tap
 from clpipe.stage import (
     PREVIOUS,
     Arguments,
     CompileTime,
     Context,
+    ImageLayer,
     Kind,
+    LayerMethod,
     Method,
     Noiseless,
     Pass,
@@ -30,6 +33,9 @@ PATCH = [(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
 # it costs. Found by experiment: with less, noise chooses moves in static areas.
 MOVE, MOVE_BY = 0.5, 0.05
 SMALLEST = 1e-12  # of variances, so that images without noise have a weight, too
+
+NOWHERE = np.float32(1e9)  # the displacement of pixels that the frame before does not show
+MAX_LANES = 16  # lanes at most, by which tables are wider than images
 
 
 class Recursive(Method):
@@ -94,10 +100,14 @@ class Recursive(Method):
             **expected_differences(context),
         }
 
+    def compensated(self, image: Floats, previous: Floats, context: Context) -> Floats:
+        """Return the previous result, moved to where the image shows the same surfaces."""
+        return previous
+
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        previous = inputs.previous
-        if previous is None or self.frames == 1:
+        if inputs.previous is None or self.frames == 1:
             return image
+        previous = self.compensated(image, inputs.previous, inputs.context)
         numbers: dict[str, Any] = typed_arguments(self.arguments(inputs.context))
         slope, offset = (
             np.array([numbers[f"{colour}_{item}"] for colour in COLOURS])
@@ -131,6 +141,60 @@ class BlockMatching(Recursive):
     @property
     def search_radius(self) -> int:
         return self.radius
+
+
+class OpticalFlow(Recursive, LayerMethod):
+    """The recursive mean along a flow that the render states, by fractions of a pixel.
+
+    The flow leads from each pixel to the place of its surface in the frame before, in px to the
+    right and down. The previous result is interpolated there, bilinearly. A pixel keeps its noise
+    if its place is outside the image, or not known.
+
+    If earlier stages move pixels, the flow is warped like ``--carry`` does.
+    """
+
+    method: ClassVar = "flow"
+    kernel: ClassVar = "temporal_denoise_flow"
+    summary: ClassVar = "recursive mean over frames along the render's optical flow"
+    layer_kind: ClassVar[Literal["flow"]] = "flow"
+    usual_layers: ClassVar = ("Vector", "Flow")
+    no_layer: ClassVar = ImageLayer("flow", np.zeros((2, 1, 1 + MAX_LANES), np.float32))
+
+    def passes(self) -> tuple[Pass, ...]:
+        follow = Pass(
+            "follow", Stencil(0), ("flow", "columns", "rows"), ("src", PREVIOUS), writes="moved"
+        )
+        blends = (replace(each, reads=("src", "moved")) for each in super().passes())
+        return tuple(each for blend in blends for each in (follow, blend))
+
+    def parse_layer(self, pixels: Array) -> Floats:
+        """Return the displacements, (2, height, width), with padding at the right."""
+        height, width = pixels.shape[:2]
+        across, down = np.float32(pixels[..., 0]), np.float32(pixels[..., 1])
+        x, y = np.arange(width) + across, np.arange(height)[:, None] + down
+        known = (abs(2 * x + 1 - width) <= width) & (abs(2 * y + 1 - height) <= height)
+        table = np.where(known, (across, down), NOWHERE)
+        return np.pad(table, ((0, 0), (0, 0), (0, MAX_LANES)))
+
+    def arguments(self, context: Context) -> Arguments:
+        table = self.layer_in(context).pixels
+        columns, rows = np.int32(table.shape[2]), np.int32(table.shape[1])
+        return {**super().arguments(context), "flow": table, "columns": columns, "rows": rows}
+
+    def compensated(self, image: Floats, previous: Floats, context: Context) -> Floats:
+        height, width = image.shape[:2]
+        table = self.layer_in(context).pixels[..., :-MAX_LANES]
+        displacements = np.broadcast_to(table, (2, height, width))
+        known = (displacements[0] < NOWHERE)[..., None]
+        places = np.where(known[..., 0], displacements, np.float32(0))
+        whole = np.floor(places)
+        u, v = (places - whole)[..., None]
+        column, row = whole.astype(np.intp) + np.mgrid[0:height, 0:width][::-1] + 1
+        padded = np.pad(previous, ((1, 1), (1, 1), (0, 0)), "reflect")
+        a, b = padded[row, column], padded[row, column + 1]
+        c, d = padded[row + 1, column], padded[row + 1, column + 1]
+        upper, lower = a + u * (b - a), c + u * (d - c)
+        return np.where(known, upper + v * (lower - upper), image)
 
 
 def expected_differences(context: Context) -> Mapping[str, float]:
@@ -191,5 +255,5 @@ STAGE = Stage(
     "Reduce noise with the frames before, in a sequence.",
     Kind.RGB,
     Kind.RGB,
-    (Recursive, BlockMatching),
+    (Recursive, BlockMatching, OpticalFlow),
 )
