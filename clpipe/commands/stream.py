@@ -162,7 +162,7 @@ class Writer(threading.Thread):
 
 
 class Pipe:
-    """A file that NumPy only reads and writes. Of other files, it asks their position."""
+    """A file with only the methods that pipes have. NumPy asks other files for their position."""
 
     def __init__(self, file: BufferedIOBase) -> None:
         self.read = file.read
