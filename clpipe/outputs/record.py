@@ -19,7 +19,7 @@ from clpipe.images.tags import FLIPS, orientation_of
 from clpipe.inputs.carry import CarriedLayers
 from clpipe.inputs.find import Job
 from clpipe.inputs.raw import RawImage
-from clpipe.outputs.motion import motion_records
+from clpipe.outputs.motion import motion_records, row_times
 from clpipe.outputs.patches import Patch, metadata_of
 from clpipe.outputs.program import all_versions, device_record, program_digest
 from clpipe.outputs.recipes import Recipe
@@ -123,6 +123,7 @@ def picture_record(
         "intrinsics": intrinsics.record() if intrinsics else None,
         "pose": chain.settings.render.pose,
         **motion_records(chain, source),
+        **row_times(chain, source),
         "photometry": photometry_of(chain, result.estimates),
         "noise": noise.record() if noise else None,
         "starts_on": chain.source.label,
