@@ -96,7 +96,7 @@ class Images:
         jobs = self.known_jobs
         if not jobs:
             known_jobs = find_jobs(self.inputs, output, loader.endings(), self.exclude)
-            jobs = loader.exposures(known_jobs)
+            jobs = loader.exposures(known_jobs, self.sequence)
         jobs = assign_views(jobs, self.poses, loader.settings.render, loader.request.truth_at)
         jobs = self.series.jobs(jobs, loader.settings)
         if self.sequence:

@@ -154,10 +154,14 @@ class ImageLoader:
             return loader.raw.first_chain(path)
         return loader.kept.first_chain(path) if loader.kept else loader.chain
 
-    def exposures(self, jobs: Sequence[Job]) -> list[Job]:
+    def exposures(self, jobs: Sequence[Job], in_sequences: bool = False) -> list[Job]:
         """Return the jobs, with the files of one exposure or panorama joined into one job.
 
         Raises:
+        Args:
+            jobs: a job for each file.
+            in_sequences: whether sub-frames are in the order of the numbers in their names.
+
             RequestError: the files do not fit together.
         """
         if self.kept:
@@ -169,7 +173,7 @@ class ImageLoader:
                 f"{shutter.light_layer}, but panoramas have no light layers; remove this "
                 "parameter to make all light flicker"
             )
-        return group_panoramas(exposures(jobs, self.settings), wide)
+        return group_panoramas(exposures(jobs, self.settings, in_sequences), wide)
 
     def check(self, jobs: Sequence[Job]) -> None:
         """Check that the values of single images are allowed.
