@@ -42,6 +42,7 @@ from clpipe.chain.isos import draw_note
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.state import has_state
+from clpipe.inputs.carry_rows import rows_note
 from clpipe.inputs.find import Job, Shard, find_jobs
 from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
@@ -188,6 +189,10 @@ class Run:
         for note in lens_notes(self._loader.settings, self.jobs):
             log.warning("%s", note)
         check_frames(self._chain, images.sequence, execution, dask)
+        if note := rows_note(self._loader.request, self._chain):
+            log.warning("%s", note)
+        if images.sequence:
+            check_flow(self._loader, self.jobs)
         check_render_options(request, self._chain.source)
         self._request = request.with_outputs(self._chain)
         self.writer = OutputWriter(execution.output, self._request)

@@ -35,6 +35,7 @@ from clpipe.images.read import (
 )
 from clpipe.inputs.carry import CarriedLayers, carry, merge_moments
 from clpipe.inputs.carry_panorama import carry_panorama
+from clpipe.inputs.carry_rows import carry_rows
 from clpipe.inputs.depth import read_depth
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import KeptLoader, kind_message
@@ -157,11 +158,11 @@ class ImageLoader:
     def exposures(self, jobs: Sequence[Job], in_sequences: bool = False) -> list[Job]:
         """Return the jobs, with the files of one exposure or panorama joined into one job.
 
-        Raises:
         Args:
             jobs: a job for each file.
             in_sequences: whether sub-frames are in the order of the numbers in their names.
 
+        Raises:
             RequestError: the files do not fit together.
         """
         if self.kept:
@@ -343,6 +344,8 @@ class ImageLoader:
             return carry_panorama(job.paths, *arguments)
         if not job.subframes:
             return carry(job.path, *arguments)
+        if request.truth_at == "rows":
+            return carry_rows(job.paths, *arguments)
         by_moment = {moment: carry(job.at(moment), *arguments) for moment in moments}
         return merge_moments(by_moment, named=len(moments) > 1)
 

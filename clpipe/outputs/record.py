@@ -140,7 +140,7 @@ def picture_record(
             {"name": path.name, "size": file.size, "sha256": file.sha256}
             for path, file in outputs.items()
         ],
-        **({"carried": [layer.record for layer in carried.layers]} if carried else {}),
+        **({"carried": carried.records} if carried else {}),
         **({"depth": [source.depth.record]} if source.depth else {}),
         **({"overscan": source.margins._asdict()} if source.margins else {}),
         "warnings": list(source.warnings),
