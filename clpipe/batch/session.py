@@ -44,6 +44,7 @@ from clpipe.engine.device import Device, open_devices
 from clpipe.engine.state import has_state
 from clpipe.inputs.carry_rows import rows_note
 from clpipe.inputs.find import Job, Shard, find_jobs
+from clpipe.inputs.flow import check_flow
 from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.metering import metered_jobs, write_exposures
@@ -188,11 +189,11 @@ class Run:
         self._chain = self._loader.first_chain(self.jobs)
         for note in lens_notes(self._loader.settings, self.jobs):
             log.warning("%s", note)
-        check_frames(self._chain, images.sequence, execution, dask)
         if note := rows_note(self._loader.request, self._chain):
             log.warning("%s", note)
         if images.sequence:
             check_flow(self._loader, self.jobs)
+        check_frames(self._chain, images.sequence, execution, dask)
         check_render_options(request, self._chain.source)
         self._request = request.with_outputs(self._chain)
         self.writer = OutputWriter(execution.output, self._request)
