@@ -141,8 +141,9 @@ def run(
             from which they are made. The choices are "development", "clean", "mosaic", "variance",
             "iid", "intensity".
         truth_at: the moment of an exposure of several files whose pose and layers are written with
-            the picture. all also writes the layers of its start and end. The choices are "start",
-            "middle", "end", "all". None is middle.
+            the picture. Use all to write also the layers of its start and end. Use rows to take
+            each row of the layers from the file in the middle of the row's exposure. The choices
+            are "start", "middle", "end", "all", "rows". None is middle.
         sequence: process the frames of each directory as a sequence, in the order of the numbers in
             their names. A draw has one value for each sequence, unless it is a drift. Automatic
             exposure and white balance follow the frames with the loops of [control]. OUT/run.csv

@@ -42,7 +42,9 @@ from clpipe.chain.isos import draw_note
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.state import has_state
+from clpipe.inputs.carry_rows import rows_note
 from clpipe.inputs.find import Job, Shard, find_jobs
+from clpipe.inputs.flow import check_flow
 from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.metering import metered_jobs, write_exposures
@@ -96,7 +98,7 @@ class Images:
         jobs = self.known_jobs
         if not jobs:
             known_jobs = find_jobs(self.inputs, output, loader.endings(), self.exclude)
-            jobs = loader.exposures(known_jobs)
+            jobs = loader.exposures(known_jobs, self.sequence)
         jobs = assign_views(jobs, self.poses, loader.settings.render, loader.request.truth_at)
         jobs = self.series.jobs(jobs, loader.settings)
         if self.sequence:
@@ -187,6 +189,10 @@ class Run:
         self._chain = self._loader.first_chain(self.jobs)
         for note in lens_notes(self._loader.settings, self.jobs):
             log.warning("%s", note)
+        if note := rows_note(self._loader.request, self._chain):
+            log.warning("%s", note)
+        if images.sequence:
+            check_flow(self._loader, self.jobs)
         check_frames(self._chain, images.sequence, execution, dask)
         check_render_options(request, self._chain.source)
         self._request = request.with_outputs(self._chain)

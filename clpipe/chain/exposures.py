@@ -9,7 +9,7 @@ import numpy as np
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.chain.chain import Chain, Step, cached_by_structure
-from clpipe.stage import Reduction, Span
+from clpipe.stage import Reduction, Span, StageRole
 from clpipe.stages.sensor_noise.staggered import Staggered
 from clpipe.stages.shutter import Rows
 
@@ -64,6 +64,15 @@ def exposures_of(chain: Chain) -> Exposures | None:
     method = chain.steps[index].method
     assert isinstance(method, Staggered)
     return Exposures(chain, index, method.spans)
+
+
+def shutter_in(chain: Chain) -> Rows | None:
+    """Return the shutter of a chain, for the first of its exposures; None if it has none."""
+    step = chain.step_in(StageRole.SHUTTER)
+    if step is None or not isinstance(step.method, Rows):
+        return None
+    exposures = exposures_of(chain)
+    return step.method.for_exposure(exposures.spans, 0) if exposures else step.method
 
 
 @cached_by_structure

@@ -43,6 +43,7 @@ class Shutter(TypedDict, total=False):
     subframes: Whole
     exposure_time: Number
     line_time: Number
+    frame_time: Number
     flicker_depth: Number
     flicker_frequency: Number
     flicker_phase: Number

@@ -18,7 +18,7 @@ from clpipe.images.pixels import DEFAULT_MAX_PIXELS, MAX_PIXELS
 from clpipe.images.video import DEFAULT_CRF, Codec
 from clpipe.reference.carried import RESAMPLING
 
-Moments = Literal["start", "middle", "end", "all"]
+Moments = Literal["start", "middle", "end", "all", "rows"]
 Transfer = Literal["srgb", "linear"]
 RedoName = Literal["missing", "old", "damaged", "all"]
 
@@ -119,7 +119,8 @@ _ALL = (
         "truth_at",
         str,
         "The moment of an exposure of several files whose pose and layers are written with the "
-        "picture. all also writes the layers of its start and end.",
+        "picture. Use all to write also the layers of its start and end. Use rows to take each row "
+        "of the layers from the file in the middle of the row's exposure.",
         default_text="middle",
         choices=get_args(Moments),
     ),

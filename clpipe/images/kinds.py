@@ -26,6 +26,8 @@ KIND_NAMES: dict[LayerKind, tuple[str, ...]] = {
     "colour": ("albedo", "basecolor", "basecolour"),
 }
 
+BLENDER_VECTORS: tuple[Vector, ...] = ((0, 1), (1, -1)), ((2, -1), (3, 1))
+
 MIN_CHANNELS: dict[LayerKind, int] = {"flow": 2, "normal": 3}  # smallest number of channels
 
 # Layers that renderers write next to the picture: data, and single components of the light. The
@@ -106,5 +108,23 @@ def flow_vectors(name: str, channels: tuple[str, ...]) -> tuple[Vector, ...]:
     (((0, 1), (1, 1)),)
     """
     if name.rpartition(".")[2].lower() == "vector" and len(channels) == 4:
-        return ((0, 1), (1, -1)), ((2, -1), (3, 1))
+        return BLENDER_VECTORS
     return tuple(((i, 1), (i + 1, 1)) for i in range(0, len(channels) - 1, 2))
+
+
+def flow_directions(names: str, channels: tuple[str, ...]) -> tuple[int, ...]:
+    """Return for each vector of a flow layer whether it leads forward (1) or back (-1) in time.
+
+    The first vector of Blender's Vector leads back. Other layers lead back if a name says so.
+
+    Args:
+        names: the names of the layer, in its file and in ``--carry``.
+        channels: the names of its channels.
+
+    >>> flow_directions("Vector", ("X", "Y", "Z", "W")), flow_directions("flow_to_prev", ("X", "Y"))
+    ((-1, 1), (-1,))
+    """
+    vectors = flow_vectors(names, channels)
+    if vectors == BLENDER_VECTORS:
+        return -1, 1
+    return (-1 if re.search("back|bwd|prev", names.lower()) else 1,) * len(vectors)

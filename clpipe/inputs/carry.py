@@ -21,7 +21,7 @@ from clpipe.images.passes import (
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import FLIPS
 from clpipe.inputs.companions import LayerSource, find_carried_layers
-from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
+from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, between_rows, warp
 from clpipe.reference.geometry import Composition, Geometry, Orientation
 
 
@@ -52,11 +52,18 @@ class CarriedLayers:
         layers: the layers, in the order of ``--carry``.
         valid: (height, width): 1 where all layers are known, otherwise 0.
         attributes: EXR attributes of the layers, such as the names of a Cryptomatte's objects.
+        other_records: entries in a sidecar of further files that the layers are made of.
     """
 
     layers: tuple[CarriedLayer, ...]
     valid: Array
     attributes: Mapping[str, str]
+    other_records: tuple[Mapping[str, Any], ...] = ()
+
+    @property
+    def records(self) -> list[Mapping[str, Any]]:
+        """The entries of the layers in a sidecar."""
+        return [*(layer.record for layer in self.layers), *self.other_records]
 
     def map_arrays(self, change: Callable[[Array], Array]) -> "CarriedLayers":
         """Return the layers with a function applied to each array, such as a crop."""
@@ -92,6 +99,7 @@ def carry(
     layers: Sequence[AovSpec],
     max_pixels: int,
     orientation: int = 1,
+    row_step: float = 0.0,
 ) -> CarriedLayers:
     """Return the layers of an image, warped like its picture.
 
@@ -103,6 +111,8 @@ def carry(
         max_pixels: a file with more pixels is rejected before it is read.
         orientation: the EXIF orientation that is applied to the picture at the end. Normals keep
             their directions.
+        row_step: the time from the start of a row to the start of the next, in frames of the
+            sequence; see :func:`clpipe.reference.carried.between_rows`.
 
     Raises:
         ImageError: a layer or companion is missing or damaged, differs from the image in size, or
@@ -117,7 +127,9 @@ def carry(
         pixels, (x, y) = read_layer_samples(each, path, (width, height), max_pixels)
         attributes |= cryptomatte_attributes(each.file, each.location.part)
         x, y = x + source.margins.left, y + source.margins.top
-        read.append(Layer(each.kind, pixels, x, y, each.vectors))
+        layer = Layer(each.kind, pixels, x, y, each.vectors)
+        is_moved = each.vectors and row_step
+        read.append(between_rows(layer, each.directions, row_step) if is_moved else layer)
     warped, valid = warp(read, geometry_of(chain, orientation), *full_size)
     carried = tuple(
         CarriedLayer(each.name, each.kind, each.channels, pixels, record_of(path, each))

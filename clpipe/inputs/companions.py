@@ -11,7 +11,7 @@ from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.text import one_line, quote_alternatives, similar_names
 from clpipe.chain.carry import AovSpec
-from clpipe.images.kinds import MIN_CHANNELS, flow_vectors, kind_from_name
+from clpipe.images.kinds import MIN_CHANNELS, flow_directions, flow_vectors, kind_from_name
 from clpipe.images.passes import LayerLocation, find_layers, layer_kind
 from clpipe.reference.carried import RESAMPLING, LayerKind, Vector
 
@@ -44,6 +44,11 @@ class LayerSource:
         """The vectors in its channels; empty unless its kind is flow."""
         found = flow_vectors(self.location.name or self.name, self.location.channels)
         return found if self.kind == "flow" else ()
+
+    @property
+    def directions(self) -> tuple[int, ...]:
+        """For each of its vectors, whether it leads forward (1) or back (-1) in time."""
+        return flow_directions(f"{self.name} {self.location.name}", self.location.channels)
 
 
 def find_carried_layers(path: Path, layers: Sequence[AovSpec]) -> list[LayerSource]:

@@ -35,6 +35,7 @@ from clpipe.images.read import (
 )
 from clpipe.inputs.carry import CarriedLayers, carry, merge_moments
 from clpipe.inputs.carry_panorama import carry_panorama
+from clpipe.inputs.carry_rows import carry_rows
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import KeptLoader, kind_message
 from clpipe.inputs.layers import read_step_layer
@@ -153,8 +154,12 @@ class ImageLoader:
             return loader.raw.first_chain(path)
         return loader.kept.first_chain(path) if loader.kept else loader.chain
 
-    def exposures(self, jobs: Sequence[Job]) -> list[Job]:
+    def exposures(self, jobs: Sequence[Job], in_sequences: bool = False) -> list[Job]:
         """Return the jobs, with the files of one exposure or panorama joined into one job.
+
+        Args:
+            jobs: a job for each file.
+            in_sequences: whether sub-frames are in the order of the numbers in their names.
 
         Raises:
             RequestError: the files do not fit together.
@@ -168,7 +173,7 @@ class ImageLoader:
                 f"{shutter.light_layer}, but panoramas have no light layers; remove this "
                 "parameter to make all light flicker"
             )
-        return group_panoramas(exposures(jobs, self.settings), wide)
+        return group_panoramas(exposures(jobs, self.settings, in_sequences), wide)
 
     def check(self, jobs: Sequence[Job]) -> None:
         """Check that the values of single images are allowed.
@@ -341,6 +346,8 @@ class ImageLoader:
             return carry_panorama(job.paths, *arguments)
         if not job.subframes:
             return carry(job.path, *arguments)
+        if request.truth_at == "rows":
+            return carry_rows(job.paths, *arguments)
         by_moment = {moment: carry(job.at(moment), *arguments) for moment in moments}
         return merge_moments(by_moment, named=len(moments) > 1)
 

@@ -38,7 +38,7 @@ def assign_views(
         jobs: all jobs of the run.
         path: the file, or COLMAP's folder; None leaves the jobs unchanged.
         settings: the camera settings of all renders.
-        truth_at: the moment of an exposure whose camera is used; "all" uses the middle.
+        truth_at: the moment of an exposure whose camera is used; "all" and "rows" use the middle.
 
     Raises:
         RequestError: the file cannot be read, is in an unknown format, or has no view of any job.
@@ -57,7 +57,7 @@ def assign_views(
                 name = stem_of(str(PurePosixPath(job.key).with_name(job.path.name)))
             views_of_files = [views.find(name, name_counts)]
             views_of_files += [view for file in files if (view := views.get(file, name_counts))]
-            at = job.paths.index(job.at("middle" if truth_at == "all" else truth_at))
+            at = job.paths.index(job.at("middle" if truth_at in ("all", "rows") else truth_at))
             has_view_per_file = len(views_of_files) == len(job.paths) and not job.is_panorama
             with_view = _with_view(job, views_of_files[at if has_view_per_file else 0], settings)
             assigned.append(

@@ -32,6 +32,24 @@ def split_numbers(key: str) -> tuple[str, list[str]]:
     return str(PurePosixPath(key).with_name(pattern)), NUMBER.findall(stem)
 
 
+def by_pattern(jobs: Sequence[Job]) -> dict[str, list[Job]]:
+    """Return jobs by the pattern of their names, each in the order of the numbers in the names.
+
+    >>> jobs = [Job(Path(name), name) for name in ("f.10.exr", "f.9.exr", "g.exr")]
+    >>> {pattern: [job.key for job in jobs] for pattern, jobs in by_pattern(jobs).items()}
+    {'f.{}': ['f.9.exr', 'f.10.exr'], 'g': ['g.exr']}
+    """
+    grouped: dict[str, list[Job]] = {}
+    for job in jobs:
+        grouped.setdefault(split_numbers(job.key)[0], []).append(job)
+    return {pattern: sorted(each, key=numbers_of) for pattern, each in grouped.items()}
+
+
+def numbers_of(job: Job) -> list[int]:
+    """Return the numbers in the name of a job's file."""
+    return [int(number) for number in split_numbers(job.key)[1]]
+
+
 def in_sequences(jobs: Sequence[Job]) -> list[Job]:
     """Return jobs with their places in sequences, one sequence after the other, in temporal order.
 

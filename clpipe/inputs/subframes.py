@@ -16,6 +16,7 @@ from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import Settings
 from clpipe.images.read import SourceImage
 from clpipe.inputs.find import Job
+from clpipe.inputs.sequences import by_pattern, numbers_of
 from clpipe.reference.geometry import Margins
 from clpipe.stage import Span, StageRole
 from clpipe.stages.shutter import Rows
@@ -41,22 +42,29 @@ def shutter_of(settings: Settings) -> Rows | None:
     return shutter if shutter.subframes > 1 or shutter.light_layer else None
 
 
-def exposures(jobs: Sequence[Job], settings: Settings) -> list[Job]:
+def exposures(jobs: Sequence[Job], settings: Settings, in_sequences: bool = False) -> list[Job]:
     """Return the jobs, with the sub-frames of one exposure joined into one job.
 
     Consecutive files of one folder form an exposure, which has the name of the first. The same
     holds for consecutive rows of a manifest, whose values must be equal.
 
+    Args:
+        jobs: a job for each file.
+        settings: the settings with the shutter.
+        in_sequences: whether files follow each other in the order of the numbers in their names.
+
     Raises:
         RequestError: the number of files in a folder is not a multiple of the number of sub-frames,
-            or rows differ.
+            rows differ, or a sequence lacks a file.
     """
     shutter = shutter_of(settings)
     if shutter is None or shutter.subframes == 1 or any(job.subframes for job in jobs):
         return list(jobs)
     count = shutter.subframes
     joined = []
-    for folder, folder_jobs in groupby(jobs, lambda job: job.path.parent):
+    by_folder = groupby(jobs, lambda job: job.path.parent)
+    groups = by_pattern(jobs).items() if in_sequences else by_folder
+    for folder, folder_jobs in groups:
         files = list(folder_jobs)
         if len(files) % count:
             raise RequestError(
@@ -66,6 +74,8 @@ def exposures(jobs: Sequence[Job], settings: Settings) -> list[Job]:
         for start in range(0, len(files), count):
             first, *others = files[start : start + count]
             check_values([first, *others], "a part of the same exposure")
+            if in_sequences:
+                _check_numbers([first, *others])
             joined.append(replace(first, subframes=tuple(job.path for job in others)))
     return joined
 
@@ -167,6 +177,21 @@ def check_values(jobs: Sequence[Job], relation: str) -> None:
         raise RequestError(
             f"{different.label}: its values differ from those of {first.label}, but both are "
             f"{relation}; give both the same values"
+        )
+
+
+def _check_numbers(jobs: Sequence[Job]) -> None:
+    """Check that one number in the names of sub-frames counts them, without gaps.
+
+    Raises:
+        RequestError: it does not.
+    """
+    steps = np.diff([numbers_of(job) for job in jobs], axis=0)
+    if steps.size and ((steps != steps[0]).any() or np.count_nonzero(steps[0]) != 1):
+        raise RequestError(
+            f"{jobs[0].label} to {jobs[-1].label}: {stage_in(StageRole.SHUTTER).name}.subframes is "
+            f"{len(jobs)}, but the numbers in the names of these files do not count the sub-frames "
+            "of one exposure; add missing files, or give each camera a directory"
         )
 
 

@@ -1,4 +1,4 @@
-"""The motion of a camera while its shutter is open, for sidecars and transforms.json."""
+"""The rows and the motion of a camera while its shutter is open, for sidecars and cameras."""
 
 from typing import Any
 
@@ -6,11 +6,10 @@ import numpy as np
 
 from clpipe.base.types import Doubles
 from clpipe.chain.chain import Chain
-from clpipe.chain.exposures import exposures_of
+from clpipe.chain.exposures import exposures_of, shutter_in
 from clpipe.images.read import SourceImage
 from clpipe.reference.pose import from_quaternion, to_quaternion
-from clpipe.stage import StageRole
-from clpipe.stages.shutter import Rows
+from clpipe.stage import Span
 
 Pose = tuple[Doubles, Doubles]  # a quaternion, and the camera's position in the world
 
@@ -24,11 +23,9 @@ def motion_records(chain: Chain, source: SourceImage) -> dict[str, Any]:
     interpolated between files (shortest arc, Shoemake 1985). The result is empty if the camera does
     not move, or the chain has no shutter.
     """
-    poses, step = chain.settings.render.motion, chain.step_in(StageRole.SHUTTER)
-    if poses is None or step is None or not isinstance(step.method, Rows):
+    poses, shutter = chain.settings.render.motion, shutter_in(chain)
+    if poses is None or shutter is None:
         return {}
-    exposures = exposures_of(chain)
-    shutter = step.method.for_exposure(exposures.spans, 0) if exposures else step.method
     _, rows = source.margins.frame_size(*source.pixels.shape[1::-1])
     readout = float(shutter.times(rows)[-1])
     span = shutter.duration(rows)
@@ -46,6 +43,26 @@ def motion_records(chain: Chain, source: SourceImage) -> dict[str, Any]:
             "files": [_record(time, *pose) for time, pose in zip(times, camera_poses, strict=True)],
         }
     }
+
+
+def row_times(chain: Chain, source: SourceImage) -> dict[str, Any]:
+    """Return when the rows of a rolling shutter are exposed, as JSON values; {} for a global one.
+
+    Row y of the render, of ``rows``, is exposed from START + y * ``step`` until END + y * ``step``,
+    for each (START, END) of ``exposures``. Times are in s from the start of the first row's
+    exposure.
+    """
+    shutter = shutter_in(chain)
+    if shutter is None or not shutter.line_time:
+        return {}
+    exposures = exposures_of(chain)
+    spans = exposures.spans if exposures else (Span(),)
+    shutters = [shutter.for_exposure(spans, number) for number in range(len(spans))]
+    _, rows = source.margins.frame_size(*source.pixels.shape[1::-1])
+    starts = [float(each.times(1)[0]) for each in shutters]
+    ends = [start + each.time for start, each in zip(starts, shutters, strict=True)]
+    times = [list(each) for each in zip(starts, ends, strict=True)]
+    return {"row_times": {"rows": rows, "step": shutter.line_time, "exposures": times}}
 
 
 def _interpolated(camera_poses: list[Pose], times: Doubles, time: float) -> Pose:

@@ -19,7 +19,7 @@ from clpipe.images.tags import FLIPS, orientation_of
 from clpipe.inputs.carry import CarriedLayers
 from clpipe.inputs.find import Job
 from clpipe.inputs.raw import RawImage
-from clpipe.outputs.motion import motion_records
+from clpipe.outputs.motion import motion_records, row_times
 from clpipe.outputs.patches import Patch, metadata_of
 from clpipe.outputs.program import all_versions, device_record, program_digest
 from clpipe.outputs.recipes import Recipe
@@ -132,6 +132,7 @@ def picture_record(
         "intrinsics": intrinsics.record() if intrinsics else None,
         "pose": chain.settings.render.pose,
         **motion_records(chain, source),
+        **row_times(chain, source),
         "photometry": photometry_of(chain, result.estimates),
         "noise": noise.record() if noise else None,
         "starts_on": chain.source.label,
@@ -148,7 +149,7 @@ def picture_record(
             {"name": path.name, "size": file.size, "sha256": file.sha256}
             for path, file in outputs.items()
         ],
-        **({"carried": [layer.record for layer in carried.layers]} if carried else {}),
+        **({"carried": carried.records} if carried else {}),
         **layer_records(source.layers.values()),
         **({"overscan": source.margins._asdict()} if source.margins else {}),
         "warnings": list(source.warnings),

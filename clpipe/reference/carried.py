@@ -4,7 +4,7 @@ Positions are counted like in :mod:`clpipe.reference.geometry`, and exact to flo
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -232,6 +232,30 @@ def map_flow(samples: Array, vectors: Sequence[Vector], move: PixelOrigins) -> A
         for to, end, (channel, sign) in zip(move.to, end_positions, channels, strict=True):
             result[..., channel] = sign * (end - to)
     return result
+
+
+def between_rows(layer: Layer, directions: Sequence[int], row_step: float) -> Layer:
+    """Return flow between moments one frame apart as flow between the moments of rolling rows.
+
+    A surface that moves by v in a frame is seen in another row y' of the other frame, and so
+    (y' - y) * row_step frames later. It then has moved by v / (1 - v_y row_step), and back in time
+    by v / (1 + v_y row_step). Its velocity is assumed to be constant for this difference.
+
+    Args:
+        layer: the layer, in the render's px.
+        directions: for each vector, whether it leads forward (1) or back (-1) in time.
+        row_step: the time from the start of a row to the start of the next, in frames.
+
+    Returns:
+        The layer, float64. A vector is NaN if its surface moves like the shutter, or faster.
+    """
+    result = layer.pixels.astype(np.float64)
+    for ((across, _), (down, sign)), direction in zip(layer.vectors, directions, strict=True):
+        slower = 1 - direction * row_step * sign * result[..., down]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            factor = np.where(slower > 0, 1 / slower, np.nan)
+        result[..., [across, down]] *= factor[..., np.newaxis]
+    return replace(layer, pixels=result)
 
 
 def _normalized(normals: Array) -> Array:

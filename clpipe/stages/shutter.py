@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from clpipe.base.tracing import float32, traceable
-from clpipe.base.types import Doubles, Floats
+from clpipe.base.types import Array, Doubles, Floats
 from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
 from clpipe.stage import (
     Arguments,
@@ -85,6 +85,14 @@ class Rows(Method):
         "s",
         ge=0,
         le=1,
+    )
+    frame_time: float = parameter(
+        0.0,
+        "Time from the start of a frame to the start of the next in its sequence, which only the "
+        "optical flow of a rolling shutter needs; 0 is not known.",
+        "s",
+        ge=0,
+        le=3600,
     )
     flicker_depth: float | None = parameter(
         None,
@@ -164,6 +172,18 @@ class Rows(Method):
         """Return when the exposure of each row starts, in s: (row,)."""
         start = self._first_exposure * self._span.start
         return np.arange(rows, dtype=np.float64) * self.line_time + start
+
+    def frames_at_middles(self, frames: int, rows: int) -> Array:
+        """Return the number of the frame in the middle of each row's exposures: (row,).
+
+        If the middle is between two frames, the earlier one is returned.
+
+        >>> Rows(exposure_time=1.0, line_time=1.0).frames_at_middles(4, 3).tolist()
+        [0, 1, 3]
+        """
+        middles = np.arange(rows) * self.line_time + self._first_exposure * self._end / 2
+        ends = np.ceil(np.round(middles * frames / self.duration(rows), 9))
+        return np.asarray(ends.astype(np.intp) - 1)
 
     def duration(self, rows: int) -> float:
         """Return the time from the start of the first row to the end of the last row, s."""
