@@ -10,9 +10,9 @@ from scipy import stats
 import clpipe
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import built_in_cameras, load_camera
-from clpipe.chain.draws import Limits, field_limits
 from clpipe.chain.files import load_settings, toml_text
 from clpipe.chain.isos import check_cameras, draw_note
+from clpipe.chain.limits import Limits, field_limits
 from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import overlay, settings_from

@@ -15,8 +15,8 @@ from clpipe.base.errors import RequestError
 from clpipe.base.tracing import NotTraceableError, Trace, call, float32, traceable
 from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.chain import COMPUTED, STRUCTURAL, Chain
-from clpipe.chain.draws import field_limits
 from clpipe.chain.families import ComputedChain
+from clpipe.chain.limits import field_limits
 from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import overlay, settings_from

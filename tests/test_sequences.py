@@ -11,7 +11,8 @@ import clpipe
 from clpipe.base.errors import RequestError
 from clpipe.camera.control import AutoIso, Control, ControlLoop
 from clpipe.chain.drawing import draw_values
-from clpipe.chain.draws import Drift, Limits
+from clpipe.chain.draws import Drift
+from clpipe.chain.limits import Limits
 from clpipe.inputs.find import Job
 from clpipe.inputs.sequences import in_sequences
 

@@ -4,13 +4,15 @@ The distributions are in :mod:`clpipe.chain.draws`.
 """
 
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import product
 from typing import Any
 
 from clpipe.base.errors import KeyedError
 from clpipe.base.text import unknown_name
-from clpipe.chain.draws import Choice, Draw, Drift, Limits, parse_draw
+from clpipe.chain.draws import Choice, Draw, Drift, parse_draw
 from clpipe.chain.keys import KEYS
+from clpipe.chain.limits import Limits
 from clpipe.reference.random import philox_rounds, stream_of
 
 LimitsOf = Callable[[str], Limits | None]  # returns the limits of the value with a dotted name
@@ -139,3 +141,12 @@ def uniform_numbers(seed_text: str, names: Iterable[str]) -> dict[str, float]:
         high, low, *_ = philox_rounds(0, 0, 0, zlib.crc32(name.encode()), stream)
         numbers[name] = ((high << 20 | low >> 12) + 0.5) * 2.0**-52
     return numbers
+
+
+def examples_of(drawn: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
+    """Yield each method with each extreme of each parameter, the others at their first extreme."""
+    first = {name: values[0] for name, values in drawn.items()}
+    methods = [{"method": method} for method in drawn.get("method", ())] or [{}]
+    others = [{k: value} for k, values in drawn.items() if k != "method" for value in values]
+    for method, other in product(methods, others or [{}]):
+        yield {**first, **method, **other}

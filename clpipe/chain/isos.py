@@ -7,7 +7,8 @@ from itertools import product
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import load_camera
 from clpipe.chain.drawing import draw_extremes
-from clpipe.chain.draws import Limits, Truncated
+from clpipe.chain.draws import Truncated
+from clpipe.chain.limits import Limits
 from clpipe.chain.settings import Settings
 
 

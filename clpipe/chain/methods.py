@@ -12,7 +12,7 @@ from clpipe.base.errors import KeyedError
 from clpipe.base.text import unknown_name
 from clpipe.base.validation import first_fault
 from clpipe.camera.control import Control
-from clpipe.chain.keys import CONTROL, OUTPUT, RENDER
+from clpipe.chain.keys import CONTROL, NOISE, OUTPUT, RENDER
 from clpipe.chain.registry import all_stages
 from clpipe.chain.render_camera import RenderCamera
 from clpipe.images.encoding import Encoding
@@ -63,6 +63,18 @@ def stage_named(key: str, name: str) -> Stage:
             raise KeyedError(key, f"{message}. The second is then called {stage}_2")
         raise KeyedError(key, unknown_name("stage", name, all_stages()))
     return all_stages()[name]
+
+
+def check_step(key: str, name: str) -> None:
+    """Check that a name is allowed under "stages" or "skip".
+
+    Raises:
+        KeyedError: the name is no stage. "noise" is also allowed under "skip".
+    """
+    if key == "stages":
+        stage_named(key, name)
+    elif name != NOISE and base_name(name) not in all_stages():
+        raise KeyedError(key, f"skip: {unknown_name('stage', name, (NOISE, *all_stages()))}")
 
 
 def parameter_names() -> list[str]:

@@ -4,10 +4,9 @@ Nothing here depends on the camera's data or on a stage's place in the chain. Th
 :mod:`clpipe.chain.making`.
 """
 
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,27 +17,26 @@ from clpipe.base.text import quote_alternatives, unknown_name
 from clpipe.base.tracing import with_changes
 from clpipe.camera.control import Control
 from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_name, load_camera
-from clpipe.chain.drawing import draw_extremes, draw_values, parse_drawn
-from clpipe.chain.draws import SMALLEST_FLOAT, Choice, Draw, Limits, field_limits
+from clpipe.chain.drawing import draw_extremes, draw_values, examples_of, parse_drawn
+from clpipe.chain.draws import Choice, Draw
 from clpipe.chain.keys import (
     CODE,
     DEFAULT_ISO,
     KEYS,
     LENS,
     MAX_STAGES,
-    NOISE,
     TABLES,
     check_type,
     string_list,
 )
+from clpipe.chain.limits import SMALLEST_FLOAT, Limits, field_limits
 from clpipe.chain.methods import (
     TABLE_MODELS,
-    base_name,
+    check_step,
     make_model,
     method_name,
     method_named,
     parameter_names,
-    stage_named,
     stage_of,
     step_names,
     unknown_parameter,
@@ -331,7 +329,7 @@ def _check_plain_values(settings: Settings, plain: Mapping[str, Any]) -> dict[st
                     key, f"{key}: found {len(names)} stages; list at most {MAX_STAGES}"
                 )
             for name in names:
-                _check_step(key, name)
+                check_step(key, name)
             checked[key] = (*settings.skip, *names) if key == "skip" else names
     checked |= {key: convert(plain[key]) for key, convert in CONVERSIONS.items() if key in plain}
     if plain.get("dump"):
@@ -340,18 +338,6 @@ def _check_plain_values(settings: Settings, plain: Mapping[str, Any]) -> dict[st
         except RequestError as error:
             raise KeyedError("dump", str(error)) from None
     return checked
-
-
-def _check_step(key: str, name: str) -> None:
-    """Check that a name is allowed under "stages" or "skip".
-
-    Raises:
-        KeyedError: the name is no stage. "noise" is also allowed under "skip".
-    """
-    if key == "stages":
-        stage_named(key, name)
-    elif name != NOISE and base_name(name) not in all_stages():
-        raise KeyedError(key, f"skip: {unknown_name('stage', name, (NOISE, *all_stages()))}")
 
 
 def _merge_table(settings: Settings, step: str, table: Mapping[str, Any]) -> dict[str, Any]:
@@ -400,14 +386,5 @@ def _check_draws(settings: Settings, changed: Container[str]) -> None:
             by_step.setdefault(step, {})[name] = extremes
     for step, drawn in by_step.items():
         constants = {k: v for k, v in settings.table(step).items() if not isinstance(v, Draw)}
-        for example in _examples(drawn):
+        for example in examples_of(drawn):
             make_model(step, {**constants, **example})
-
-
-def _examples(drawn: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
-    """Yield each method with each extreme of each parameter, the others at their first extreme."""
-    first = {name: values[0] for name, values in drawn.items()}
-    methods = [{"method": method} for method in drawn.get("method", ())] or [{}]
-    others = [{k: value} for k, values in drawn.items() if k != "method" for value in values]
-    for method, other in product(methods, others or [{}]):
-        yield {**first, **method, **other}
