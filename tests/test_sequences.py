@@ -88,11 +88,12 @@ def test_a_loop_ignores_changes_within_its_hysteresis():
 
 
 def test_auto_iso_is_in_thirds_of_a_stop_and_does_not_flutter():
-    auto = AutoIso(200.0, Control(iso_max=3200.0, iso_min=100.0))
+    auto = AutoIso(200.0, (50, 6400), Control(iso_max=3200.0, iso_min=100.0))
     isos = [auto.next(ev) for ev in np.linspace(-3, 6, 400)]
     assert (min(isos), max(isos)) == (100, 3200)
     assert {round(3 * math.log2(iso / 100), 9) % 1 for iso in isos} == {0}
-    auto = AutoIso(200.0, Control(iso_max=3200.0))
+    auto = AutoIso(200.0, (50, 6400), Control(iso_max=3200.0))
+    assert AutoIso(200.0, (200, 1600), Control(iso_max=3200.0)).next(9.0) == 1600
     assert len({auto.next(0.5 + 0.08 * (-1) ** n) for n in range(20)}) == 1
 
 

@@ -24,7 +24,7 @@ class Control(BaseModel):
         speed: the most that a loop changes, in EV per frame. 0 is no limit.
         hysteresis: the smallest change of the metered value that a loop follows, in EV.
         iso_max: the highest ISO of auto ISO; None is no auto ISO. Auto ISO multiplies the ISO that
-            is set by the exposure's gain, in thirds of a stop.
+            is set by the exposure's gain, in thirds of a stop, within the camera's range.
         iso_min: the lowest ISO of auto ISO; None is the ISO that is set.
     """
 
@@ -83,15 +83,16 @@ class AutoIso:
     The ISO stays until the exposure asks for one that is more than a step away. The conversion gain
     of a camera therefore does not switch to and fro.
 
-    >>> auto = AutoIso(100.0, Control(iso_max=800.0))
+    >>> auto = AutoIso(100.0, (50.0, 25600.0), Control(iso_max=800.0))
     >>> [round(auto.next(ev)) for ev in (0.0, 0.2, 1.0, 0.8, 5.0, -1.0)]
     [100, 100, 200, 200, 800, 100]
     """
 
-    def __init__(self, iso: float, control: Control) -> None:
+    def __init__(self, iso: float, iso_range: tuple[float, float], control: Control) -> None:
         assert control.iso_max is not None
+        low, high = iso_range
         self._iso = iso
-        self._ends = control.iso_min or iso, control.iso_max
+        self._ends = max(control.iso_min or iso, low), min(control.iso_max, high)
         self._step: int | None = None
 
     def next(self, ev: float) -> float:

@@ -117,7 +117,7 @@ class Meter:
             if method.headroom != Auto.model_fields["headroom"].default:
                 values[exposure.name]["headroom"] = method.headroom
             if control.iso_max is not None:
-                self._iso = self._iso or AutoIso(chain.settings.iso, control)
+                self._iso = self._iso or AutoIso(chain.iso, chain.camera.iso_range, control)
                 values["iso"] = round(self._iso.next(ev), DIGITS)
         if balance:
             chain = chain_of(values) if values else chain
