@@ -189,6 +189,15 @@ def test_draws_are_of_a_sequence_and_drifts_of_a_frame(frames, tmp_path):
     assert len(set(column["dark_current.temperature"])) == 18
 
 
+def test_a_drawn_iso_may_exceed_the_range_of_the_camera(frames, tmp_path):
+    options = {"camera": "google-pixel", "iso": {"choice": [6400]}}
+    run(tmp_path, "out", sequence=True, **options)
+    sidecar = json.loads((tmp_path / "out/a/0.json").read_text())
+    assert sidecar["iso"] == 6400
+    with clpipe.Stream(device="numpy", **options) as camera:
+        assert camera(np.full((24, 32, 3), 0.1, np.float32)).index == 0
+
+
 def test_shards_are_whole_sequences(frames, tmp_path):
     assert len(run(tmp_path, "out", sequence=True, shard="2/2")) == 9
     assert {name[0] for name in pictures(tmp_path / "out")} == {"b"}

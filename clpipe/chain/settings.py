@@ -132,7 +132,11 @@ class Settings:
 
     def drawn_values(self, name: str, frame: int) -> dict[str, Any]:
         """Return the values of :meth:`drawn` that are drawn, nested like a configuration."""
-        constants = self.drawn(name, frame).constants() if self.draws else {}
+        drawn = self.drawn(name, frame)
+        constants = drawn.constants() if self.draws else {}
+        low, high = load_camera(drawn.camera).iso_range
+        if drawn.pushed and not low <= drawn.iso <= high:
+            constants["iso"] = {"choice": [drawn.iso]}  # only a draw may exceed the range
         values: dict[str, Any] = {}
         for key in self.draws:
             table, _, name = key.rpartition(".")
