@@ -278,3 +278,11 @@ def test_rates():
             parse_rate(text)
         with pytest.raises(RequestError, match="--bit-rate: found"):
             parse_bit_rate(text)
+
+
+def test_a_report_needs_single_pictures(clpipe, frames):
+    clpipe("run", frames(), *RUN)
+    stderr = clpipe("report", "out", status=2).stderr
+    assert "out: its pictures are in clips, such as cam0.mkv, but a report needs single" in stderr
+    clpipe("run", "in", "-o", "out/plain", "--sequence", *RUN[6:])
+    clpipe("report", "out/plain")

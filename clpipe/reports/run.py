@@ -23,6 +23,7 @@ KEYS = (
     "warnings",
 )
 SHARED_KEYS = ("device", "versions")  # keys whose values are equal in most sidecars
+CLIPS = (".mp4", ".mkv")
 LOGS = "run*.jsonl"
 
 
@@ -177,6 +178,12 @@ def read_run(folder: Path) -> Run:
         raise RequestError(
             f"{folder}: has no picture of clpipe with its sidecar (NAME.json), and no log "
             "(run.jsonl). Name the output directory of clpipe run"
+        )
+    clips = [path for suffix in CLIPS for path in folder.glob(f"**/*{suffix}")]
+    if clips and not run.all_pictures:
+        raise RequestError(
+            f"{folder}: its pictures are in clips, such as {clips[0].name}, but a report needs "
+            "single pictures. To write them, run the frames with --sequence and --format png"
         )
     return run
 
