@@ -59,19 +59,19 @@ class Turns:
 
     def wait(self, job: Job) -> bool:
         """Wait until all jobs before have ended their turns. Return False if the run has ended."""
-
-        def is_next() -> bool:
-            return job.place not in self._waiting or next(iter(self._waiting)) == job.place
-
         with self._changed:
-            self._changed.wait_for(lambda: self._is_closed or is_next())
-            return is_next()
+            while job.place in self._waiting and next(iter(self._waiting)) != job.place:
+                if self._is_closed:
+                    return False
+                self._changed.wait()
+        return True
 
     def end(self, job: Job) -> None:
         """End a job's turn, if it has not ended."""
         with self._changed:
-            self._waiting.pop(job.place, None)
-            self._changed.notify_all()
+            if job.place in self._waiting:
+                del self._waiting[job.place]
+                self._changed.notify_all()
 
     def close(self) -> None:
         """End the run: no job waits any longer."""

@@ -70,17 +70,10 @@ def decode(planes: Sequence[Array], bits: int, matrix: int = BT709, is_full: boo
         (height, width, 3) uint8 for 8 bits, else uint16; full range.
     """
     scale = 2 ** (bits - 8)
-    black, span, chroma_span = (
-        (0, 2**bits - 1, 2**bits - 1)
-        if is_full
-        else (
-            16 * scale,
-            219 * scale,
-            224 * scale,
-        )
-    )
-    luma = (planes[0] - np.float32(black)) / np.float32(span)
-    chroma = [(plane - np.float32(128 * scale)) / np.float32(chroma_span) for plane in planes[1:]]
+    full, limited = (0, 2**bits - 1, 2**bits - 1), (16 * scale, 219 * scale, 224 * scale)
+    black, span, chroma_span = map(np.float32, full if is_full else limited)
+    luma = (planes[0] - black) / span
+    chroma = [(plane - np.float32(128 * scale)) / chroma_span for plane in planes[1:]]
     if chroma[0].shape != luma.shape:
         chroma = [_doubled(plane)[: luma.shape[0], : luma.shape[1]] for plane in chroma]
     table = np.linalg.inv(to_ycbcr(matrix).astype(np.float64)).astype(np.float32)
