@@ -163,12 +163,13 @@ class Stream:
             ImageError: this is no array.
             RequestError: the stream is closed.
         """
-        if self._is_closed:
-            raise RequestError("this stream is closed; make another one")
         self._is_threaded = True
         image, layers = as_array(frame, "frame"), _by_kind(depth, flow)
         index = next(self._numbers)
-        if not self._free.acquire(blocking=not self._drop):
+        is_free = self._is_closed or self._free.acquire(blocking=not self._drop)
+        if self._is_closed:
+            raise RequestError("this stream is closed; make another one")
+        if not is_free:
             self.dropped += 1
             return False
         copied = {kind: layer.copy() for kind, layer in layers.items()}
@@ -201,6 +202,7 @@ class Stream:
         if not self._is_closed:
             self._is_closed = True
             self._thread.submit(self._shots.put, None)
+            self._free.release()  # a thread that waits in put then learns of it
 
     def finish(self) -> Iterator[Shot]:
         """Yield the pictures of all frames that were put; none can be put any more."""
