@@ -122,13 +122,10 @@ class Frames:
             return
         for sequence, frames in groupby(jobs, key=lambda job: job.place and job.place.sequence):
             existing: list[Job] = []
-            for job in frames:
-                if sequence and sequence not in self._recomputed:
-                    if self._is_done(job):
-                        existing.append(job)
-                        continue
+            for job in frames if sequence else ():
+                existing.append(job)
+                if not self._is_done(job):
                     self._recomputed.add(sequence)
-                yield from existing
-                existing.clear()
-                yield job
+                    break
             yield from existing
+            yield from frames

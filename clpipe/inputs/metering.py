@@ -221,19 +221,16 @@ def merged(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, An
 
 
 def write_exposures(path: Path, jobs: Sequence[Job]) -> None:
-    """Write frames as a manifest with their settings.
+    """Write frames as a manifest with their settings. All files of an exposure have the same.
 
     Raises:
         ImageError: the manifest cannot be written.
     """
-    rows = [row for job in jobs for row in _rows(path.parent, job)]
+    rows = []
+    for job in jobs:
+        name = job.name or (job.stem if key_of(path.parent, job.path) != job.key else "")
+        own = job.values, job.frames, job.location
+        rows.append(Row(job.path, job.key, name, *own))
+        for file in job.subframes:
+            rows.append(Row(file, "", f"{name}.{file.stem}" if name else "", *own))
     write_new(path, manifest_text(path.parent, rows))
-
-
-def _rows(folder: Path, job: Job) -> Iterator[Row]:
-    """Yield a row for each file of a frame's exposure, with the same values."""
-    name = job.name or (job.stem if key_of(folder, job.path) != job.key else "")
-    yield Row(job.path, job.key, name, job.values, job.frames, job.location)
-    for path in job.subframes:
-        other = f"{name}.{path.stem}" if name else ""
-        yield Row(path, "", other, job.values, job.frames, job.location)
