@@ -51,9 +51,9 @@ class ClipOptions:
     """
 
     suffix: str
-    video: VideoOptions = field(default_factory=VideoOptions)
-    decoded: bool = False
-    name: str = ""
+    video: VideoOptions
+    decoded: bool
+    name: str
 
     def record(self) -> dict[str, Any]:
         """Return what determines the bytes of a clip, besides its frames, as JSON values."""
@@ -111,10 +111,10 @@ def take_clip_options(options: dict[str, Any]) -> ClipOptions | None:
     video = {to: options.pop(name) for name, to in VIDEO_FIELDS.items() if name in options}
     decoded = options.pop("decoded", False)
     output: Path = options["output"]
-    formats: Sequence[str] = options.get("format", ())
-    suffix = output.suffix.lower()
-    is_file = suffix[1:] in CLIP_FORMATS and not output.is_dir()
-    if not is_file and not set(formats) & set(CLIP_FORMATS):
+    suffix = output.suffix.lower()[1:]
+    is_file = suffix in CLIP_FORMATS and not output.is_dir()
+    formats = dict.fromkeys([*options.get("format", ()), *([suffix] if is_file else [])])
+    if not formats.keys() & CLIP_FORMATS:
         if video or decoded:
             name = next((n for n, to in VIDEO_FIELDS.items() if to in video), "decoded")
             raise RequestError(
@@ -122,11 +122,10 @@ def take_clip_options(options: dict[str, Any]) -> ClipOptions | None:
                 "--format mp4"
             )
         return None
-    if len(formats) > 1 or (is_file and formats and formats[0] != suffix[1:]):
-        found = ", ".join([*formats, *([str(output)] if is_file else [])])
+    if len(formats) > 1:
         raise RequestError(
-            f"--format: found {found}, but a run writes either clips of one format or pictures; "
-            "use one run for each"
+            f"--format: found {', '.join(formats)}, but a run writes either clips of one format or "
+            "pictures; use one run for each"
         )
     for name in ("keep", "carry", "patch", "webdataset", "dask"):
         if options.get(name):
@@ -138,12 +137,8 @@ def take_clip_options(options: dict[str, Any]) -> ClipOptions | None:
         raise RequestError(
             f"--truth: found {mosaics[0]}, but a clip contains only pictures; remove it"
         )
-    clips = ClipOptions(
-        suffix if is_file else f".{formats[0]}",
-        VideoOptions(**video),
-        decoded,
-        output.stem if is_file else "",
-    )
+    name = output.stem if is_file else ""
+    clips = ClipOptions(f".{next(iter(formats))}", VideoOptions(**video), decoded, name)
     clips.video.check_suffix(clips.suffix)
     require("a clip", "av")
     options["output"] = output.parent if is_file else output
