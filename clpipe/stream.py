@@ -7,13 +7,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self, Unpack
+from typing import TYPE_CHECKING, Any, Self, Unpack
 
 import numpy as np
 
 from clpipe.base.errors import DeviceFailedError, ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.base.validation import check_argument_types
+from clpipe.chain.options import Transfer
 from clpipe.engine.runner import Result
 from clpipe.engine.state import State
 from clpipe.images.arrays import as_array
@@ -107,7 +108,7 @@ class Stream:
         device: str | int | None = None,
         until: str | None = None,
         keep: str | Sequence[str] | None = None,
-        transfer: Literal["linear", "srgb"] = "linear",
+        transfer: Transfer = "linear",
         drop: bool = False,
         **settings: "Unpack[Keywords]",
     ) -> None:

@@ -16,22 +16,16 @@ import numpy as np
 from clpipe.base.errors import ClpipeError, ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.chain.keys import KEYS
+from clpipe.chain.options import Transfer
 from clpipe.commands.chain_options import SETTINGS, device_option, options, set_option, settings_in
 from clpipe.commands.options import Command, OutputPath
 from clpipe.stream import Stream
 
 
 @click.command("stream", cls=Command)
-@options("config", KEYS["camera"], KEYS["iso"], *SETTINGS, "until")
+@options("config", KEYS["camera"], KEYS["iso"], *SETTINGS, "until", "transfer")
 @set_option
 @device_option
-@click.option(
-    "--transfer",
-    type=click.Choice(["linear", "srgb"]),
-    default="linear",
-    show_default=True,
-    help="srgb converts uint8 frames of a simulator to light.",
-)
 @click.option(
     "--name",
     default="stream",
@@ -55,7 +49,7 @@ def stream(
     selector: str | None,
     config: tuple[str, ...],
     until: str | None,
-    transfer: str,
+    transfer: Transfer | None,
     name: str,
     drop: bool,
     log_path: Path | None,
@@ -86,7 +80,7 @@ def stream(
         name=name,
         device=selector,
         until=until,
-        transfer=transfer,  # type: ignore[arg-type]
+        transfer=transfer or "linear",
         drop=drop,
         **settings,
     )
