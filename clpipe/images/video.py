@@ -330,12 +330,10 @@ def _rgb(frame: "av.VideoFrame") -> Array:
     """Return a decoded frame as RGB, see :func:`read_video`."""
     bits = frame.format.components[0].bits
     if frame.format.is_rgb:
-        if bits == 8:
-            return frame.to_ndarray(format="rgb24")
-        if frame.format.name.startswith("gbrp"):
-            levels = frame.to_ndarray()
-            return np.rint(levels * np.float32(65535 / (2**bits - 1))).astype(np.uint16)
-        return frame.to_ndarray(format="rgb48le")
+        if bits == 8 or not frame.format.name.startswith("gbrp"):
+            return frame.to_ndarray(format="rgb24" if bits == 8 else "rgb48le")
+        scale = np.float32(65535 / (2**bits - 1))
+        return np.rint(frame.to_ndarray() * scale).astype(np.uint16)
     is_full = frame.color_range == FULL or frame.format.name.startswith("yuvj")
     matrix = frame.colorspace
     if matrix not in WEIGHTS:
