@@ -111,7 +111,7 @@ class Meter:
         if exposure:
             method = exposure.method
             assert isinstance(method, Auto)
-            metered |= self._measure(chain, exposure, image, image_key)
+            metered["metered_ev"] = self._measure(chain, exposure, image, image_key)["metered_ev"]
             ev = round(follow(exposure.name, metered["metered_ev"]) + method.ev, DIGITS) + 0.0
             values[exposure.name] = {"method": "gain", "ev": ev}
             if method.headroom != Auto.model_fields["headroom"].default:
