@@ -88,12 +88,8 @@ def decode(planes: Sequence[Array], bits: int, matrix: int = BT709, is_full: boo
 
 def _doubled(plane: Floats) -> Floats:
     """Return a chroma plane of 4:2:0 at the positions of luma, by linear interpolation."""
-    height, width = plane.shape
     padded = np.pad(plane, ((1, 1), (0, 1)), mode="edge")
-    rows = np.empty((2 * height, width + 1), np.float32)
-    rows[::2] = 0.75 * padded[1:-1] + 0.25 * padded[:-2]
-    rows[1::2] = 0.75 * padded[1:-1] + 0.25 * padded[2:]
-    doubled = np.empty((2 * height, 2 * width), np.float32)
-    doubled[:, ::2] = rows[:, :-1]
-    doubled[:, 1::2] = (rows[:, :-1] + rows[:, 1:]) / 2
-    return doubled
+    middle, above, below = 0.75 * padded[1:-1], 0.25 * padded[:-2], 0.25 * padded[2:]
+    rows = np.stack([middle + above, middle + below], 1).reshape(-1, padded.shape[1])
+    left, right = rows[:, :-1], rows[:, 1:]
+    return np.stack([left, (left + right) / 2], 2).reshape(len(rows), -1)
