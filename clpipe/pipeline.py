@@ -27,7 +27,7 @@ from clpipe.engine.clipping import WARNING_SHARE, clipped_share, clipping_text
 from clpipe.engine.device import Device, open_device
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result, Runner
-from clpipe.engine.state import State, has_state
+from clpipe.engine.state import State
 from clpipe.images.arrays import as_array, as_image
 from clpipe.images.kinds import MIN_CHANNELS, flow_vectors
 from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
@@ -193,10 +193,9 @@ class Pipeline(ReadOnly):
             ImageError: the image is too large.
         """
         chain = prepared.runner.chain
-        options = RunOptions(state=state if has_state(chain) else None)
         with self._lock:
             seed = noise_key(chain.settings, prepared.own_key)
-            result = prepared.runner.run(prepared.pixels, seed, options)
+            result = prepared.runner.run(prepared.pixels, seed, RunOptions(state=state))
         share = clipped_share(result, chain) or 0.0
         # Photographs are already clipped.
         if share >= WARNING_SHARE and chain.source is not Kind.DISPLAY:

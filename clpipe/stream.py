@@ -1,18 +1,20 @@
 """Frames of a simulator that is running: each is developed like a frame of a sequence."""
 
+import itertools
 import queue
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self, Unpack
+from typing import TYPE_CHECKING, Any, Self, Unpack
 
 import numpy as np
 
 from clpipe.base.errors import DeviceFailedError, ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.base.validation import check_argument_types
+from clpipe.chain.options import Transfer
 from clpipe.engine.runner import Result
 from clpipe.engine.state import State
 from clpipe.images.arrays import as_array
@@ -85,8 +87,8 @@ class Stream:
         keep: steps whose images are also returned, or "all".
         transfer: "srgb" if frames are finished pictures of sRGB in eight bits, as most simulators
             render them. They are converted to light.
-        drop: whether :meth:`put` drops a frame instead of waiting, if the one before it has not
-            begun yet.
+        drop: whether :meth:`put` drops a frame instead of waiting, if nobody has got the pictures
+            of the two before it.
         **settings: as for :class:`Pipeline`.
 
     Attributes:
@@ -106,7 +108,7 @@ class Stream:
         device: str | int | None = None,
         until: str | None = None,
         keep: str | Sequence[str] | None = None,
-        transfer: Literal["linear", "srgb"] = "linear",
+        transfer: Transfer = "linear",
         drop: bool = False,
         **settings: "Unpack[Keywords]",
     ) -> None:
@@ -117,14 +119,12 @@ class Stream:
         self._drop = drop
         self._meter = Meter(lambda: self._pipeline.device)
         self._state = State()
-        self._count = 0
+        self._numbers = itertools.count()
         # One frame waits while another is developed, so a picture is at most two frames late.
-        self._is_free = threading.Semaphore(1)
-        self._frames: queue.SimpleQueue[tuple[int, Array, Mapping[str, Array]] | None]
-        self._frames = queue.SimpleQueue()
-        self._shots: queue.Queue[Shot | Exception | None] = queue.Queue(1)
-        self._thread: threading.Thread | None = None
-        self._is_closed = False
+        self._free = threading.Semaphore(2)
+        self._shots: queue.SimpleQueue[Shot | Exception | None] = queue.SimpleQueue()
+        self._thread = ThreadPoolExecutor(1, "stream")
+        self._is_threaded = self._is_closed = False
 
     def __enter__(self) -> Self:
         return self
@@ -147,15 +147,15 @@ class Stream:
             ImageError, RequestError: as for :meth:`Pipeline.process`. The next frame can still be
                 developed.
         """
-        if self._thread:
+        if self._is_threaded:
             raise RequestError("this stream develops the frames of put; use get, not a call")
-        return self._develop(self._next_index(), as_array(frame, "frame"), _by_kind(depth, flow))
+        return self._develop(next(self._numbers), as_array(frame, "frame"), _by_kind(depth, flow))
 
     def put(self, frame: Array, depth: Array | None = None, flow: Array | None = None) -> bool:
         """Pass the next frame to the stream's thread. The frame is copied.
 
-        This waits until the frame before it begins, or with ``drop`` drops the frame in this case.
-        Somebody must :meth:`get` pictures, or the stream stops taking frames.
+        This waits until somebody got the picture of the frame before the last, or with
+        ``drop`` drops the frame in this case.
 
         Returns:
             Whether the frame was taken.
@@ -164,16 +164,17 @@ class Stream:
             ImageError: this is no array.
             RequestError: the stream is closed.
         """
+        self._is_threaded = True
+        image, layers = as_array(frame, "frame"), _by_kind(depth, flow)
+        index = next(self._numbers)
+        is_free = self._is_closed or self._free.acquire(blocking=not self._drop)
         if self._is_closed:
             raise RequestError("this stream is closed; make another one")
-        index = self._next_index()
-        self._start()
-        if not self._is_free.acquire(blocking=not self._drop):
+        if not is_free:
             self.dropped += 1
             return False
-        layers = _by_kind(depth, flow).items()
-        copied = {kind: np.array(as_array(layer, kind)) for kind, layer in layers}
-        self._frames.put((index, np.array(as_array(frame, "frame")), copied))
+        copied = {kind: layer.copy() for kind, layer in layers.items()}
+        self._thread.submit(self._deliver, index, image.copy(), copied)
         return True
 
     def get(self, timeout: float | None = None) -> Shot | None:
@@ -186,13 +187,13 @@ class Stream:
             TimeoutError: there is no picture yet.
             ImageError, RequestError: this frame failed. The next one can still be developed.
         """
-        self._start()
         try:
             shot = self._shots.get(timeout=timeout)
         except queue.Empty:
             raise TimeoutError("no picture yet") from None
         if shot is None:
             self._shots.put(None)  # for the next call
+        self._free.release()
         if isinstance(shot, Exception):
             raise shot
         return shot
@@ -201,7 +202,8 @@ class Stream:
         """Say that no more frames follow. Pictures of earlier frames can still be got."""
         if not self._is_closed:
             self._is_closed = True
-            self._frames.put(None)
+            self._thread.submit(self._shots.put, None)
+            self._free.release()  # a thread that waits in put then learns of it
 
     def finish(self) -> Iterator[Shot]:
         """Yield the pictures of all frames that were put; none can be put any more."""
@@ -210,31 +212,16 @@ class Stream:
             yield shot
 
     def close(self) -> None:
-        """Stop the stream. Pictures that nobody got are lost."""
+        """Stop the stream, once the frames that were put are developed."""
         self.end()
-        is_over = self._thread is None
-        while not is_over:
-            with suppress(ImageError, RequestError):
-                is_over = self.get() is None
+        self._thread.shutdown()
 
-    def _next_index(self) -> int:
-        self._count += 1
-        return self._count - 1
-
-    def _start(self) -> None:
-        """Start the thread that develops frames."""
-        if not self._thread:
-            self._thread = threading.Thread(target=self._develop_all, name="stream", daemon=True)
-            self._thread.start()
-
-    def _develop_all(self) -> None:
-        while item := self._frames.get():
-            self._is_free.release()
-            try:
-                self._shots.put(self._develop(*item))
-            except Exception as error:
-                self._shots.put(error)
-        self._shots.put(None)
+    def _deliver(self, *frame: Any) -> None:
+        """Develop a frame for :meth:`get`."""
+        try:
+            self._shots.put(self._develop(*frame))
+        except Exception as error:
+            self._shots.put(error)
 
     def _light(self, frame: Array) -> Array:
         """Return the light of a frame.
@@ -280,6 +267,10 @@ class Stream:
 
 
 def _by_kind(depth: Array | None, flow: Array | None) -> dict[str, Array]:
-    """Return the layers that were passed, by kind."""
+    """Return the layers that were passed, by kind.
+
+    Raises:
+        ImageError: one is no array.
+    """
     layers = {"depth": depth, "flow": flow}
-    return {kind: layer for kind, layer in layers.items() if layer is not None}
+    return {kind: as_array(layer, kind) for kind, layer in layers.items() if layer is not None}

@@ -10,7 +10,7 @@ from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import Picture
 from clpipe.analysis.report import NoiseReport
 from clpipe.base.errors import RequestError
-from clpipe.base.types import Array, Doubles, Floats, Mask
+from clpipe.base.types import Doubles, Floats, Mask
 from clpipe.images.video import read_video, video_info
 from clpipe.outputs.noise_areas import select_flat
 from clpipe.reference.colour import rgb_to_ycbcr
@@ -36,15 +36,12 @@ def load_frames(path: Path) -> list[Picture]:
     width, height = int(info.width * scale), int(info.height * scale)
     left, top = (info.width - width) // 2, (info.height - height) // 2
     step = 1 / (2**info.bits - 1)
-
-    def picture(number: int, frame: Array) -> Picture:
+    pictures = []
+    for number, frame in enumerate(islice(read_video(path), MAX_FRAMES)):
         crop = frame[top : top + height, left : left + width]
         pixels = crop * np.float32(1 / np.iinfo(frame.dtype).max)
         name = Path(f"{path}, frame {number},")  # for messages
-        return Picture(name, "display", pixels, "", 0.0, 1.0, step=step, is_coded=True)
-
-    frames = islice(read_video(path), MAX_FRAMES)
-    pictures = [picture(number, frame) for number, frame in enumerate(frames)]
+        pictures.append(Picture(name, "display", pixels, "", 0.0, 1.0, step=step, is_coded=True))
     if len(pictures) < 2:
         raise RequestError(f"{path}: this clip has one frame; give a clip of several frames")
     return pictures

@@ -6,6 +6,7 @@ there. A run that was interrupted therefore resumes with the missing frames.
 
 import glob
 import logging
+import os
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -13,16 +14,10 @@ from itertools import groupby
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from clpipe.base.errors import ImageError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import create_parents, discard, shorten_name, sync_folder
-from clpipe.batch.clips import (
-    Clip,
-    ClipOptions,
-    SequenceClips,
-    check_overwritten,
-    clips_of,
-)
-from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, Outcome
+from clpipe.batch.clips import Clip, ClipOptions, SequenceClips, clips_of
+from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
 from clpipe.batch.sinks import Executor, Folder
 from clpipe.batch.tar_sink import StagedWriter
 from clpipe.chain.chain import Chain
@@ -34,8 +29,7 @@ from clpipe.images.video import VideoOptions, VideoWriter, read_video
 from clpipe.images.write import write_png
 from clpipe.inputs.find import Job
 from clpipe.inputs.sequences import sequence_of
-from clpipe.outputs.existing import ExistingFiles, Redo, find_existing
-from clpipe.outputs.sidecar import SIDECAR
+from clpipe.outputs.existing import OVERWRITTEN, ExistingFiles, Redo, find_existing, is_marked
 from clpipe.outputs.writer import OutputWriter
 
 log = logging.getLogger(__name__)
@@ -69,21 +63,20 @@ class Clips(Folder):
     def __init__(
         self, writer: OutputWriter, redo: Redo, jobs: Sequence[Job], options: ClipOptions
     ) -> None:
-        sequences = clips_of(jobs, writer, options)
+        self._sequences = clips_of(jobs, writer, options)
         folders = {
             job.stem: str(each.staging.relative_to(writer.folder))
-            for each in sequences
+            for each in self._sequences.values()
             for job in each.jobs
         }
         super().__init__(ClipWriter(writer.folder, writer.request, folders, options.video), redo)
         self.options = options
-        self._sequences = {sequence_of(each.jobs[0]): each for each in sequences}
 
     def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> ExistingFiles:
         """Return what exists of a frame, in its clip or in the directory that will be encoded."""
         clips = self._sequences[sequence_of(job)].clips
         clip = next(each for each in clips if each.rendition == rendition)
-        if clip.is_kept:
+        if self.redo.keeps(clip.existing):
             return clip.existing
         # Frames are written without fsync, see `Tars.found`.
         return find_existing(
@@ -101,15 +94,18 @@ class Clips(Folder):
             DeviceError: no device is usable.
             OutputError: nothing more can be written.
         """
-        if self.redo is not Redo.ALL:
-            check_overwritten([*self._sequences.values()])
+        for clip in (clip for each in self._sequences.values() for clip in each.clips):
+            for path in (clip.path, clip.records_path):
+                if self.redo is not Redo.ALL and os.path.lexists(path) and not is_marked(path):
+                    raise RequestError(
+                        f"{path}: clpipe did not write this file, and it {OVERWRITTEN}"
+                    )
         encoding: Future[Outcome] | None = None
         with ThreadPoolExecutor(1, "clip") as pool:
             for outcome in executor.run(self._searched(jobs)):
                 sequence = self._sequences[sequence_of(outcome.job)]
-                sequence.add(outcome)
-                if not sequence.is_complete:
-                    yield named(outcome, sequence)
+                if not sequence.add(outcome):
+                    yield self._named(outcome)
                     continue
                 if encoding:
                     yield encoding.result()
@@ -125,10 +121,10 @@ class Clips(Folder):
         """
         for name, group in groupby(jobs, key=sequence_of):
             clips, frames = self._sequences[name].clips, iter(group)
-            if any(clip.records_path.exists() for clip in clips):
+            if self.redo is not Redo.ALL and any(clip.records_path.exists() for clip in clips):
                 known = [*frames]
                 for clip in clips:
-                    clip.find(known, self.writer, self.options, self.redo)
+                    clip.existing = clip.find(known, self.writer, self.options, self.redo.verifies)
                 frames = iter(known)
             yield from frames
 
@@ -141,33 +137,35 @@ class Clips(Folder):
         Raises:
             OutputError: nothing more can be written.
         """
-        if sequence.failed:
+        outcome = self._named(outcome)
+        if failed := sequence.jobs_with(FAILED):
             log.warning(
                 "%s: no clip is written, because the frame %s failed. The other frames are kept, "
                 "and the same command resumes",
                 sequence.clips[0].path,
-                sequence.failed,
+                failed[0].label,
             )
-            return named(outcome, sequence)
-        pictures = [job for job in sequence.jobs if sequence.statuses[job.stem] != LEFT_OUT]
+            return outcome
+        pictures = sequence.jobs_with(DONE, SKIPPED)
         written: list[Path] = []
         try:
             for clip in sequence.clips if pictures else ():
                 decoded = [clip.decoded_path(job) for job in pictures]
-                if not clip.is_kept:
+                if not self.redo.keeps(clip.existing):
                     for path in decoded:  # those of an older clip
                         discard(path)
                     self._encode(sequence, clip, pictures)
                     written += [clip.path, clip.records_path]
                 if self.options.decoded and not all(path.exists() for path in decoded):
-                    decode_clip(clip, decoded)
+                    create_parents(decoded[0])
+                    for path, frame in zip(decoded, read_video(clip.path), strict=True):
+                        write_png(path, frame)
         except ImageError as error:
             self.writer.check_folder()
-            return replace(named(outcome, sequence), status=FAILED, error=str(error))
+            return replace(outcome, status=FAILED, error=str(error))
         discard(sequence.staging)
         outputs = tuple(str(path.relative_to(self.writer.folder)) for path in written)
-        status = DONE if written else outcome.status
-        return replace(named(outcome, sequence), status=status, outputs=outputs)
+        return replace(outcome, status=DONE if written else outcome.status, outputs=outputs)
 
     def _encode(self, sequence: SequenceClips, clip: Clip, jobs: Sequence[Job]) -> None:
         """Write a clip and the records of its frames, in this order.
@@ -184,26 +182,11 @@ class Clips(Folder):
             for job in jobs:
                 path = self.writer.path(job, ending, clip.rendition)
                 video.add(read_whole_numbers(path, colours=True))
-        frames = [(job, self.writer.path(job, SIDECAR, clip.rendition)) for job in jobs]
-        stems = {job.stem for job in jobs}
-        left_out = [job.stem for job in sequence.jobs if job.stem not in stems]
-        clip.write_records(frames, left_out, self.options)
+        clip.write_records(jobs, sequence.jobs_with(LEFT_OUT), self.writer, self.options)
         sync_folder(clip.path.parent)
 
-
-def decode_clip(clip: Clip, paths: Sequence[Path]) -> None:
-    """Write the frames of a clip as PNGs.
-
-    Raises:
-        ImageError: the clip cannot be read, or a file cannot be written.
-    """
-    create_parents(paths[0])
-    for path, frame in zip(paths, read_video(clip.path), strict=True):
-        write_png(path, frame)
-
-
-def named(outcome: Outcome, sequence: SequenceClips) -> Outcome:
-    """Return the outcome of a frame with the clip in its name, and without the hidden files."""
-    clip = sequence.clips[0].path.relative_to(sequence.folder)
-    job = replace(outcome.job, name=f"{clip}/{PurePosixPath(outcome.job.stem).name}")
-    return replace(outcome, job=job, outputs=())
+    def _named(self, outcome: Outcome) -> Outcome:
+        """Return a frame's outcome with the clip in its name, and without the hidden files."""
+        first = self._sequences[sequence_of(outcome.job)].clips[0]
+        clip, frame = first.path.relative_to(self.writer.folder), PurePosixPath(outcome.job.stem)
+        return replace(outcome, job=replace(outcome.job, name=f"{clip}/{frame.name}"), outputs=())

@@ -48,32 +48,29 @@ class Turns:
 
     def __init__(self) -> None:
         self._changed = threading.Condition()  # guards all attributes
-        self._tickets: dict[Place, int] = {}
-        self._ended: set[int] = set()
-        self._next = 0
+        self._waiting: dict[Place | None, None] = {}  # whose turns have not ended, in order
         self._is_closed = False
 
     def expect(self, job: Job) -> None:
         """Append a job to the order. It must end its turn, even if it fails."""
         if job.place:
             with self._changed:
-                self._tickets[job.place] = len(self._tickets)
+                self._waiting[job.place] = None
 
     def wait(self, job: Job) -> bool:
         """Wait until all jobs before have ended their turns. Return False if the run has ended."""
         with self._changed:
-            ticket = self._tickets.get(job.place, 0) if job.place else 0
-            self._changed.wait_for(lambda: self._is_closed or self._next >= ticket)
-            return not self._is_closed or self._next >= ticket
+            while job.place in self._waiting and next(iter(self._waiting)) != job.place:
+                if self._is_closed:
+                    return False
+                self._changed.wait()
+        return True
 
     def end(self, job: Job) -> None:
         """End a job's turn, if it has not ended."""
         with self._changed:
-            if job.place in self._tickets:
-                self._ended.add(self._tickets[job.place])
-                while self._next in self._ended:
-                    self._ended.remove(self._next)
-                    self._next += 1
+            if job.place in self._waiting:
+                del self._waiting[job.place]
                 self._changed.notify_all()
 
     def close(self) -> None:
@@ -125,13 +122,10 @@ class Frames:
             return
         for sequence, frames in groupby(jobs, key=lambda job: job.place and job.place.sequence):
             existing: list[Job] = []
-            for job in frames:
-                if sequence and sequence not in self._recomputed:
-                    if self._is_done(job):
-                        existing.append(job)
-                        continue
+            for job in frames if sequence else ():
+                existing.append(job)
+                if not self._is_done(job):
                     self._recomputed.add(sequence)
-                yield from existing
-                existing.clear()
-                yield job
+                    break
             yield from existing
+            yield from frames

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from clpipe.base.about import full_version
@@ -267,13 +268,8 @@ class Run:
 
     def _metered(self, jobs: Iterable[Job], frames: list[Job]) -> Iterator[Job]:
         """Yield frames with the settings of their sequence, and append them to a list."""
-        execution = self.execution
-
-        def open_device() -> Device | None:
-            opened = open_devices(execution.devices[:1], execution.memory)
-            return opened[0] if opened else None
-
-        for job, _ in metered_jobs(self._loader, jobs, open_device):
+        opened = partial(open_devices, self.execution.devices[:1], self.execution.memory)
+        for job, _ in metered_jobs(self._loader, jobs, lambda: next(iter(opened()), None)):
             frames.append(job)
             yield job
 

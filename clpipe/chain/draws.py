@@ -7,7 +7,7 @@ nine digits, enough for a float32, so that platforms whose ``log`` differs in th
 import math
 from collections.abc import Mapping, Sequence
 from statistics import NormalDist
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -118,8 +118,40 @@ class NumberDraw(Draw):
         raise NotImplementedError(type(self).__name__)
 
 
-class Uniform(NumberDraw):
+class RangeDraw(NumberDraw):
     """Any number of a range, including both ends; a whole number if the value must be whole.
+
+    The first field of a subclass contains the ends.
+    """
+
+    @property
+    def _ends(self) -> Ends:
+        return getattr(self, next(iter(type(self).model_fields)))
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        low, high = self._ends
+        if low > high:
+            raise ValueError(f"found [{low:g}, {high:g}]; put the lower end first")
+        return self
+
+    def range_of(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
+        return self._ends
+
+    def truncated(self, limits: Limits) -> Self | None:
+        name = next(iter(type(self).model_fields))
+        ends = limits.overlap(*self._ends)
+        return self.model_copy(update={name: ends}) if ends else None
+
+    def number(self, uniform: float, limits: Limits, followed: Any) -> float:
+        low, high = self._ends
+        if limits.whole:
+            return min(math.floor(low + uniform * (high - low + 1)), high)
+        return min(max(low * (1 - uniform) + high * uniform, low), high)
+
+
+class Uniform(RangeDraw):
+    """A number that is uniform in its range.
 
     >>> Uniform(uniform=(3, 5)).value(0.99, Limits(whole=True), None)
     5
@@ -127,26 +159,8 @@ class Uniform(NumberDraw):
 
     uniform: Ends
 
-    @model_validator(mode="after")
-    def _check_order(self) -> "Uniform":
-        _check_ascending(*self.uniform)
-        return self
 
-    def range_of(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
-        return self.uniform
-
-    def truncated(self, limits: Limits) -> "Uniform | None":
-        ends = limits.overlap(*self.uniform)
-        return Uniform(uniform=ends) if ends else None
-
-    def number(self, uniform: float, limits: Limits, followed: Any) -> float:
-        low, high = self.uniform
-        if limits.whole:
-            return min(math.floor(low + uniform * (high - low + 1)), high)
-        return min(max(low * (1 - uniform) + high * uniform, low), high)
-
-
-class Drift(NumberDraw):
+class Drift(RangeDraw):
     """A number that drifts slowly through the frames of a sequence, uniform in its range.
 
     A standard Gaussian is drawn every ``frames`` frames. Between two of them, a frame has
@@ -162,11 +176,6 @@ class Drift(NumberDraw):
     drift: Ends
     frames: Annotated[float, Field(ge=1)] = 100.0
 
-    @model_validator(mode="after")
-    def _check_order(self) -> "Drift":
-        _check_ascending(*self.drift)
-        return self
-
     def knots(self, frame: int) -> tuple[int, int]:
         """Return the numbers of the two draws that a frame is between."""
         first = math.floor(frame / self.frames)
@@ -178,19 +187,8 @@ class Drift(NumberDraw):
         normal = math.cos(angle) * _normal(first) + math.sin(angle) * _normal(second)
         return NormalDist().cdf(normal)
 
-    def range_of(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
-        return self.drift
 
-    def truncated(self, limits: Limits) -> "Drift | None":
-        ends = limits.overlap(*self.drift)
-        return Drift(drift=ends, frames=self.frames) if ends else None
-
-    def number(self, uniform: float, limits: Limits, followed: Any) -> float:
-        low, high = self.drift
-        return min(max(low * (1 - uniform) + high * uniform, low), high)
-
-
-class LogUniform(NumberDraw):
+class LogUniform(RangeDraw):
     """A number whose logarithm is uniform: each octave of the range is as likely as the others.
 
     >>> round(LogUniform(log_uniform=(100, 6400)).value(0.5, Limits(), None))
@@ -200,18 +198,10 @@ class LogUniform(NumberDraw):
     log_uniform: Ends
 
     @model_validator(mode="after")
-    def _check_order(self) -> "LogUniform":
+    def _check_positive(self) -> Self:
         if self.log_uniform[0] <= 0:
             raise ValueError(f"found {list(self.log_uniform)}, but both ends must be above 0")
-        _check_ascending(*self.log_uniform)
         return self
-
-    def range_of(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
-        return self.log_uniform
-
-    def truncated(self, limits: Limits) -> "LogUniform | None":
-        ends = limits.overlap(*self.log_uniform)
-        return LogUniform(log_uniform=ends) if ends else None
 
     def number(self, uniform: float, limits: Limits, followed: Any) -> float:
         low, high = self.log_uniform
@@ -362,11 +352,6 @@ def parse_draw(key: str, table: Mapping[str, Any]) -> Draw:
         elif fault.problem == "missing":
             reason = f"the draw {names[0]} needs this key; add it"
         raise KeyedError(key, f"{key}: {field}: {reason}") from None
-
-
-def _check_ascending(low: float, high: float) -> None:
-    if low > high:
-        raise ValueError(f"found [{low:g}, {high:g}]; put the lower end first")
 
 
 def _exp(log: float) -> float:

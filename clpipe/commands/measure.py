@@ -75,7 +75,12 @@ def measure(
         raise RequestError(f"--plot: found {plot}; expected a name that ends in .png")
     if plot is not None:
         require("--plot", "matplotlib")
-    clip = clip_in(images, alone=truth is None and not snr)
+    clip = next((path for path in images if path.suffix.lower() in VIDEO_SUFFIXES), None)
+    if clip and (len(images) > 1 or truth or snr):
+        raise RequestError(
+            f"{clip}: a clip is measured against the mean of its frames; name one clip, without "
+            "--truth and --snr"
+        )
     bursts = bursts_in(images)
     if truth is not None and len(bursts) > 1:
         raise RequestError(
@@ -113,21 +118,6 @@ def measure(
         for title, (headings, *rows) in measure_tables(report):
             click.echo(f"\n{title}")
             show(headings, rows, left=0 if headings[0] else 1)
-
-
-def clip_in(images: Sequence[Path], alone: bool) -> Path | None:
-    """Return the clip among images; None if there is none.
-
-    Raises:
-        RequestError: there are other images, or other options that do not apply to clips.
-    """
-    clip = next((path for path in images if path.suffix.lower() in VIDEO_SUFFIXES), None)
-    if clip and (len(images) > 1 or not alone):
-        raise RequestError(
-            f"{clip}: a clip is measured against the mean of its frames; name one clip, without "
-            "--truth and --snr"
-        )
-    return clip
 
 
 def show_snr(curve: Sequence[SnrStep], as_json: bool) -> None:

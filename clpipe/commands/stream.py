@@ -2,9 +2,9 @@
 
 import json
 import sys
-import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from io import BufferedIOBase, BufferedReader
 from pathlib import Path
@@ -16,22 +16,16 @@ import numpy as np
 from clpipe.base.errors import ClpipeError, ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.chain.keys import KEYS
+from clpipe.chain.options import Transfer
 from clpipe.commands.chain_options import SETTINGS, device_option, options, set_option, settings_in
 from clpipe.commands.options import Command, OutputPath
-from clpipe.stream import Shot, Stream
+from clpipe.stream import Stream
 
 
 @click.command("stream", cls=Command)
-@options("config", KEYS["camera"], KEYS["iso"], *SETTINGS, "until")
+@options("config", KEYS["camera"], KEYS["iso"], *SETTINGS, "until", "transfer")
 @set_option
 @device_option
-@click.option(
-    "--transfer",
-    type=click.Choice(["linear", "srgb"]),
-    default="linear",
-    show_default=True,
-    help="srgb converts uint8 frames of a simulator to light.",
-)
 @click.option(
     "--name",
     default="stream",
@@ -55,7 +49,7 @@ def stream(
     selector: str | None,
     config: tuple[str, ...],
     until: str | None,
-    transfer: str,
+    transfer: Transfer | None,
     name: str,
     drop: bool,
     log_path: Path | None,
@@ -86,79 +80,66 @@ def stream(
         name=name,
         device=selector,
         until=until,
-        transfer=transfer,  # type: ignore[arg-type]
+        transfer=transfer or "linear",
         drop=drop,
         **settings,
     )
-    with open(log_path, "w", encoding="utf-8") if log_path else nullcontext() as log:
-        writer = Writer(camera, cast(BufferedIOBase, sys.stdout.buffer), log)
-        writer.start()
-        began = time.perf_counter()
+    began = time.perf_counter()
+    with (
+        open(log_path, "w", encoding="utf-8") if log_path else nullcontext() as log,
+        ThreadPoolExecutor(1, "pictures") as pool,
+    ):
+        output = cast(BufferedIOBase, sys.stdout.buffer)
+        written = pool.submit(write_pictures, camera, output, log)
         try:
             for frame in frames_in(cast(BufferedReader, sys.stdin.buffer)):
-                if writer.error:
-                    break
                 camera.put(frame)
         finally:
             camera.end()
-            writer.join()
+            count, failed = written.result()  # its error is the reason if the stream was closed
             seconds = time.perf_counter() - began
             click.echo(
-                f"{writer.count} pictures in {seconds:.1f} s, {writer.count / seconds:.1f} per "
-                f"second; {camera.dropped} frames dropped, {writer.failed} failed",
+                f"{count} pictures in {seconds:.1f} s, {count / seconds:.1f} per second; "
+                f"{camera.dropped} frames dropped, {failed} failed",
                 err=True,
             )
-    if writer.error:
-        raise writer.error
-    sys.exit(1 if writer.failed else 0)
+    sys.exit(1 if failed else 0)
 
 
-class Writer(threading.Thread):
-    """Writes the pictures of a stream while others are developed.
+def write_pictures(stream: Stream, output: BufferedIOBase, log: TextIO | None) -> tuple[int, int]:
+    """Write the pictures of a stream while others are developed. At an error, end the stream.
 
     Args:
         stream: the stream.
         output: where pictures are written.
         log: where a line for each picture is written, if anywhere.
 
-    Attributes:
-        count: the number of pictures that were written.
-        failed: the number of frames that failed.
-        error: why no more can be written.
+    Returns:
+        The number of pictures, and of frames that failed.
+
+    Raises:
+        OSError: a picture or line cannot be written.
     """
-
-    def __init__(self, stream: Stream, output: BufferedIOBase, log: TextIO | None) -> None:
-        super().__init__(name="pictures", daemon=True)
-        self._stream = stream
-        self._output = output
-        self._log = log
-        self.count = self.failed = 0
-        self.error: Exception | None = None
-
-    def run(self) -> None:
-        """Write all pictures. After an error, the others are dropped, so that nobody waits."""
-        is_over = False
-        while not is_over:
+    count = failed = 0
+    try:
+        while True:
             try:
-                shot = self._stream.get()
-                is_over = shot is None
-                if shot and not self.error:
-                    self._write(shot)
+                shot = stream.get()
             except ClpipeError as error:
-                self.failed += 1
+                failed += 1
                 click.echo(f"clpipe: {error}", err=True)
-            except OSError as error:
-                self.error = error
-
-    def _write(self, shot: Shot) -> None:
-        np.lib.format.write_array(Pipe(self._output), shot.image)
-        self._output.flush()
-        self.count += 1
-        if self._log:
-            record = {"frame": shot.index, "settings": shot.settings, "metered": shot.metered}
-            line = json.dumps({**record, "estimates": shot.result.estimates})
-            self._log.write(line + "\n")
-            self._log.flush()
+                continue
+            if shot is None:
+                return count, failed
+            np.lib.format.write_array(Pipe(output), shot.image)
+            output.flush()
+            count += 1
+            if log:
+                record = {"frame": shot.index, "settings": shot.settings, "metered": shot.metered}
+                log.write(json.dumps({**record, "estimates": shot.result.estimates}) + "\n")
+                log.flush()
+    finally:
+        stream.end()
 
 
 class Pipe:

@@ -157,15 +157,12 @@ class Flow:
         """Enqueue a stack that needs buffers of these sizes; all take at most ``memory`` bytes."""
         self.reset_launch_cache()
         member = stack.members[0]
-        if not (state := member.work.options.state):
-            self.reserve(sizes, memory)
-            self._submit(flight, stack)
-            return
-        state.begin_frame(self, member.work.plan, member.extents)
-        others = {name: size for name, size in sizes.items() if name not in state.buffers}
-        self.reserve(others, memory - state.bytes)
+        if state := member.work.options.state:
+            state.begin_frame(self, member.work.plan, member.extents)
+            sizes = {name: size for name, size in sizes.items() if name not in state.buffers}
+            memory -= state.bytes
+        self.reserve(sizes, memory)
         self._submit(flight, stack)
-        state.end_frame()
 
     def reset_launch_cache(self) -> LaunchCache:
         """Return the launch cache, and start an empty one, because buffers will be overwritten."""

@@ -61,7 +61,7 @@ class Recovery:
         failed = False
         if state := work.options.state:
             if generation != self.generation:  # its commands, or those of a frame before, are lost
-                state.lose()
+                state.is_lost = True
             state.check()
         while True:
             if generation != self.generation:  # the enqueued commands are lost
@@ -83,7 +83,7 @@ class Recovery:
                 is_full = isinstance(error, cl.MemoryError | MemoryError)
                 survives = self._context_survives()
                 if state:
-                    state.lose()
+                    state.is_lost = True
                 elif survives and is_full:
                     memory = memory if full is None else device.tiling(work, memory).bytes // 2
                     full = error

@@ -1,6 +1,5 @@
 """State: what the frames of a sequence leave on a device, or in NumPy, for the next frame."""
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from clpipe.base.errors import DeviceFailedError
@@ -8,7 +7,7 @@ from clpipe.base.types import Floats
 from clpipe.chain.chain import Chain, Step, cached_by_structure
 from clpipe.engine.bindings import slot_buffer
 from clpipe.engine.extents import Extent, Extents
-from clpipe.engine.ir import Image, Plan
+from clpipe.engine.ir import Plan
 from clpipe.stage import PREVIOUS
 
 if TYPE_CHECKING:
@@ -58,13 +57,12 @@ class State:
     """
 
     def __init__(self) -> None:
-        self.buffers: Mapping[str, Any] = {}
+        self.buffers: dict[str, Any] = {}
         self.is_lost = False
         self._arrays: dict[str, Floats] = {}  # in NumPy, by step
         self._flow: Flow | None = None
         # The layout of the planes, which is () before the first frame.
         self._layout: Layout = ()
-        self._next_layout: Layout = ()
         # A frame reads one set of planes and writes the other, because a stencil reads neighbours.
         self._read: dict[str, Any] = {}
         self._written: dict[str, Any] = {}
@@ -89,41 +87,26 @@ class State:
         return self._layout != layout_of(plan, extents)
 
     def begin_frame(self, flow: "Flow", plan: Plan, extents: Extents) -> None:
-        """Set :attr:`buffers` for a frame that is to be enqueued.
+        """Set :attr:`buffers` for a frame that is enqueued next. The next one reads its results.
 
         Raises:
             DeviceFailedError: the frame before is lost.
         """
         if self._flow not in (None, flow):
-            self.lose()
+            self.is_lost = True
         self.check()
-        layout, is_first = layout_of(plan, extents), self.is_first(plan, extents)
-        if is_first:
+        if self.is_first(plan, extents):
             flow.drain()  # no command may use a buffer that is released
             self._read, self._written = {}, {}
-        buffers: dict[str, Any] = {}
-
-        def add(step: str, image: Image, planes: dict[str, Any]) -> None:
-            for channel, slot in enumerate(plan.slots[image.number]):
-                name = f"{step} {channel}"
-                if name not in planes:
-                    planes[name] = flow.new_buffer(extents[image.level].plane_bytes)
-                buffers[slot_buffer(slot)] = planes[name]
-
+        self._layout, self._flow, self.buffers = layout_of(plan, extents), flow, {}
         for step, before, after in plan.states:
-            assert is_first == (before is None), "frames are planned one by one"
-            if before:
-                add(step, before, self._read)
-            add(step, after, self._written)
-        self.buffers, self._next_layout, self._flow = buffers, layout, flow
-
-    def end_frame(self) -> None:
-        """Let the next frame read what the enqueued one writes."""
-        self._read, self._written, self._layout = self._written, self._read, self._next_layout
-
-    def lose(self) -> None:
-        """Let all later frames fail."""
-        self.is_lost = True
+            for image, planes in ((before, self._read), (after, self._written)):
+                for channel, slot in enumerate(plan.slots[image.number] if image else ()):
+                    name = f"{step} {channel}"
+                    if name not in planes:
+                        planes[name] = flow.new_buffer(extents[after.level].plane_bytes)
+                    self.buffers[slot_buffer(slot)] = planes[name]
+        self._read, self._written = self._written, self._read
 
     def check(self) -> None:
         """Check that the frame before is on the device.

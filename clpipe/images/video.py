@@ -85,16 +85,12 @@ class VideoOptions:
             raise RequestError(f"found {self.codec} with {self.bits} bits; expected {allowed}")
         if self.rate <= 0:
             raise RequestError(f"found a frame rate of {self.rate}; expected one above 0")
-        if self.crf is not None and self.bit_rate is not None:
-            raise RequestError(
-                f"found crf {self.crf} and bit_rate {self.bit_rate}; remove one of them"
-            )
-        for name in ("crf", "bit_rate"):
-            value = getattr(self, name)
-            if self.is_lossless and value is not None:
-                raise RequestError(
-                    f"found {name} {value}, but ffv1 is lossless; remove crf and bit_rate"
-                )
+        rates = {"crf": self.crf, "bit_rate": self.bit_rate}
+        found = [f"{name} {value}" for name, value in rates.items() if value is not None]
+        if len(found) > 1:
+            raise RequestError(f"found {' and '.join(found)}; remove one of them")
+        if found and self.is_lossless:
+            raise RequestError(f"found {found[0]}, but ffv1 is lossless; remove crf and bit_rate")
 
     @property
     def is_lossless(self) -> bool:
@@ -134,7 +130,6 @@ class VideoInfo:
         codec: FFmpeg's name of the codec, such as "hevc" for H.265.
         tag: the container's code of the codec, such as "hvc1".
         width, height: size in px.
-        pixels: FFmpeg's name of the pixel format.
         bits: bits per sample.
         rate: frames per second.
         frames: the number of frames.
@@ -146,7 +141,6 @@ class VideoInfo:
     tag: str
     width: int
     height: int
-    pixels: str
     bits: int
     rate: Fraction
     frames: int
@@ -184,7 +178,6 @@ class VideoWriter:
         self.path = path
         self.options = options
         self.count = 0
-        self._size = (0, 0)
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -228,18 +221,17 @@ class VideoWriter:
         height, width = frame.shape[:2]
         if not self.count:
             options.check_size(width, height)
-            self._size = (width, height)
             self._stream = self._new_stream(width, height)
-        elif (width, height) != self._size:
-            first = "x".join(map(str, self._size))
+        stream = self._stream
+        if (width, height) != (stream.width, stream.height):
             raise ImageError(
                 f"{self.path}: frame {self.count} has {width}x{height} px, but the frames before "
-                f"it have {first} px; frames of one video have one size"
+                f"it have {stream.width}x{stream.height} px; frames of one video have one size"
             )
         encoded = self._frame(frame)
         encoded.pts = self.count
         encoded.time_base = 1 / options.rate
-        self._container.mux(self._stream.encode(encoded))
+        self._container.mux(stream.encode(encoded))
         self.count += 1
 
     def _new_stream(self, width: int, height: int) -> "av.VideoStream":
@@ -299,15 +291,13 @@ def video_info(path: Path) -> VideoInfo:
     """
     with _opened(path) as (container, stream):
         context = stream.codec_context
-        pixels = context.format
-        assert pixels
+        assert context.format
         return VideoInfo(
             codec=context.name,
             tag=context.codec_tag.strip("\0"),
             width=context.width,
             height=context.height,
-            pixels=pixels.name,
-            bits=pixels.components[0].bits,
+            bits=context.format.components[0].bits,
             rate=stream.average_rate or Fraction(0),
             frames=stream.frames or sum(packet.size > 0 for packet in container.demux(stream)),
             primaries=context.color_primaries,
@@ -340,12 +330,10 @@ def _rgb(frame: "av.VideoFrame") -> Array:
     """Return a decoded frame as RGB, see :func:`read_video`."""
     bits = frame.format.components[0].bits
     if frame.format.is_rgb:
-        if bits == 8:
-            return frame.to_ndarray(format="rgb24")
-        if frame.format.name.startswith("gbrp"):
-            levels = frame.to_ndarray()
-            return np.rint(levels * np.float32(65535 / (2**bits - 1))).astype(np.uint16)
-        return frame.to_ndarray(format="rgb48le")
+        if bits == 8 or not frame.format.name.startswith("gbrp"):
+            return frame.to_ndarray(format="rgb24" if bits == 8 else "rgb48le")
+        scale = np.float32(65535 / (2**bits - 1))
+        return np.rint(frame.to_ndarray() * scale).astype(np.uint16)
     is_full = frame.color_range == FULL or frame.format.name.startswith("yuvj")
     matrix = frame.colorspace
     if matrix not in WEIGHTS:

@@ -70,17 +70,10 @@ def decode(planes: Sequence[Array], bits: int, matrix: int = BT709, is_full: boo
         (height, width, 3) uint8 for 8 bits, else uint16; full range.
     """
     scale = 2 ** (bits - 8)
-    black, span, chroma_span = (
-        (0, 2**bits - 1, 2**bits - 1)
-        if is_full
-        else (
-            16 * scale,
-            219 * scale,
-            224 * scale,
-        )
-    )
-    luma = (planes[0] - np.float32(black)) / np.float32(span)
-    chroma = [(plane - np.float32(128 * scale)) / np.float32(chroma_span) for plane in planes[1:]]
+    full, limited = (0, 2**bits - 1, 2**bits - 1), (16 * scale, 219 * scale, 224 * scale)
+    black, span, chroma_span = map(np.float32, full if is_full else limited)
+    luma = (planes[0] - black) / span
+    chroma = [(plane - np.float32(128 * scale)) / chroma_span for plane in planes[1:]]
     if chroma[0].shape != luma.shape:
         chroma = [_doubled(plane)[: luma.shape[0], : luma.shape[1]] for plane in chroma]
     table = np.linalg.inv(to_ycbcr(matrix).astype(np.float64)).astype(np.float32)
@@ -95,12 +88,8 @@ def decode(planes: Sequence[Array], bits: int, matrix: int = BT709, is_full: boo
 
 def _doubled(plane: Floats) -> Floats:
     """Return a chroma plane of 4:2:0 at the positions of luma, by linear interpolation."""
-    height, width = plane.shape
     padded = np.pad(plane, ((1, 1), (0, 1)), mode="edge")
-    rows = np.empty((2 * height, width + 1), np.float32)
-    rows[::2] = 0.75 * padded[1:-1] + 0.25 * padded[:-2]
-    rows[1::2] = 0.75 * padded[1:-1] + 0.25 * padded[2:]
-    doubled = np.empty((2 * height, 2 * width), np.float32)
-    doubled[:, ::2] = rows[:, :-1]
-    doubled[:, 1::2] = (rows[:, :-1] + rows[:, 1:]) / 2
-    return doubled
+    middle, above, below = 0.75 * padded[1:-1], 0.25 * padded[:-2], 0.25 * padded[2:]
+    rows = np.stack([middle + above, middle + below], 1).reshape(-1, padded.shape[1])
+    left, right = rows[:, :-1], rows[:, 1:]
+    return np.stack([left, (left + right) / 2], 2).reshape(len(rows), -1)

@@ -14,15 +14,13 @@ from clpipe.base.reading import check_unchanged
 from clpipe.base.types import Array
 from clpipe.chain.carry import AovSpec
 from clpipe.chain.chain import Chain
-from clpipe.images.passes import (
-    cryptomatte_attributes,
-    read_layer,
-)
+from clpipe.images.passes import cryptomatte_attributes, read_layer
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import FLIPS
+from clpipe.inputs.carry_rows import combine_rows, files_by_row, row_step
 from clpipe.inputs.companions import LayerSource, find_carried_layers
 from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, between_rows, warp
-from clpipe.reference.geometry import Composition, Geometry, Orientation
+from clpipe.reference.geometry import Composition, Geometry, Margins, Orientation
 
 
 @dataclass(frozen=True)
@@ -93,49 +91,100 @@ class CarriedLayers:
 
 
 def carry(
-    path: Path,
+    paths: Sequence[Path],
     source: SourceImage,
     chain: Chain,
     layers: Sequence[AovSpec],
     max_pixels: int,
     orientation: int = 1,
-    row_step: float = 0.0,
 ) -> CarriedLayers:
     """Return the layers of an image, warped like its picture.
 
     Args:
-        path: the image file.
+        paths: the image file; or all files of a rolling shutter's exposure, if each row of the
+            layers is from the file in the middle of its exposure. Flow then leads to the row of the
+            other frame in which the surface is seen.
         source: the image.
         chain: the chain whose stages move pixels.
         layers: the layers to carry.
         max_pixels: a file with more pixels is rejected before it is read.
         orientation: the EXIF orientation that is applied to the picture at the end. Normals keep
             their directions.
-        row_step: the time from the start of a row to the start of the next, in frames of the
-            sequence; see :func:`clpipe.reference.carried.between_rows`.
 
     Raises:
         ImageError: a layer or companion is missing or damaged, differs from the image in size, or
-            its kind is unknown.
+            its kind is unknown. Or the files have different layers.
+        RequestError: the time between frames is not known, but flow leads between rows.
     """
-    full_size = source.pixels.shape[1::-1]
-    width, height = source.margins.frame_size(*full_size)
-    found = find_carried_layers(path, layers)
+    size = source.pixels.shape[1::-1]
+    by_row = files_by_row(chain, len(paths), size[1], source.margins)
+    used = {number: paths[number] for number in np.unique(by_row).tolist()}
+    sources_by_file = find_same_layers([*used.values()], layers)
     read: list[Layer] = []
-    attributes: dict[str, str] = {}
-    for each in found:
-        pixels, (x, y) = read_layer_samples(each, path, (width, height), max_pixels)
-        attributes |= cryptomatte_attributes(each.file, each.location.part)
-        x, y = x + source.margins.left, y + source.margins.top
-        layer = Layer(each.kind, pixels, x, y, each.vectors)
-        is_moved = each.vectors and row_step
-        read.append(between_rows(layer, each.directions, row_step) if is_moved else layer)
-    warped, valid = warp(read, geometry_of(chain, orientation), *full_size)
-    carried = tuple(
-        CarriedLayer(each.name, each.kind, each.channels, pixels, record_of(path, each))
-        for each, pixels in zip(found, warped, strict=True)
+    for matching in zip(*sources_by_file, strict=True):
+        parts = {
+            number: read_source(each, used[number], source.margins, size, max_pixels)
+            for number, each in zip(used, matching, strict=True)
+        }
+        layer = combine_rows(parts, by_row)
+        if layer.vectors and len(paths) > 1:
+            layer = between_rows(layer, matching[0].directions, row_step(chain))
+        read.append(layer)
+    warped, valid = warp(read, geometry_of(chain, orientation), *size)
+    first, *others = (
+        [record_of(path, each) for each in found]
+        for path, found in zip(used.values(), sources_by_file, strict=True)
     )
-    return CarriedLayers(carried, valid, attributes)
+    carried = tuple(
+        CarriedLayer(each.name, each.kind, each.channels, pixels, record)
+        for each, pixels, record in zip(sources_by_file[0], warped, first, strict=True)
+    )
+    other_records = tuple(record for records in others for record in records)
+    return CarriedLayers(carried, valid, attributes_of(sources_by_file[0]), other_records)
+
+
+def find_same_layers(paths: Sequence[Path], layers: Sequence[AovSpec]) -> list[list[LayerSource]]:
+    """Return the carried layers of each file. All files have the same layers.
+
+    Raises:
+        ImageError: a layer is missing, or files have different layers.
+    """
+    sources_by_file = [find_carried_layers(path, layers) for path in paths]
+    names = [[(each.name, each.kind, each.channels) for each in found] for found in sources_by_file]
+    for path, layer_names in zip(paths, names, strict=True):
+        if layer_names != names[0]:
+            raise ImageError(
+                f"{path}: the layers of this file differ from those of {paths[0]}; render all "
+                "files of one picture with the same layers"
+            )
+    return sources_by_file
+
+
+def attributes_of(layers: Sequence[LayerSource]) -> dict[str, str]:
+    """Return the EXR attributes of layers, such as the names of a Cryptomatte's objects."""
+    attributes: dict[str, str] = {}
+    for each in layers:
+        attributes |= cryptomatte_attributes(each.file, each.location.part)
+    return attributes
+
+
+def read_source(
+    layer: LayerSource, path: Path, margins: Margins, size: tuple[int, int], max_pixels: int
+) -> Layer:
+    """Return a layer at its place in an image with overscan.
+
+    Args:
+        layer: the layer.
+        path: the image file.
+        margins: the overscan of the image.
+        size: width and height of the image with its overscan, in px.
+        max_pixels: a file with more pixels is rejected before it is read.
+
+    Raises:
+        ImageError: as for :func:`read_layer_samples`.
+    """
+    pixels, (x, y) = read_layer_samples(layer, path, margins.frame_size(*size), max_pixels)
+    return Layer(layer.kind, pixels, x + margins.left, y + margins.top, layer.vectors)
 
 
 def read_layer_samples(
@@ -186,7 +235,7 @@ def merge_moments(by_moment: Mapping[str, CarriedLayers], named: bool) -> Carrie
     valid = first.valid.copy()
     for other in others:
         valid *= other.valid
-    return CarriedLayers(tuple(layers), valid, first.attributes)
+    return replace(first, layers=tuple(layers), valid=valid)
 
 
 def geometry_of(chain: Chain, orientation: int) -> Geometry | None:

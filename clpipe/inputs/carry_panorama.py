@@ -5,22 +5,21 @@ from pathlib import Path
 
 import numpy as np
 
-from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
 from clpipe.chain.carry import AovSpec
 from clpipe.chain.chain import Chain
 from clpipe.chain.panorama import projection_of
-from clpipe.images.passes import cryptomatte_attributes
 from clpipe.images.pixels import display_window
 from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import (
     CarriedLayer,
     CarriedLayers,
+    attributes_of,
+    find_same_layers,
     geometry_of,
     read_layer_samples,
     record_of,
 )
-from clpipe.inputs.companions import find_carried_layers
 from clpipe.inputs.panoramas import pieces
 from clpipe.reference.carried import Layer, warp
 from clpipe.reference.geometry import Composition, Geometry
@@ -59,14 +58,7 @@ def carry_panorama(
     panorama, projection = source.panorama, projection_of(chain)
     assert panorama
     assert projection
-    sources_by_file = [find_carried_layers(path, layers) for path in paths]
-    names = [[(each.name, each.kind, each.channels) for each in found] for found in sources_by_file]
-    for path, layer_names in zip(paths, names, strict=True):
-        if layer_names != names[0]:
-            raise ImageError(
-                f"{path}: the layers of this file differ from those of {paths[0]}; render all "
-                "views of a panorama with the same layers"
-            )
+    sources_by_file = find_same_layers(paths, layers)
     size = file_size(panorama, len(paths))
     read = []
     for matching in zip(*sources_by_file, strict=True):
@@ -97,10 +89,7 @@ def carry_panorama(
         name, channel = f"{each.name}.{DISTANCE}", f"{layer}.{DISTANCE}"
         record = {**record, "layer": name, "channels": [channel]}
         carried.append(CarriedLayer(name, each.kind, (channel,), pixels, record))
-    attributes: dict[str, str] = {}
-    for each in sources_by_file[0]:
-        attributes |= cryptomatte_attributes(each.file, each.location.part)
-    return CarriedLayers(tuple(carried), valid, attributes)
+    return CarriedLayers(tuple(carried), valid, attributes_of(sources_by_file[0]))
 
 
 def file_size(panorama: Panorama, files: int) -> tuple[int, int]:

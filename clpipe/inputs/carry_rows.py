@@ -1,68 +1,77 @@
-"""Carried layers of a rolling shutter: each row from the sub-frame in which it is exposed."""
+"""Carried layers of a rolling shutter: each row from the file in which it is exposed."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
-from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.types import Array, Mask
-from clpipe.chain.carry import AovSpec
+from clpipe.base.errors import RequestError
+from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
 from clpipe.chain.exposures import shutter_in
 from clpipe.chain.registry import stage_in
 from clpipe.chain.request import Request
-from clpipe.images.read import SourceImage
-from clpipe.inputs.carry import CarriedLayers, carry, geometry_of
-from clpipe.inputs.companions import find_carried_layers
-from clpipe.reference.carried import Layer, warp
+from clpipe.images.pixels import display_window
+from clpipe.reference.carried import Layer
+from clpipe.reference.geometry import Margins
 from clpipe.stage import StageRole
-from clpipe.stages.shutter import Rows
 
 
-def carry_rows(
-    paths: Sequence[Path],
-    source: SourceImage,
-    chain: Chain,
-    layers: Sequence[AovSpec],
-    max_pixels: int,
-    orientation: int = 1,
-) -> CarriedLayers:
-    """Return the layers of an exposure, each row from the file in the middle of its exposure.
-
-    Flow leads to the row of the other frame in which the surface is seen.
+def files_by_row(chain: Chain, count: int, height: int, margins: Margins) -> Array:
+    """Return the number of the file in the middle of each row's exposure: (height,).
 
     Args:
-        paths: the files of the exposure, the first one first.
-        source: the image.
-        chain: the chain whose stages move pixels.
-        layers: the layers to carry.
-        max_pixels: a file with more pixels is rejected before it is read.
-        orientation: as for :func:`clpipe.inputs.carry.carry`.
+        chain: the chain, whose shutter has combined the files.
+        count: the number of files of the exposure.
+        height: the height of the image with its overscan, in px.
+        margins: the overscan.
+    """
+    if count == 1:
+        return np.zeros(height, np.intp)
+    shutter = shutter_in(chain)
+    assert shutter
+    _, rows = margins.frame_size(0, height)
+    in_picture = np.clip(np.arange(height) - margins.top, 0, rows - 1)
+    return shutter.frames_at_middles(count, rows)[in_picture]
+
+
+def combine_rows(parts: Mapping[int, Layer], by_row: Array) -> Layer:
+    """Return a layer, each row from its file. It is 0 outside of the data window of a file.
+
+    Args:
+        parts: the layer in each file, by the number of the file.
+        by_row: the number of the file of each row of the image.
+    """
+    first, *others = parts.values()
+    if not others:
+        return first
+    left, top = min(each.x for each in parts.values()), min(each.y for each in parts.values())
+    right = max(each.x + each.pixels.shape[1] for each in parts.values())
+    bottom = max(each.y + each.pixels.shape[0] for each in parts.values())
+    numbers = by_row[np.clip(np.arange(top, bottom), 0, len(by_row) - 1)]
+    pixels = np.zeros((bottom - top, right - left, first.pixels.shape[2]), first.pixels.dtype)
+    for number, each in parts.items():
+        window = display_window(each.pixels, each.x - left, each.y - top, *pixels.shape[1::-1])
+        pixels[numbers == number] = window[numbers == number]
+    return replace(first, pixels=pixels, x=left, y=top)
+
+
+def row_step(chain: Chain) -> float:
+    """Return the time from the start of a row to the start of the next, in frames.
 
     Raises:
-        ImageError: as for :func:`clpipe.inputs.carry.carry`, or files have different layers.
-        RequestError: the time between frames is not known, but a layer is flow.
+        RequestError: the time between frames is not known.
     """
-    width, height = source.pixels.shape[1::-1]
     shutter = shutter_in(chain)
-    assert shutter  # it has combined the files
-    _, rows = source.margins.frame_size(width, height)
-    by_row = shutter.frames_at_middles(len(paths), rows)
-    by_row = by_row[np.clip(np.arange(height) - source.margins.top, 0, rows - 1)]
-    by_pixel = np.broadcast_to(by_row[:, None, None], (height, width, 1))
-    (numbers,), _ = warp([Layer("label", by_pixel)], geometry_of(chain, orientation), width, height)
-    row_step = 0.0
-    if any(each.kind == "flow" for each in find_carried_layers(paths[0], layers)):
-        row_step = _row_step(shutter)
-    combined: CarriedLayers | None = None
-    for number in np.unique(by_row):
-        path = paths[int(number)]
-        part = carry(path, source, chain, layers, max_pixels, orientation, row_step)
-        combined = _combined(path, combined, part, numbers[..., 0] == number)
-    assert combined
-    return combined
+    if not (shutter and shutter.line_time):
+        return 0.0
+    if not shutter.frame_time:
+        name = stage_in(StageRole.SHUTTER).name
+        raise RequestError(
+            f"--truth-at rows: optical flow needs {name}.frame_time, the time from frame to frame, "
+            f"which is not set. For 24 frames per second, add --set {name}.frame_time={1 / 24:.6f}"
+        )
+    return shutter.line_time / shutter.frame_time
 
 
 def rows_note(request: Request, chain: Chain) -> str:
@@ -74,52 +83,4 @@ def rows_note(request: Request, chain: Chain) -> str:
     return (
         f"--carry: layers show one moment ({request.truth_at}), but the rows of this rolling "
         "shutter show different ones. To take each row from its own moment, add --truth-at rows"
-    )
-
-
-def _row_step(shutter: Rows) -> float:
-    """Return the time from the start of a row to the start of the next, in frames.
-
-    Raises:
-        RequestError: the time between frames is not known.
-    """
-    if not shutter.line_time:
-        return 0.0
-    if not shutter.frame_time:
-        name = stage_in(StageRole.SHUTTER).name
-        raise RequestError(
-            f"--truth-at rows: optical flow needs {name}.frame_time, the time from frame to frame, "
-            f"which is not set. For 24 frames per second, add --set {name}.frame_time={1 / 24:.6f}"
-        )
-    return shutter.line_time / shutter.frame_time
-
-
-def _combined(
-    path: Path, others: CarriedLayers | None, part: CarriedLayers, chosen: Mask
-) -> CarriedLayers:
-    """Return the layers of a file at chosen pixels, and elsewhere those of the other files.
-
-    Raises:
-        ImageError: the layers of the file differ from those of the others.
-    """
-    named = [replace(e, record={**e.record, "moment": "rows"}) for e in part.layers]
-    if others is None:
-        return replace(part, layers=tuple(named))
-    if [(e.name, e.channels) for e in named] != [(e.name, e.channels) for e in others.layers]:
-        raise ImageError(
-            f"{path}: its layers differ from those of other files of the same exposure; render "
-            "all files with the same layers"
-        )
-
-    def choose(new: Array, old: Array) -> Array:
-        return np.where(chosen.reshape(chosen.shape + (1,) * (new.ndim - 2)), new, old)
-
-    return replace(
-        others,
-        layers=tuple(
-            replace(old, pixels=choose(new.pixels, old.pixels))
-            for new, old in zip(named, others.layers, strict=True)
-        ),
-        valid=choose(part.valid, others.valid),
-        other_records=(*others.other_records, *(each.record for each in named)),
     )

@@ -24,18 +24,19 @@ def check_flow(loader: ImageLoader, jobs: Sequence[Job]) -> None:
     Raises:
         RequestError: two frames differ.
     """
-    if loader.kept or not loader.request.carry:
+    specs = loader.request.aov_specs()
+    if loader.kept or not specs:
         return
     for sequence, frames in groupby(jobs, key=sequence_of):
         first: tuple[Job, Geometry | None] | None = None
         for job in frames:
             try:
-                flow = first or _flow_of(loader, job)
+                layers = () if first else find_carried_layers(job.path, specs)
+                if not (first or any(each.kind == "flow" for each in layers)):
+                    break
                 geometry = loader.for_job(with_drawn(loader, job)).chain.geometry
             except (ImageError, RequestError):
                 continue  # the run reports it for this frame
-            if not flow:
-                break
             first = first or (job, geometry)
             if geometry != first[1]:
                 raise RequestError(
@@ -43,13 +44,3 @@ def check_flow(loader: ImageLoader, jobs: Sequence[Job]) -> None:
                     f"Optical flow needs the same one in all frames of the sequence {sequence}. "
                     "Set one value for all of them, or carry no flow"
                 )
-
-
-def _flow_of(loader: ImageLoader, job: Job) -> bool:
-    """Return whether a layer of a frame is flow.
-
-    Raises:
-        ImageError: a layer is missing.
-    """
-    specs = loader.request.aov_specs()
-    return any(each.kind == "flow" for each in find_carried_layers(job.path, specs))

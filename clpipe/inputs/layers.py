@@ -10,7 +10,7 @@ from clpipe.chain.carry import AovSpec
 from clpipe.chain.chain import Chain
 from clpipe.chain.layers import layer_of, layer_steps
 from clpipe.images.pixels import display_window
-from clpipe.inputs.carry import file_record, read_layer_samples
+from clpipe.inputs.carry import file_record, read_source
 from clpipe.inputs.companions import LayerFinder, LayerSource
 from clpipe.reference.geometry import Margins
 from clpipe.stage import ImageLayer
@@ -43,13 +43,12 @@ def read_step_layer(
         RequestError: as for :func:`~clpipe.chain.layers.layer_of`.
     """
     found = _find(path, chain, step, [each.pattern for each in carried if each.pattern])
-    pixels, (x, y) = read_layer_samples(found, path, margins.frame_size(width, height), max_pixels)
-    place = x + margins.left, y + margins.top
+    layer = read_source(found, path, margins, (width, height), max_pixels)
     # The first vector is that to the frame before.
-    channels, signs = found.vectors[0] if found.vectors else ((0,), (1,))
-    samples = pixels[..., list(channels)] * np.array(signs, np.float32)
-    outside = np.nan if found.vectors else np.inf
-    window = display_window(samples, *place, width, height, outside)
+    channels, signs = layer.vectors[0] if layer.vectors else ((0,), (1,))
+    samples = layer.pixels[..., list(channels)] * np.array(signs, np.float32)
+    outside = np.nan if layer.vectors else np.inf
+    window = display_window(samples, layer.x, layer.y, width, height, outside)
     record = {"layer": found.name, **file_record(path, found.file)}
     try:
         return layer_of(chain, step, window, record)

@@ -35,7 +35,6 @@ from clpipe.images.read import (
 )
 from clpipe.inputs.carry import CarriedLayers, carry, merge_moments
 from clpipe.inputs.carry_panorama import carry_panorama
-from clpipe.inputs.carry_rows import carry_rows
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import KeptLoader, kind_message
 from clpipe.inputs.layers import read_step_layer
@@ -345,10 +344,11 @@ class ImageLoader:
         if loaded.source.panorama and layers:
             return carry_panorama(job.paths, *arguments)
         if not job.subframes:
-            return carry(job.path, *arguments)
-        if request.truth_at == "rows":
-            return carry_rows(job.paths, *arguments)
-        by_moment = {moment: carry(job.at(moment), *arguments) for moment in moments}
+            return carry([job.path], *arguments)
+        by_moment = {
+            moment: carry(job.paths if moment == "rows" else [job.at(moment)], *arguments)
+            for moment in moments
+        }
         return merge_moments(by_moment, named=len(moments) > 1)
 
     def is_skipped(self, job: Job, error: Exception) -> bool:

@@ -109,8 +109,8 @@ class Meter:
             return self._loops.setdefault(name, ControlLoop(control)).next(ev)
 
         if exposure:
-            assert isinstance(exposure.method, Auto)
             method = exposure.method
+            assert isinstance(method, Auto)
             metered["metered_ev"] = self._measure(chain, exposure, image, image_key)["metered_ev"]
             ev = round(follow(exposure.name, metered["metered_ev"]) + method.ev, DIGITS) + 0.0
             values[exposure.name] = {"method": "gain", "ev": ev}
@@ -132,9 +132,8 @@ class Meter:
     ) -> Mapping[str, float]:
         """Return the numbers that a step estimates from a frame."""
         part = chain.up_to([step.name])
-        if self._runner is None:
-            self._runner = Runner(part, self._open_device())
-        self._runner = self._runner.for_chain(part)
+        known = self._runner
+        self._runner = known.for_chain(part) if known else Runner(part, self._open_device())
         options = RunOptions(boxes=[CORNER])  # the picture itself is not needed
         result = self._runner.run(image, noise_key(chain.settings, image_key), options)
         return result.estimates[step.name]
@@ -159,14 +158,13 @@ def metered_jobs(
     for _, frames in groupby(jobs, key=sequence_of):
         meter = Meter(opened)
         for job in frames:
-            drawn = job
+            drawn, reading = job, Reading()
             try:
                 drawn = with_drawn(loader, job)
                 own = loader.for_job(drawn)
-                if own.kept or own.raw.is_raw(job.path) or not any(loops_of(own.chain)):
-                    yield drawn, Reading()
-                    continue
-                reading = read_job(own, drawn, meter)
+                is_fixed = own.kept or own.raw.is_raw(job.path)
+                if not is_fixed and any(loops_of(own.chain)):
+                    reading = read_job(own, drawn, meter)
             except (ImageError, RequestError, MemoryError) as error:
                 reading = Reading(error=error)
             yield with_values(drawn, reading.values), reading
@@ -183,21 +181,16 @@ def read_job(loader: ImageLoader, job: Job, meter: Meter) -> Reading:
     Raises:
         ImageError, RequestError: the frame cannot be read or metered.
     """
-    source = loader.read(job)
-    loaded = loader.enter(job, source)
-    assert loaded  # None is possible only with --start-at
+    loaded = loader.enter(job, loader.read(job))
+    assert loaded and job.place  # None is possible only with --start-at
 
     def chain_of(values: Mapping[str, Any]) -> Chain:
-        other = replace(
-            loader, request=loader.request.for_image(job.key, merged(job.values, values))
-        )
-        entered = other.enter(job, loaded.source)  # it has the layers of the frame
+        request = loader.request.for_image(job.key, merged(job.values, values))
+        entered = replace(loader, request=request).enter(job, loaded.source)  # it has the layers
         assert entered
         return entered.chain
 
-    assert job.place
-    pixels, key, place = loaded.source.pixels, loaded.key, job.place.index
-    return meter.read(loaded.chain, pixels, key, place, chain_of)
+    return meter.read(loaded.chain, loaded.source.pixels, loaded.key, job.place.index, chain_of)
 
 
 def with_drawn(loader: ImageLoader, job: Job) -> Job:
@@ -228,19 +221,16 @@ def merged(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, An
 
 
 def write_exposures(path: Path, jobs: Sequence[Job]) -> None:
-    """Write frames as a manifest with their settings.
+    """Write frames as a manifest with their settings. All files of an exposure have the same.
 
     Raises:
         ImageError: the manifest cannot be written.
     """
-    rows = [row for job in jobs for row in _rows(path.parent, job)]
+    rows = []
+    for job in jobs:
+        name = job.name or (job.stem if key_of(path.parent, job.path) != job.key else "")
+        own = job.values, job.frames, job.location
+        rows.append(Row(job.path, job.key, name, *own))
+        for file in job.subframes:
+            rows.append(Row(file, "", f"{name}.{file.stem}" if name else "", *own))
     write_new(path, manifest_text(path.parent, rows))
-
-
-def _rows(folder: Path, job: Job) -> Iterator[Row]:
-    """Yield a row for each file of a frame's exposure, with the same values."""
-    name = job.name or (job.stem if key_of(folder, job.path) != job.key else "")
-    yield Row(job.path, job.key, name, job.values, job.frames, job.location)
-    for path in job.subframes:
-        other = f"{name}.{path.stem}" if name else ""
-        yield Row(path, "", other, job.values, job.frames, job.location)

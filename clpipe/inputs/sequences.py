@@ -18,18 +18,19 @@ log = logging.getLogger(__name__)
 NUMBER = re.compile(r"(?:(?<=[._])-|^-)?\d+")
 MAX_GAPS = 5  # the most gaps that a message lists
 
-Named = tuple[list[str], Job]  # the numbers of a frame's name, as texts, and its job
-
 
 def split_numbers(key: str) -> tuple[str, list[str]]:
     """Split the numbers of a file's name off, and return the rest and the numbers.
 
-    >>> split_numbers("cam0/frame_-5.exr"), split_numbers("shot-12.exr")
-    (('cam0/frame_{}', ['-5']), ('shot-{}', ['12']))
+    All names without numbers have the rest "frames".
+
+    >>> split_numbers("cam0/frame_-5.exr"), split_numbers("shot-12.exr"), split_numbers("a.exr")
+    (('cam0/frame_{}', ['-5']), ('shot-{}', ['12']), ('frames', []))
     """
     stem = Path(key).stem
-    pattern = NUMBER.sub("{}", stem.replace("{", "(").replace("}", ")"))
-    return str(PurePosixPath(key).with_name(pattern)), NUMBER.findall(stem)
+    numbers = NUMBER.findall(stem)
+    pattern = NUMBER.sub("{}", stem.replace("{", "(").replace("}", ")")) if numbers else "frames"
+    return str(PurePosixPath(key).with_name(pattern)), numbers
 
 
 def by_pattern(jobs: Sequence[Job]) -> dict[str, list[Job]]:
@@ -37,7 +38,7 @@ def by_pattern(jobs: Sequence[Job]) -> dict[str, list[Job]]:
 
     >>> jobs = [Job(Path(name), name) for name in ("f.10.exr", "f.9.exr", "g.exr")]
     >>> {pattern: [job.key for job in jobs] for pattern, jobs in by_pattern(jobs).items()}
-    {'f.{}': ['f.9.exr', 'f.10.exr'], 'g': ['g.exr']}
+    {'f.{}': ['f.9.exr', 'f.10.exr'], 'frames': ['g.exr']}
     """
     grouped: dict[str, list[Job]] = {}
     for job in jobs:
@@ -67,16 +68,11 @@ def in_sequences(jobs: Sequence[Job]) -> list[Job]:
     Raises:
         RequestError: two frames of a sequence have the same number.
     """
-    by_pattern: dict[str, list[Named]] = {}
-    for job in jobs:
-        pattern, numbers = split_numbers(job.key)
-        if not numbers:
-            pattern = str(PurePosixPath(pattern).with_name("frames"))
-        by_pattern.setdefault(pattern, []).append((numbers, job))
     sequences: dict[str, list[tuple[int, Job]]] = {}
-    for pattern, members in by_pattern.items():
-        frame = _frame_column([numbers for numbers, _ in members])
-        for place, (numbers, job) in enumerate(members):
+    for pattern, members in by_pattern(jobs).items():
+        names = [split_numbers(job.key)[1] for job in members]
+        frame = _frame_column(names)
+        for place, (numbers, job) in enumerate(zip(names, members, strict=True)):
             name = _name(pattern, numbers, frame)
             number = int(numbers[frame]) if numbers else place
             sequences.setdefault(name, []).append((number, job))

@@ -59,9 +59,7 @@ def row_times(chain: Chain, source: SourceImage) -> dict[str, Any]:
     spans = exposures.spans if exposures else (Span(),)
     shutters = [shutter.for_exposure(spans, number) for number in range(len(spans))]
     _, rows = source.margins.frame_size(*source.pixels.shape[1::-1])
-    starts = [float(each.times(1)[0]) for each in shutters]
-    ends = [start + each.time for start, each in zip(starts, shutters, strict=True)]
-    times = [list(each) for each in zip(starts, ends, strict=True)]
+    times = [[float(each.times(1)[0]), float(each.times(1)[0]) + each.time] for each in shutters]
     return {"row_times": {"rows": rows, "step": shutter.line_time, "exposures": times}}
 
 
