@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from statistics import NormalDist
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -183,35 +183,54 @@ class NumberDraw(Draw):
         raise NotImplementedError(type(self).__name__)
 
 
-class Uniform(NumberDraw):
+class Range(NumberDraw):
+    """A distribution of the numbers of a range, including both ends; uniform by default."""
+
+    key: ClassVar[str]  # the field with the two ends
+
+    @property
+    def _ends(self) -> tuple[float, float]:
+        low, high = getattr(self, self.key)
+        return low, high
+
+    @model_validator(mode="after")
+    def _check_order(self) -> "Range":
+        low, high = self._ends
+        if low > high:
+            raise ValueError(f"found [{low:g}, {high:g}]; put the lower end first")
+        return self
+
+    def range_of(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
+        return self._ends
+
+    def truncated(self, limits: Limits) -> "Range | None":
+        ends = limits.overlap(*self._ends)
+        return self.model_copy(update={self.key: ends}) if ends else None
+
+    def number(self, uniform: float, limits: Limits, followed: Any) -> float:
+        low, high = self._ends
+        return min(max(low * (1 - uniform) + high * uniform, low), high)
+
+
+class Uniform(Range):
     """Any number of a range, including both ends; a whole number if the value must be whole.
 
     >>> Uniform(uniform=(3, 5)).value(0.99, Limits(whole=True), None)
     5
     """
 
+    key = "uniform"
+
     uniform: Ends
-
-    @model_validator(mode="after")
-    def _check_order(self) -> "Uniform":
-        _check_ascending(*self.uniform)
-        return self
-
-    def range_of(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
-        return self.uniform
-
-    def truncated(self, limits: Limits) -> "Uniform | None":
-        ends = limits.overlap(*self.uniform)
-        return Uniform(uniform=ends) if ends else None
 
     def number(self, uniform: float, limits: Limits, followed: Any) -> float:
         low, high = self.uniform
         if limits.whole:
             return min(math.floor(low + uniform * (high - low + 1)), high)
-        return min(max(low * (1 - uniform) + high * uniform, low), high)
+        return super().number(uniform, limits, followed)
 
 
-class Drift(NumberDraw):
+class Drift(Range):
     """A number that drifts slowly through the frames of a sequence, uniform in its range.
 
     A standard Gaussian is drawn every ``frames`` frames. Between two of them, a frame has
@@ -224,13 +243,10 @@ class Drift(NumberDraw):
     ((2, 3), 0.5)
     """
 
+    key = "drift"
+
     drift: Ends
     frames: Annotated[float, Field(ge=1)] = 100.0
-
-    @model_validator(mode="after")
-    def _check_order(self) -> "Drift":
-        _check_ascending(*self.drift)
-        return self
 
     def knots(self, frame: int) -> tuple[int, int]:
         """Return the numbers of the two draws that a frame is between."""
@@ -243,40 +259,23 @@ class Drift(NumberDraw):
         normal = math.cos(angle) * _normal(first) + math.sin(angle) * _normal(second)
         return NormalDist().cdf(normal)
 
-    def range_of(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
-        return self.drift
 
-    def truncated(self, limits: Limits) -> "Drift | None":
-        ends = limits.overlap(*self.drift)
-        return Drift(drift=ends, frames=self.frames) if ends else None
-
-    def number(self, uniform: float, limits: Limits, followed: Any) -> float:
-        low, high = self.drift
-        return min(max(low * (1 - uniform) + high * uniform, low), high)
-
-
-class LogUniform(NumberDraw):
+class LogUniform(Range):
     """A number whose logarithm is uniform: each octave of the range is as likely as the others.
 
     >>> round(LogUniform(log_uniform=(100, 6400)).value(0.5, Limits(), None))
     800
     """
 
+    key = "log_uniform"
+
     log_uniform: Ends
 
     @model_validator(mode="after")
-    def _check_order(self) -> "LogUniform":
+    def _check_positive(self) -> "LogUniform":
         if self.log_uniform[0] <= 0:
             raise ValueError(f"found {list(self.log_uniform)}, but both ends must be above 0")
-        _check_ascending(*self.log_uniform)
         return self
-
-    def range_of(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
-        return self.log_uniform
-
-    def truncated(self, limits: Limits) -> "LogUniform | None":
-        ends = limits.overlap(*self.log_uniform)
-        return LogUniform(log_uniform=ends) if ends else None
 
     def number(self, uniform: float, limits: Limits, followed: Any) -> float:
         low, high = self.log_uniform
@@ -427,11 +426,6 @@ def parse_draw(key: str, table: Mapping[str, Any]) -> Draw:
         elif fault.problem == "missing":
             reason = f"the draw {names[0]} needs this key; add it"
         raise KeyedError(key, f"{key}: {field}: {reason}") from None
-
-
-def _check_ascending(low: float, high: float) -> None:
-    if low > high:
-        raise ValueError(f"found [{low:g}, {high:g}]; put the lower end first")
 
 
 def _exp(log: float) -> float:
