@@ -12,7 +12,7 @@ from typing import Any
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
 from clpipe.base.files import sha256_of, write_atomic
-from clpipe.base.reading import check_regular
+from clpipe.base.reading import check_regular, read_start
 from clpipe.batch.outcome import FAILED, Outcome
 from clpipe.batch.run_log import log_name
 from clpipe.batch.tars import STAGING
@@ -361,9 +361,7 @@ def check_overwritten(sequences: Sequence[SequenceClips]) -> None:
 def _holds_records(path: Path) -> bool:
     """Return whether a file begins like :meth:`Clip.write_records`, or is zeros."""
     try:
-        check_regular(path)
-        with open(path, "rb") as file:
-            start = file.read(len(RECORD_START))
+        start = read_start(path, len(RECORD_START))
     except OSError:
         return False
     return start == RECORD_START or not start.strip(b"\0")

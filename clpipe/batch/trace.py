@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from clpipe.base.errors import RequestError
 from clpipe.base.files import atomic_file, create_parents
-from clpipe.base.reading import check_regular
+from clpipe.base.reading import read_start
 from clpipe.batch.outcome import STEPS, Outcome
 
 BEGINNING = b'{"traceEvents"'
@@ -25,9 +25,7 @@ def check_trace(path: Path) -> None:
     if path.suffix != ".json":
         raise RequestError(f"--trace: found {path}; expected a name that ends in .json")
     try:
-        check_regular(path)
-        with open(path, "rb") as file:
-            own = file.read(len(BEGINNING)) == BEGINNING
+        own = read_start(path, len(BEGINNING)) == BEGINNING
     except FileNotFoundError:
         return
     except OSError:

@@ -16,6 +16,7 @@ import numpy as np
 
 from clpipe.analysis.crops import HEIGHT, WIDTH, Crop, choose_crops
 from clpipe.base.errors import ImageError
+from clpipe.base.reading import read_errors
 from clpipe.base.types import Array
 from clpipe.chain.rendition import BASELINES, NOISY, PICTURES
 from clpipe.images.preview import decode_8_bit, jpeg_bytes, reduce, thumbnail_bytes
@@ -61,10 +62,8 @@ def checked(blob: Blob) -> bytes:
     """
     if blob.problem:
         raise ImageError(blob.problem)
-    try:
+    with read_errors(blob.name):
         data = blob.read()
-    except OSError as error:
-        raise ImageError(f"{blob.name}: cannot be read: {error.strerror}") from None
     if hashlib.sha256(data).hexdigest() != blob.sidecar_entry["sha256"]:
         raise ImageError(
             f"{blob.name}: has changed since the run; its SHA-256 differs from its sidecar"
