@@ -83,8 +83,7 @@ class DarkFigures:
 
 def dark_figures(dark: Floats, sensor: Sensor, hot: Pixels) -> DarkFigures:
     """Return the figures of dark frames, (frame, height, width), without hot pixels."""
-    good = np.ones(dark.shape[1:], bool)
-    good[hot.rows, hot.columns] = False
+    good = hot.outside(dark.shape[1:])
     frames = len(dark)
     sites = sites_of(sensor.bayer)
     levels = np.array([[float(f[s].mean(where=good[s])) for s in sites] for f in dark])

@@ -6,7 +6,7 @@ import numpy as np
 
 from clpipe.analysis.calibration.line_fit import Estimate, Line
 from clpipe.analysis.calibration.repeats import Sensor, Stack
-from clpipe.base.types import Array, Floats
+from clpipe.base.types import Array, Floats, Mask
 from clpipe.reference.cfa import sites
 
 SURE = 7.0  # standard deviations; by chance, not one of 1e8 pixels exceeds this
@@ -30,6 +30,12 @@ class Pixels:
     columns: Array
     excess: Array
     seen_on: float
+
+    def outside(self, shape: tuple[int, ...]) -> Mask:
+        """Return the mask of all other pixels of a plane of this shape."""
+        good = np.ones(shape, bool)
+        good[self.rows, self.columns] = False
+        return good
 
     def record(self) -> dict[str, object]:
         """Positions as [column, row] and excess in DN, as JSON values."""
@@ -124,8 +130,7 @@ def dark_pattern(
         DSNU, without columns, rows and temporal noise.
     """
     values = dark.astype(np.float64)
-    good = np.ones(dark.shape, bool)
-    good[bad.rows, bad.columns] = False
+    good = bad.outside(dark.shape)
     for site in sites(sensor.pattern).values():
         values[site] -= values[site][good[site]].mean()
     values[~good] = 0
