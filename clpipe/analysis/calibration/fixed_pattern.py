@@ -8,6 +8,7 @@ from clpipe.analysis.calibration.line_fit import Estimate, Line
 from clpipe.analysis.calibration.repeats import Sensor, Stack
 from clpipe.base.types import Array, Floats, Mask
 from clpipe.reference.cfa import sites
+from clpipe.reference.image import in_blocks
 
 SURE = 7.0  # standard deviations; by chance, not one of 1e8 pixels exceeds this
 # We chose these values; tests/test_calibrate.py shows what they find and reject.
@@ -209,6 +210,4 @@ def _surface() -> Array:
 
 def _blocks(plane: Array) -> Array:
     """Return a plane cut into whole blocks, (blocks, BLOCK, BLOCK)."""
-    rows, columns = (n // BLOCK for n in plane.shape)
-    cut = plane[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK)
-    return cut.swapaxes(1, 2).reshape(-1, BLOCK, BLOCK)
+    return in_blocks(plane, BLOCK).swapaxes(1, 2).reshape(-1, BLOCK, BLOCK)
