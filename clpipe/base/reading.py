@@ -195,6 +195,21 @@ def read_named(option: str, path: Path, max_bytes: int) -> bytes:
         return read_bytes(path, max_bytes)
 
 
+def read_named_text(name: str, path: Path, max_bytes: int = TEXT_BYTES) -> str:
+    """Return the text of a UTF-8 file, with or without a byte order mark.
+
+    Raises:
+        RequestError: it is no such file, or is larger than ``max_bytes``. The message begins with
+            ``name``.
+    """
+    with read_errors(name, RequestError):
+        data = read_bytes(path, max_bytes)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise RequestError(f"{name}: this file is not text in UTF-8") from None
+
+
 def read_text(path: Path) -> str:
     """Return the text of a small UTF-8 file, with or without a byte order mark.
 
