@@ -244,6 +244,17 @@ def write_atomic(path: Path, *parts: bytes | memoryview) -> Stored:
     return Stored(size, digest.hexdigest())
 
 
+def check_suffix(option: str, path: Path, *suffixes: str) -> None:
+    """Check that the name of a file to write ends in one of some suffixes.
+
+    Raises:
+        RequestError: it does not.
+    """
+    if path.suffix not in suffixes:
+        expected = f"expected a name that ends in {', '.join(suffixes)}"
+        raise RequestError(f"{option}: found {path}; {expected}")
+
+
 def check_folder(folder: Path) -> None:
     """Check that neither an output directory nor one of its parents is an existing file.
 
