@@ -29,6 +29,7 @@ from clpipe.chain.keys import (
     NOISE,
     TABLES,
     check_type,
+    set_dotted,
     string_list,
 )
 from clpipe.chain.methods import (
@@ -95,8 +96,7 @@ class Settings:
         lists = {"stages": list(self.stages), "skip": list(self.skip)}
         record = {**plain, **lists, **{name: dict(table) for name, table in self.tables.items()}}
         for key, draw in self.draws.items():
-            table, _, name = key.rpartition(".")
-            (record.setdefault(table, {}) if table else record)[name] = draw.record()
+            set_dotted(record, key, draw.record())
         return record
 
     def drawn(self, name: str, frame: int = 0) -> "Settings":
@@ -137,8 +137,7 @@ class Settings:
         constants = self.drawn(name, frame).constants() if self.draws else {}
         values: dict[str, Any] = {}
         for key in self.draws:
-            table, _, name = key.rpartition(".")
-            (values.setdefault(table, {}) if table else values)[name] = constants[key]
+            set_dotted(values, key, constants[key])
         return values
 
     def constants(self) -> dict[str, Any]:
