@@ -100,10 +100,10 @@ def cached_hash(class_: type[T]) -> type[T]:
     hash_of_fields = class_.__hash__
 
     def cached(self: Any) -> int:
-        known = vars(self)
-        if "_hash" not in known:
-            known["_hash"] = hash_of_fields(self)
-        return int(known["_hash"])
+        if "_hash" not in self.__dict__:
+            self.__dict__["_hash"] = hash_of_fields(self)
+        known: int = self.__dict__["_hash"]
+        return known
 
     class_.__hash__ = cached  # type: ignore[method-assign]
     return class_

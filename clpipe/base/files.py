@@ -88,7 +88,7 @@ class FileGroup:
 
     def _sync(self) -> None:
         for temporary, path in zip(self._temporary_paths, self.paths, strict=True):
-            with write_errors(path):
+            with _write_errors(path):
                 sync_file(temporary)
 
     def _rename(self) -> None:
@@ -96,7 +96,7 @@ class FileGroup:
         for number, (temporary, path) in enumerate(
             zip(self._temporary_paths, self.paths, strict=True)
         ):
-            with write_errors(path):
+            with _write_errors(path):
                 if number == last:
                     os.utime(temporary)  # makes the file newer than the files that it describes
                 temporary.replace(path)
@@ -175,7 +175,7 @@ def _file_group(group: FileGroup | None) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def write_errors(path: Path) -> Iterator[None]:
+def _write_errors(path: Path) -> Iterator[None]:
     """Raise an OSError of the ``with`` block as an ImageError about a file."""
     try:
         yield
@@ -205,7 +205,7 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
     )
     is_written = False
     try:
-        with write_errors(path):
+        with _write_errors(path):
             with _create_temporary(temporary) as file:
                 yield file
                 file.flush()

@@ -205,7 +205,7 @@ class Range(NumberDraw):
 
     def truncated(self, limits: Limits) -> "Range | None":
         ends = limits.overlap(*self._ends)
-        return self.model_copy(update={self.key: ends}) if ends else None
+        return type(self)(**{**vars(self), self.key: ends}) if ends else None
 
     def number(self, uniform: float, limits: Limits, followed: Any) -> float:
         low, high = self._ends

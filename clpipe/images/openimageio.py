@@ -14,7 +14,7 @@ import OpenImageIO as oiio
 from PIL import Image
 
 from clpipe.base.errors import ImageError
-from clpipe.base.reading import check_regular, read_errors, read_start
+from clpipe.base.reading import check_regular, read_errors
 from clpipe.base.text import printable
 from clpipe.base.types import Array
 from clpipe.images import pfm, radiance
@@ -81,7 +81,8 @@ def open_image(path: Path) -> Iterator[Any]:
         raise ImageError(f"{str(path)!a}: its name is not UTF-8; rename it") from None
     try:
         size = check_regular(path).st_size
-        signature = read_start(path, 16)
+        with path.open("rb") as start:
+            signature = start.read(16)
     except FileNotFoundError:
         raise ImageError(f"{path}: no such file") from None
     except OSError as error:

@@ -15,7 +15,8 @@ from PIL import ImageCms
 
 from clpipe.base.about import __version__
 from clpipe.base.cpu_time import CpuTimer
-from clpipe.base.files import Stored, write_atomic, write_errors
+from clpipe.base.errors import ImageError
+from clpipe.base.files import Stored, write_atomic
 from clpipe.base.system import max_file_size, temporary_file
 from clpipe.base.types import Array, Floats
 from clpipe.images.attributes import PREFIX
@@ -185,7 +186,7 @@ def _stored(path: Path, size: int, encode: Callable[[str], None]) -> Stored:
     """
     # Encoders do not notice every error of a full disk, and libjpeg then ends the process. Encoders
     # therefore write to memory, or to a disk with enough space.
-    with write_errors(path):
+    try:
         _check_file_limit(2 * size)
         with temporary_file(2 * size) as to:
             encode(to)
@@ -195,6 +196,8 @@ def _stored(path: Path, size: int, encode: Callable[[str], None]) -> Stored:
                 memoryview(encoded) as data,
             ):
                 return write_atomic(path, data)
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
 def _check_file_limit(size: int) -> None:
