@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from clpipe.analysis.comparison import Comparison, Noise
 from clpipe.base.errors import RequestError
-from clpipe.base.files import write_new
+from clpipe.base.files import check_suffix, write_new
 from clpipe.base.text import one_line
 from clpipe.base.types import Array
 from clpipe.reference.curve import to_8_bit
@@ -49,8 +49,7 @@ def check_name(path: Path, pictures: Sequence[Path]) -> None:
     Raises:
         RequestError: its extension is unknown, or a picture has that name.
     """
-    if path.suffix not in SUFFIXES:
-        raise RequestError(f"-o: found {path}; expected a name that ends in {', '.join(SUFFIXES)}")
+    check_suffix("-o", path, *SUFFIXES)
     if os.path.realpath(path) in map(os.path.realpath, pictures):
         raise RequestError(f"-o: {path} is one of the pictures; give the figure another name")
 

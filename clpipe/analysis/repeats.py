@@ -8,6 +8,7 @@ from clpipe.analysis.pictures import Picture
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.outputs.noise_areas import halved
+from clpipe.reference.image import in_blocks
 
 # A repeat counts as a ground truth if it has less than this share of the others' noise energy.
 # Energies are measured against the mean of n frames. A ground truth then has the share (n - 1) /
@@ -84,12 +85,10 @@ def reject_other_scenes(images: Sequence[Picture], noise: Floats) -> None:
     Raises:
         RequestError: one does.
     """
-    frames, rows, columns = len(noise), noise.shape[1] // BLOCK, noise.shape[2] // BLOCK
-    if min(rows, columns) < 2:
+    frames, height, width = noise.shape[:3]
+    if min(height, width) < 2 * BLOCK:
         return
-    whole = noise[:, : rows * BLOCK, : columns * BLOCK].reshape(
-        frames, rows, BLOCK, columns, BLOCK, -1
-    )
+    whole = in_blocks(noise.reshape(frames, height, width, -1), BLOCK, axis=1)
     means = whole.mean((2, 4), dtype=np.float64)
     for axis in (1, 2):  # remove noise of rows and columns, and changes of brightness
         means -= means.mean(axis, keepdims=True)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from clpipe.analysis.intensity import NoiseCurve
@@ -77,7 +77,7 @@ def json_number(value: float) -> float | None:
 
 def line_record(lines: LineNoise) -> dict[str, float | None]:
     """Row or column noise as JSON values."""
-    return {"sigma": json_number(lines.sigma), "limit": json_number(lines.limit)}
+    return {name: json_number(value) for name, value in asdict(lines).items()}
 
 
 def curve_record(curve: NoiseCurve) -> dict[str, list[float]]:
@@ -98,7 +98,7 @@ def channel_record(channel: Channel) -> dict[str, Any]:
         "samples": channel.count,
         "sigma": channel.sigma,
         "sigma_picture": channel.whole_sigma,
-        "law": law and {"a": law.a, "b": law.b, "a_error": law.a_error, "b_error": law.b_error},
+        "law": law and asdict(law),
         "intensity": curve_record(channel.curve),
         "intensity_picture": whole and curve_record(whole),
         "row": line_record(channel.rows),

@@ -1,10 +1,11 @@
-"""Caches in memory, which drop the least recently used values."""
+"""Caches in memory, which drop the least recently used values, and hashes of their keys."""
 
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from typing import Any, Generic, TypeVar
 
+T = TypeVar("T")
 V = TypeVar("V")
 
 
@@ -89,3 +90,20 @@ class BoundedCache(Generic[V]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return BoundedCache, (self._capacity, self._size)
+
+
+def cached_hash(class_: type[T]) -> type[T]:
+    """Decorate a frozen dataclass, so that each object hashes its fields only once.
+
+    A plan, for example, is looked up for each image, and hashing its contents is slow.
+    """
+    hash_of_fields = class_.__hash__
+
+    def cached(self: Any) -> int:
+        if "_hash" not in self.__dict__:
+            self.__dict__["_hash"] = hash_of_fields(self)
+        known: int = self.__dict__["_hash"]
+        return known
+
+    class_.__hash__ = cached  # type: ignore[method-assign]
+    return class_

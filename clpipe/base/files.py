@@ -176,7 +176,7 @@ def _file_group(group: FileGroup | None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _write_errors(path: Path) -> Iterator[None]:
-    """Convert an OSError to an ImageError about a file."""
+    """Raise an OSError of the ``with`` block as an ImageError about a file."""
     try:
         yield
     except OSError as error:
@@ -242,6 +242,17 @@ def write_atomic(path: Path, *parts: bytes | memoryview) -> Stored:
                 digest.update(part)
             size += len(part)
     return Stored(size, digest.hexdigest())
+
+
+def check_suffix(option: str, path: Path, *suffixes: str) -> None:
+    """Check that the name of a file to write ends in one of some suffixes.
+
+    Raises:
+        RequestError: it does not.
+    """
+    if path.suffix not in suffixes:
+        expected = f"expected a name that ends in {', '.join(suffixes)}"
+        raise RequestError(f"{option}: found {path}; {expected}")
 
 
 def check_folder(folder: Path) -> None:

@@ -148,6 +148,26 @@ def _state(path: Path) -> tuple[int, ...]:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
+@contextmanager
+def read_errors(name: object, error_type: type[Exception] = ImageError) -> Iterator[None]:
+    """Name the file in an OSError of the ``with`` block, and raise it as an error of a type."""
+    try:
+        yield
+    except OSError as error:
+        raise error_type(f"{name}: cannot be read: {error.strerror or error}") from None
+
+
+def read_start(path: Path, count: int) -> bytes:
+    """Return the first bytes of a regular file.
+
+    Raises:
+        OSError: the file cannot be read, or is not a regular file.
+    """
+    check_regular(path)
+    with path.open("rb") as file:
+        return file.read(count)
+
+
 def read_bytes(path: Path, max_bytes: int = TEXT_BYTES) -> bytes:
     """Return the contents of a regular file of at most ``max_bytes`` bytes.
 
@@ -171,10 +191,23 @@ def read_named(option: str, path: Path, max_bytes: int) -> bytes:
     Raises:
         RequestError: the file cannot be read, is not a regular file, or is larger.
     """
-    try:
+    with read_errors(f"{option} {path}", RequestError):
         return read_bytes(path, max_bytes)
-    except OSError as error:
-        raise RequestError(f"{option} {path}: cannot be read: {error.strerror}") from None
+
+
+def read_named_text(name: str, path: Path, max_bytes: int = TEXT_BYTES) -> str:
+    """Return the text of a UTF-8 file, with or without a byte order mark.
+
+    Raises:
+        RequestError: it is no such file, or is larger than ``max_bytes``. The message begins with
+            ``name``.
+    """
+    with read_errors(name, RequestError):
+        data = read_bytes(path, max_bytes)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise RequestError(f"{name}: this file is not text in UTF-8") from None
 
 
 def read_text(path: Path) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.base.errors import RequestError
-from clpipe.base.reading import TEXT_BYTES, check_regular
+from clpipe.base.reading import TEXT_BYTES, check_regular, read_start
 from clpipe.inputs.find import Job
 from clpipe.outputs.folder import remove_unfinished
 from clpipe.outputs.sidecar import SIDECAR, SidecarError, is_sidecar, parse_sidecar
@@ -120,10 +120,8 @@ def is_clpipe_tar(path: Path) -> bool:
     A loss of power may leave zeros.
     """
     try:
-        check_regular(path)
-        with open(path, "rb") as file:
-            if not file.read(tarfile.RECORDSIZE).strip(b"\0"):
-                return True
+        if not read_start(path, tarfile.RECORDSIZE).strip(b"\0"):
+            return True
         with tarfile.open(path, "r:") as tar:
             for info in tar:
                 is_text = info.isreg() and info.name.endswith(f".{SIDECAR}")

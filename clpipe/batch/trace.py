@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from clpipe.base.errors import RequestError
-from clpipe.base.files import atomic_file, create_parents
-from clpipe.base.reading import check_regular
+from clpipe.base.files import atomic_file, check_suffix, create_parents
+from clpipe.base.reading import read_start
 from clpipe.batch.outcome import STEPS, Outcome
 
 BEGINNING = b'{"traceEvents"'
@@ -22,12 +22,9 @@ def check_trace(path: Path) -> None:
     Raises:
         RequestError: the name does not end in .json, or the file exists and is not a trace.
     """
-    if path.suffix != ".json":
-        raise RequestError(f"--trace: found {path}; expected a name that ends in .json")
+    check_suffix("--trace", path, ".json")
     try:
-        check_regular(path)
-        with open(path, "rb") as file:
-            own = file.read(len(BEGINNING)) == BEGINNING
+        own = read_start(path, len(BEGINNING)) == BEGINNING
     except FileNotFoundError:
         return
     except OSError:

@@ -242,6 +242,11 @@ class Chain:
         """Whether a step draws random numbers."""
         return any(p.random for s in self.steps for p in s.passes)
 
+    def with_methods(self, methods: Mapping[str, Method]) -> "Chain":
+        """Return the chain with other methods of some steps, by step name."""
+        steps = (replace(s, method=methods[s.name]) if s.name in methods else s for s in self.steps)
+        return replace(self, steps=tuple(steps))
+
     def with_settings(self, settings: Settings) -> "Chain":
         """Return the chain with other settings, which resolve to the same steps."""
         return with_changes(self, {"settings": settings})

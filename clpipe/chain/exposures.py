@@ -39,21 +39,21 @@ class Exposures:
         return tuple(self._chain_before_merge(number) for number in range(1, len(self.spans)))
 
     def _chain_before_merge(self, number: int) -> Chain:
-        steps = tuple(
-            replace(step, method=step.method.for_exposure(self.spans, number))
-            if isinstance(step.method, Rows)
-            else step
-            for step in self.chain.steps[: self.index]
+        before = replace(self.chain, steps=self.chain.steps[: self.index])
+        methods = {step.name: step.method for step in before.steps}
+        return before.with_methods(
+            {
+                k: m.for_exposure(self.spans, number)
+                for k, m in methods.items()
+                if isinstance(m, Rows)
+            }
         )
-        return replace(self.chain, steps=steps)
 
     def merge_chain(self, images: Sequence[Floats]) -> Chain:
         """Return the chain that merges ``images``, the results of the chains in :attr:`later`."""
         method = self.step.method
         assert isinstance(method, Staggered)
-        merge_step = replace(self.step, method=method.with_later_images(np.stack(images)))
-        before, after = self.chain.steps[: self.index], self.chain.steps[self.index + 1 :]
-        return replace(self.chain, steps=(*before, merge_step, *after))
+        return self.chain.with_methods({self.step.name: method.with_later_images(np.stack(images))})
 
 
 def exposures_of(chain: Chain) -> Exposures | None:

@@ -159,6 +159,18 @@ def check_type(key: str, value: Any) -> None:
         raise KeyedError(key, f"{key}: found {value!r}, but expected {known.allowed}")
 
 
+def set_dotted(values: dict[str, Any], key: str, value: Any) -> None:
+    """Set a value in nested ones, by a key such as ``iso`` or ``stage.parameter``.
+
+    >>> nested = {"iso": 100}
+    >>> set_dotted(nested, "gamma.exponent", 2.0)
+    >>> nested
+    {'iso': 100, 'gamma': {'exponent': 2.0}}
+    """
+    table, _, name = key.rpartition(".")
+    (values.setdefault(table, {}) if table else values)[name] = value
+
+
 def string_list(values: Mapping[str, Any], key: str, what: str) -> tuple[str, ...]:
     """Return the list of texts under a key; empty if the key is missing.
 

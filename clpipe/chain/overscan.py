@@ -29,12 +29,9 @@ def with_overscan(chain: Chain, margins: Margins) -> Chain:
 
     Plans and kernels differ from the ones for ``chain`` only in numbers.
     """
-    count = overscan_step_count(chain)
-    steps = tuple(
-        replace(step, method=step.method.with_margins(margins)) if number < count else step
-        for number, step in enumerate(chain.steps)
-    )
-    return replace(chain, steps=steps, margins=margins)
+    steps = chain.steps[: overscan_step_count(chain)]
+    moved = chain.with_methods({step.name: step.method.with_margins(margins) for step in steps})
+    return replace(moved, margins=margins)
 
 
 def margins_of_array(overscan: Sequence[int], image: Array) -> Margins:

@@ -1,7 +1,5 @@
 """Chains whose image is the atlas of a panorama, seen through a wide lens."""
 
-from dataclasses import replace
-
 from clpipe.chain.chain import Chain
 from clpipe.reference.panorama import Panorama
 from clpipe.reference.projection import Projection
@@ -13,13 +11,9 @@ def with_panorama(chain: Chain, panorama: Panorama) -> Chain:
 
     Plans and kernels differ from the ones for ``chain`` only in numbers.
     """
-    steps = tuple(
-        replace(step, method=step.method.with_panorama(panorama))
-        if isinstance(step.method, WideAngle)
-        else step
-        for step in chain.steps
-    )
-    return replace(chain, steps=steps)
+    methods = {s.name: s.method for s in chain.steps}
+    wide = {k: m.with_panorama(panorama) for k, m in methods.items() if isinstance(m, WideAngle)}
+    return chain.with_methods(wide)
 
 
 def projection_of(chain: Chain) -> Projection | None:

@@ -27,6 +27,7 @@ from clpipe.chain.keys import (
     MAX_STAGES,
     TABLES,
     check_type,
+    set_dotted,
     string_list,
 )
 from clpipe.chain.limits import SMALLEST_FLOAT, Limits, field_limits
@@ -93,8 +94,7 @@ class Settings:
         lists = {"stages": list(self.stages), "skip": list(self.skip)}
         record = {**plain, **lists, **{name: dict(table) for name, table in self.tables.items()}}
         for key, draw in self.draws.items():
-            table, _, name = key.rpartition(".")
-            (record.setdefault(table, {}) if table else record)[name] = draw.record()
+            set_dotted(record, key, draw.record())
         return record
 
     def drawn(self, name: str, frame: int = 0) -> "Settings":
@@ -139,8 +139,7 @@ class Settings:
             constants["iso"] = {"choice": [drawn.iso]}  # only a draw may exceed the range
         values: dict[str, Any] = {}
         for key in self.draws:
-            table, _, name = key.rpartition(".")
-            (values.setdefault(table, {}) if table else values)[name] = constants[key]
+            set_dotted(values, key, constants[key])
         return values
 
     def constants(self) -> dict[str, Any]:

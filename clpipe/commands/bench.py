@@ -14,9 +14,9 @@ from clpipe.commands.chain_options import chain_options, device_option, request_
 from clpipe.commands.completion import methods_of
 from clpipe.commands.machine import ask_for_report, machine_record
 from clpipe.commands.options import Command, json_option
-from clpipe.commands.printing import show, show_json
+from clpipe.commands.printing import Rows, show, show_json
+from clpipe.engine.bench import Speed, bench_methods
 from clpipe.engine.bench import bench as run_bench
-from clpipe.engine.bench import bench_methods
 from clpipe.engine.device import open_device
 from clpipe.images.pixels import MAX_PIXELS
 
@@ -87,50 +87,43 @@ def bench(
     if methods is not None:
         stage = stage_named("--methods", methods)
         speeds = bench_methods(device, stage, chain.settings, width, height, repeat)
-        if as_json:
-            show_json({**machine_record(device), "methods": [asdict(speed) for speed in speeds]})
-            return
-        click.echo(f"{device.info.label}: {stage.name}, {width}x{height}, planes to planes")
-        rows = [(s.method, f"{s.launches}", f"{s.ms:.1f}", f"{s.mp_per_s:.0f}") for s in speeds]
-        show(("method", "launches", "ms", "MP/s"), rows, left=1)
-        ask_for_report(device)
-        return
-    if batch:
+        record = {**machine_record(device), "methods": [asdict(speed) for speed in speeds]}
+        title = f"{device.info.label}: {stage.name}, {width}x{height}, planes to planes"
+        headings: tuple[str, ...] = ("method", "launches", "ms", "MP/s")
+        rows: Rows = [
+            (s.method, f"{s.launches}", f"{s.ms:.1f}", f"{s.mp_per_s:.0f}") for s in speeds
+        ]
+    elif batch:
         batches = [bench_batch(device, request, workload) for workload in workloads()]
-        if as_json:
-            show_json({**machine_record(device), "batches": [b.record() for b in batches]})
-            return
-        click.echo(
+        record = {**machine_record(device), "batches": [b.record() for b in batches]}
+        title = (
             f"{device.info.label}: half-float EXR to JPEG on {available_processors()} CPUs. "
             "For each image, the table lists the CPU time of each step in ms, their sum, and "
             "its share of the CPUs' time."
         )
-        show(BATCH_HEADINGS, map(batch_row, batches), left=1)
-        ask_for_report(device)
-        return
-    report = run_bench(device, chain, width, height, repeat)
+        headings, rows = BATCH_HEADINGS, list(map(batch_row, batches))
+    else:
+        report = run_bench(device, chain, width, height, repeat)
+        record = report.record() | machine_record(device)
+        title = (
+            f"{report.device}: {report.width}x{report.height}, "
+            f"copy {report.copy_gb_per_s:.1f} GB/s, {report.bytes_per_pixel:.1f} bytes a pixel, "
+            f"first run {report.first_run_s:.2f} s"
+        )
+        headings = ("launch", "ms", "MP/s", "GB/s", "of copy")
+        rows = [launch_row(speed) for speed in (*report.launches, report.chain)]
     if as_json:
-        show_json(report.record() | machine_record(device))
+        show_json(record)
         return
-    click.echo(
-        f"{report.device}: {report.width}x{report.height}, copy {report.copy_gb_per_s:.1f} GB/s, "
-        f"{report.bytes_per_pixel:.1f} bytes a pixel, first run {report.first_run_s:.2f} s"
-    )
-    show(
-        ("launch", "ms", "MP/s", "GB/s", "of copy"),
-        (
-            (
-                speed.name,
-                f"{speed.ms:.1f}",
-                f"{speed.mp_per_s:.0f}",
-                f"{speed.gb_per_s:.1f}",
-                f"{speed.share_of_copy:.0%}",
-            )
-            for speed in (*report.launches, report.chain)
-        ),
-        left=1,
-    )
+    click.echo(title)
+    show(headings, rows, left=1)
     ask_for_report(device)
+
+
+def launch_row(speed: Speed) -> tuple[str, ...]:
+    """Return the table row of one launch, or of the chain."""
+    numbers = f"{speed.ms:.1f}", f"{speed.mp_per_s:.0f}", f"{speed.gb_per_s:.1f}"
+    return speed.name, *numbers, f"{speed.share_of_copy:.0%}"
 
 
 def batch_row(speed: BatchSpeed) -> tuple[str, ...]:

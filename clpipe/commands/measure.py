@@ -18,6 +18,7 @@ from clpipe.analysis.statistics import SIGMAS, gaussian_beyond
 from clpipe.analysis.temporal import measure_clip
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
+from clpipe.base.files import check_suffix
 from clpipe.commands.options import EXISTING, Command, json_option
 from clpipe.commands.printing import Rows, number, show, show_json
 from clpipe.images.video import VIDEO_SUFFIXES
@@ -71,9 +72,8 @@ def measure(
     clpipe run render.exr -o clean --iso 3200 --until quantize --skip noise
     clpipe measure noisy/render.exr --truth clean/render.exr
     """
-    if plot is not None and plot.suffix != ".png":
-        raise RequestError(f"--plot: found {plot}; expected a name that ends in .png")
     if plot is not None:
+        check_suffix("--plot", plot, ".png")
         require("--plot", "matplotlib")
     clip = next((path for path in images if path.suffix.lower() in VIDEO_SUFFIXES), None)
     if clip and (len(images) > 1 or truth or snr):

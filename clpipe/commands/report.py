@@ -7,7 +7,7 @@ import click
 
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
-from clpipe.base.files import write_new
+from clpipe.base.files import check_suffix, write_new
 from clpipe.commands.options import EXISTING, Command, json_option, output_option
 from clpipe.commands.printing import show_json
 from clpipe.commands.progress import status_line
@@ -36,8 +36,7 @@ def report(folders: tuple[Path, ...], output: Path | None, as_json: bool) -> Non
             f"found {len(folders)} directories; name one for a report, or two to compare them"
         )
     path = output or folders[0] / "report.html"
-    if path.suffix != ".html":
-        raise RequestError(f"-o: found {path}; expected a name that ends in .html")
+    check_suffix("-o", path, ".html")
     if os.path.lexists(path) and not is_marked(path):
         raise RequestError(
             f"{path}: clpipe did not write this file, so it is not overwritten; move it, or name "

@@ -56,14 +56,8 @@ class Check:
 
     def record(self) -> dict[str, Any]:
         """Return the check as JSON values."""
-        return {
-            "stage": self.stage,
-            "method": self.method,
-            "cases": self.cases,
-            **asdict(self.difference),
-            "tolerance": self.tolerance,
-            "passed": self.passed,
-        }
+        values = asdict(self)
+        return {**values.pop("difference"), **values, "passed": self.passed}
 
 
 def example(kind: Kind, size: tuple[int, int], half: bool = False, seed: int = 0) -> Array:

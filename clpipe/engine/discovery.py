@@ -32,6 +32,8 @@ from clpipe.engine.verdicts import Verdicts, verdicts
 POCL_ADDRESS_SPACE = 256 << 20
 THREAD_ADDRESS_SPACE = 8 << 20
 
+NO_TARGET = Target("", "")
+
 _process: int | None = None  # the process id that first used OpenCL, here or before a fork
 
 
@@ -41,18 +43,19 @@ class DeviceInfo:
 
     index: int
     platform: str
-    name: str
-    type: str  # "GPU", "CPU", "emulator" or "accelerator"
-    version: str  # of OpenCL, as reported by the device
-    driver: str
-    compute_units: int
-    memory: int  # bytes
-    max_buffer: int  # bytes
-    lanes: int
-    target: Target  # the CPU for which kernels are compiled
     problem: str
-    handle: Any
     hardware: Hardware
+    version: str  # of OpenCL, as reported by the device
+    # The defaults are those of a platform without devices.
+    name: str = "no device"
+    type: str = "none"  # "GPU", "CPU", "emulator" or "accelerator"
+    driver: str = ""
+    compute_units: int = 0
+    memory: int = 0  # bytes
+    max_buffer: int = 0  # bytes
+    lanes: int = 0
+    target: Target = NO_TARGET  # the CPU for which kernels are compiled
+    handle: Any = None
 
     @property
     def label(self) -> str:
@@ -164,22 +167,7 @@ def empty_platform(
     index: int, platform: str, reason: str, version: str = "", handle: int = 0
 ) -> DeviceInfo:
     """Return an entry for an installed platform without devices, which contains the reason."""
-    return DeviceInfo(
-        index=index,
-        platform=platform.strip(),
-        name="no device",
-        type="none",
-        version=version.strip(),
-        driver="",
-        compute_units=0,
-        memory=0,
-        max_buffer=0,
-        lanes=0,
-        target=Target("", ""),
-        problem=reason,
-        handle=None,
-        hardware=Hardware(handle),
-    )
+    return DeviceInfo(index, platform.strip(), reason, Hardware(handle), version.strip())
 
 
 def runtime_advice() -> str:

@@ -3,10 +3,11 @@
 Images of one size form a level. The source is on level 0. Each resampling leads to the next level.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 
+from clpipe.base.cache import cached_hash
 from clpipe.engine.bindings import Parameter
 from clpipe.engine.ops import Op
 from clpipe.reference.resample import Resampler, sizes
@@ -108,20 +109,13 @@ class Cpu:
     cache: int
 
 
+@cached_hash
 @dataclass(frozen=True)
 class Bands:
     """Launches that one kernel runs band by band on a CPU; see :mod:`clpipe.engine.bands`."""
 
     parts: tuple[Launch, ...]
     cpu: Cpu
-
-    def __hash__(self) -> int:
-        return self._hash
-
-    @cached_property
-    def _hash(self) -> int:
-        # Cached, because each launch looks its strips up.
-        return hash((self.parts, self.cpu))
 
 
 @dataclass(frozen=True)
@@ -196,6 +190,7 @@ def reads_of(launch: AnyLaunch) -> tuple[Read, ...]:
     return launch.reads if isinstance(launch, Launch | Histogram) else ()
 
 
+@cached_hash
 @dataclass(frozen=True)
 class Plan:
     """The launches that develop one image, in order, and the slots of its planes.
@@ -230,14 +225,6 @@ class Plan:
     incremental: bool = False
     states: tuple[tuple[str, Image | None, Image], ...] = ()
     resamplings: tuple[Resampler, ...] = ()
-
-    def __hash__(self) -> int:
-        return self._hash
-
-    @cached_property
-    def _hash(self) -> int:
-        # Cached, because a plan is looked up for each image and hashing its contents is slow.
-        return hash(tuple(getattr(self, each.name) for each in fields(self)))
 
     @cached_property
     def unscaled(self) -> "Plan":

@@ -14,7 +14,7 @@ import OpenImageIO as oiio
 from PIL import Image
 
 from clpipe.base.errors import ImageError
-from clpipe.base.reading import check_regular
+from clpipe.base.reading import check_regular, read_errors
 from clpipe.base.text import printable
 from clpipe.base.types import Array
 from clpipe.images import pfm, radiance
@@ -151,11 +151,10 @@ def radiance_header(path: Path) -> radiance.RadianceHeader:
     Raises:
         ImageError: the header is damaged, or the file cannot be read.
     """
+    with read_errors(path), path.open("rb") as file:
+        data = file.read(radiance.HEADER_BYTES)
     try:
-        with path.open("rb") as file:
-            return radiance.radiance_header(file.read(radiance.HEADER_BYTES))
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+        return radiance.radiance_header(data)
     except ImageError as error:
         raise ImageError(f"{path}: {error}") from None
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.errors import ImageError
-from clpipe.base.reading import check_regular
+from clpipe.base.reading import check_regular, read_start
 from clpipe.base.types import Array, Floats
 from clpipe.camera.profile import SRGB_TO_XYZ, Matrix
 from clpipe.images.dng import ARRAY_SEPARATOR, D65
@@ -201,9 +201,7 @@ def _open_raw(path: Path, max_pixels: int) -> Iterator[Any]:
     import rawpy
 
     try:
-        check_regular(path)
-        with path.open("rb") as file:
-            start = file.read(8)
+        start = read_start(path, 8)
         if not start:
             raise ImageError(f"{path}: the file is empty")
         for mark, what in OTHER_FORMATS.items():

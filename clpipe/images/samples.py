@@ -166,7 +166,7 @@ def digest_of(path: Path) -> str:
     Raises:
         ImageError: it cannot be read.
     """
-    try:
+    try:  # a context manager would take longer, for each image
         return sha256_of(path)[0]
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 
-from clpipe.base.errors import ImageError
+from clpipe.base.reading import read_errors
 from clpipe.base.text import printable
 from clpipe.base.types import Array, Floats
 from clpipe.images import png, radiance
@@ -133,10 +133,8 @@ def png_colours(path: Path) -> png.PngColours:
     Raises:
         ImageError: the file cannot be read.
     """
-    try:
+    with read_errors(path):
         return png.png_colours(path)
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 def _profile(spec: Any) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from clpipe.base.errors import RequestError
-from clpipe.base.reading import read_named
+from clpipe.base.reading import read_named_text
 from clpipe.base.types import Doubles
 from clpipe.inputs.annotations import MAX_BYTES, MAX_COORDINATE, AnnotatedRender, reject
 
@@ -76,10 +76,7 @@ def read_kitti(folder: Path) -> Kitti:
 
 
 def _lines(path: Path) -> list[str]:
-    try:
-        return read_named("--annotations", path, MAX_BYTES).decode().splitlines()
-    except UnicodeDecodeError:
-        raise RequestError(f"--annotations {path}: this file is not text in UTF-8") from None
+    return read_named_text(f"--annotations {path}", path, MAX_BYTES).splitlines()
 
 
 def _objects(path: Path) -> list[KittiObject]:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.files import sha256_of
 from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_name, load_camera
 from clpipe.chain.chain import Chain
 from clpipe.chain.methods import base_name
@@ -22,6 +21,7 @@ from clpipe.images.dump import Dump, read_dump
 from clpipe.images.pixels import DEFAULT_MAX_PIXELS
 from clpipe.images.raw import RAW_SUFFIXES, RawInfo, read_raw, read_raw_info
 from clpipe.images.read import RENDER_SUFFIXES, SourceImage
+from clpipe.images.samples import digest_of
 from clpipe.images.tags import Tags, to_attributes
 from clpipe.inputs.plausibility import brightness_warnings, input_warnings
 from clpipe.reference.cfa import PATTERNS
@@ -79,11 +79,7 @@ class RawLoader:
             pixels = read_dump(path, facts, max_pixels)
         else:
             pixels = read_raw(path, facts, max_pixels)
-        try:
-            digest, _ = sha256_of(path)
-        except OSError as error:
-            raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
-        return RawImage(pixels, digest, "", (), {}, facts=facts)
+        return RawImage(pixels, digest_of(path), "", (), {}, facts=facts)
 
     def first_chain(self, path: Path) -> Chain:
         """Return the chain of the first raw, to reject a wrong request before the run starts.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.errors import RequestError
-from clpipe.base.reading import parse_json, read_named
+from clpipe.base.reading import parse_json, read_named, read_named_text
 from clpipe.base.types import Array
 from clpipe.inputs.manifest import MANIFEST_BYTES
 from clpipe.reference.pose import from_opengl, from_quaternion
@@ -204,10 +204,7 @@ def _from_colmap(folder: Path) -> Iterator[View]:
 
 
 def _lines(path: Path) -> Iterator[str]:
-    try:
-        text = read_named("--poses", path, MANIFEST_BYTES).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise RequestError(f"--poses {path}: this file is not text in UTF-8") from None
+    text = read_named_text(f"--poses {path}", path, MANIFEST_BYTES)
     return iter([line.strip() for line in text.split("\n")])
 
 

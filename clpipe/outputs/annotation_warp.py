@@ -107,16 +107,16 @@ def warp_annotation(annotation: Record, mapping: PixelMapping) -> Record | None:
             return None
         changes |= from_mask
     else:
-        parts = outline or [_box_outline(annotation["bbox"])]
-        clipped = _warp_outline([np.reshape(part, (-1, 2)) for part in parts], mapping)
+        parts = [np.reshape(part, (-1, 2)) for part in outline or ()]
+        clipped = _warp_outline(parts or [_corners(annotation["bbox"])], mapping)
         if clipped is None:
             return None
-        polygons, share = clipped
-        changes["bbox"] = _bounds(polygons)
-        area = sum(abs(_area(part)) for part in polygons)
-        changes |= {"area": round(area, 3), "truncated": round(1 - share, 4)}
+        visible, share = clipped
+        changes["bbox"] = _box_around(visible)
+        changes |= {"area": round(visible.area, 3), "truncated": round(1 - share, 4)}
         if outline:
-            changes["segmentation"] = [part.round(3).ravel().tolist() for part in polygons]
+            rings = [np.array(part.exterior.coords)[:-1] for part in visible.geoms]
+            changes["segmentation"] = [ring.round(3).ravel().tolist() for ring in rings]
     if points := annotation.get("keypoints"):
         changes |= _warp_keypoints(points, mapping)
     return changes
@@ -127,18 +127,14 @@ def warp_box(box: Sequence[float], mapping: PixelMapping) -> tuple[list[float], 
 
     Return None if nothing of the box is in the picture. Boxes are x, y, width and height in px.
     """
-    clipped = _warp_outline([_box_outline(box)], mapping)
-    if clipped is None:
-        return None
-    outlines, share = clipped
-    return _bounds(outlines), share
+    clipped = _warp_outline([_corners(box)], mapping)
+    return clipped and (_box_around(clipped[0]), clipped[1])
 
 
-def _bounds(outlines: Sequence[Array]) -> list[float]:
-    """Return the bounding box of outlines: x, y, width and height."""
-    low = np.min([part.min(0) for part in outlines], 0)
-    high = np.max([part.max(0) for part in outlines], 0)
-    return [*low.round(3).tolist(), *(high - low).round(3).tolist()]
+def _box_around(shape: Any) -> list[float]:
+    """Return the bounding box of a shapely geometry: x, y, width and height."""
+    left, top, right, bottom = shape.bounds
+    return [round(value, 3) for value in (left, top, right - left, bottom - top)]
 
 
 def warp_mask(mask: Array, mapping: PixelMapping) -> Array:
@@ -150,25 +146,22 @@ def warp_mask(mask: Array, mapping: PixelMapping) -> Array:
     return np.asarray(warped[..., 0])
 
 
-def _box_outline(box: Sequence[float]) -> Array:
+def _corners(box: Sequence[float]) -> Array:
     x, y, width, height = box
     return np.array([[x, y], [x + width, y], [x + width, y + height], [x, y + height]])
 
 
-def _area(outline: Array) -> float:
-    """Return the signed area in px^2 of an outline, (corner, 2)."""
-    x, y = outline.T
-    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
+def _warp_outline(parts: Sequence[Array], mapping: PixelMapping) -> tuple[Any, float] | None:
+    """Return the visible shape, and the share of the area in the picture; None if all is outside.
 
+    Args:
+        parts: outlines in the render, (corner, 2) each.
+        mapping: the mapping to the picture.
 
-def _warp_outline(
-    parts: Sequence[Array], mapping: PixelMapping
-) -> tuple[list[Array], float] | None:
-    """Return outlines in the picture and the share of their area in it, or None if all are outside.
-
-    Each outline is (corner, 2).
+    Returns:
+        Polygons without holes as a shapely MultiPolygon, and the share.
     """
-    from shapely import Polygon, box, make_valid
+    from shapely import MultiPolygon, Polygon, box, make_valid
     from shapely.ops import unary_union
 
     left, top, right, bottom = mapping.margins
@@ -181,10 +174,10 @@ def _warp_outline(
         _, pieces = _warp_shape(valid.intersection(render), mapping)
         visible += [piece.intersection(picture) for piece in pieces]
     kept = unary_union(visible).simplify(SIMPLIFY_TOLERANCE)
-    outlines = [np.array(piece.exterior.coords)[:-1] for piece in _polygons(kept)]
-    if sum(abs(_area(each)) for each in outlines) < MIN_AREA:
+    shown = MultiPolygon([Polygon(piece.exterior) for piece in _polygons(kept)])
+    if shown.area < MIN_AREA:
         return None
-    return outlines, min(sum(each.area for each in visible) / whole, 1.0)
+    return shown, min(sum(each.area for each in visible) / whole, 1.0)
 
 
 def _polygons(shape: Any) -> list[Any]:

@@ -6,6 +6,7 @@ The constants are arbitrary choices. tests/test_statistics.py shows what they se
 import numpy as np
 
 from clpipe.base.types import Doubles, Floats, Mask
+from clpipe.reference.image import in_blocks
 
 PICTURE, FLAT, HALVED = PLACES = ("picture", "flat", "halved")
 
@@ -39,10 +40,7 @@ def halved(noise: Floats) -> Floats:
 
     An odd last row or column is dropped.
     """
-    frames, height, width, channels = noise.shape
-    even = noise[:, : height // 2 * 2, : width // 2 * 2]
-    blocks = even.reshape(frames, height // 2, 2, width // 2, 2, channels)
-    return np.asarray(blocks.mean((2, 4)), np.float32)
+    return np.asarray(in_blocks(noise, 2, axis=1).mean((2, 4)), np.float32)
 
 
 def select_flat(truth: Floats, noise: Floats, mask: Mask) -> Mask:

@@ -183,8 +183,7 @@ def with_exposure(chain: Chain, ev: float) -> Chain:
     if settings.noise_key:
         settings = replace(settings, noise_key=bracket_key(settings.noise_key, ev))
     method = settings.method(step.name).resolve(step.context)
-    steps = (replace(s, method=method) if s is step else s for s in chain.steps)
-    return replace(chain, steps=tuple(steps), settings=settings)
+    return replace(chain.with_methods({step.name: method}), settings=settings)
 
 
 @lru_cache(maxsize=64)  # plans are cached per chain, and most images of a run share one chain

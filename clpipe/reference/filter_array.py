@@ -13,6 +13,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.text import unknown_name
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.reference.cfa import PATTERNS, Pattern
+from clpipe.reference.image import mirror
 
 MAX_PERIOD = 8
 MIRRORED = 2  # the longest period that a mirrored border (reflect-101) continues
@@ -246,9 +247,7 @@ def periodic_indices(size: int, period: int, reach: int) -> Array:
     """
     positions = np.arange(-reach, size + reach)
     if period <= MIRRORED or size < period:
-        mirror_period = max(2 * (size - 1), 1)
-        phase = positions % mirror_period
-        return np.asarray(np.where(phase < size, phase, mirror_period - phase))
+        return mirror(positions, size)
     before = positions % period
     after = positions - period * ((positions - size) // period + 1)
     return np.where(positions < 0, before, np.where(positions >= size, after, positions))

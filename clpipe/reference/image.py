@@ -37,3 +37,22 @@ def mirrored(image: Floats, margin: int) -> Floats:
     rows = mirror(np.arange(-margin, image.shape[0] + margin), image.shape[0])
     columns = mirror(np.arange(-margin, image.shape[1] + margin), image.shape[1])
     return image[rows][:, columns]
+
+
+def in_blocks(images: Array, side: int, axis: int = 0) -> Array:
+    """Return the whole blocks of images, with an axis of ``side`` px after each of the two axes.
+
+    The last rows and columns that fill no block are dropped.
+
+    >>> in_blocks(np.arange(15).reshape(3, 5), 2).max((1, 3)).tolist()
+    [[6, 8]]
+
+    Args:
+        images: the images.
+        side: the side of a block in px.
+        axis: the number of the axis of rows; that of columns is the next one.
+    """
+    before, (height, width) = images.shape[:axis], images.shape[axis : axis + 2]
+    rows, columns = height // side, width // side
+    whole = images[(*(np.s_[:],) * axis, np.s_[: rows * side], np.s_[: columns * side])]
+    return whole.reshape(*before, rows, side, columns, side, *images.shape[axis + 2 :])

@@ -5,10 +5,11 @@ the principal point in units of the focal length, or of half the short side.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 
+from clpipe.base.cache import cached_hash
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.reference.geometry import NO_MARGINS, Margins
@@ -24,6 +25,7 @@ from clpipe.reference.radial import (
 )
 
 
+@cached_hash
 @dataclass(frozen=True)
 class DistortionMap:
     """A lens as a map of an image: the origin of the light of each pixel.
@@ -55,24 +57,6 @@ class DistortionMap:
     half_diagonals: float | None = None
     fit: bool = False
     margins: Margins = NO_MARGINS
-
-    @cached_property
-    def _hash(self) -> int:
-        return hash(
-            (
-                *(
-                    self.radial,
-                    self.tangential,
-                    self.focal,
-                    self.relative_focal_length,
-                    self.centre,
-                ),
-                *(self.red, self.blue, self.half_diagonals, self.fit, self.margins),
-            )
-        )
-
-    def __hash__(self) -> int:
-        return self._hash
 
     @property
     def is_identity(self) -> bool:

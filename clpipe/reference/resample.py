@@ -251,23 +251,22 @@ def _taps(resampling: Resampling, size: int) -> Taps:
     first = np.minimum(lowest, size - width)
     tap_weights = weights(first[:, None] + np.arange(width))
     tap_weights = (tap_weights / tap_weights.sum(1, keepdims=True)).astype(np.float32)
-    padded = np.minimum(np.arange(count + PADDING), count - 1)
-    first, tap_weights = first[padded].astype(np.int32), tap_weights[padded]
-    table = tap_weights if resampling.axis == "rows" else tap_weights.T
-    return Taps(first, tap_weights, np.ascontiguousarray(table))
+    return _padded_taps(resampling.axis, first, tap_weights)
 
 
 @lru_cache(maxsize=64)
 def _taps_of_bins(bins: Bins, size: int) -> Taps:
     count, factor = bins.size(size), min(bins.factor, size)
-    padded = np.minimum(np.arange(count + PADDING), count - 1)
-    first = (padded * factor).astype(np.int32)
-    tap_weights = np.full((len(padded), factor), 1 / factor, np.float32)
-    return Taps(
-        first,
-        tap_weights,
-        tap_weights if bins.axis == "rows" else np.ascontiguousarray(tap_weights.T),
-    )
+    tap_weights = np.full((count, factor), 1 / factor, np.float32)
+    return _padded_taps(bins.axis, np.arange(count) * factor, tap_weights)
+
+
+def _padded_taps(axis: Axis, first: Array, tap_weights: Floats) -> Taps:
+    """Return the taps of new lines, after which the last line is repeated."""
+    padded = np.minimum(np.arange(len(first) + PADDING), len(first) - 1)
+    tap_weights = tap_weights[padded]
+    table = np.ascontiguousarray(tap_weights if axis == "rows" else tap_weights.T)
+    return Taps(first[padded].astype(np.int32), tap_weights, table)
 
 
 def overlap(distance: Array, ratio: float) -> Array:

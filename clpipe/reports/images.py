@@ -16,6 +16,7 @@ import numpy as np
 
 from clpipe.analysis.crops import HEIGHT, WIDTH, Crop, choose_crops
 from clpipe.base.errors import ImageError
+from clpipe.base.reading import read_errors
 from clpipe.base.types import Array
 from clpipe.chain.rendition import BASELINES, NOISY, PICTURES
 from clpipe.images.preview import decode_8_bit, jpeg_bytes, reduce, thumbnail_bytes
@@ -61,10 +62,8 @@ def checked(blob: Blob) -> bytes:
     """
     if blob.problem:
         raise ImageError(blob.problem)
-    try:
+    with read_errors(blob.name):
         data = blob.read()
-    except OSError as error:
-        raise ImageError(f"{blob.name}: cannot be read: {error.strerror}") from None
     if hashlib.sha256(data).hexdigest() != blob.sidecar_entry["sha256"]:
         raise ImageError(
             f"{blob.name}: has changed since the run; its SHA-256 differs from its sidecar"
@@ -123,12 +122,8 @@ def _small_pictures(
     """Yield the numbers of pictures, each with its thumbnail or the reason for its absence."""
 
     def small(i: int) -> tuple[str, str]:
-        if not (file := picture_file(pictures[i])):
-            return "", ""
-        try:
-            return data_uri("webp", thumbnail_bytes(checked(file), file.name, THUMBNAIL_SIZE)), ""
-        except ImageError as error:
-            return "", str(error)
+        file = picture_file(pictures[i])
+        return _thumbnail(file, THUMBNAIL_SIZE) if file else ("", "")
 
     pixels = 0.0
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -139,6 +134,14 @@ def _small_pictures(
                 pixels += number(pictures[i].value("width")) * number(pictures[i].value("height"))
             if pixels >= MAX_THUMBNAIL_PIXELS:
                 return
+
+
+def _thumbnail(file: Blob, side: int) -> tuple[str, str]:
+    """Return a thumbnail as a data URI and "", or "" and the reason for its absence."""
+    try:
+        return data_uri("webp", thumbnail_bytes(checked(file), file.name, side)), ""
+    except ImageError as error:
+        return "", str(error)
 
 
 def _entry(picture: RunPicture, image: str, label: str) -> dict[str, Any]:
@@ -379,12 +382,9 @@ def _strip(picture: RunPicture, budget: Budget, problems: list[str]) -> list[dic
     """Return thumbnails of the kept stages of a picture in the order of its chain."""
     stage_thumbnails = []
     for name, file in _kept(picture):
-        try:
-            image = data_uri("webp", thumbnail_bytes(checked(file), file.name, 2 * THUMBNAIL_SIZE))
-        except ImageError as error:
-            problems.append(str(error))
-            continue
-        if budget.take(image):
+        image, problem = _thumbnail(file, 2 * THUMBNAIL_SIZE)
+        problems += [problem] if problem else []
+        if image and budget.take(image):
             stage_thumbnails.append({"label": name, "image": image})
     return stage_thumbnails
 

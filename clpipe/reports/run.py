@@ -4,7 +4,7 @@ import os
 import tarfile
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -231,10 +231,8 @@ def _in_tar(run: Run, path: Path) -> Iterator[RunPicture]:
             for member in tar:
                 if not member.isfile():
                     continue
-                name, folder = (
-                    PurePosixPath(member.name).name,
-                    str(PurePosixPath(member.name).parent),
-                )
+                at = PurePosixPath(member.name)
+                name, folder = at.name, str(at.parent)
                 location = member.offset_data, member.size
                 siblings[folder][name] = Blob(str(path), f"{label}/{member.name}", {}, *location)
                 is_text = name.endswith(f".{SIDECAR}") and member.size <= TEXT_BYTES
@@ -275,11 +273,8 @@ def _read_picture(
         return
     files = {}
     for file, sidecar_entry in output_entries(record).items():
-        label = _joined(folder, file)
-        found = siblings.get(file, Blob("", label, {}))
-        files[file.removeprefix(f"{stem}.")] = Blob(
-            found.path, found.name, sidecar_entry, found.offset, found.size
-        )
+        found = siblings.get(file, Blob("", _joined(folder, file), {}))
+        files[file.removeprefix(f"{stem}.")] = replace(found, sidecar_entry=sidecar_entry)
     image = _joined(folder, stem.removesuffix(rendition.suffix))
     yield RunPicture(image, rendition, run.reduced_record(record), files)
 

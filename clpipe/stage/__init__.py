@@ -21,6 +21,7 @@ from clpipe.stage.bases import (
     Span,
     Unchanged,
     odd_size,
+    principal_point_parameter,
 )
 from clpipe.stage.checking import run_reference, variant_label, variants
 from clpipe.stage.context import Context, ImageLayer, ReferenceContext
@@ -85,6 +86,7 @@ __all__ = [
     "odd_size",
     "parameter",
     "period_of",
+    "principal_point_parameter",
     "run_reference",
     "sensor_bits",
     "sensor_normals",

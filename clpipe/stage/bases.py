@@ -1,6 +1,6 @@
 """Base classes that several methods share."""
 
-from typing import ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -40,22 +40,20 @@ class LensMethod(Method):
         return self.for_lens(context.optics.calibration).resolve(context)
 
 
+def principal_point_parameter(name: str, edge: str, auto: str, optics: bool = False) -> Any:
+    """Declare a coordinate of the principal point; arguments as for :func:`parameter`."""
+    text = f"Distance of the principal point from the {edge} edge; OpenCV's {name} + 0.5."
+    return parameter(None, text, "px", auto, optics=optics)
+
+
 class PrincipalPointMethod(Method):
     """A method that measures positions from the principal point."""
 
-    cx: float | None = parameter(
-        None,
-        "Distance of the principal point from the left edge; OpenCV's cx + 0.5.",
-        "px",
-        "render.cx, else the centre",
-        optics=True,
+    cx: float | None = principal_point_parameter(
+        "cx", "left", "render.cx, else the centre", optics=True
     )
-    cy: float | None = parameter(
-        None,
-        "Distance of the principal point from the upper edge; OpenCV's cy + 0.5.",
-        "px",
-        "render.cy, else the centre",
-        optics=True,
+    cy: float | None = principal_point_parameter(
+        "cy", "upper", "render.cy, else the centre", optics=True
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import field_validator
 
 from clpipe.base.errors import ImageError
-from clpipe.base.reading import cached_by_mtime
+from clpipe.base.reading import cached_by_mtime, read_errors
 from clpipe.base.tracing import float32
 from clpipe.base.types import Array, Floats
 from clpipe.reference.random import Stream, normal_of, philox
@@ -170,9 +170,8 @@ def read_map(path: str) -> Floats:
         ValueError: the file cannot be read, or does not contain such a map.
     """
     try:
-        return _read_map(path)
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
+        with read_errors(path):
+            return _read_map(path)
     except ImageError as error:
         raise ValueError(str(error)) from None
 

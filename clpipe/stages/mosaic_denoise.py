@@ -25,6 +25,7 @@ from clpipe.stage import (
     odd_size,
     parameter,
 )
+from clpipe.stages.sensor_noise.model import read_noise_parameter, shot_noise_parameter
 
 # h = FACTOR * strength * noise. Found by experiment: at strength 1 it is within 0.1 dB of the
 # highest PSNR for the image in tests/data, ISO 1600 to 12800. tools/pages/quality.py measures that
@@ -58,22 +59,8 @@ class NonLocalMeans(Method):
     strength: float = parameter(
         1.0, "Strength relative to the expected noise; 0 disables it.", ge=0, le=100
     )
-    a: float | None = parameter(
-        None,
-        "Shot noise: the variance per unit of signal.",
-        "signal",
-        "the a of sensor_noise, else from the camera and ISO",
-        ge=0,
-        le=1,
-    )
-    b: float | None = parameter(
-        None,
-        "Read noise: the variance without light.",
-        "signal^2",
-        "the b of sensor_noise, else from the camera and ISO",
-        ge=0,
-        le=1,
-    )
+    a: float | None = shot_noise_parameter("the a of sensor_noise, else from the camera and ISO")
+    b: float | None = read_noise_parameter("the b of sensor_noise, else from the camera and ISO")
 
     @field_validator("size")
     @classmethod

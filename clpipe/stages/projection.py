@@ -28,6 +28,7 @@ from clpipe.stage import (
     StageRole,
     Unchanged,
     parameter,
+    principal_point_parameter,
 )
 from clpipe.stages.distortion import filter_arguments
 
@@ -44,18 +45,8 @@ class WideAngle(Method):
 
     kernel: ClassVar = "projection"
 
-    cx: float | None = parameter(
-        None,
-        "Distance of the principal point from the left edge; OpenCV's cx + 0.5.",
-        "px",
-        "the centre",
-    )
-    cy: float | None = parameter(
-        None,
-        "Distance of the principal point from the upper edge; OpenCV's cy + 0.5.",
-        "px",
-        "the centre",
-    )
+    cx: float | None = principal_point_parameter("cx", "left", "the centre")
+    cy: float | None = principal_point_parameter("cy", "upper", "the centre")
     width: int | None = parameter(
         None, "Width of the image.", "px", "that of the whole field of view", ge=1, le=65536
     )

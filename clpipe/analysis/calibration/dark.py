@@ -50,8 +50,7 @@ class DarkFrames:
             return None
         mean = dark.mean(axis=0, dtype=np.float64)
         hot = fixed_pattern.hot_in_dark(mean, sensor)
-        good = np.ones(mean.shape, bool)
-        good[hot.rows, hot.columns] = False
+        good = hot.outside(mean.shape)
         level = float(mean[good].mean())
         if abs(level - sensor.black_level) > max(1.0, 0.1 * float(dark[0].std())):
             notes.append(
@@ -76,8 +75,7 @@ class DarkFrames:
 
     def columns(self) -> Floats:
         """Return the offset of each column in DN, (width,)."""
-        good = np.ones(self.mean.shape, bool)
-        good[self.hot.rows, self.hot.columns] = False
+        good = self.hot.outside(self.mean.shape)
         return np.mean(self.mean - self.level, axis=0, where=good).astype(np.float32)
 
     def row_noise(self) -> Estimate | None:

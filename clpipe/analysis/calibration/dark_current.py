@@ -5,7 +5,7 @@ from its shot noise and its pattern (EMVA 1288, release 4.0, 2021, describes bot
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -27,9 +27,9 @@ class DarkCurrent:
 
     def record(self) -> dict[str, object]:
         """Return the figures as JSON values."""
-        spread = self.spread and {"value": self.spread.value, "error": self.spread.error}
-        current = {"value": self.current.value, "error": self.current.error}
-        return {"current_e_per_s": current, "spread": spread, "times_s": list(self.times)}
+        spread = self.spread and asdict(self.spread)
+        times = list(self.times)
+        return {"current_e_per_s": asdict(self.current), "spread": spread, "times_s": times}
 
 
 def dark_current(
@@ -96,8 +96,6 @@ def variances(frames: Floats, sensor: Sensor) -> tuple[Estimate, Estimate]:
 
 def slope_of(x: Doubles, estimates: tuple[Estimate, ...]) -> Estimate:
     """Return the slope of a line through estimates, each weighted by its error."""
-    y = np.array([e.value for e in estimates])
-    weight = 1 / np.array([max(e.error, 1e-12) for e in estimates]) ** 2
-    middle = float((weight * x).sum() / weight.sum())
-    spread = float((weight * (x - middle) ** 2).sum())
-    return Estimate(float((weight * (x - middle) * y).sum() / spread), spread**-0.5)
+    values, errors = zip(*((e.value, max(e.error, 1e-12)) for e in estimates), strict=True)
+    fit, covariance = np.polyfit(x, values, 1, w=1 / np.array(errors), cov="unscaled")
+    return Estimate(float(fit[0]), float(covariance[0, 0] ** 0.5))

@@ -13,6 +13,7 @@ from clpipe.analysis.calibration.fixed_pattern import Pixels
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.base.types import Array, Doubles, Floats, Mask
+from clpipe.reference.image import in_blocks
 
 MIN_FRAMES_FOR_LEVELS = 4  # frames needed to measure the scatter of their levels
 MIN_FRAMES_FOR_JUMPS = 8  # frames needed to find pixels that jump
@@ -83,8 +84,7 @@ class DarkFigures:
 
 def dark_figures(dark: Floats, sensor: Sensor, hot: Pixels) -> DarkFigures:
     """Return the figures of dark frames, (frame, height, width), without hot pixels."""
-    good = np.ones(dark.shape[1:], bool)
-    good[hot.rows, hot.columns] = False
+    good = hot.outside(dark.shape[1:])
     frames = len(dark)
     sites = sites_of(sensor.bayer)
     levels = np.array([[float(f[s].mean(where=good[s])) for s in sites] for f in dark])
@@ -221,10 +221,9 @@ def shading_of(mean: Doubles, good: Mask, sites: Sequence[tuple[slice, slice]]) 
     flat = np.where(good, mean, np.nan)
     for site in sites:
         flat[site] -= np.nanmean(flat[site])
-    height, width = (side // BLOCK * BLOCK for side in mean.shape)
-    if min(height, width) < MIN_BLOCKS * BLOCK:
+    if min(mean.shape) < MIN_BLOCKS * BLOCK:
         return None
-    parts = flat[:height, :width].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK)
+    parts = in_blocks(flat, BLOCK)
     blocks = np.nanmean(parts, axis=(1, 3))
     noise = float(np.nanvar(parts - blocks[:, None, :, None]) / BLOCK**2)
     variance = Estimate(smooth_variance(blocks), 1.5 * noise * (2 / blocks.size) ** 0.5 + TINY)

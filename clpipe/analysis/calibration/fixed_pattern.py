@@ -6,8 +6,9 @@ import numpy as np
 
 from clpipe.analysis.calibration.line_fit import Estimate, Line
 from clpipe.analysis.calibration.repeats import Sensor, Stack
-from clpipe.base.types import Array, Floats
+from clpipe.base.types import Array, Floats, Mask
 from clpipe.reference.cfa import sites
+from clpipe.reference.image import in_blocks
 
 SURE = 7.0  # standard deviations; by chance, not one of 1e8 pixels exceeds this
 # We chose these values; tests/test_calibrate.py shows what they find and reject.
@@ -30,6 +31,12 @@ class Pixels:
     columns: Array
     excess: Array
     seen_on: float
+
+    def outside(self, shape: tuple[int, ...]) -> Mask:
+        """Return the mask of all other pixels of a plane of this shape."""
+        good = np.ones(shape, bool)
+        good[self.rows, self.columns] = False
+        return good
 
     def record(self) -> dict[str, object]:
         """Positions as [column, row] and excess in DN, as JSON values."""
@@ -124,8 +131,7 @@ def dark_pattern(
         DSNU, without columns, rows and temporal noise.
     """
     values = dark.astype(np.float64)
-    good = np.ones(dark.shape, bool)
-    good[bad.rows, bad.columns] = False
+    good = bad.outside(dark.shape)
     for site in sites(sensor.pattern).values():
         values[site] -= values[site][good[site]].mean()
     values[~good] = 0
@@ -204,6 +210,4 @@ def _surface() -> Array:
 
 def _blocks(plane: Array) -> Array:
     """Return a plane cut into whole blocks, (blocks, BLOCK, BLOCK)."""
-    rows, columns = (n // BLOCK for n in plane.shape)
-    cut = plane[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK)
-    return cut.swapaxes(1, 2).reshape(-1, BLOCK, BLOCK)
+    return in_blocks(plane, BLOCK).swapaxes(1, 2).reshape(-1, BLOCK, BLOCK)

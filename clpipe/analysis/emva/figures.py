@@ -176,13 +176,9 @@ def _slope(x: Doubles, y: Doubles) -> Estimate:
 
 def _line(x: Doubles, y: Doubles) -> tuple[Estimate, Estimate]:
     """Fit a line by least squares, and return slope and offset with errors from residuals."""
-    terms = np.stack([x, np.ones_like(x)], axis=1)
-    inverse = np.linalg.inv(terms.T @ terms)
-    found = inverse @ terms.T @ y
-    residuals = y - terms @ found
-    errors = np.sqrt(np.diag(inverse) * (residuals @ residuals) / (len(x) - 2))
-    slope, offset = (Estimate(float(v), float(e)) for v, e in zip(found, errors, strict=True))
-    return slope, offset
+    (slope, offset), covariance = np.polyfit(x, y, 1, cov=True)
+    slope_error, offset_error = np.sqrt(np.diag(covariance))
+    return Estimate(float(slope), float(slope_error)), Estimate(float(offset), float(offset_error))
 
 
 def _quotient(above: Estimate, below: Estimate) -> Estimate:

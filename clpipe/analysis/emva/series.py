@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.reading import read_text
+from clpipe.base.reading import read_named_text
 from clpipe.base.text import one_line, whole_number
 from clpipe.base.types import Array
 from clpipe.images.samples import read_whole_numbers
@@ -149,13 +149,7 @@ def read_series(path: Path) -> Series:
     Raises:
         RequestError: the text cannot be read, a line is wrong, or required frames are missing.
     """
-    try:
-        text = read_text(path)
-    except OSError as error:
-        raise RequestError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise RequestError(f"{path}: this file is not text in UTF-8") from None
-    lines = _Lines(path, text)
+    lines = _Lines(path, read_named_text(str(path), path))
     size: list[int] = []
     exposures: dict[tuple[float, float, bool], Exposure] = {}
     while found := lines.next():

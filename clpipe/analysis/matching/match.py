@@ -7,7 +7,7 @@ from clpipe.analysis.matching.result import Match, measured
 from clpipe.analysis.matching.scenes import load_scenes
 from clpipe.analysis.matching.search import Search, Watch
 from clpipe.analysis.matching.space import space_for
-from clpipe.base.errors import RequestError
+from clpipe.base.files import check_suffix
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.device import open_device
@@ -19,10 +19,9 @@ def check_names(output: Path, plot: Path | None) -> None:
     Raises:
         RequestError: one is wrong.
     """
-    if output.suffix != ".toml":
-        raise RequestError(f"-o: found {output}; expected a name that ends in .toml")
-    if plot is not None and plot.suffix != ".png":
-        raise RequestError(f"--plot: found {plot}; expected a name that ends in .png")
+    check_suffix("-o", output, ".toml")
+    if plot is not None:
+        check_suffix("--plot", plot, ".png")
 
 
 def match_files(

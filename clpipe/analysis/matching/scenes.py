@@ -26,6 +26,7 @@ from clpipe.base.reading import check_input
 from clpipe.base.types import Doubles, Floats, Mask
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding
 from clpipe.images.read import read_finished
+from clpipe.reference.image import in_blocks
 
 MAX_UNCROPPED = 640  # px; larger pictures are reduced to their flattest crops of CROP x CROP
 CROP = 512  # px; crops begin at multiples of 16, to align with the blocks of a JPEG
@@ -303,9 +304,7 @@ def static_mask(path: Path, frame: Floats, clean: Doubles, against: str, flat: M
 
 def block_means(plane: Doubles, block: int) -> Doubles:
     """Return the means of whole blocks, (rows, columns)."""
-    rows, columns = (size // block for size in plane.shape)
-    whole = plane[: rows * block, : columns * block]
-    return np.asarray(whole.reshape(rows, block, columns, block).mean((1, 3)))
+    return np.asarray(in_blocks(plane, block).mean((1, 3)))
 
 
 def reject_noisy_mean(path: Path, frame: Floats, mean: Floats, against: str) -> None:

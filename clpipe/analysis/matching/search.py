@@ -9,6 +9,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from clpipe.analysis.matching.space import (
     variants_of,
 )
 from clpipe.base.types import Doubles, Mask
+from clpipe.chain.keys import set_dotted
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.device import Device
@@ -151,7 +153,7 @@ class Search:
         self.watch.advanced(0.0, first, self.scenes)
         best = self.converged(first, trial_targets)
         LOG.info("start: residuals of %.2g", best.residual)
-        tried = {labels(best)}
+        tried = {labels(best.choices)}
         parts, count = list(self.space.choices) * ROUNDS, len(self.space.choices)
         unchanged = 0  # number of parts tried since the best candidate last changed
         for number, part in enumerate(parts):
@@ -208,7 +210,7 @@ class Search:
         methods. At another size, all numbers start anew.
         """
         choices = {**best.choices, part: choice}
-        other = tuple(each.text for each in choices.values())
+        other = labels(choices)
         if other in tried or best.residual < GOOD_RESIDUAL:
             return best
         tried.add(other)
@@ -348,9 +350,9 @@ def typical_residual(cost: float, targets: Sequence[Target]) -> float:
     return float((2 * cost / columns) ** 0.5)
 
 
-def labels(candidate: Candidate) -> tuple[str, ...]:
-    """Return the names of a candidate's choices."""
-    return tuple(choice.text for choice in candidate.choices.values())
+def labels(choices: Mapping[str, Choice]) -> tuple[str, ...]:
+    """Return the names of choices."""
+    return tuple(choice.text for choice in choices.values())
 
 
 def steps_of(candidate: Candidate, part: str) -> list[str]:
@@ -366,13 +368,7 @@ def merge_choices(first: Choice, second: Choice) -> Choice:
 
 def with_numbers(settings: Settings, numbers: Mapping[str, float]) -> Settings:
     """Return the settings with numbers set by their dotted names."""
-    values: dict[str, object] = {}
+    values: dict[str, Any] = {}
     for name, number in numbers.items():
-        step, _, parameter = name.rpartition(".")
-        if step:
-            table = values.setdefault(step, {})
-            assert isinstance(table, dict)
-            table[parameter] = number
-        else:
-            values[name] = number
+        set_dotted(values, name, number)
     return overlay(settings, values)

@@ -9,7 +9,7 @@ from clpipe.analysis.noise_models.dng import read_dng
 from clpipe.analysis.noise_models.model import SensorModel
 from clpipe.base.errors import RequestError
 from clpipe.base.files import write_new
-from clpipe.base.reading import check_exists, check_regular, parse_json, read_text
+from clpipe.base.reading import check_exists, parse_json, read_start, read_text
 from clpipe.camera.profile import Camera, parse_camera
 from clpipe.camera.text import check_profile_name
 
@@ -55,9 +55,7 @@ def read_model(path: Path, camera: str | None) -> SensorModel:
     """
     check_exists(path)
     try:
-        check_regular(path)
-        with path.open("rb") as file:
-            head = file.read(512)
+        head = read_start(path, 512)
         is_tiff = head.startswith(TIFF)
         text = "" if is_tiff or b"\0" in head else read_text(path)
     except OSError as error:

@@ -46,18 +46,22 @@ class Gain(Method):
 
     def gain_at(self, iso: float) -> float:
         """The value of a render's 1.0 over the sensor's full scale, without gain from metering."""
-        return float(self.gain)
+        return float(self.factor(iso))
 
     @property
     def gain(self) -> np.float32:
         """The gain."""
         return float32(2.0 ** (self.ev - self.headroom))
 
+    def factor(self, iso: float) -> np.float32:
+        """Return the value of one unit of a render, over the sensor's full scale, at an ISO."""
+        return self.gain
+
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("exposure", arguments=("gain",)),)
 
     def arguments(self, context: Context) -> Arguments:
-        return {"gain": self.gain}
+        return {"gain": self.factor(context.iso)}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        return image * self.gain
+        return image * self.factor(inputs.context.iso)

@@ -6,9 +6,8 @@ from typing import ClassVar, Self
 import numpy as np
 
 from clpipe.base.tracing import float32
-from clpipe.base.types import Floats
 from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
-from clpipe.stage import Arguments, Context, ReferenceContext, parameter
+from clpipe.stage import Context, parameter
 from clpipe.stages.exposure.gain import Gain
 
 SATURATION = 78.0  # lx s at ISO 1; the exposure that saturates the sensor
@@ -73,16 +72,6 @@ class Photometric(Gain):
         return context.replace(headroom=headroom, exposure_time=self.time(self.exposure_time))
 
     def factor(self, iso: float) -> np.float32:
-        """Return the value of one unit of a render, over the sensor's full scale, at an ISO."""
         assert self.f_number and self.exposure_time
         exposure = self.q * self.scale * self.exposure_time / self.f_number**2  # lx s
         return float32(exposure * iso / SATURATION * 2.0 ** (self.ev - self.headroom))
-
-    def gain_at(self, iso: float) -> float:
-        return float(self.factor(iso))
-
-    def arguments(self, context: Context) -> Arguments:
-        return {"gain": self.factor(context.iso)}
-
-    def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        return image * self.factor(inputs.context.iso)

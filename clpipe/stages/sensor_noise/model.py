@@ -1,7 +1,7 @@
 """The strength of sensor noise: its parameters, and the noise model that they define."""
 
 from math import isclose
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from pydantic import model_validator
@@ -27,6 +27,18 @@ EMVA = ("system_gain", "read_noise", "adc_noise")
 PAPER = ("chi", "theta", "b_before", "b_after", "p0")
 
 
+def shot_noise_parameter(auto: str) -> Any:
+    """Declare the parameter a. ``auto`` is as for :func:`~clpipe.stage.parameter`."""
+    text = "Shot noise: the variance per unit of signal."
+    return parameter(None, text, "signal", auto, ge=0, le=1)
+
+
+def read_noise_parameter(auto: str) -> Any:
+    """Declare the parameter b. ``auto`` is as for :func:`~clpipe.stage.parameter`."""
+    text = "Read noise: the variance without light."
+    return parameter(None, text, "signal^2", auto, ge=0, le=1)
+
+
 class SensorNoise(SignalMethod):
     """The strength of the noise in one of three parametrisations, and the full well.
 
@@ -35,22 +47,8 @@ class SensorNoise(SignalMethod):
     Subclasses draw the noise.
     """
 
-    a: float | None = parameter(
-        None,
-        "Shot noise: the variance per unit of signal.",
-        "signal",
-        "from the camera and ISO",
-        ge=0,
-        le=1,
-    )
-    b: float | None = parameter(
-        None,
-        "Read noise: the variance without light.",
-        "signal^2",
-        "from the camera and ISO",
-        ge=0,
-        le=1,
-    )
+    a: float | None = shot_noise_parameter("from the camera and ISO")
+    b: float | None = read_noise_parameter("from the camera and ISO")
     system_gain: float | None = parameter(
         None, "Instead of a: the system gain (EMVA 1288).", "DN/e-", "not used", gt=0
     )
