@@ -114,7 +114,7 @@ class Developers:
 
     def is_small(self, state: JobState) -> bool:
         """Return whether a small image may share launches with others. With state, it may not."""
-        if any(has_state(recipe.chain) for recipe in state.recipes):
+        if state.job.place and any(has_state(recipe.chain) for recipe in state.recipes):
             return False
         size = state.source.pixels.shape[1::-1] if state.source else (0, 0)
         return all(each is not None and each.can_stack(*size) for each in self.devices)

@@ -59,6 +59,8 @@ class Turns:
 
     def wait(self, job: Job) -> bool:
         """Wait until all jobs before have ended their turns. Return False if the run has ended."""
+        if not job.place:
+            return True
         with self._changed:
             while job.place in self._waiting and next(iter(self._waiting)) != job.place:
                 if self._is_closed:
@@ -68,6 +70,8 @@ class Turns:
 
     def end(self, job: Job) -> None:
         """End a job's turn, if it has not ended."""
+        if not job.place:
+            return
         with self._changed:
             if job.place in self._waiting:
                 del self._waiting[job.place]

@@ -9,7 +9,8 @@ from clpipe.chain.chain import Chain
 from clpipe.chain.exposures import exposures_of, shutter_in
 from clpipe.images.read import SourceImage
 from clpipe.reference.pose import from_quaternion, to_quaternion
-from clpipe.stage import Span
+from clpipe.stage import Span, StageRole
+from clpipe.stages.shutter import Rows
 
 Pose = tuple[Doubles, Doubles]  # a quaternion, and the camera's position in the world
 
@@ -23,7 +24,8 @@ def motion_records(chain: Chain, source: SourceImage) -> dict[str, Any]:
     interpolated between files (shortest arc, Shoemake 1985). The result is empty if the camera does
     not move, or the chain has no shutter.
     """
-    poses, shutter = chain.settings.render.motion, shutter_in(chain)
+    poses = chain.settings.render.motion
+    shutter = shutter_in(chain) if poses else None
     if poses is None or shutter is None:
         return {}
     _, rows = source.margins.frame_size(*source.pixels.shape[1::-1])
@@ -52,9 +54,10 @@ def row_times(chain: Chain, source: SourceImage) -> dict[str, Any]:
     for each (START, END) of ``exposures``. Times are in s from the start of the first row's
     exposure.
     """
-    shutter = shutter_in(chain)
-    if shutter is None or not shutter.line_time:
+    step = chain.step_in(StageRole.SHUTTER)
+    if step is None or not isinstance(step.method, Rows) or not step.method.line_time:
         return {}
+    shutter = step.method
     exposures = exposures_of(chain)
     spans = exposures.spans if exposures else (Span(),)
     shutters = [shutter.for_exposure(spans, number) for number in range(len(spans))]
