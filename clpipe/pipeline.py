@@ -182,9 +182,15 @@ class Pipeline(ReadOnly):
             RequestError: a name or value is not allowed.
         """
         arrays = {} if depth is None else {"depth": depth}
-        return self.develop(self.prepare(image, key, arrays, overscan, settings), key)
+        prepared = self.prepare(image, key, arrays, overscan, settings)
+        result, chain = self.develop(prepared), prepared.runner.chain
+        share = clipped_share(result, chain) or 0.0
+        # Photographs are already clipped.
+        if share >= WARNING_SHARE and chain.source is not Kind.DISPLAY:
+            warnings.warn(f"{key}: {clipping_text(share)}", stacklevel=2)
+        return result
 
-    def develop(self, prepared: Prepared, key: str, state: State | None = None) -> Result:
+    def develop(self, prepared: Prepared, state: State | None = None) -> Result:
         """Return the result of an image that :meth:`prepare` has prepared.
 
         ``state`` is the state of the sequence that the image is a frame of.
@@ -192,15 +198,9 @@ class Pipeline(ReadOnly):
         Raises:
             ImageError: the image is too large.
         """
-        chain = prepared.runner.chain
+        seed = noise_key(prepared.runner.chain.settings, prepared.own_key)
         with self._lock:
-            seed = noise_key(chain.settings, prepared.own_key)
-            result = prepared.runner.run(prepared.pixels, seed, RunOptions(state=state))
-        share = clipped_share(result, chain) or 0.0
-        # Photographs are already clipped.
-        if share >= WARNING_SHARE and chain.source is not Kind.DISPLAY:
-            warnings.warn(f"{key}: {clipping_text(share)}", stacklevel=3)
-        return result
+            return prepared.runner.run(prepared.pixels, seed, RunOptions(state=state))
 
     def prepare(
         self,

@@ -257,7 +257,7 @@ class Stream:
         )
         prepared = prepared_with(reading.values) if reading.values else first
         try:
-            result = pipeline.develop(prepared, key, self._state)
+            result = pipeline.develop(prepared, self._state)
         except DeviceFailedError:
             self._state = State()  # the next frame starts again
             raise
