@@ -13,12 +13,13 @@ import clpipe
 
 LOOPS = {"exposure": {"method": "auto"}, "control": {"iso_max": 3200.0}}
 BALANCE = {"white_balance": {"method": "gray_world"}}
-CHAINS = {
+CHAINS: dict[str, dict] = {
     "default": {},
     "auto exposure and ISO": LOOPS,
     "auto exposure, ISO and white balance": {**LOOPS, **BALANCE},
     "eight-bit sRGB frames": {"transfer": "srgb"},
     "raw": {"until": "quantize"},
+    "-c video": {"config": "video"},
 }
 
 
