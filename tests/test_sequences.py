@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from clpipe.chain.draws import Drift
 from clpipe.chain.limits import Limits
 from clpipe.inputs.find import Job
 from clpipe.inputs.sequences import in_sequences
+from clpipe.stages import DEFAULT_CHAIN
+from tests.conftest import ROOT
 
 LOOPS = {"exposure": {"method": "auto"}, "white_balance": {"method": "gray_world"}}
 
@@ -109,6 +112,24 @@ def test_a_drift_is_uniform_and_slow():
     assert np.histogram(drawn[:, 10], 4, (100, 200))[0] == pytest.approx(75, abs=30)
     assert abs(np.diff(drawn)).max() < 20
     assert abs(np.corrcoef(drawn[:, 0], drawn[:, 60])[0, 1]) < 0.2
+
+
+def test_the_documented_defaults_of_the_loops_are_those_of_the_code():
+    page = (ROOT / "docs" / "sequences.md").read_text()
+    table = page[page.index("| parameter |") : page.index("loops.toml")]
+    rows = dict(re.findall(r"^\| `(\w+)` \| .* \| ([^|]+) \|$", table, re.MULTILINE))
+    defaults = {name: field.default for name, field in Control.model_fields.items()}
+    in_words = {"iso_max": "none", "iso_min": "the ISO that is set"}
+    assert rows == {
+        name: in_words[name] if default is None else f"{default:g}"
+        for name, default in defaults.items()
+    }
+
+
+def test_video_is_the_default_chain_with_temporal_denoising():
+    stages = [*clpipe.Pipeline("video", device="numpy").settings.stages]
+    stages.remove("temporal_denoise")
+    assert tuple(stages) == DEFAULT_CHAIN
 
 
 @pytest.fixture
