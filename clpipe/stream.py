@@ -87,8 +87,7 @@ class Stream:
         keep: steps whose images are also returned, or "all".
         transfer: "srgb" if frames are finished pictures of sRGB in eight bits, as most simulators
             render them. They are converted to light.
-        drop: whether :meth:`put` drops a frame instead of waiting, if nobody has got the pictures
-            of the two before it.
+        drop: whether :meth:`put` drops a frame instead of waiting, see there.
         **settings: as for :class:`Pipeline`.
 
     Attributes:
@@ -154,8 +153,8 @@ class Stream:
     def put(self, frame: Array, depth: Array | None = None, flow: Array | None = None) -> bool:
         """Pass the next frame to the stream's thread. The frame is copied.
 
-        This waits until somebody got the picture of the frame before the last, or with
-        ``drop`` drops the frame in this case.
+        At most two frames are in the stream. If neither of their pictures has been fetched with
+        :meth:`get`, this waits for the first to be fetched. With ``drop``, it drops the frame.
 
         Returns:
             Whether the frame was taken.
@@ -199,7 +198,7 @@ class Stream:
         return shot
 
     def end(self) -> None:
-        """Say that no more frames follow. Pictures of earlier frames can still be got."""
+        """Accept no more frames. The pictures of earlier frames can still be fetched."""
         if not self._is_closed:
             self._is_closed = True
             self._thread.submit(self._shots.put, None)

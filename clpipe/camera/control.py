@@ -39,7 +39,7 @@ class Control(BaseModel):
 
 
 class ControlLoop:
-    """Follows a metered value in EV. It starts with the first one, as if it had always been so.
+    """Follows a metered value in EV. It starts at the first one, as if the scene had not changed.
 
     A value is followed once it differs from the last one that was followed by more than the
     hysteresis. The loop then approaches it exponentially, at its highest speed at most.

@@ -35,8 +35,8 @@ from clpipe.stream import Stream
 @click.option(
     "--drop",
     is_flag=True,
-    help="Drop frames that arrive before the one before them has begun, instead of letting the "
-    "sender wait.",
+    help="Drop frames that arrive while two others are being developed or written, instead of "
+    "letting the sender wait.",
 )
 @click.option(
     "--log",
