@@ -240,10 +240,14 @@ def test_stages(clpipe):
 
 
 def test_devices(clpipe):
-    rows = json.loads(clpipe("devices", "--json").stdout)
+    state = json.loads(clpipe("devices", "--json").stdout)
+    rows, cache = state["devices"], state["kernel_cache"]
+    assert 0 <= cache["usable"] <= cache["programs"] and not cache["problem"]
     assert sum(row["status"] == "used by default" for row in rows) == 1
     assert rows[-1]["index"] == "numpy"
-    assert "used by default" in clpipe("devices").stdout
+    shown = clpipe("devices").stdout
+    assert "used by default" in shown
+    assert f"kernel cache: {cache['folder']}, " in shown
 
 
 def test_check(clpipe):

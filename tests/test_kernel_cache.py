@@ -1,10 +1,14 @@
 """The kernel cache is verified before use, and private to the user."""
 
+import io
+import json
 import mmap
 import os
+import shutil
 import subprocess
 import sys
 import zipfile
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,13 +18,19 @@ import pytest
 from clpipe.base import process_folder, system
 from clpipe.base.errors import DeviceError
 from clpipe.base.memory import FreeMemory
-from clpipe.engine import builders, cache_folder
+from clpipe.engine import builders, cache_folder, runtimes
 from clpipe.engine.builders import BinaryBuilder, PoclBuilder
 from clpipe.engine.store import Store
-from tests.conftest import run_python
+from tests.conftest import ROOT, run_python
 from tests.test_programs import DEVELOP, python
 
 TEXT = "__kernel void f(__global int *a) { a[get_global_id(0)] = 7; }"
+COMPILED = "compiled a program that was not in the cache"
+
+
+def text_of(test: Path) -> str:
+    """A program of one test: all tests of a process share PoCL's folder."""
+    return f"{TEXT} __kernel void of_{test.name}(__global int *a) {{ a[0] = 1; }}"
 
 
 def put(path: Path, data: bytes = b"data") -> Path:
@@ -94,11 +104,74 @@ def builder(device, tmp_path):
 
 
 def test_a_program_is_built_and_kept(builder, tmp_path):
-    # The text is this test's, since PoCL's folder is that of the whole process.
-    text = TEXT.replace("f(", f"f(/* {tmp_path} */ ")
+    text = text_of(tmp_path)
     assert builder(text) == 7
     assert builder.store.load(text, "-w")
     assert builder(text) == 7
+
+
+def test_an_entry_that_pocl_does_not_use_is_replaced(builder, device, tmp_path, caplog):
+    """PoCL derives a program's folder from more than clpipe knows, such as the paths of headers."""
+    if "Portable Computing" not in device.info.platform:
+        pytest.skip("looks at PoCL's programs")
+    text = text_of(tmp_path)
+    put(tmp_path / "other/AB/CDEF/f/1-1-1/f.so")
+    packed = builders._pack(tmp_path / "other", "AB/CDEF", frozenset({"f/1-1-1/f.so"}))
+    builder.store.keep(packed, text, "-w")
+    with caplog.at_level("DEBUG", logger=builders.log.name):
+        assert builder(text) == 7
+    assert [record.message for record in caplog.records] == [COMPILED]
+    names = zipfile.ZipFile(io.BytesIO(builder.store.load(text, "-w"))).namelist()
+    assert any(name.endswith(".so") for name in names)
+    assert not any(name.startswith("AB/CDEF") for name in names)
+
+
+def test_what_a_simultaneous_process_stored_stays(builder, device, tmp_path):
+    if "Portable Computing" not in device.info.platform:
+        pytest.skip("looks at PoCL's programs")
+    text = text_of(tmp_path)
+    pocl = Path(os.environ["POCL_CACHE_DIR"])
+    one = PoclBuilder(builder.context, builder.store, pocl)
+    program = one.build(text, ["-w"])
+    ((name, _),) = one._built.values()
+    put(tmp_path / "other" / name / "f/9-9-9/f.so")
+    packed = builders._pack(tmp_path / "other", name, frozenset({"f/9-9-9/f.so"}))
+    builder.store.keep(packed, text, "-w")
+    assert program.all_kernels()
+    one.keep()
+    names = zipfile.ZipFile(io.BytesIO(builder.store.load(text, "-w"))).namelist()
+    assert f"{name}/f/9-9-9/f.so" in names and f"{name}/program.bc" in names
+
+
+def test_a_program_that_cannot_be_stored_is_named_once(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(Store, "keep", lambda *_: False)
+    monkeypatch.setattr(builders, "cache_problem", lambda: "")
+    for _ in range(2):
+        builders.store_compiled(Store(tmp_path / "programs", "full"), b"data", TEXT)
+    assert len(caplog.messages) == 1
+    assert f"{tmp_path}/programs: compiled kernels could not be written" in caplog.text
+    monkeypatch.setattr(builders, "cache_problem", lambda: "they cannot be cached in x")
+    builders.store_compiled(Store(tmp_path / "other", "read-only"), b"data", TEXT)
+    assert len(caplog.messages) == 1  # the notice of compiling says it
+
+
+def test_the_key_has_all_that_determines_compiled_kernels(device, monkeypatch):
+    info = device.info
+    key = partial(runtimes.compiler_key, info.handle.platform, info.handle, info.target)
+    first = key()
+    library = runtimes.library_of(info.handle.platform.int_ptr)
+    if sys.platform == "linux":
+        assert library.is_file() and str(library) in first[1]
+    for name in ("POCL_EXTRA_BUILD_FLAGS", "POCL_WORK_GROUP_METHOD", "CL_CONFIG_CPU_TARGET_ARCH"):
+        with monkeypatch.context() as patch:
+            patch.setenv(name, "-DX")
+            assert key() != first
+    for name in runtimes.RUN_TIME_VARIABLES:
+        with monkeypatch.context() as patch:
+            patch.setenv(name, "1")
+            assert key() == first
+    monkeypatch.setattr(runtimes, "library_of", lambda _: None)
+    assert key() != first
 
 
 def test_what_a_runtime_does_not_take_is_compiled(builder, device):
@@ -160,6 +233,68 @@ def test_without_room_to_compile_pocl_is_not_asked(tmp_path, monkeypatch):
         builder.build(TEXT, [])
 
 
+COUNTED = f"import logging; logging.basicConfig(level=logging.DEBUG); {DEVELOP}"
+
+
+def compilations(**environment):
+    """The number of programs that a fresh process compiles."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("XDG_CACHE_HOME", "POCL_CACHE_DIR", "PYTHONPATH"):
+            patch.delenv(name, raising=False)
+        return run_python("-c", COUNTED, **environment).stderr.count(COMPILED)
+
+
+@pytest.mark.slow
+def test_environments_and_variables_that_alternate_compile_once_each(device, tmp_path):
+    if "Portable Computing" not in device.info.platform:
+        pytest.skip("needs PoCL")
+    packages, copied = Path(cl.__file__).parents[1], tmp_path / "copied"
+    for name in ("pyopencl", "pocl_binary_distribution"):
+        if (packages / name).is_dir():
+            shutil.copytree(packages / name, copied / name, copy_function=os.link)
+    environments = (
+        {},
+        {"PYTHONPATH": os.pathsep.join((str(copied), str(ROOT)))},
+        {"POCL_WORK_GROUP_METHOD": "loops"},
+        {"POCL_EXTRA_BUILD_FLAGS": "-DX"},
+    )
+    cache = {"CLPIPE_CACHE_DIR": tmp_path / "cache"}
+    counts = [[compilations(**cache, **e) for e in environments] for _ in range(2)]
+    assert all(counts[0]) and not any(counts[1])
+    usable = [
+        json.loads(
+            run_python("-m", "clpipe", "devices", "--json", **cache, **environment).stdout
+        )["kernel_cache"]
+        for environment in environments
+    ]
+    assert [state["usable"] for state in usable] == counts[0]
+    assert {state["programs"] for state in usable} == {sum(counts[0])}
+
+
+@pytest.mark.slow
+def test_processes_that_start_at_once_leave_a_cache_that_the_next_one_uses(device, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "CLPIPE_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", DEVELOP]
+    processes = [subprocess.Popen(command, env=environment) for _ in range(2)]
+    assert [process.wait(timeout=300) for process in processes] == [0, 0]
+    assert compilations(CLPIPE_CACHE_DIR=tmp_path) == 0
+
+
+@pytest.mark.slow
+def test_a_read_only_cache_is_used_and_a_new_program_is_not_promised(device, tmp_path):
+    cache, unwritable = tmp_path / "cache", "cache_folder.is_usable = lambda _: False"
+    first = compilations(CLPIPE_CACHE_DIR=cache)
+    read_only = f"from clpipe.engine import cache_folder; {unwritable}; {COUNTED}"
+    done = run_python("-c", read_only, CLPIPE_CACHE_DIR=cache)
+    assert first and done.stderr.count(COMPILED) == 0
+    notice = (
+        f"{read_only}; from clpipe.engine.programs import *; from clpipe.engine.discovery import *;"
+        "print(cache_notice(choose(None, find_devices())))"
+    )
+    said = run_python("-c", notice, CLPIPE_CACHE_DIR=cache).stdout.strip()
+    assert said == f"later runs compile them again, because they cannot be cached in {cache}"
+
+
 @pytest.mark.slow
 def test_a_second_process_compiles_nothing(device, tmp_path):
     """Nor does one after damage compile more than was damaged."""
@@ -167,7 +302,7 @@ def test_a_second_process_compiles_nothing(device, tmp_path):
         pytest.skip("looks at PoCL's programs")
 
     def kept():
-        return {path: path.stat().st_mtime_ns for path in tmp_path.glob("programs/*")}
+        return {path: path.stat().st_mtime_ns for path in tmp_path.glob("programs/*/*")}
 
     python(DEVELOP, CLPIPE_CACHE_DIR=tmp_path)
     first = kept()

@@ -1,23 +1,30 @@
 """``clpipe devices``: list the OpenCL devices of this machine, and which one is used."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import click
 
 from clpipe.base.errors import DeviceError
+from clpipe.base.memory import format_bytes
 from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.discovery import DeviceInfo, choose, find_devices
+from clpipe.engine.programs import CacheState, cache_state
 
 
 @click.command("devices", cls=Command)
 @json_option
 def devices(as_json: bool) -> None:
-    """List the OpenCL devices, which one is used by default, and why the others are not."""
-    rows = device_rows(find_devices(retest=True))
+    """List the OpenCL devices and the cache of compiled kernels.
+
+    The list shows which device is used by default, and why the others are not.
+    """
+    found = find_devices(retest=True)
+    rows, cache = device_rows(found), cache_state(found)
     if as_json:
-        show_json(rows)
+        show_json({"devices": rows, "kernel_cache": asdict(cache)})
         return
     shown = [{key: v for key, v in row.items() if key != "target_reason"} for row in rows]
     show([key.replace("_", " ") for key in shown[0]], [[*map(str, r.values())] for r in shown])
@@ -25,6 +32,16 @@ def devices(as_json: bool) -> None:
         if row["target"]:
             lanes = f"{row['lanes']} lanes"
             click.echo(f"{row['index']}: for {row['target']}, {lanes}: {row['target_reason']}")
+    click.echo(cache_text(cache))
+
+
+def cache_text(cache: CacheState) -> str:
+    """Return the kernel cache's state in words."""
+    if cache.folder is None:
+        return f"no kernel cache: {cache.problem}"
+    size = f"{format_bytes(cache.bytes)}, {cache.programs} compiled programs"
+    text = f"kernel cache: {cache.folder}, {size}, {cache.usable} of them for this environment"
+    return f"{text}; read-only: {cache.problem}" if cache.problem else text
 
 
 def device_rows(devices: Sequence[DeviceInfo]) -> list[dict[str, Any]]:

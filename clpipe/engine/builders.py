@@ -8,12 +8,14 @@ process has a separate folder for PoCL, and the cache stores each program's part
 """
 
 import io
+import logging
 import os
 import re
 import threading
 import zipfile
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +23,11 @@ from clpipe.base.errors import DeviceError, ImageError
 from clpipe.base.files import unsynced_files, write_new
 from clpipe.base.memory import format_bytes, free_memory
 from clpipe.base.process_folder import MIN_FREE_SPACE, has_free_space
+from clpipe.engine.cache_folder import cache_problem
 from clpipe.engine.store import Store
 
 COMPILER_MEMORY = 112 << 20  # bytes of memory; measured: 86 to 105 MiB for the default chain
+log = logging.getLogger(__name__)
 
 
 class BinaryBuilder:
@@ -54,11 +58,28 @@ class BinaryBuilder:
         with suppress(cl.Error):
             (binary,) = program.get_info(cl.program_info.BINARIES)
             if binary:
-                self._store.keep(binary, source, *options)
+                store_compiled(self._store, binary, source, *options)
         return program
 
     def keep(self) -> None:
         """Do nothing, because :meth:`build` has stored the binaries."""
+
+
+def store_compiled(store: Store, data: bytes, *key: str) -> None:
+    """Store a program that this process compiled. Log each at the level DEBUG, and a failure."""
+    log.debug("compiled a program that was not in the cache")
+    if not store.keep(data, *key) and store.folder and not cache_problem():
+        _warn_not_stored(store.folder.parent)
+
+
+@cache
+def _warn_not_stored(folder: Path) -> None:
+    """Log once that compiled kernels could not be stored, although the folder is writable."""
+    log.warning(
+        "%s: compiled kernels could not be written here, so later runs compile them again. "
+        "Free some space on this disk.",
+        folder,
+    )
 
 
 class PoclBuilder:
@@ -98,14 +119,15 @@ class PoclBuilder:
             if cached := self._store.load(source, *options):
                 _unpack(cached, self._folder)
             unpacked = _list_programs(self._folder) - before
+            stored = {name: _list_files(self._folder / name) for name in unpacked}
             if not unpacked:
                 self._check_resources()
             program = cl.Program(self._context, source).build(options, cache_dir=False)
             added = _list_programs(self._folder) - before
-            if len(added) == 1:
-                (name,) = added
-                files = _list_files(self._folder / name) if unpacked == added else frozenset()
-                self._built[source, tuple(options)] = name, files
+            # PoCL adds a folder next to an unpacked one if it cannot use it.
+            if len(used := (added - unpacked) or unpacked) == 1:
+                (name,) = used
+                self._built[source, tuple(options)] = name, stored.get(name, frozenset())
         return program
 
     def _check_resources(self) -> None:
@@ -139,10 +161,12 @@ class PoclBuilder:
         """Store the files that PoCL has compiled since the programs were built."""
         with self._build_lock:
             for (source, options), (name, stored) in list(self._built.items()):
-                files = _list_files(self._folder / name)
-                if files - stored:
+                if _list_files(self._folder / name) - stored:
+                    if cached := self._store.load(source, *options):  # of a simultaneous process
+                        _unpack(cached, self._folder)
+                    files = _list_files(self._folder / name)
                     data = _pack(self._folder, name, files)
-                    self._store.keep(data, source, *options)
+                    store_compiled(self._store, data, source, *options)
                     self._built[source, options] = name, files
 
 

@@ -20,6 +20,7 @@ from clpipe.base.process_folder import MIN_FREE_SPACE, process_folder
 from clpipe.base.system import writable_by_others
 
 VARIABLE = "CLPIPE_CACHE_DIR"  # names another folder
+POCL_SWITCH = "POCL_KERNEL_CACHE"  # PoCL caches nothing if this is set, unless it begins with "1"
 log = logging.getLogger(__name__)
 
 
@@ -55,9 +56,15 @@ def configured_folder() -> Path | None:
 
 @cache
 def cache_folder() -> Path | None:
-    """Return the folder for kernels, or None if it is unusable or others may write to it."""
+    """Return the folder for kernels. It may be read-only.
+
+    Returns:
+        None if the folder is missing and cannot be created, or if others may write to it.
+    """
     folder = configured_folder()
-    return folder.resolve() if folder and is_usable(folder) and is_private(folder) else None
+    if folder and (is_usable(folder) or folder.is_dir()) and is_private(folder):
+        return folder.resolve()
+    return None
 
 
 def is_private(folder: Path) -> bool:
@@ -75,12 +82,16 @@ def is_private(folder: Path) -> bool:
     return not reason
 
 
-def cache_notice() -> str:
-    """Return in words where later runs find the kernels compiled now."""
-    if folder := cache_folder():
-        return f"later runs find them in {folder}"
-    location = configured_folder() or "the home directory"
-    return f"later runs compile them again, because they cannot be cached in {location}"
+def pocl_caches_nothing() -> bool:
+    """Return whether the user has switched PoCL's cache off."""
+    return not os.environ.get(POCL_SWITCH, "1").startswith("1")
+
+
+def cache_problem() -> str:
+    """Return why kernels that are compiled now cannot be cached; "" if they can."""
+    if is_usable(cache_folder()):
+        return ""
+    return f"they cannot be cached in {configured_folder() or 'the home directory'}"
 
 
 def pocl_folder() -> Path | None:

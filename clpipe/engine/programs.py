@@ -8,8 +8,9 @@ import logging
 import re
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,16 @@ from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import DeviceError, RequestError
 from clpipe.base.system import preserve_signal_handlers
 from clpipe.engine.builders import BinaryBuilder, PoclBuilder
-from clpipe.engine.cache_folder import cache_folder, cache_notice, pocl_folder
+from clpipe.engine.cache_folder import (
+    POCL_SWITCH,
+    cache_folder,
+    cache_problem,
+    pocl_caches_nothing,
+    pocl_folder,
+)
 from clpipe.engine.discovery import DeviceInfo
 from clpipe.engine.ir import Kernel
-from clpipe.engine.runtimes import is_pocl
+from clpipe.engine.runtimes import compiler_key, is_pocl
 from clpipe.engine.store import Store
 
 # PoCL includes the declarations of all OpenCL functions before each program. The first option makes
@@ -116,15 +123,72 @@ class Programs:
 
 def builder_for(info: DeviceInfo, context: Any) -> BinaryBuilder | PoclBuilder | None:
     """Return the builder of a device's programs; None if the driver has its own cache."""
+    store = store_of(info)
+    if is_pocl(info.platform):
+        pocl = pocl_folder()
+        return PoclBuilder(context, store, pocl) if pocl else None
+    return BinaryBuilder(context, store) if store else None
+
+
+def store_of(info: DeviceInfo) -> Store | None:
+    """Return the cache of a device's programs; None if the driver has its own cache.
+
+    It contains only programs that the device's runtime can use in this environment.
+    """
     from pyopencl.characterize import has_src_build_cache
 
-    folder, pocl = cache_folder(), pocl_folder()
-    platform = info.handle.platform.version
-    versions = (info.platform, platform, info.name, info.version, info.driver, info.target.name)
-    store = Store(folder / "programs" if folder else None, *versions)
-    if is_pocl(info.platform):
-        return PoclBuilder(context, store, pocl) if pocl else None
-    return None if has_src_build_cache(info.handle) else BinaryBuilder(context, store)
+    if not is_pocl(info.platform) and has_src_build_cache(info.handle):
+        return None
+    folder = None if pocl_caches_nothing() and is_pocl(info.platform) else cache_folder()
+    key = compiler_key(info.handle.platform, info.handle, info.target)
+    return Store(folder / "programs" if folder else None, *key)
+
+
+@dataclass(frozen=True)
+class CacheState:
+    """The kernel cache on disk.
+
+    Args:
+        folder: its folder; None if there is none.
+        problem: why kernels that are compiled now cannot be cached; "" if they can.
+        bytes: the size of all its files.
+        programs: the number of compiled programs, of all environments.
+        usable: how many of them the given devices can use in this environment.
+    """
+
+    folder: str | None
+    problem: str
+    bytes: int
+    programs: int
+    usable: int
+
+
+def cache_state(devices: Sequence[DeviceInfo]) -> CacheState:
+    """Return the state of the kernel cache, as seen from the devices of this environment."""
+    folder = cache_folder()
+    files = [path for path in folder.rglob("*") if path.is_file()] if folder else []
+    stores = [store_of(info) for info in devices if info.handle]
+    usable = {store.folder: len(store) for store in stores if store and store.folder}
+    return CacheState(
+        folder=str(folder) if folder else None,
+        problem=cache_problem(),
+        bytes=sum(path.stat().st_size for path in files),
+        programs=sum(folder / "programs" in path.parents for path in files) if folder else 0,
+        usable=sum(usable.values()),
+    )
+
+
+def cache_notice(info: DeviceInfo) -> str:
+    """Return in words whether later runs find the kernels that are compiled now, and where."""
+    if store_of(info) is None:
+        return "the driver caches them"
+    if is_pocl(info.platform) and pocl_caches_nothing():
+        problem = f"{POCL_SWITCH} switches PoCL's cache off"
+    else:
+        problem = cache_problem()
+    if problem:
+        return f"later runs compile them again, because {problem}"
+    return f"later runs find them in {cache_folder()}"
 
 
 def programs_of(info: DeviceInfo) -> Programs:
@@ -157,7 +221,7 @@ def notice_if_slow(info: DeviceInfo) -> Iterator[None]:
     def announce() -> None:
         if not _notice_logged.is_set():
             _notice_logged.set()
-            log.info("compiling kernels for %s; %s", info.label, cache_notice())
+            log.info("compiling kernels for %s; %s", info.label, cache_notice(info))
 
     timer = threading.Timer(NOTICE_DELAY, announce)
     timer.daemon = True

@@ -1,10 +1,23 @@
 """The types of OpenCL devices, and how kernels are compiled for them."""
 
+import ctypes
+import os
 import shutil
+import sys
+from pathlib import Path
 from typing import Any
 
 from clpipe.engine.cache_folder import pocl_problem
 from clpipe.engine.cpu_target import Target
+
+# Compilers read environment variables with these prefixes. The named ones do not affect the code.
+PREFIXES = ("POCL_", "CL_CONFIG_")
+RUN_TIME_VARIABLES = (
+    *("POCL_CACHE_DIR", "POCL_KERNEL_CACHE", "POCL_DEVICES", "POCL_MEMORY_LIMIT"),
+    *("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT", "POCL_PTHREAD_MIN_THREADS"),
+    *("POCL_AFFINITY", "POCL_STARTUP_DELAY", "POCL_SIGFPE_HANDLER", "POCL_SIGUSR2_HANDLER"),
+    *("POCL_DEBUG", "POCL_TRACING", "POCL_TRACING_OPT", "POCL_TRACING_FILTER"),
+)
 
 
 def is_pocl(platform: str) -> bool:
@@ -59,6 +72,42 @@ def needs_test(type_: str, platform: Any, device: Any) -> bool:
 def platform_id(platform: Any) -> str:
     """Return a text that identifies a platform and its version."""
     return f"{platform.name.strip()}, {platform.version.strip()}"
+
+
+def compiler_key(platform: Any, device: Any, target: Target) -> tuple[str, ...]:
+    """Return texts that identify everything that determines compiled kernels, except the source.
+
+    PoCL's own cache depends on the path of its headers and on variables. It compiles again if they
+    differ, for example in a copy of an environment.
+    """
+    library = library_of(platform.int_ptr)
+    variables = {
+        name: value
+        for name, value in sorted(os.environ.items())
+        if name.startswith(PREFIXES) and name not in RUN_TIME_VARIABLES
+    }
+    return (
+        attempt(platform, device, target),
+        f"{library}, {library.stat().st_size} bytes" if library else "",
+        repr(variables),
+    )
+
+
+def library_of(platform: int) -> Path | None:
+    """Return the file of a platform's library; None if it cannot be found.
+
+    Args:
+        platform: the platform's handle. By the ICD extension (Khronos, cl_khr_icd), it points to a
+            pointer to the table of the library's functions.
+    """
+    if sys.platform != "linux":
+        return None
+    functions = ctypes.cast(platform, ctypes.POINTER(ctypes.POINTER(ctypes.c_void_p)))[0]
+    symbol = (ctypes.c_char_p * 4)()  # dladdr's Dl_info, which begins with the library's path
+    if not ctypes.CDLL(None).dladdr(ctypes.c_void_p(functions[1]), symbol):
+        return None
+    file = Path(os.fsdecode(symbol[0] or b"")).resolve()
+    return file if file.is_file() else None
 
 
 def attempt(platform: Any, device: Any, target: Target) -> str:
