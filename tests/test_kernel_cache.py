@@ -262,9 +262,9 @@ def test_environments_and_variables_that_alternate_compile_once_each(device, tmp
     counts = [[compilations(**cache, **e) for e in environments] for _ in range(2)]
     assert all(counts[0]) and not any(counts[1])
     usable = [
-        json.loads(
-            run_python("-m", "clpipe", "devices", "--json", **cache, **environment).stdout
-        )["kernel_cache"]
+        json.loads(run_python("-m", "clpipe", "devices", "--json", **cache, **environment).stdout)[
+            "kernel_cache"
+        ]
         for environment in environments
     ]
     assert [state["usable"] for state in usable] == counts[0]

@@ -124,10 +124,12 @@ class Programs:
 def builder_for(info: DeviceInfo, context: Any) -> BinaryBuilder | PoclBuilder | None:
     """Return the builder of a device's programs; None if the driver has its own cache."""
     store = store_of(info)
+    if store is None:
+        return None
     if is_pocl(info.platform):
-        pocl = pocl_folder()
-        return PoclBuilder(context, store, pocl) if pocl else None
-    return BinaryBuilder(context, store) if store else None
+        folder = pocl_folder()
+        return PoclBuilder(context, store, folder) if folder else None
+    return BinaryBuilder(context, store)
 
 
 def store_of(info: DeviceInfo) -> Store | None:

@@ -90,11 +90,51 @@ class Method(BaseModel):
         """The margins of the image that it reads, outside the frame."""
         return self._margins
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Reject the assignment, because chains share methods.
+
+        Raises:
+            AttributeError: always. pydantic rejects only fields, so private attributes need this.
+        """
+        raise AttributeError(
+            f"{type(self).__name__}.{name} cannot be set, because chains share methods; use the "
+            f"copy that with_state({name}=...) returns"
+            if name in self.__private_attributes__
+            else f"{type(self).__name__}.{name} cannot be set, because chains share methods; "
+            "declare a private attribute, and use the copy that with_state returns"
+        )
+
+    def with_state(self, **values: Any) -> Self:
+        """Return a copy with other private attributes.
+
+        Args:
+            **values: the values, by the attributes' names, with their underscores.
+
+        Raises:
+            AttributeError: the class declares no private attribute of a name.
+
+        Example:
+            >>> from pydantic import PrivateAttr
+            >>> class Gain(Method):
+            ...     _range: float = PrivateAttr(1.0)
+            ...
+            ...     def resolve(self, context):
+            ...         return self.with_state(_range=context.camera.signal_range)
+            >>> Gain().with_state(_range=2.0)._range
+            2.0
+        """
+        if unknown := values.keys() - self.__private_attributes__.keys():
+            raise AttributeError(
+                f"{type(self).__name__} declares no private attribute {', '.join(sorted(unknown))}"
+            )
+        other = self.model_copy()
+        assert other.__pydantic_private__ is not None  # _margins is declared here
+        other.__pydantic_private__.update(values)
+        return other
+
     def with_margins(self, margins: Margins) -> Self:
         """Return the (resolved) method for an image with overscan."""
-        other = self.model_copy()
-        other._margins = margins
-        return other
+        return self.with_state(_margins=margins)
 
     def with_image_state_of(self, other: "Method") -> Self:
         """Return the (resolved) method for the image that belongs to another one of its step."""

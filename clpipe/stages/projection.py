@@ -92,9 +92,7 @@ class WideAngle(Method):
 
     def with_panorama(self, panorama: Panorama) -> Self:
         """Return the (resolved) method for an image that is the atlas of a panorama."""
-        other = self.model_copy()
-        other._panorama = panorama
-        return other
+        return self.with_state(_panorama=panorama)
 
     def with_image_state_of(self, other: Method) -> Self:
         updated = super().with_image_state_of(other)
@@ -102,9 +100,7 @@ class WideAngle(Method):
         return updated.with_panorama(panorama) if panorama else updated
 
     def resolve(self, context: Context) -> Self:
-        resolved = self.model_copy()
-        resolved._optics = tuple(context.optics.known.items())
-        return resolved
+        return self.with_state(_optics=tuple(context.optics.known.items()))
 
     def next_context(self, context: Context) -> Context:
         return context.without_view()

@@ -62,9 +62,7 @@ class Binning(Method):
                 f"remosaic.method=binning: the mosaic is {array.name}; binning needs cells of "
                 "2x2 or 3x3 equal filters, for example quad-RGGB and nona-RGGB"
             )
-        other = self.model_copy()
-        other._factor = factor
-        return other
+        return self.with_state(_factor=factor)
 
     def next_context(self, context: Context) -> Context:
         array = binned(context.filter_array, self._factor)

@@ -155,9 +155,7 @@ class Rows(Method):
             spans: the spans of all exposures.
             number: the number of this exposure.
         """
-        other = self.model_copy()
-        other._span, other._end = spans[number], spans[-1].end
-        return other
+        return self.with_state(_span=spans[number], _end=spans[-1].end)
 
     @property
     def _first_exposure(self) -> float:

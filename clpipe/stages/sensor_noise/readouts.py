@@ -118,8 +118,7 @@ class Readouts(SensorNoise):
             raise RequestError(
                 f"sensor_noise.part: readout {resolved.part} does not exist; choose 0 to {last}"
             )
-        resolved._signal_range = context.camera.signal_range
-        return resolved
+        return resolved.with_state(_signal_range=context.camera.signal_range)
 
     def next_context(self, context: Context) -> Context:
         return super().next_context(context).replace(full_scale=self.full_scale)
@@ -152,8 +151,7 @@ class Readouts(SensorNoise):
         if self.is_exact:
             return NoNoise(full_signal=self.full_scale)
         clean = self.model_copy(update={"a": 0.0, "b": 0.0, "tukey_lambda": None})
-        clean._full_signal, clean._is_clean = self.full_signal, True
-        return clean
+        return clean.with_state(_full_signal=self.full_signal, _is_clean=True)
 
     @property
     def full_signal(self) -> float | None:

@@ -38,9 +38,7 @@ class Staggered(Readouts):
         return tuple(Readout(i, self.ratio**-i, 1) for i in range(self.count))
 
     def resolve(self, context: Context) -> Self:
-        resolved = super().resolve(context)
-        resolved._light_changes = context.light_changes
-        return resolved
+        return super().resolve(context).with_state(_light_changes=context.light_changes)
 
     @property
     def spans(self) -> tuple[Span, ...]:
@@ -56,9 +54,7 @@ class Staggered(Readouts):
         Args:
             images: of the method's kind, (exposure, height, width).
         """
-        other = self.model_copy()
-        other._later_images = images
-        return other
+        return self.with_state(_later_images=images)
 
     @property
     def is_exact(self) -> bool:

@@ -98,9 +98,7 @@ class ArrayMethod(CameraGains):
     @classmethod
     def for_array(cls, array: FilterArray, gains: CameraGains) -> Self:
         """The (resolved) gains on a filter array."""
-        method = cls(**dict(gains))
-        method._array = replace(array, gains=gains.gains)
-        return method
+        return cls(**dict(gains)).with_state(_array=replace(array, gains=gains.gains))
 
     def next_context(self, context: Context) -> Context:
         array = self._array.with_gains(self.gains, self.inverse)
