@@ -1,6 +1,5 @@
 """The Python API: a chain of stages as a callable object."""
 
-import itertools
 import threading
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -21,8 +20,10 @@ from clpipe.chain.files import load_settings
 from clpipe.chain.identity import image_key, noise_key
 from clpipe.chain.layers import layer_of_array, layer_steps
 from clpipe.chain.making import make_chain
+from clpipe.chain.methods import base_name
 from clpipe.chain.overscan import margins_of_array
-from clpipe.chain.settings import Settings, overlay
+from clpipe.chain.registry import load_stage_file, loaded_stage_files
+from clpipe.chain.settings import Settings, overlay, settings_from
 from clpipe.engine.clipping import WARNING_SHARE, clipped_share, clipping_text
 from clpipe.engine.device import Device, open_device
 from clpipe.engine.options import RunOptions
@@ -81,6 +82,9 @@ class Pipeline(ReadOnly):
             ``denoise={"method": "mean"}``. A draw, such as ``iso={"choice": [100, 800]}``, depends
             on the key of the image.
 
+    A pipeline can be pickled, for example for ``multiprocessing``. Each process opens the device
+    for itself. OpenCL does not survive a fork, so start processes with "spawn" or "forkserver".
+
     Raises:
         RequestError: a name or value is not allowed.
         DeviceError: there is no usable device.
@@ -99,13 +103,32 @@ class Pipeline(ReadOnly):
     ) -> None:
         self._settings = overlay(load_settings(*as_texts(config)), plain(settings))
         self._chain_range = start_at, until
-        self._numbers = itertools.count()
+        self._keep = tuple(as_texts(keep))
+        self._selector = None if device is None else str(device)
+        self._count = 0
+        self._open()
+
+    def _open(self) -> None:
+        """Build the chain, and open the device in this process."""
         self._lock = threading.Lock()  # lets one thread use the device at a time
         chain = self._chain(self._settings)
-        kept = chain.select(as_texts(keep))
+        kept = chain.select(self._keep)
         encode = chain.result is Kind.DISPLAY
-        opened_device = open_device(None if device is None else str(device))
-        self._runner = Runner(chain, opened_device, kept, encode=encode, final=not encode)
+        device = open_device(self._selector)
+        self._runner = Runner(chain, device, kept, encode=encode, final=not encode)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the arguments, because a device cannot leave its process."""
+        state = {k: v for k, v in vars(self).items() if k not in ("_lock", "_runner", "_settings")}
+        code = loaded_stage_files(base_name(name) for name in self._settings.stages)
+        return {**state, "settings": self._settings.record(), "stage_files": code}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for file in state.pop("stage_files"):
+            load_stage_file(file)
+        self._settings = settings_from(state.pop("settings"))
+        vars(self).update(state)
+        self._open()
 
     def _chain(self, settings: Settings) -> Chain:
         start_at, until = self._chain_range
@@ -306,7 +329,13 @@ class Pipeline(ReadOnly):
         return warped if layer.ndim == 3 else warped[..., 0], valid
 
     def _runner_for(self, key: str, settings: Mapping[str, Any]) -> Runner:
-        """Return the runner of an image, with its own draws and settings."""
+        """Return the runner of an image, with its own draws and settings.
+
+        Raises:
+            DeviceError: this process was forked from the one that opened the device.
+        """
+        if self.device:
+            self.device.check_process()
         image_settings = overlay(self._settings, plain(settings)) if settings else self._settings
         return (
             self._runner.for_chain(self._chain(image_settings.drawn(key)))
@@ -335,7 +364,10 @@ class Pipeline(ReadOnly):
         for item in images:
             image, arguments = item if isinstance(item, tuple) else (item, {})
             keywords = {"key": arguments} if isinstance(arguments, str) else arguments
-            yield self.process(image, **{"key": str(next(self._numbers)), **keywords})
+            with self._lock:
+                key = str(self._count)
+                self._count += 1
+            yield self.process(image, **{"key": key, **keywords})
 
 
 def digest_of(image: Array) -> str:

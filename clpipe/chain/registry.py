@@ -78,6 +78,12 @@ def load_stage_file(path: Path) -> Stage:
         return _load_file(path, Path(os.path.realpath(path)))
 
 
+def loaded_stage_files(stages: Iterable[str]) -> list[Path]:
+    """Return the files of those of the named stages that stage files define."""
+    names = set(stages)
+    return [path for path, stage in _from_files.items() if stage.name in names]
+
+
 def code_files(stage_files: Iterable[Path]) -> list[Path]:
     """Return stage files and the kernels of their stages, which is all of their code.
 

@@ -1,6 +1,7 @@
 """An open OpenCL device, which runs plans on images, whole or in tiles."""
 
 import logging
+import os
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -11,6 +12,7 @@ from clpipe.base.errors import DeviceError, ImageError
 from clpipe.base.memory import format_bytes
 from clpipe.engine.discovery import (
     DeviceInfo,
+    check_process,
     choose,
     choose_all,
     devices_of_process,
@@ -56,6 +58,7 @@ class Device:
         self.info = info
         self.memory = memory or usable_memory(info)
         self._cl = cl
+        self._process = os.getpid()
         self._recovery = Recovery(self)
         self._open()
 
@@ -76,6 +79,14 @@ class Device:
                 f"{self.info.label} cannot be opened: {error}. Close other programs that use it, "
                 "or choose another device."
             ) from None
+
+    def check_process(self) -> None:
+        """Check that the device was opened in this process.
+
+        Raises:
+            DeviceError: this process was forked from the one that opened it.
+        """
+        check_process(self._process)
 
     @property
     def bytes_held(self) -> int:
@@ -110,8 +121,9 @@ class Device:
         Raises:
             ImageError: an image does not fit into the device's memory, even in tiles. The message
                 does not name the image.
-            DeviceError: a kernel does not compile.
+            DeviceError: a kernel does not compile, or the process was forked.
         """
+        self.check_process()
         groups: dict[Any, list[Work[R]]] = {}
         for work in works:
             key = work if work.is_for_itself else work.plan.unscaled

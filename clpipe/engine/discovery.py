@@ -82,6 +82,22 @@ class DeviceInfo:
         return 1 if is_pocl(self.platform) else self.handle.mem_base_addr_align // 8
 
 
+def check_process(process: int | None) -> None:
+    """Check that no fork separates this process from the one that used OpenCL.
+
+    Args:
+        process: the id of that process; None if none has used it.
+
+    Raises:
+        DeviceError: this process was forked from that one.
+    """
+    if process not in (None, os.getpid()):
+        raise DeviceError(
+            "this process was forked from one that had used OpenCL, so OpenCL would hang here. "
+            'Use multiprocessing\'s "spawn" or "forkserver", or fork before OpenCL is used.'
+        )
+
+
 def find_devices(retest: bool = False) -> list[DeviceInfo]:
     """Return every device of every OpenCL platform, in the platforms' order. Each is tested once.
 
@@ -93,11 +109,7 @@ def find_devices(retest: bool = False) -> list[DeviceInfo]:
             too small.
     """
     global _process
-    if _process not in (None, os.getpid()):
-        raise DeviceError(
-            "this process was forked from one that had used OpenCL, so OpenCL would hang here. "
-            'Use multiprocessing\'s "spawn" or "forkserver", or fork before OpenCL is used.'
-        )
+    check_process(_process)
     check_address_space(
         POCL_ADDRESS_SPACE + THREAD_ADDRESS_SPACE * processors(), "an OpenCL runtime"
     )
