@@ -59,6 +59,14 @@ def test_a_clip_contains_the_pictures_in_temporal_order(clpipe, frames):
             assert np.array_equal(frame, Image.open(f"plain/cam0/f{n}{suffix}.png"))
 
 
+def test_a_frame_is_done_when_its_clip_exists(clpipe, frames):
+    run = api.run(frames("in/a", "in/b"), "out", format="mkv", codec="ffv1", device="numpy")
+    for outcome in run:
+        assert video_info(OUT / outcome.job.name.partition("/")[0]).frames == 5
+        assert all((OUT / name).exists() for name in outcome.outputs)
+    assert run.summary.counts["done"] == 10
+
+
 def test_records_contain_the_sidecar_of_each_frame(clpipe, frames):
     clpipe("run", frames(numbers=[1, 2, 4]), *RUN, "--fps", "30000/1001")
     clpipe("run", "in", "-o", "plain", "--sequence", "--format", "png", *RUN[6:])

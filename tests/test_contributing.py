@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 from zipfile import ZipFile
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -57,22 +58,30 @@ def test_the_commands_it_shows_work(tmp_path, monkeypatch):
     assert (tmp_path / "out" / "render.jpg").is_file()
 
 
-@pytest.mark.slow
-def test_the_example_sink_works(tmp_path, monkeypatch):
-    """Pictures are in the archive after a run, and a second run skips them."""
+def test_the_example_sink_works(tmp_path, monkeypatch, write_exr):
+    """Pictures are in the archive when they are done, also those of subdirectories."""
     example: dict[str, Any] = {}
     exec(next(block.text for block in blocks(PAGE) if block.language == "python"), example)
     monkeypatch.setattr(Run, "sink", lambda run: example["Zip"](run.writer, run.execution.redo))
-    for status in ("done", "skipped"):
-        run = clpipe.run(STILL_LIFE, tmp_path / "out", processes=2)
-        assert [outcome.status for outcome in run] == [status]
-    name = STILL_LIFE.stem
-    with ZipFile(tmp_path / "out" / "pictures.zip") as archive:
-        assert sorted(archive.namelist()) == [f"{name}.jpg", f"{name}.json"]
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        "pictures.zip",
-        "run.jsonl",
-    ]
+    renders, out = tmp_path / "in", tmp_path / "out"
+
+    def statuses() -> dict[str, str]:
+        found = {}
+        for outcome in clpipe.run(renders, out, device="numpy", processes=2):
+            with ZipFile(out / "pictures.zip") as archive:
+                assert {*outcome.outputs} <= {*archive.namelist()}
+            found[outcome.job.key] = outcome.status
+        return found
+
+    for name in ("a", "sub/b"):
+        write_exr(renders / f"{name}.exr", np.full((8, 8, 3), 0.2, np.float32))
+    assert statuses() == {"a.exr": "done", "sub/b.exr": "done"}
+    write_exr(renders / "sub/a.exr", np.full((8, 8, 3), 0.2, np.float32))
+    assert statuses() == {"a.exr": "skipped", "sub/b.exr": "skipped", "sub/a.exr": "done"}
+    with ZipFile(out / "pictures.zip") as archive:
+        names = sorted(archive.namelist())
+    assert names == [f"{n}.{e}" for n in ("a", "sub/a", "sub/b") for e in ("jpg", "json")]
+    assert [path.name for path in out.rglob("*") if path.is_file()] == ["pictures.zip", "run.jsonl"]
 
 
 def test_every_lock_says_what_it_guards():

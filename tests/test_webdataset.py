@@ -83,6 +83,28 @@ def test_what_readers_see(clpipe, renders):
             assert sample[ending] == stem.with_suffix(f".{ending}").read_bytes()
 
 
+def test_an_image_is_done_when_its_tar_exists(clpipe, renders):
+    run = api.run(renders(), "out", iso=3200, device="numpy", webdataset=4)
+    waiting: list[int] = []
+    run.watch = lambda: waiting.append(run.summary.waiting)
+    for outcome in run:
+        with tarfile.open(OUT / outcome.job.name.partition("/")[0]) as tar:
+            assert {n.partition("/")[2] for n in outcome.outputs} <= {*tar.getnames()}
+            assert len(outcome.outputs) == 2
+    assert run.summary.counts["done"] == 10
+    assert max(waiting) >= 4 and waiting[-1] == 0
+
+
+def test_a_stopped_run_says_what_waits_for_its_tar(clpipe, renders):
+    run = api.run(renders(), "out", iso=3200, device="numpy", webdataset=8, jobs=1)
+    run.watch = lambda: run.stop() if run.summary.waiting == 3 else None
+    assert list(run) == [] and not (OUT / "000000.tar").exists()
+    assert run.summary.made >= 3 and run.summary.interrupted
+    kept = run.summary.made
+    again = api.run("in", "out", iso=3200, device="numpy", webdataset=8)
+    assert [outcome.status for outcome in again].count("skipped") == kept
+
+
 def test_members_say_nothing_of_who_made_them_when(clpipe, renders):
     clpipe("run", renders(1), *RUN)
     with tarfile.open("out/000000.tar") as tar:

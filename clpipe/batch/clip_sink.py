@@ -8,7 +8,6 @@ import glob
 import logging
 import os
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path, PurePosixPath
@@ -18,7 +17,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import create_parents, discard, shorten_name, sync_folder
 from clpipe.batch.clips import Clip, ClipOptions, SequenceClips, clips_of
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
-from clpipe.batch.sinks import Executor, Folder
+from clpipe.batch.sinks import Executor, GroupSink
 from clpipe.batch.tar_sink import StagedWriter
 from clpipe.chain.chain import Chain
 from clpipe.chain.formats import extension_of
@@ -45,8 +44,8 @@ class ClipWriter(StagedWriter):
         self.video.check_size(*chain.size(*source.pixels.shape[1::-1]))
 
 
-class Clips(Folder):
-    """Clips as a sink. Each sequence is encoded while the pictures of the next one are made.
+class Clips(GroupSink[SequenceClips]):
+    """Clips as a sink.
 
     Args:
         writer: writes the files of a rendition.
@@ -57,8 +56,6 @@ class Clips(Folder):
     Raises:
         RequestError: see :func:`clpipe.batch.clips.clips_of`.
     """
-
-    allows_processes = False
 
     def __init__(
         self, writer: OutputWriter, redo: Redo, jobs: Sequence[Job], options: ClipOptions
@@ -74,7 +71,7 @@ class Clips(Folder):
 
     def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> ExistingFiles:
         """Return what exists of a frame, in its clip or in the directory that will be encoded."""
-        clips = self._sequences[sequence_of(job)].clips
+        clips = self.group(job).clips
         clip = next(each for each in clips if each.rendition == rendition)
         if self.redo.keeps(clip.existing):
             return clip.existing
@@ -86,8 +83,8 @@ class Clips(Folder):
     def receive(self, executor: Executor, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
         """Let an executor do the jobs, and yield their outcomes.
 
-        The outcome of a sequence's last frame comes after its clips have been encoded, and names
-        them. It has failed if they cannot be.
+        The outcomes of a sequence come after its clips have been encoded, and the last one names
+        them. If they cannot be encoded, the last one has failed, and the others name no files.
 
         Raises:
             RequestError: clpipe did not write a file that would be overwritten.
@@ -100,18 +97,10 @@ class Clips(Folder):
                     raise RequestError(
                         f"{path}: clpipe did not write this file, and it {OVERWRITTEN}"
                     )
-        encoding: Future[Outcome] | None = None
-        with ThreadPoolExecutor(1, "clip") as pool:
-            for outcome in executor.run(self._searched(jobs)):
-                sequence = self._sequences[sequence_of(outcome.job)]
-                if not sequence.add(outcome):
-                    yield self._named(outcome)
-                    continue
-                if encoding:
-                    yield encoding.result()
-                encoding = pool.submit(self._finish, sequence, outcome)
-            if encoding:
-                yield encoding.result()
+        yield from super().receive(executor, self._searched(jobs))
+
+    def group(self, job: Job) -> SequenceClips:
+        return self._sequences[sequence_of(job)]
 
     def _searched(self, jobs: Iterable[Job]) -> Iterator[Job]:
         """Yield jobs. Before the first one of a sequence, its existing clips are searched.
@@ -128,7 +117,20 @@ class Clips(Folder):
                 frames = iter(known)
             yield from frames
 
-    def _finish(self, sequence: SequenceClips, outcome: Outcome) -> Outcome:
+    def finish(self, group: SequenceClips, outcomes: list[Outcome]) -> list[Outcome]:
+        named = [*map(self.named, outcomes)]
+        if failed := group.jobs_with(FAILED):
+            log.warning(
+                "%s: no clip is written, because the frame %s failed. The other frames are kept, "
+                "and the same command resumes",
+                group.clips[0].path,
+                failed[0].label,
+            )
+        elif named:
+            named[-1] = self._finished(group, named[-1])
+        return named
+
+    def _finished(self, sequence: SequenceClips, last: Outcome) -> Outcome:
         """Encode the clips of a sequence whose frames are all there.
 
         Returns:
@@ -137,19 +139,10 @@ class Clips(Folder):
         Raises:
             OutputError: nothing more can be written.
         """
-        outcome = self._named(outcome)
-        if failed := sequence.jobs_with(FAILED):
-            log.warning(
-                "%s: no clip is written, because the frame %s failed. The other frames are kept, "
-                "and the same command resumes",
-                sequence.clips[0].path,
-                failed[0].label,
-            )
-            return outcome
         pictures = sequence.jobs_with(DONE, SKIPPED)
         written: list[Path] = []
         try:
-            for clip in sequence.clips if pictures else ():
+            for clip in sequence.clips:
                 decoded = [clip.decoded_path(job) for job in pictures]
                 if not self.redo.keeps(clip.existing):
                     for path in decoded:  # those of an older clip
@@ -162,10 +155,10 @@ class Clips(Folder):
                         write_png(path, frame)
         except ImageError as error:
             self.writer.check_folder()
-            return replace(outcome, status=FAILED, error=str(error))
+            return replace(last, status=FAILED, error=str(error))
         discard(sequence.staging)
         outputs = tuple(str(path.relative_to(self.writer.folder)) for path in written)
-        return replace(outcome, status=DONE if written else outcome.status, outputs=outputs)
+        return replace(last, status=DONE if written else last.status, outputs=outputs)
 
     def _encode(self, sequence: SequenceClips, clip: Clip, jobs: Sequence[Job]) -> None:
         """Write a clip and the records of its frames, in this order.
@@ -185,8 +178,7 @@ class Clips(Folder):
         clip.write_records(jobs, sequence.jobs_with(LEFT_OUT), self.writer, self.options)
         sync_folder(clip.path.parent)
 
-    def _named(self, outcome: Outcome) -> Outcome:
-        """Return a frame's outcome with the clip in its name, and without the hidden files."""
-        first = self._sequences[sequence_of(outcome.job)].clips[0]
+    def named(self, outcome: Outcome) -> Outcome:
+        first = self.group(outcome.job).clips[0]
         clip, frame = first.path.relative_to(self.writer.folder), PurePosixPath(outcome.job.stem)
         return replace(outcome, job=replace(outcome.job, name=f"{clip}/{frame.name}"), outputs=())

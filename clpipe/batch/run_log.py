@@ -50,6 +50,8 @@ class Summary:
     much_clipped: int = 0  # images with a clipped share of MUCH or more
     most_clipped: tuple[float, str] = (0.0, "")  # the largest clipped share, and its image
     old: int = 0  # existing pictures that another version of the program made
+    # Images that have pictures, but no outcome yet, because their tar or clip is not complete.
+    waiting: int = 0
 
     def add(self, outcome: Outcome) -> None:
         """Count the outcome of one image."""
@@ -71,6 +73,11 @@ class Summary:
     def finished(self) -> int:
         """The number of images that have an outcome."""
         return sum(self.counts.values())
+
+    @property
+    def made(self) -> int:
+        """The number of images that have an outcome, or pictures that wait for it."""
+        return self.finished + self.waiting
 
     @property
     def exit_status(self) -> int:

@@ -152,6 +152,7 @@ class Run:
         jobs: the images of this part of the run; may be empty.
         summary: counts of outcomes so far.
         notes: remarks about the output directory, complete when the run has ended.
+        watch: called when ``summary.waiting`` changes.
 
     Raises:
         RequestError: a name or value is not allowed, or a result would overwrite something.
@@ -179,6 +180,7 @@ class Run:
         self._echo = echo
         self._running: Executor | None = None
         self._is_stopped = False
+        self.watch: Callable[[], None] = lambda: None
         self._loader = ImageLoader(request)
         self.jobs, self._tars = images.jobs(self._loader, execution.output)
         self.summary = Summary(len(self.jobs))
@@ -236,6 +238,7 @@ class Run:
         start = {"arguments": list(self._arguments), "images": len(self.jobs)}
         with ExitStack() as stack:
             sink = self.sink()
+            sink.waiting = self._wait
             executor = self._running = stack.enter_context(self._executor(sink, jobs))
             if self._is_stopped:
                 executor.stop()
@@ -272,6 +275,10 @@ class Run:
         for job, _ in metered_jobs(self._loader, jobs, lambda: next(iter(opened()), None)):
             frames.append(job)
             yield job
+
+    def _wait(self, change: int) -> None:
+        self.summary.waiting += change
+        self.watch()
 
     def _send_log(self, url: str) -> None:
         """Upload the log next to the tars, under a unique name."""

@@ -8,10 +8,12 @@ output directory (:class:`Folder`), clips (:class:`clpipe.batch.clip_sink.Clips`
 (:class:`clpipe.batch.remote_tars.RemoteTars`).
 """
 
-from collections.abc import Generator, Iterable, Mapping
-from typing import Any, Protocol
+from abc import abstractmethod
+from collections.abc import Callable, Generator, Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, Generic, Protocol, TypeVar
 
-from clpipe.batch.outcome import Outcome
+from clpipe.batch.outcome import DONE, SKIPPED, Outcome
 from clpipe.chain.rendition import Rendition
 from clpipe.inputs.find import Job
 from clpipe.outputs.existing import ExistingFiles, Redo, find_existing
@@ -53,6 +55,8 @@ class Folder:
         allows_processes: whether several processes may write its pictures. Processes search for
             existing pictures in the output directory only, so a sink that overrides ``found`` sets
             this to False.
+        waiting: called with 1 if an image's pictures wait for the file that will contain them, and
+            with -1 before its outcome is yielded.
     """
 
     allows_processes = True
@@ -60,6 +64,7 @@ class Folder:
     def __init__(self, writer: OutputWriter, redo: Redo = Redo.OLD) -> None:
         self.writer = writer
         self.redo = redo
+        self.waiting: Callable[[int], None] = lambda change: None
 
     def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> ExistingFiles:
         """Return what exists of a rendition. The threads of an executor call it at the same time.
@@ -83,3 +88,76 @@ class Folder:
             RequestError, DeviceError, OutputError: as :meth:`Executor.run`.
         """
         return executor.run(jobs)
+
+
+class Group(Protocol):
+    """Images whose pictures become parts of one file."""
+
+    def add(self, outcome: Outcome) -> bool:
+        """Add the outcome of an image. Return whether it was the last one."""
+
+
+G = TypeVar("G", bound=Group)
+
+
+class GroupSink(Folder, Generic[G]):
+    """A sink that packs the pictures of several images into one file."""
+
+    allows_processes = False
+
+    @abstractmethod
+    def group(self, job: Job) -> G:
+        """Return the group of an image."""
+
+    @abstractmethod
+    def named(self, outcome: Outcome) -> Outcome:
+        """Return an outcome that names the packed file instead of hidden ones."""
+
+    @abstractmethod
+    def finish(self, group: G, outcomes: list[Outcome]) -> list[Outcome]:
+        """Write the file of a group, in a thread of its own.
+
+        Args:
+            group: the group, complete.
+            outcomes: the outcomes of its images that were done or skipped.
+
+        Returns:
+            These outcomes, as :meth:`named` returns them.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+
+    def receive(self, executor: Executor, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
+        """Let an executor do the jobs, and yield each outcome after the file of its group exists.
+
+        A group is packed while the pictures of the next one are made. Failures are yielded at once.
+        If the run stops, the images of incomplete groups have no outcome. The next run skips them.
+
+        Raises:
+            RequestError, DeviceError, OutputError: as :meth:`Executor.run`.
+        """
+        held: dict[int, list[Outcome]] = {}  # by the id of the group
+        packed: Future[list[Outcome]] | None = None
+        with ThreadPoolExecutor(1, "pack") as pool:
+            for outcome in executor.run(jobs):
+                group = self.group(outcome.job)
+                outcomes = held.setdefault(id(group), [])
+                is_last = group.add(outcome)
+                if outcome.status in (DONE, SKIPPED):
+                    outcomes.append(outcome)
+                    self.waiting(+1)
+                else:
+                    yield self.named(outcome)
+                if packed and (is_last or packed.done()):
+                    yield from self._released(packed.result())
+                    packed = None
+                if is_last:
+                    packed = pool.submit(self.finish, group, held.pop(id(group)))
+            if packed:
+                yield from self._released(packed.result())
+
+    def _released(self, outcomes: Iterable[Outcome]) -> Generator[Outcome, None, None]:
+        for outcome in outcomes:
+            self.waiting(-1)
+            yield outcome

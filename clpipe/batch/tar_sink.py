@@ -9,7 +9,6 @@ import shutil
 import tarfile
 import threading
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from io import BytesIO
@@ -19,7 +18,7 @@ from typing import Any
 from clpipe.base.errors import ImageError, OutputError
 from clpipe.base.files import Stored, atomic_file, sync_folder, unsynced_files
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, Outcome
-from clpipe.batch.sinks import Executor, Folder
+from clpipe.batch.sinks import Executor, GroupSink
 from clpipe.batch.tars import OF_PATCHES, STAGING, Members, Tar, prepare
 from clpipe.chain.rendition import Rendition
 from clpipe.inputs.find import Job
@@ -101,12 +100,6 @@ class Packer:
         if redo.keeps(found):
             self._reused[member] = list(files)
         return found
-
-    def packed(self, outcome: Outcome) -> Outcome:
-        """Return an outcome that names the tar instead of the hidden directory."""
-        job = replace(outcome.job, name=f"{self.tar.name}/{outcome.job.stem}")
-        outputs = tuple(file.removeprefix(STAGING) for file in outcome.outputs)
-        return replace(outcome, job=job, outputs=outputs)
 
     def add(self, outcome: Outcome) -> bool:
         """Add the outcome of a job. Returns whether it was the last one."""
@@ -206,16 +199,14 @@ class Packer:
         sync_folder(self.tar.folder)  # saves the tar before its pictures are removed
 
 
-class Tars(Folder):
-    """Tars as a sink. Each is packed while the pictures of the next one are made.
+class Tars(GroupSink[Packer]):
+    """Tars as a sink.
 
     Args:
         writer: writes the files of a rendition.
         redo: which existing pictures are made again.
         tars: the tars of the run's part.
     """
-
-    allows_processes = False
 
     def __init__(self, writer: OutputWriter, redo: Redo, tars: Sequence[Tar]) -> None:
         folders = {job.stem: tar.staging.name for tar in tars for job in tar.jobs}
@@ -227,7 +218,7 @@ class Tars(Folder):
 
     def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> ExistingFiles:
         """Return what exists of a rendition, in its tar or in the directory that will be packed."""
-        packed = self._packers[self._folders[job.stem]].found(job, rendition, request, self.redo)
+        packed = self.group(job).found(job, rendition, request, self.redo)
         if packed is not ExistingFiles.NOTHING:
             return packed
         # Without fsync, a power failure may leave a file with its size and time, but without its
@@ -244,20 +235,21 @@ class Tars(Folder):
             OutputError: nothing more can be written.
         """
         prepare(self.tars, self.redo is Redo.ALL)
-        packing: Future[None] | None = None
-        with ThreadPoolExecutor(1, "pack") as pool:
-            for outcome in executor.run(jobs):
-                folder = self._folders[outcome.job.stem]
-                packer = self._packers[folder]
-                is_last = packer.add(outcome)
-                yield packer.packed(outcome)
-                if is_last:
-                    if packing:
-                        packing.result()
-                    packing = pool.submit(self.pack, packer)
-                    del self._packers[folder]
-            if packing:
-                packing.result()
+        yield from super().receive(executor, jobs)
+
+    def group(self, job: Job) -> Packer:
+        return self._packers[self._folders[job.stem]]
+
+    def named(self, outcome: Outcome) -> Outcome:
+        job = replace(outcome.job, name=f"{self.group(outcome.job).tar.name}/{outcome.job.stem}")
+        outputs = tuple(file.removeprefix(STAGING) for file in outcome.outputs)
+        return replace(outcome, job=job, outputs=outputs)
+
+    def finish(self, group: Packer, outcomes: list[Outcome]) -> list[Outcome]:
+        self.pack(group)
+        named = [*map(self.named, outcomes)]
+        del self._packers[group.tar.staging.name]
+        return named
 
     def pack(self, packer: Packer) -> None:
         """Write a tar.

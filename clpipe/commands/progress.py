@@ -87,6 +87,7 @@ class Reporter:
         self._quiet = quiet
         self._keeps_old = run.execution.redo is Redo.MISSING
         self._several = summary.total > 1
+        run.watch = self._show_progress
         self._last_line = self._start = time.perf_counter()
         self._bar: Progress | None = None
         self._is_live = console.is_terminal and not quiet
@@ -110,7 +111,7 @@ class Reporter:
             self._bar = bar_on(self._console)
             self._task = self._bar.add_task("", total=self._summary.total)
             self._bar.start()
-        self._bar.update(self._task, completed=self._summary.finished, description=description)
+        self._bar.update(self._task, completed=self._summary.made, description=description)
 
     def _compiling(self, compiled: int, total: int) -> None:
         """Show how many kernels are compiled, if compiling takes long."""
@@ -133,14 +134,19 @@ class Reporter:
             if not self._warnings[warning]:
                 self.print(f"clpipe: {outcome.job.display_name}: warning: {warning}")
             self._warnings[warning] += 1
+        self._show_progress()
+        has_line = not (self._bar and self._several) and self._summary.total <= MAX_LINES
+        if has_line and outcome.status == DONE:
+            self.print(f"{outcome.job.display_name} -> {self._files(outcome)}")
+
+    def _show_progress(self) -> None:
+        """Update the bar, or print a line if the last one is old and images have no own lines."""
         if self._bar and self._several:
             self._show(self._progress_text())
-        elif self._summary.total > MAX_LINES:
+        elif not self._quiet and self._summary.total > MAX_LINES:
             if time.perf_counter() - self._last_line >= LINE_INTERVAL:
                 self._last_line = time.perf_counter()
                 self.print(self._progress_text(with_count=True))
-        elif outcome.status == DONE:
-            self.print(f"{outcome.job.display_name} -> {self._files(outcome)}")
 
     def _files(self, outcome: Outcome) -> str:
         first, *others = self._writer.renditions_of(outcome.job)
@@ -160,9 +166,9 @@ class Reporter:
         parts = [f"{text} MP/s", summary.shares()] + [f"{failed} failed"] * bool(failed)
         if not with_count:
             return "  ".join(parts)
-        left = summary.total - summary.finished
-        remaining = format_duration(summary.elapsed * left / summary.finished)
-        count = f"{summary.finished} of {summary.total} images"
+        left = summary.total - summary.made
+        remaining = format_duration(summary.elapsed * left / max(summary.made, 1))
+        count = f"{summary.made} of {summary.total} images"
         return "; ".join([count, *parts, f"about {remaining} left"])
 
     def _clipping_warning(self) -> str:
@@ -222,7 +228,9 @@ class Reporter:
         text = f"{done} of {summary.total} {images} done{existing}, {counts[FAILED]} failed"
         if counts[LEFT_OUT]:
             text += f", {counts[LEFT_OUT]} left out"
-        if left := summary.total - summary.finished:
+        if summary.waiting:
+            text += f", {summary.waiting} kept for the next run"
+        if left := summary.total - summary.made:
             text += f", {left} not begun"
         if counts[DONE]:
             speed = summary.megapixels / summary.elapsed
