@@ -14,7 +14,10 @@ import pytest
 from PIL import Image
 
 from clpipe.base.errors import DeviceError
+from clpipe.camera.profile import built_in_cameras, load_camera
+from clpipe.commands.cameras import camera_record, camera_tables
 from clpipe.commands.main import COMMANDS, main
+from clpipe.commands.printing import short_text
 from clpipe.engine import discovery
 from tests.conftest import ROOT, STILL_LIFE, run_python, written
 
@@ -340,6 +343,33 @@ def test_cameras_are_listed_and_shown(clpipe):
     assert "found 12800, but camera canon-5d2 goes from 100 to 6400" in text
     assert "(most similar: sony-a7s2)" in clpipe("cameras", "sony-a7s", status=2).stderr
     assert "but no camera is named" in clpipe("cameras", "--iso", 100, status=2).stderr
+
+
+@pytest.mark.parametrize("name", built_in_cameras())
+def test_every_value_of_a_profile_is_shown(name):
+    camera = load_camera(name)
+    *tables, (_, _, fixed) = camera_tables(camera, None)
+    shown = {key: value.replace("\n", " ") for key, value, _ in fixed}
+    record = camera_record(camera)
+    titles = {"make", "model"}
+    assert all(getattr(camera, key) in tables[0][0] for key in titles)
+    for key in camera.model_fields_set - titles - {"gain_stages", "sources"}:
+        assert shown[key] == short_text(getattr(camera, key))
+        assert record[key] == getattr(camera, key) and key not in record["unknown"]
+    columns = {
+        heading.partition(":")[0]: [row[column] for row in rows if row[0]]
+        for _, headings, rows in tables
+        for column, heading in enumerate(headings)
+    }
+    renamed = {"iso": "ISO", "read_noise": "both", "row_noise": "row", "column_noise": "column"}
+    row = 0
+    for stage in camera.gain_stages:
+        for key in stage.model_fields_set:
+            cells = columns[renamed.get(key, key)][row : row + len(stage.iso)]
+            for cell, value in zip(cells, getattr(stage, key), strict=True):
+                numbers = [float(part) for part in cell.split(", ")]
+                assert numbers == pytest.approx(np.ravel(value), rel=0.005), key
+        row += len(stage.iso)
 
 
 def test_a_burst_is_frames_and_one_truth(clpipe, write_exr, tmp_path):

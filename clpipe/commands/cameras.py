@@ -18,8 +18,10 @@ from clpipe.commands.completion import cameras_or_import
 from clpipe.commands.options import EXISTING, Command, json_option, output_option
 from clpipe.commands.printing import Rows, short_text, show, show_json
 
-# Fields that are the same at every ISO, with units.
-FIXED = {
+# Fields of a profile that are the same at every ISO, with units. Every sensor has these.
+COMMON = {
+    "name": "",
+    "iso_range": "ISO",
     "black_level": "DN",
     "white_level": "DN",
     "bits": "",
@@ -45,7 +47,20 @@ FIXED = {
     "dark_shading_length": "px",
     "banding_amplitude": "e-",
     "banding_period": "rows",
+    "xyz_to_camera": "XYZ to camera RGB",
 }
+# Fields that only some sensors have. A profile without them has no unknown values.
+SPECIAL = {
+    "aliases": "",
+    "filter_array": "",
+    "row_noise_ratio": "",
+    "column_noise_ratio": "",
+    "readout_ratio": "",
+    "readout_noise": "",
+    "photodiode_ratio": "",
+    "photodiode_crosstalk": "",
+}
+FIXED = {**COMMON, **SPECIAL}
 DERIVED = ("bits",)  # the fields of FIXED that are computed from others
 UNKNOWN = "unknown"
 
@@ -205,7 +220,11 @@ def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[st
         (
             "At every ISO",
             ("", "value", "unit"),
-            [(key, known_text(camera, key), unit) for key, unit in FIXED.items()],
+            [
+                (key, known_text(camera, key).replace("], [", "],\n["), unit)  # a row per line
+                for key, unit in FIXED.items()
+                if key not in SPECIAL or key in camera.model_fields_set
+            ],
         ),
     ]
 
@@ -267,13 +286,12 @@ def camera_record(camera: Camera, iso: float | None = None) -> dict[str, Any]:
     """
     isos = [iso] if iso is not None else [i for stage in camera.gain_stages for i in stage.iso]
     return {
-        "name": camera.name,
         "make": camera.make,
         "model": camera.model,
-        "aliases": camera.aliases,
-        "iso_range": camera.iso_range,
         **{key: getattr(camera, key) for key in FIXED},
-        "unknown": [key for key in FIXED if known_text(camera, key) == UNKNOWN],
+        "unknown": [
+            key for key in FIXED if key not in SPECIAL and known_text(camera, key) == UNKNOWN
+        ],
         "noise": [noise_at(camera, i) for i in isos],
         "sources": camera.sources,
     }

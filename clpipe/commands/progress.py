@@ -143,10 +143,11 @@ class Reporter:
         """Update the bar, or print a line if the last one is old and images have no own lines."""
         if self._bar and self._several:
             self._show(self._progress_text())
-        elif not self._quiet and self._summary.total > MAX_LINES:
-            if time.perf_counter() - self._last_line >= LINE_INTERVAL:
-                self._last_line = time.perf_counter()
-                self.print(self._progress_text(with_count=True))
+            return
+        is_due = time.perf_counter() - self._last_line >= LINE_INTERVAL
+        if is_due and not self._quiet and self._summary.total > MAX_LINES:
+            self._last_line = time.perf_counter()
+            self.print(self._progress_text(with_count=True))
 
     def _files(self, outcome: Outcome) -> str:
         first, *others = self._writer.renditions_of(outcome.job)
