@@ -1,12 +1,19 @@
 """Users' own stages: from a file, and from an installed package."""
 
 import ast
+import itertools
 import re
 
+import numpy as np
 import pytest
 
 from clpipe.chain import registry
+from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
+from clpipe.chain.settings import settings_from
+from clpipe.engine.bands import Cpu
+from clpipe.engine.codegen import write_kernel
+from clpipe.engine.plan import make_plan
 from tests.conftest import ROOT, STILL_LIFE, cli_output, run_python
 from tests.test_contributing import block
 
@@ -118,6 +125,57 @@ def test_a_kernel_with_a_syntax_error_is_named_with_its_own_line(clpipe, stage_f
     assert f"{tmp_path}/vignette.cl:5:" in output
     assert "scal'" in output
     assert not list((tmp_path / "out").iterdir())
+
+
+def renamed(stage_file, name):
+    """Give the function of the example stage another name."""
+    kernel = stage_file.with_suffix(".cl")
+    kernel.write_text(kernel.read_text().replace("vignette(", f"{name}("))
+    stage_file.write_text(stage_file.read_text().replace('"vignette", arg', f'"{name}", arg'))
+
+
+@pytest.mark.parametrize(
+    "name", ["bright_ROW", "ROW_of", "COLUMNS_gain", "src_image_gain", "src_tap2", "values_ROW"]
+)
+def test_names_that_contain_words_of_the_generator(clpipe, stage_file, name):
+    """The source is that of another name, in all places where rows and launches have numbers."""
+
+    def sources():
+        registry._from_files.clear()
+        registry.load_stage_file(stage_file)
+        for stages in ("exposure,vignette,gamma", "vignette,optical_blur,vignette,denoise"):
+            chain = make_chain(settings_from({"stages": stages.split(",")}))
+            for cpu, lanes in itertools.product((None, Cpu(2, 1 << 19)), (1, 8)):
+                plan = make_plan(chain, cpu=cpu)
+                for launch in plan.launches:
+                    yield re.sub(r"launch_\w+", "", write_kernel(plan, launch, lanes).source)
+
+    before = [*sources()]
+    assert any(re.search(r"src_image\d", text) for text in before)  # launches in bands have numbers
+    renamed(stage_file, name)
+    assert [*sources()] == [re.sub(r"\bvignette\(", f"{name}(", text) for text in before]
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("nearest", "clpipe's kernels/lib/lanes.h also defines this name"),
+        ("exposure", "clpipe's kernels/exposure.cl also defines this name"),
+        ("LANES", "clpipe uses this name"),
+        ("first", "clpipe uses this name for a variable"),
+        ("rgb", "clpipe uses this name for a variable"),
+    ],
+)
+def test_a_function_with_a_name_of_clpipe_is_rejected(
+    clpipe, stage_file, tmp_path, write_exr, name, reason
+):
+    renamed(stage_file, name)
+    kernel = stage_file.with_suffix(".cl")
+    render = write_exr("a.exr", np.full((24, 33, 3), 0.2, np.float32))
+    options = ("--stages", "exposure,vignette", "--stage-file", stage_file)
+    message = clpipe("run", render, "-o", tmp_path / "out", *options, status=(1, 2))
+    assert f"{kernel}: it defines the function {name}, but {reason}" in message
+    assert "Traceback" not in message and "rename the function" in message
 
 
 def test_a_name_is_taken_by_another_file(clpipe, stage_file, tmp_path):

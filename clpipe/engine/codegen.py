@@ -27,7 +27,7 @@ from clpipe.engine.ir import (
     Reduce,
 )
 from clpipe.engine.kernel_builder import KernelBuilder, kernel_opening, sort_parameters
-from clpipe.engine.sources import LIBRARY, files_text
+from clpipe.engine.sources import LIBRARY, check_plugin_names, files_text
 from clpipe.engine.work_items import (
     PARTIALS,
     RUN,
@@ -44,12 +44,16 @@ from clpipe.stage import LineTable
 # share a Philox call, and the phase of a Bayer pattern.
 EXTENT = "{width, height, pitch, left * LANES, top * 4, columns, rows, border, 0}"
 ITEM_SUMS = "(int4)(fold_columns(even_rows, first), fold_columns(odd_rows, first))"
+UNNAMED = "kernel_without_a_name_yet"  # stands for the name in the text that it is a digest of
 STORE_SUMS = f"store_sums({ITEM_SUMS}, sums, first, e);"
-PLACEHOLDER_NAME = "kernel_without_a_name_yet"
 
 
 def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
-    """Return the OpenCL source of one launch of a plan, for a device with ``lanes`` lanes."""
+    """Return the OpenCL source of one launch of a plan, for a device with ``lanes`` lanes.
+
+    Raises:
+        RequestError: a plug-in's function has the name of something else in the source.
+    """
     builder = KernelBuilder(plan, lanes)
     for number in ("width", "height", "pitch", "left", "top", "columns", "rows", "border"):
         builder.number(number)
@@ -95,12 +99,14 @@ def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
     # The hint prevents Intel's compiler from vectorising our vectors, up to nine times slower.
     text += (
         '#line 1 "launch"\n'
-        f"__kernel __attribute__((vec_type_hint(vf), reqd_work_group_size({size}, 1, 1)))\n"
-        f"void {PLACEHOLDER_NAME}(\n    {signature})\n{{\n{opening_lines}"
-        f"    const extent e = {EXTENT};\n{setup}{body}}}\n"
+        f"__kernel __attribute__((vec_type_hint(vf), reqd_work_group_size({size}, 1, 1)))\nvoid "
     )
-    name = f"launch_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
-    source = text.replace(PLACEHOLDER_NAME, name)
+    function = (
+        f"(\n    {signature})\n{{\n{opening_lines}    const extent e = {EXTENT};\n{setup}{body}}}\n"
+    )
+    check_plugin_names(seen, function)
+    name = f"launch_{hashlib.sha256(f'{text}{UNNAMED}{function}'.encode()).hexdigest()[:16]}"
+    source = f"{text}{name}{function}"
     return Kernel(name, source, tuple(parameters.values()), launch, tuple(sorted(seen)))
 
 
@@ -136,7 +142,7 @@ def _bands(builder: KernelBuilder, launch: Launch, bands: Bands) -> str:
         lead, overlap = schedule.leads[number], schedule.overlaps[number]
         vectors, high = columns_of(part, lanes), part.rows
         wide = lanes * vectors
-        code = in_part(block_code(builder, part), number).replace("COLUMNS", str(vectors))
+        code = block_code(builder, part, str(number), str(vectors))
         lines += [
             f"{{ // {part.name}",
             f"const int low = int_max(strip_top - {lead}, (int)top * 4);",
@@ -198,18 +204,13 @@ def _functions_of_bands(builder: KernelBuilder, bands: Bands, seen: set[str]) ->
             for read in bands.parts[number].reads:
                 for op in read.prologue:
                     include(op.kernel)
-            texts.append(in_part(tap_function(builder, bands.parts[number]), number))
+            texts.append(tap_function(builder, bands.parts[number], str(number)))
 
     for number, part in enumerate(bands.parts):
         add_taps(number)
         for file in kernels_of([*part.ops, part.sums]):
             include(file)
     return "".join(texts)
-
-
-def in_part(code: str, number: int) -> str:
-    """Return the code of a launch with its own names for the image and the taps of a stencil."""
-    return code.replace("src_image", f"src_image{number}").replace("src_tap", f"src_tap{number}")
 
 
 def _whole_image(builder: KernelBuilder, launch: Launch) -> str:

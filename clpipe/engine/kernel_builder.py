@@ -1,6 +1,6 @@
 """The parameters of a kernel, collected under canonical names while its source is generated."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from clpipe.engine.bands import Ring
 from clpipe.engine.bindings import (
@@ -116,10 +116,11 @@ class KernelBuilder:
         """Return the variable with the extent of an image."""
         return f"e{image.number}" if image.number in self.rings else "e"
 
-    def image(self, read: Read, row: str) -> str:
-        """Return an expression for an image at a row of the work item's block."""
+    def image(self, read: Read) -> Callable[[str], str]:
+        """Return a function from a row of the work item's block to an expression for an image."""
         at = "ring_at" if read.image.number in self.rings else "image_at"
-        return f"{at}({', '.join(self.planes(read))}, {self.extent(read.image)}, first, {row})"
+        image = f"{at}({', '.join(self.planes(read))}, {self.extent(read.image)}, first"
+        return lambda row: f"{image}, {row})"
 
     def strip(self, name: str) -> str:
         """Return the parameter for the "columns" or "rows" of a strip."""
