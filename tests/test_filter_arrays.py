@@ -16,7 +16,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import settings_from
 from clpipe.dataset import Dataset
-from clpipe.engine.check import ARRAYS, NOISE, compare, mosaic_parameters
+from clpipe.engine.check import ARRAYS, compare, mosaic_parameters, sensor_parameters
 from clpipe.engine.runner import Runner
 from clpipe.images.dng import write_dng
 from clpipe.images.raw import read_raw, read_raw_info
@@ -160,7 +160,7 @@ def test_a_polarised_array_has_no_colours():
 @pytest.mark.slow
 @pytest.mark.parametrize(("array", "lanes"), [("x-trans", "many"), ("RGBW", "one")])
 def test_the_raw_is_the_same_bit_for_bit(device, scalar_device, array, lanes):
-    until = {"stages": [*settings_from({}).stages[:25]], **NOISE}
+    until = {"stages": [*settings_from({}).stages[:25]], **sensor_parameters()}
     chain = on(array, **until)
     assert chain.steps[-1].name == "quantize"
     on_device = scalar_device if lanes == "one" else device

@@ -1,6 +1,7 @@
 """Every kernel against its NumPy reference: odd sizes, 1xN images, all four patterns."""
 
 import json
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -10,6 +11,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.engine.check import (
+    ISO,
     SIZES,
     Difference,
     chain_for,
@@ -20,6 +22,8 @@ from clpipe.engine.check import (
     depends_on_pattern,
     example,
     filter_arrays_for,
+    sensor_parameters,
+    stages_to_raw,
 )
 from clpipe.engine.runner import Runner
 from clpipe.engine.sources import kernel_folder
@@ -214,3 +218,17 @@ def test_the_command_checks_every_stage(clpipe, monkeypatch):
     assert checked >= {(stage.name, method.method) for stage, method in methods.METHODS}
     ends = {"exposure..quantize", "source..8 bit", "exposure..gamma"}
     assert ends <= {check["stage"] for check in record["checks"]}
+
+
+def test_every_source_of_noise_is_checked_in_the_raw(monkeypatch):
+    """Also that of a plug-in. A new stage that draws noise in the mosaic needs a sensor's role."""
+    plugin = replace(all_stages()["row_noise"], name="my_noise")
+    monkeypatch.setattr("clpipe.chain.registry._from_files", {"my_noise.py": plugin})
+    sensor = {stage.name for stage in all_stages().values() if stage.is_sensor}
+    for stage in all_stages().values():
+        for method in stage.methods if stage.reads is stage.writes is Kind.MOSAIC else ():
+            (step,) = chain_for(stage, method, {}, "GRBG").steps
+            assert stage.name in sensor or not any(each.random for each in step.passes)
+    settings = Settings(iso=ISO, stages=stages_to_raw(), parameters=sensor_parameters())
+    enabled = {step.name for step in make_chain(settings).steps if step.passes}
+    assert sensor <= enabled and len(sensor) == 14

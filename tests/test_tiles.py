@@ -12,7 +12,7 @@ from clpipe.chain.registry import all_stages, load_stage_file
 from clpipe.chain.settings import Settings, settings_from
 from clpipe.engine.bindings import step_buffer
 from clpipe.engine.buffers import crop_patches
-from clpipe.engine.check import NOISE, chain_for, example
+from clpipe.engine.check import chain_for, example, sensor_parameters
 from clpipe.engine.extents import Box, whole_image
 from clpipe.engine.ir import Lines, Plan
 from clpipe.engine.options import RunOptions
@@ -217,7 +217,7 @@ def test_numbers_found_twice_and_kept_images(device, monkeypatch):
 def test_every_source_of_noise(device, monkeypatch):
     names = list(all_stages())
     chain = tuple(names[: names.index("quantize") + 1])
-    settings = Settings(iso=3200, stages=chain, parameters=NOISE)
+    settings = Settings(iso=3200, stages=chain, parameters=sensor_parameters())
     runner = Runner(make_chain(settings, Kind.RGB), device, encode=False, final=True)
     _, count = in_tiles(runner, example(Kind.RGB, (150, 203)), 64, 48, monkeypatch)
     assert count >= 6

@@ -11,12 +11,13 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.types import Array
 from clpipe.base.validation import check_argument_types
+from clpipe.chain.registry import stage_in
 from clpipe.dataset.arrays import packed, unpacked
 from clpipe.images.arrays import as_array
 from clpipe.pipeline import Pipeline
 from clpipe.reference.cfa import PATTERNS
+from clpipe.stage import StageRole
 
-FIRST, LAST = "crosstalk", "normalize"  # the stages from the clean mosaic to the noisy one
 MOSAIC, PACKED = 1, 4  # numbers of channels
 
 
@@ -60,12 +61,14 @@ class RawNoise(ReadOnly):
         device: str | int | None = None,
         **settings: Any,
     ) -> None:
+        first, last = (stage_in(role).name for role in (StageRole.SENSOR, StageRole.LEVELS))
         for name in ("start_at", "until"):
             if name in settings:
                 raise RequestError(
-                    f"RawNoise: found {name}, but it always runs from {FIRST} to {LAST}"
+                    f"RawNoise: found {name}, but it always runs from {first} to {last}"
                 )
         self._settings = {**settings, "camera": str(camera), "iso": iso, "seed": seed or 0}
+        self._settings |= {"start_at": first, "until": last}
         self._seed = seed
         self._device = device
         self._pattern = self._pipeline("numpy").chain.filter_array.pattern
@@ -145,4 +148,4 @@ class RawNoise(ReadOnly):
         return self._opened[1:]
 
     def _pipeline(self, device: str | int | None) -> Pipeline:
-        return Pipeline(device=device, start_at=FIRST, until=LAST, **self._settings)
+        return Pipeline(device=device, **self._settings)

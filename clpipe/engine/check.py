@@ -9,14 +9,14 @@ import numpy as np
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
 from clpipe.chain.making import make_chain
-from clpipe.chain.registry import all_stages
+from clpipe.chain.registry import all_stages, stage_in
 from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
 from clpipe.engine.options import DEFAULTS, RunOptions
 from clpipe.engine.runner import Runner, submit_batch
 from clpipe.engine.state import State, has_state
 from clpipe.reference.cfa import PATTERNS, Pattern
-from clpipe.stage import PERIOD, Kind, Method, Stage, variant_label, variants
+from clpipe.stage import PERIOD, Kind, Method, Stage, StageRole, variant_label, variants
 
 # Odd sizes, one pixel wide and high, smaller than the widest border, more than one work-group.
 SIZES = ((1, 1), (1, 9), (11, 1), (2, 3), (6, 5), (37, 53), (9, 530))
@@ -197,14 +197,27 @@ def check_method(
     return Check(stage.name, label, len(all_patterns) * len(sizes), total, method.tolerance)
 
 
-# Parameters that enable every source of noise.
-NOISE: Mapping[str, Mapping[str, Any]] = {
-    "prnu": {"sigma": 0.01},
-    "defect_pixels": {"hot_share": 0.01, "hot_level": 0.1, "dead_share": 0.01},
-    "dsnu": {"sigma": 0.001},
-    "row_noise": {"sigma": 0.003},
-    "column_noise": {"sigma": 0.002},
-}
+def sensor_parameters() -> dict[str, Mapping[str, Any]]:
+    """Return parameters that enable every effect of the sensor, by stage.
+
+    The noise of the stage with the role SENSOR_NOISE is that of camera and ISO.
+    """
+    found: dict[str, Mapping[str, Any]] = {}
+    for stage in all_stages().values():
+        if stage.is_sensor and stage.role is not StageRole.SENSOR_NOISE:
+            # The default may be a method that does nothing, which has no example.
+            method = next((m for m in stage.methods if m.example), stage.methods[0])
+            found[stage.name] = {"method": method.method, **method.example}
+    return found
+
+
+def stages_to_raw() -> tuple[str, ...]:
+    """Return all stages from the render to the raw. Plug-ins of the sensor come last of these."""
+    names = [*all_stages()]
+    raw = stage_in(StageRole.RAW).name
+    chain = names[: names.index(raw)]
+    others = [name for name in sensor_parameters() if name not in chain]
+    return (*chain, *others, raw)
 
 
 def check_raw(
@@ -215,15 +228,14 @@ def check_raw(
 ) -> Check:
     """Check all stages from half RGB to the raw: device and NumPy must be equal after quantize.
 
-    ``noise`` is the method of the stage sensor_noise.
+    Every effect of the sensor is enabled. ``noise`` is the method of the stage sensor_noise.
     """
-    names, patterns = list(all_stages()), patterns or PATTERNS
-    stages = tuple(names[: names.index("quantize") + 1])
+    stages, patterns = stages_to_raw(), patterns or PATTERNS
     total = Difference()
     for pattern in patterns:
-        parameters: dict[str, dict[str, Any]] = {"mosaic": {"pattern": pattern}}
-        parameters["sensor_noise"] = {"method": noise}
-        settings = Settings(iso=ISO, stages=stages, parameters={**NOISE, **parameters})
+        parameters = sensor_parameters() | {stage_in(StageRole.PATTERN).name: {"pattern": pattern}}
+        parameters[stage_in(StageRole.SENSOR_NOISE).name] = {"method": noise}
+        settings = Settings(iso=ISO, stages=stages, parameters=parameters)
         total += compare(device, make_chain(settings), sizes, half=True)
     cases = len(patterns) * len(sizes)
     return Check("exposure..quantize", f"the raw, {noise}", cases, total, 0.0)
@@ -268,7 +280,7 @@ def check_stack(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Che
     """
     total, images, separate = Difference(), [], []
     for seed, size in enumerate(sizes):
-        chain = make_chain(Settings(iso=ISO + 100 * seed, parameters=NOISE))
+        chain = make_chain(Settings(iso=ISO + 100 * seed, parameters=sensor_parameters()))
         image = example(chain.source, size, half=True, seed=seed)
         runner = Runner(chain, device, final=True)
         separate.append(runner.run(image, "check").final)
@@ -290,7 +302,7 @@ def check_all(
             for values in variants(method):
                 yield check_method(device, stage, method, sizes, values=values)
     if not stages:
-        for noise in all_stages()["sensor_noise"].by_name:
+        for noise in stage_in(StageRole.SENSOR_NOISE).by_name:
             yield check_raw(device, noise, sizes)
         yield check_formats(device, sizes)
         yield check_stack(device, sizes)

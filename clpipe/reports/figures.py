@@ -11,8 +11,10 @@ from typing import Any
 from clpipe.base.memory import format_bytes
 from clpipe.base.text import format_duration, one_line
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS
+from clpipe.chain.registry import stage_in
 from clpipe.engine.clipping import WARNING_SHARE
 from clpipe.reports.run import Run, RunPicture
+from clpipe.stage import StageRole
 
 TIMES = 60  # the most intervals into which a run is divided
 DISTINCT = 12  # the most values of a parameter that are listed
@@ -276,7 +278,8 @@ def drawn(pictures: Sequence[RunPicture], steps: Sequence[Step]) -> list[Paramet
             ("clipped share", ("clipped",)),
         )
     ]
-    repeated = {("sensor_noise", "a"), ("sensor_noise", "b")}
+    noise = stage_in(StageRole.SENSOR_NOISE).name
+    repeated = {(noise, "a"), (noise, "b")}
     facts += [
         Parameter(f"{step.name}.{each.name}", each.values, f"{step.name}.{each.name}" in requested)
         for step in steps

@@ -15,10 +15,12 @@ from clpipe.analysis.report import NoiseReport
 from clpipe.analysis.statistics import Channel
 from clpipe.analysis.svg import law_svg, noise_svg
 from clpipe.base.errors import ClpipeError
+from clpipe.chain.registry import all_stages, stage_in
 from clpipe.chain.rendition import DEVELOPMENT, MOSAIC
 from clpipe.reports.figures import number
 from clpipe.reports.images import checked, picture_file
 from clpipe.reports.run import Blob, Run, RunPicture
+from clpipe.stage import StageRole
 
 MAX_LAWS = 12  # raws that are compared with the noise model
 LIMIT = 5.0  # standard errors; a larger deviation from the model is reported
@@ -165,8 +167,8 @@ def other_noise(picture: RunPicture) -> float:
     It contains row noise, column noise, DSNU and rounding to DN. Rounding adds 1/12 DN² twice,
     because the truth is rounded as well.
     """
-    lines = ("row_noise", "column_noise", "dsnu")
+    lines = [s.name for s in all_stages().values() if s.role is StageRole.SENSOR_OFFSETS]
     variance = sum(number(parameters_of(picture, step).get("sigma")) ** 2 for step in lines)
-    digital = parameters_of(picture, "quantize")
+    digital = parameters_of(picture, stage_in(StageRole.RAW).name)
     step = number(digital.get("white_level")) - number(digital.get("black_level"))
     return variance + (2 / (12 * step**2) if step > 0 else 0.0)

@@ -238,8 +238,13 @@ class StageRole(Enum):
     BALANCE = "its red_gain and blue_gain are those of a raw input"
     COLOURS_OF_LIGHT = "it is skipped for a raw input, because the sensor already saw its light"
     COLOURS = "its matrix is that of a raw input"
+    LENS = "it changes the light before it reaches the sensor"
     FALLOFF = "it defines the fall-off of light"
     RESPONSE = "it is a part of the curve from light to codes"
+    SENSOR = "it is an effect of the sensor on the mosaic, before the raw"
+    SENSOR_OFFSETS = "like SENSOR; its sigma is that of offsets that it adds"
+    SENSOR_NOISE = "like SENSOR; it adds the shot and read noise"
+    RAW = "it rounds the mosaic to a raw"
     DENOISING = "its strength follows camera and ISO"
     BASELINE = "its noise is that of a baseline"
 
@@ -277,6 +282,15 @@ class Stage:
         """
         default_method = None if is_set or not self.default_method else self.default_method(context)
         return default_method or method
+
+    @property
+    def is_sensor(self) -> bool:
+        """Whether it is an effect of the sensor on the mosaic, such as noise."""
+        return self.role in (
+            StageRole.SENSOR,
+            StageRole.SENSOR_OFFSETS,
+            StageRole.SENSOR_NOISE,
+        )
 
     def for_kind(self, kind: Kind | None) -> "Stage":
         """Return the stage for an entering image of a kind; itself if it does not read this

@@ -19,6 +19,7 @@ from clpipe.stage import (
     Signal,
     SignalMethod,
     Stage,
+    StageRole,
     parameter,
 )
 
@@ -99,4 +100,11 @@ class Sine(SignalMethod):
         return y + sine_of_turns(turns, backend.where) * n["amplitude"]
 
 
-STAGE = Stage("banding", "Add a periodic wave over the rows.", Kind.MOSAIC, Kind.MOSAIC, (Sine,))
+STAGE = Stage(
+    "banding",
+    "Add a periodic wave over the rows.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (Sine,),
+    role=StageRole.SENSOR,
+)

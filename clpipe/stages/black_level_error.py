@@ -20,6 +20,7 @@ from clpipe.stage import (
     Signal,
     SignalMethod,
     Stage,
+    StageRole,
     parameter,
 )
 
@@ -117,4 +118,5 @@ STAGE = Stage(
     Kind.MOSAIC,
     Kind.MOSAIC,
     (Offsets,),
+    role=StageRole.SENSOR,
 )

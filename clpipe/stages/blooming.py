@@ -13,6 +13,7 @@ from clpipe.stage import (
     Signal,
     SignalMethod,
     Stage,
+    StageRole,
     Stencil,
     Unchanged,
     parameter,
@@ -84,4 +85,5 @@ STAGE = Stage(
     Kind.MOSAIC,
     Kind.MOSAIC,
     (NoBlooming, Column),
+    role=StageRole.SENSOR,
 )

@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from clpipe.stage import Context, Kind, NoiseScope, Stage
+from clpipe.stage import Context, Kind, NoiseScope, Stage, StageRole
 from clpipe.stages.row_noise import LineNoise
 
 
@@ -27,5 +27,10 @@ class Gaussian(LineNoise):
 
 
 STAGE = Stage(
-    "column_noise", "Add an offset to each column.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,)
+    "column_noise",
+    "Add an offset to each column.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (Gaussian,),
+    role=StageRole.SENSOR_OFFSETS,
 )

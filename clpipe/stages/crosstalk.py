@@ -12,6 +12,7 @@ from clpipe.stage import (
     Signal,
     SignalMethod,
     Stage,
+    StageRole,
     Stencil,
     parameter,
 )
@@ -63,5 +64,10 @@ class Neighbours(SignalMethod):
 
 
 STAGE = Stage(
-    "crosstalk", "Let charge leak to neighbouring pixels.", Kind.MOSAIC, Kind.MOSAIC, (Neighbours,)
+    "crosstalk",
+    "Let charge leak to neighbouring pixels.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (Neighbours,),
+    role=StageRole.SENSOR,
 )

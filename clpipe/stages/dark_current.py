@@ -19,6 +19,7 @@ from clpipe.stage import (
     Signal,
     SignalMethod,
     Stage,
+    StageRole,
     parameter,
     sensor_bits,
 )
@@ -171,4 +172,5 @@ STAGE = Stage(
     Kind.MOSAIC,
     Kind.MOSAIC,
     (Thermal,),
+    role=StageRole.SENSOR,
 )

@@ -26,6 +26,7 @@ from clpipe.stage import (
     Signal,
     SignalMethod,
     Stage,
+    StageRole,
     parameter,
 )
 
@@ -296,4 +297,5 @@ STAGE = Stage(
     Kind.MOSAIC,
     Kind.MOSAIC,
     (Smooth, File),
+    role=StageRole.SENSOR,
 )

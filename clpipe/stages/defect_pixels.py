@@ -17,6 +17,7 @@ from clpipe.stage import (
     Signal,
     SignalMethod,
     Stage,
+    StageRole,
     parameter,
     sensor_bits,
 )
@@ -111,4 +112,11 @@ def alive_pixels(height: int, width: int, stream: Stream, limit: int) -> Floats:
     return (sensor_bits(height, width, stream) <= limit).astype(np.float32)
 
 
-STAGE = Stage("defect_pixels", "Make some pixels hot or dead.", Kind.MOSAIC, Kind.MOSAIC, (Random,))
+STAGE = Stage(
+    "defect_pixels",
+    "Make some pixels hot or dead.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (Random,),
+    role=StageRole.SENSOR,
+)

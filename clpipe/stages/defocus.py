@@ -19,6 +19,7 @@ from clpipe.stage import (
     Pass,
     ReferenceContext,
     Stage,
+    StageRole,
     Stencil,
     Unchanged,
     parameter,
@@ -249,5 +250,10 @@ class ThinLens(FocalLengthMethod, LayerMethod):
 
 
 STAGE = Stage(
-    "defocus", "Blur surfaces that are out of focus.", Kind.RGB, Kind.RGB, (InFocus, ThinLens)
+    "defocus",
+    "Blur surfaces that are out of focus.",
+    Kind.RGB,
+    Kind.RGB,
+    (InFocus, ThinLens),
+    role=StageRole.LENS,
 )

@@ -32,6 +32,7 @@ from clpipe.stage import (
     ReferenceContext,
     Resample,
     Stage,
+    StageRole,
     Unchanged,
     parameter,
 )
@@ -300,4 +301,5 @@ STAGE = Stage(
     Kind.RGB,
     Kind.RGB,
     (LensDistortion, NoDistortion, BrownConrady, Fisheye, Poly3, Poly5, PtLens),
+    role=StageRole.LENS,
 )

@@ -12,6 +12,7 @@ from clpipe.stage import (
     Pass,
     Signal,
     Stage,
+    StageRole,
     sensor_normals,
 )
 
@@ -45,5 +46,10 @@ class Gaussian(GaussianNoise):
 
 
 STAGE = Stage(
-    "dsnu", "Add a fixed offset to each pixel (DSNU).", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,)
+    "dsnu",
+    "Add a fixed offset to each pixel (DSNU).",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (Gaussian,),
+    role=StageRole.SENSOR_OFFSETS,
 )

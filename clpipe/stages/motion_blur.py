@@ -22,6 +22,7 @@ from clpipe.stage import (
     ReferenceContext,
     Resample,
     Stage,
+    StageRole,
     Stencil,
     parameter,
 )
@@ -232,4 +233,5 @@ STAGE = Stage(
     Kind.RGB,
     Kind.RGB,
     (Linear, Perspective),
+    role=StageRole.LENS,
 )

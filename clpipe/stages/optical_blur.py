@@ -21,6 +21,7 @@ from clpipe.stage import (
     Pass,
     ReferenceContext,
     Stage,
+    StageRole,
     Stencil,
     Unchanged,
     parameter,
@@ -324,4 +325,5 @@ STAGE = Stage(
     Kind.RGB,
     Kind.RGB,
     (Lens, NoBlur),
+    role=StageRole.LENS,
 )

@@ -15,6 +15,7 @@ from clpipe.stage import (
     Pass,
     Signal,
     Stage,
+    StageRole,
     parameter,
     sensor_normals,
 )
@@ -59,5 +60,10 @@ class Gaussian(GaussianNoise):
 
 
 STAGE = Stage(
-    "prnu", "Vary the sensitivity of pixels (PRNU).", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,)
+    "prnu",
+    "Vary the sensitivity of pixels (PRNU).",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (Gaussian,),
+    role=StageRole.SENSOR,
 )

@@ -26,6 +26,7 @@ from clpipe.stage import (
     Signal,
     SignalMethod,
     Stage,
+    StageRole,
     parameter,
 )
 
@@ -196,5 +197,10 @@ class Pwl(Linear):
 
 
 STAGE = Stage(
-    "quantize", "Digitise with the ADC: signal to DN.", Kind.MOSAIC, Kind.RAW, (Linear, Pwl)
+    "quantize",
+    "Digitise with the ADC: signal to DN.",
+    Kind.MOSAIC,
+    Kind.RAW,
+    (Linear, Pwl),
+    role=StageRole.RAW,
 )

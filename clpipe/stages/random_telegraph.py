@@ -18,6 +18,7 @@ from clpipe.stage import (
     Signal,
     SignalMethod,
     Stage,
+    StageRole,
     parameter,
     sensor_bits,
 )
@@ -114,4 +115,5 @@ STAGE = Stage(
     Kind.MOSAIC,
     Kind.MOSAIC,
     (TwoLevels,),
+    role=StageRole.SENSOR,
 )

@@ -16,6 +16,7 @@ from clpipe.stage import (
     Pass,
     Signal,
     Stage,
+    StageRole,
 )
 
 
@@ -65,4 +66,11 @@ class Gaussian(LineNoise):
         return self.with_defaults(sigma=context.camera.row_noise(context.iso))
 
 
-STAGE = Stage("row_noise", "Add an offset to each row.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,))
+STAGE = Stage(
+    "row_noise",
+    "Add an offset to each row.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (Gaussian,),
+    role=StageRole.SENSOR_OFFSETS,
+)

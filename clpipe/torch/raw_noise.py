@@ -18,11 +18,11 @@ from clpipe.base.validation import check_argument_types
 from clpipe.chain.chain import Chain
 from clpipe.chain.files import load_settings
 from clpipe.chain.making import make_chain
+from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import overlay
-from clpipe.stage import NoiseScope
+from clpipe.stage import NoiseScope, StageRole
 from clpipe.torch.table import SampleDraws, Table
 
-FIRST, LAST = "crosstalk", "normalize"
 MAX_CHAINS = 1024  # number of chains if values are drawn
 POSITION_RANGE = 512  # px; positions are drawn from a sensor that is this much larger than a sample
 
@@ -165,7 +165,8 @@ class RawNoise(ReadOnly):
         """Return the chain of a sample's name, on which draws depend."""
         if not self._settings.draws:
             name = ""
-        return make_chain(self._settings.drawn(name), start_at=FIRST, until=LAST)
+        first, last = (stage_in(role).name for role in (StageRole.SENSOR, StageRole.LEVELS))
+        return make_chain(self._settings.drawn(name), start_at=first, until=last)
 
 
 def _unpacked(planes: Tensor, order: Tensor) -> Tensor:

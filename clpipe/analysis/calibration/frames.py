@@ -22,7 +22,7 @@ from clpipe.inputs.kept import embedded_settings
 from clpipe.inputs.raw import may_be_dump
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.reference.filter_array import MONO, NAMED
-from clpipe.stage import Kind
+from clpipe.stage import Kind, StageRole
 
 MOSAICS = (*RENDER_SUFFIXES, ".png")  # extensions of mosaics that are not camera raws
 
@@ -219,7 +219,8 @@ def _from_kept(
     context, camera = step.method.next_context(step.context), chain.camera
     black = camera.black_level if context.black_level is None else context.black_level
     white = camera.white_level if context.white_level is None else context.white_level
-    ev = next((getattr(s.method, "ev", 0) for s in chain.steps if s.stage.name == "exposure"), 0)
+    exposure = chain.step_in(StageRole.EXPOSURE)
+    ev = getattr(exposure.method, "ev", 0) if exposure else 0
     return CalibrationFrame(
         path,
         camera.make,

@@ -14,12 +14,13 @@ from clpipe.base.files import check_folder, create_parents, write_new
 from clpipe.camera.profile import Camera, load_camera
 from clpipe.chain.identity import image_key, noise_key
 from clpipe.chain.making import make_chain
+from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
 from clpipe.images.write import write_png
+from clpipe.stage import StageRole
 
-FIRST, LAST = "crosstalk", "quantize"  # the stages between the clean mosaic and the raw
 BEYOND = 0.1  # number of exposures above saturation, relative to the number below it
 SATURATED = 0.01  # s; the exposure time at which the light saturates the sensor
 SHARE = 0.5  # exposure of the PRNU stack, relative to saturation
@@ -84,8 +85,9 @@ def simulate(
     exposures = (*series.bright, *series.dark, series.bright_stack, series.dark_stack)
     total, done = sum(len(each.frames) for each in exposures), 0
     samples = np.uint8 if series.bits <= 8 else np.uint16
+    first, last = (stage_in(role).name for role in (StageRole.SENSOR, StageRole.RAW))
     for exposure in exposures:
-        chain = make_chain(_simulate_exposure(settings, exposure), start_at=FIRST, until=LAST)
+        chain = make_chain(_simulate_exposure(settings, exposure), start_at=first, until=last)
         runner = (
             runner.for_chain(chain) if runner else Runner(chain, device, encode=False, final=True)
         )

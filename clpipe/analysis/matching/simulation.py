@@ -19,12 +19,11 @@ from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
 from clpipe.images.jpeg import jpeg_round_trip
-from clpipe.stage import Kind, Method, ReferenceContext
+from clpipe.stage import Kind, Method, ReferenceContext, StageRole
 
 LINEAR = 16  # linear-light scenes that are cached for one tone curve
-UNDONE = ("gamma", "tone_curve")  # stages that an inverse_gamma or inverse_tone_curve stage undoes
 # Stages that have already been applied to a picture.
-SEEN = ("shutter", "defocus", "motion_blur", "distortion", "vignetting", "optical_blur")
+SEEN = (StageRole.SHUTTER, StageRole.LENS, StageRole.FALLOFF)
 
 
 class Simulator:
@@ -53,7 +52,7 @@ class Simulator:
             key: the key that seeds the noise.
             count: the number of frames; None uses the scene's number.
         """
-        seen = [name for name in settings.step_names if base_name(name) in SEEN]
+        seen = [name for name in settings.step_names if all_stages()[base_name(name)].role in SEEN]
         chain = make_chain(replace(settings, skip=(*settings.skip, *seen)))
         keys = [f"{key}:{scene.name}:{number}" for number in range(count or len(scene.frames))]
         with self._lock:
@@ -115,8 +114,9 @@ def undoing(chain: Chain) -> list[Method]:
     """Return the methods that convert a finished picture to the light that the chain starts on."""
     found = []
     for step in reversed(chain.steps):
-        if step.stage.name in UNDONE:
-            inverse = all_stages()[f"inverse_{step.stage.name}"].by_name[step.method.method]
+        inverse_stage = all_stages().get(f"inverse_{step.stage.name}")
+        if step.stage.role is StageRole.RESPONSE and inverse_stage:
+            inverse = inverse_stage.by_name[step.method.method]
             values = step.method.model_dump(include=set(inverse.model_fields))
             found.append(inverse.model_validate(values))
     return found

@@ -1,6 +1,6 @@
 """Sensor noise: shot noise and read noise."""
 
-from clpipe.stage import Kind, Stage
+from clpipe.stage import Kind, Stage, StageRole
 from clpipe.stages.sensor_noise.gaussian import Gaussian
 from clpipe.stages.sensor_noise.no_noise import NoNoise
 from clpipe.stages.sensor_noise.poisson import Poisson
@@ -15,4 +15,5 @@ STAGE = Stage(
     Kind.MOSAIC,
     Kind.MOSAIC,
     (SkewedGaussian, Gaussian, Poisson, DualGain, SplitPixel, SplitDualGain, Staggered, NoNoise),
+    role=StageRole.SENSOR_NOISE,
 )
