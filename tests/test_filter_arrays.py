@@ -157,6 +157,13 @@ def test_a_polarised_array_has_no_colours():
     np.testing.assert_allclose(gray.final, 0.2, atol=1e-6)
 
 
+def test_neighbours_outside_the_image_continue_the_array(device):
+    effects = sensor_parameters()
+    stages = {name: effects[name] for name in ("crosstalk", "blooming")}
+    chain = on("x-trans", stages=["mosaic", *stages], **stages)
+    assert compare(device, chain, [(37, 53), (1, 40)]).largest == 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("array", "lanes"), [("x-trans", "many"), ("RGBW", "one")])
 def test_the_raw_is_the_same_bit_for_bit(device, scalar_device, array, lanes):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clpipe.base.types import Floats
-from clpipe.reference.image import tap
+from clpipe.reference.filter_array import periodic_indices
 from clpipe.reference.math import inverse_root, square_root
 from clpipe.reference.poisson import poisson_of
 from clpipe.reference.random import (
@@ -169,7 +169,15 @@ class NumpyBackend(Backend):
     photons = staticmethod(poisson_of)
     tukey_lambda = staticmethod(tukey_lambda_of)
     in_upper_half = staticmethod(in_upper_half)
-    tap = staticmethod(tap)
+
+    def tap(self, image: Floats, dx: int, dy: int) -> Floats:
+        # Borders continue the filter array, as on the device.
+        periods, reach = self.inputs.context.filter_array.period, max(abs(dx), abs(dy))
+        (rows, height), (columns, width) = zip(periods, image.shape, strict=True)
+        down = periodic_indices(height, rows, reach)[reach + dy :][:height]
+        across = periodic_indices(width, columns, reach)[reach + dx :][:width]
+        shifted: Floats = image[down][:, across]
+        return shifted
 
     @property
     def _stream(self) -> Stream:
