@@ -4,7 +4,8 @@
 
 It reads Markdown, and in Python files docstrings, comments and messages. Code, tables and names
 in backquotes are skipped. Without paths it checks :data:`CHECKED`. The exit status is 1 if it finds
-anything. The rules are those of CONTRIBUTING.md, "Writing".
+anything. The rules are those of CONTRIBUTING.md, "Writing". :mod:`tools.names` finds names that no
+longer exist.
 """
 
 import ast
@@ -16,6 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tools import ROOT
+from tools.names import faults_of
 
 CHECKED = (
     *("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "docs", "clpipe"),
@@ -137,10 +139,10 @@ def main(names: list[str]) -> int:
             else [place]
         )
         for path in files:
-            for line, text in texts_of(path):
-                for fault in faults_in(text):
-                    print(f"{path.relative_to(ROOT)}:{line}: {fault}")
-                    count += 1
+            faults = [(line, f) for line, text in texts_of(path) for f in faults_in(text)]
+            for line, fault in (*faults, *faults_of(path)):
+                print(f"{path.relative_to(ROOT)}:{line}: {fault}")
+                count += 1
     return int(count > 0)
 
 

@@ -131,7 +131,8 @@ def close_and_remove(path: Path, file: int, first: int, length: int) -> None:
     Args:
         path: the file.
         file: its descriptor.
-        first, length: the range, as for :func:`lock_range`.
+        first: the first byte, as for :func:`lock_range`.
+        length: the number of bytes.
     """
     with contextlib.suppress(OSError):
         if fcntl:

@@ -220,7 +220,8 @@ def run_of(
         options: arguments of :func:`run`, by the names of :data:`OPTIONS`. An ISO and a bracket may
             be texts with commas. None is an option that is not set.
         settings: values of a configuration file, nested.
-        arguments, echo: as for :class:`Run`.
+        arguments: as for :class:`Run`.
+        echo: as for :class:`Run`.
 
     Raises:
         RequestError: as for :func:`run`.

@@ -234,7 +234,7 @@ def check_same(aspect: str, values: Mapping[str, str]) -> None:
     """Check that a value is the same on all workers.
 
     Args:
-        what: the name of the value, for the message.
+        aspect: the name of the value, for the message.
         values: the value of each worker.
 
     Raises:

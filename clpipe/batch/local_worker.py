@@ -34,7 +34,7 @@ class ProcessConfig:
 
     Args:
         number: its number, from 0.
-        of: the number of processes.
+        count: the number of processes.
         threads: the number of threads if the run does not set it.
         processors: the processors that it is bound to. () binds it to none.
         sequential: whether a single thread makes the images, see :mod:`clpipe.batch.threads`.

@@ -54,8 +54,8 @@ def host_bytes(
         renditions: the number of its results that exist at a time.
         formats: the formats of the last image and of the raw.
         keep: the steps whose image is also written.
-        beside: the number of further images of three floats: one for the sum of sub-frames, and
-            two for each further exposure and each carried layer.
+        extra_images: the number of further images of three floats: one for the sum of sub-frames,
+            and two for each further exposure and each carried layer.
         in_numpy: whether NumPy develops it.
 
     Raises:

@@ -142,7 +142,7 @@ class Run:
     Args:
         request: the pictures to make.
         images: the images to make them of.
-        where: the output directory and the devices.
+        execution: the output directory and the devices.
         dask: the address of a Dask scheduler whose workers do the work. None is this machine.
         arguments: command-line arguments for the log.
         echo: also called with each line of the log.

@@ -23,7 +23,7 @@ class RunSpec:
 
     Args:
         request: the pictures to make.
-        where: the output directory and the devices.
+        execution: the output directory and the devices.
         first: the job whose chain is compiled first.
         folder: the directory that relative paths start from. None is the working directory.
     """
@@ -55,7 +55,8 @@ class RunSpec:
             devices: the devices of the process.
             threads: the number of threads if the run does not set it.
             sharing: the number of processes that share the machine's memory.
-            in_flight, compiled: as for :class:`~clpipe.batch.threads.Batch`.
+            in_flight: as for :class:`~clpipe.batch.threads.Batch`.
+            compiled: as for :class:`~clpipe.batch.threads.Batch`.
         """
         number = self.execution.threads or threads
         memory = default_budget(sharing)

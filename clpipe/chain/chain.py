@@ -105,7 +105,7 @@ class Chain:
     # The settings are an example of these draws.
     draws: Mapping[str, Draw] = field(default_factory=dict)
     margins: Margins = NO_MARGINS  # the overscan of the chain's input
-    # Results that all chains of this structure share, see of_structure(). None if there are none.
+    # Results that all chains of this structure share, see `cached_by_structure`. None shares none.
     structure: dict[Any, Any] | None = field(default=None, init=False)
 
     def __repr__(self) -> str:
@@ -209,7 +209,8 @@ class Chain:
         """Return the intrinsics of the result; None if they are unknown.
 
         Args:
-            width, height: the size of the input, in px.
+            width: the width of the input in px.
+            height: its height in px.
             shot: the camera values in the image's file, see :meth:`Intrinsics.of_render`.
 
         Raises:

@@ -99,7 +99,8 @@ def layer_of_array(
         chain: the chain.
         step: the name of the step.
         pixels: the layer, (height, width), or for flow (height, width, 2).
-        width, height: of the image in px.
+        width: the width of the image in px.
+        height: its height in px.
 
     Raises:
         ImageError: the array is missing, has another shape, or has values that the step cannot use.

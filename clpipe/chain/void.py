@@ -20,7 +20,8 @@ def black_area_warning(chain: Chain, width: int, height: int) -> str:
 
     Args:
         chain: the chain of the picture.
-        width, height: the size of the input in px, with its overscan.
+        width: the width of the input in px, with its overscan.
+        height: its height in px, with its overscan.
 
     Raises:
         ImageError: the distortion folds the image over.

@@ -41,7 +41,8 @@ def jobs_of(
 
     Args:
         loader: reads the images.
-        inputs, exclude: as for :func:`clpipe.inputs.find.find_jobs`.
+        inputs: as for :func:`clpipe.inputs.find.find_jobs`.
+        exclude: as for :func:`clpipe.inputs.find.find_jobs`.
         skips: whether to skip files with unreadable headers, with a warning.
 
     Raises:

@@ -57,7 +57,7 @@ def prefetched(
         loader: decodes and develops.
         batches: the batches.
         threads: how many images are decoded at once.
-        together: how many batches are begun together.
+        group_size: how many batches are begun together.
 
     Yields:
         The batches in order, each with a callable that waits for its samples. The callable raises

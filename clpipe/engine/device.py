@@ -44,7 +44,7 @@ class Device:
     Only one thread may use it at a time. Several devices may run at once, each in its own thread.
 
     Args:
-        chosen: the device to open.
+        info: the device to open.
         memory: the most bytes that its buffers may use. None is the default of
             :func:`~clpipe.engine.discovery.usable_memory`.
 

@@ -27,7 +27,7 @@ class Store:
 
     Args:
         folder: the folder, which the first write creates. None caches nothing.
-        namespace: texts that are part of every key.
+        *namespace: texts that are part of every key.
     """
 
     def __init__(self, folder: Path | None, *namespace: str) -> None:

@@ -207,7 +207,8 @@ class Explorer:
 
         Args:
             number: "number" among its facts.
-            x, y: column and row, in px.
+            x: the column in px.
+            y: the row in px.
 
         Raises:
             RequestError: the result is no longer kept, or has no such pixel.
@@ -225,7 +226,9 @@ class Explorer:
         """Measure the noise in a part of an image against its truth, like ``clpipe measure``.
 
         Args:
-            image, values, view: as for :meth:`develop`.
+            image: as for :meth:`develop`.
+            values: as for :meth:`develop`.
+            view: as for :meth:`develop`.
             box: left, top, width and height in px. For mosaics they are rounded down to even.
 
         Raises:

@@ -38,8 +38,10 @@ def overscan_margins(x: int, y: int, data: Sequence[int], display: Sequence[int]
     It is 0 if the windows do not overlap.
 
     Args:
-        x, y: column and row of the data window's upper left pixel in the display window.
-        data, display: the width and height of each in px.
+        x: the column of the data window's upper left pixel in the display window.
+        y: the row of this pixel.
+        data: the width and height of the data window in px.
+        display: the width and height of the display window in px.
 
     >>> tuple(overscan_margins(-2, 1, (10, 6), (7, 7)))
     (2, 0, 1, 0)
@@ -60,8 +62,10 @@ def display_window(
 
     Args:
         data: the data window, (rows, columns, channel).
-        x, y: column and row of its upper left pixel in the display window.
-        width, height: size of the display window in px.
+        x: the column of its upper left pixel in the display window.
+        y: the row of this pixel.
+        width: the width of the display window in px.
+        height: its height in px.
         outside: the value of pixels outside the data window.
     """
     window = np.full((height, width, data.shape[2]), outside, data.dtype)

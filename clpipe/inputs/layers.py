@@ -32,7 +32,8 @@ def read_step_layer(
         path: the image file.
         chain: the chain of the image.
         step: the name of the step.
-        width, height: size of the image with its overscan, in px.
+        width: the width of the image with its overscan, in px.
+        height: its height with its overscan, in px.
         margins: the overscan on each side.
         carried: the carried layers. Their patterns name companions that are searched as well.
         max_pixels: a file with more pixels is rejected before it is read.

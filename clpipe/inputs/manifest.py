@@ -270,7 +270,7 @@ def _row(
         folder: the folder of the manifest.
         location: the manifest and the row.
         record: the values.
-        alike: values of earlier rows. Rows with equal values share one object.
+        shared: values of earlier rows. Rows with equal values share one object.
 
     Raises:
         RequestError: path, name or frames are not allowed.

@@ -200,7 +200,8 @@ def panorama_of(
         paths: the files.
         wide: the lens that views them.
         envmap: OpenEXR's attribute of the first file, "" if it has none.
-        width, height: the size of each file, in px.
+        width: the width of each file in px.
+        height: its height in px.
 
     Raises:
         ImageError: a cube map is not six squares.

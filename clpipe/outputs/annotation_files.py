@@ -36,7 +36,7 @@ class AnnotationWriter(Protocol):
 
         Args:
             file: the picture's path in the folder.
-            way: the mapping from the render to the picture.
+            mapping: the mapping from the render to the picture.
             render: the annotations of its render.
 
         Returns:
@@ -219,7 +219,7 @@ class _WarpedObject:
 
     Args:
         original: the object in the render.
-        way: the mapping from the render to the picture.
+        mapping: the mapping from the render to the picture.
     """
 
     def __init__(self, original: BopObject, mapping: PixelMapping) -> None:

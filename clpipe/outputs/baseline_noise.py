@@ -164,7 +164,8 @@ def curve_of(truth: Floats, noise: Floats) -> Doubles:
     It is interpolated linearly between intensities that occur.
 
     Args:
-        truth, noise: values of one channel, (pixel,).
+        truth: values of one channel without noise, (pixel,).
+        noise: the noise of this channel, (pixel,).
     """
     index = np.rint(truth * (CURVE_POINTS - 1)).astype(np.intp)
     noise = noise.astype(np.float64)

@@ -56,7 +56,7 @@ def cameras_json(pictures: Sequence[OutputPicture], prefix: str = "") -> str:
 
     Args:
         pictures: the pictures.
-        up: the relative path from the file's folder to the pictures' folder.
+        prefix: the relative path from the file's folder to the pictures' folder.
     """
     views, responses = [], Responses()
     for each in pictures:
@@ -145,7 +145,7 @@ def nerfstudio(
 
     Args:
         pictures: the pictures whose pose is known.
-        up: the relative path from the file's folder to the pictures' folder.
+        prefix: the relative path from the file's folder to the pictures' folder.
         skipped: receives the names of pictures that the format cannot hold, by reason.
         splits: "train", "val" or "test" for each picture, by its name in sidecars.
     """

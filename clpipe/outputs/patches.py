@@ -127,7 +127,8 @@ class Patches:
 
         Args:
             chain: the chain that makes the picture.
-            width, height: size of the image in px.
+            width: the width of the image in px.
+            height: its height in px.
 
         Raises:
             ImageError: the picture is smaller than a patch.
@@ -244,7 +245,8 @@ def all_patches(patches: Patches, chain: Chain, width: int, height: int, key: st
     Args:
         patches: the number and size of patches.
         chain: the chain that makes the picture.
-        width, height: size of the image in px.
+        width: the width of the image in px.
+        height: its height in px.
         key: the key of the image.
 
     Raises:

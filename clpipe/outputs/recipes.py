@@ -63,7 +63,7 @@ class Recipe:
         noise: for a variance map, the steps whose noise has this variance in the chain's last
             image, see :func:`clpipe.chain.truth.variance_of`; otherwise ().
         key: the key of the image.
-        spread: measures the noise of a baseline, which is put into the chain afterwards.
+        matcher: measures the noise of a baseline, which is put into the chain afterwards.
         estimates: measured values of the noise of a baseline.
     """
 
@@ -127,7 +127,7 @@ def recipes(selected: Iterable[Rendition], chain: Chain, key: str) -> list[Recip
     a bracket.
 
     Args:
-        asked: the renditions. A baseline comes after the pictures that it is measured on.
+        selected: the renditions. A baseline comes after the pictures that it is measured on.
         chain: the chain of the noisy picture.
         key: the key of the image.
 

@@ -77,7 +77,8 @@ def warp(
     Args:
         layers: layers of one image.
         geometry: how its pixels move; None moves none.
-        width, height: of the image.
+        width: the width of the image in px.
+        height: its height in px.
 
     Returns:
         Each layer, (rows, columns, channel) of its own type. Flow, and blended layers of whole

@@ -60,8 +60,10 @@ class Geometry(Protocol):
         the image, where nothing is known.
 
         Args:
-            x, y: positions in the output.
-            width, height: of the input.
+            x: columns of positions in the output.
+            y: their rows.
+            width: the width of the input in px.
+            height: its height in px.
         """
         ...
 
@@ -83,9 +85,11 @@ class ForwardMapped:
         """Return the positions in the output for positions of the input; NaN if there is none.
 
         Args:
-            x, y: the positions.
+            x: the columns of the positions.
+            y: their rows.
             at: positions in the image that select the view, for the start of a vector.
-            width, height: of the input.
+            width: the width of the input in px.
+            height: its height in px.
         """
         raise NotImplementedError(type(self).__name__)
 
@@ -244,7 +248,8 @@ def destinations(
         geometry: how the pixels move.
         to: x and y of the positions, float64 of any shape.
         start: positions of the output nearby, of the same shape.
-        width, height: of the input.
+        width: the width of the input in px.
+        height: its height in px.
         at: see :meth:`ForwardMapped.destinations`; None is the positions themselves.
 
     Returns:

@@ -63,7 +63,8 @@ class Intrinsics:
         """Return the intrinsics of a render, undistorted; None if its focal length is not known.
 
         Args:
-            width, height: in px.
+            width: the width of the render in px.
+            height: its height in px.
             shot: known values: fx, fy, cx, cy in px; focal_length and sensor_width in mm, along the
                 longer side; pixel_pitch in um; camera_angle_x in radians.
             places: where each value is stated, for the message.
@@ -105,7 +106,8 @@ class Intrinsics:
         """Return the intrinsics of the resized image.
 
         Args:
-            width, height: of the result.
+            width: the width of the result in px.
+            height: its height in px.
             shown: the columns and rows that it shows, from the upper left corner.
         """
         x, y = width / shown[0], height / shown[1]

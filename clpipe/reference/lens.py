@@ -94,8 +94,10 @@ class DistortionMap:
         """Return the positions in the render that positions of the image show, in px, float64.
 
         Args:
-            x, y: positions in the image; float64, of any shape.
-            width, height: of the input.
+            x: columns of positions in the image; float64, of any shape.
+            y: their rows; float64, of the same shape.
+            width: the width of the input in px.
+            height: its height in px.
             lateral: the lateral colour of the channel.
 
         Raises:
@@ -210,7 +212,8 @@ class _ScaledLens:
             radial: the model.
             farthest: r of the farthest corner of the input.
             corner: r_d of the farthest corner of the image.
-            what, unit: for the message.
+            what: the name of the length, for the message.
+            unit: its unit, for the message.
         """
         at = None if radial.is_identity else fold_radius(radial, farthest)
         if at is not None and not radial.distort(np.array(at)) > corner:
@@ -284,7 +287,8 @@ def fitting_scale(lens: DistortionMap, width: int, height: int) -> float:
 
     Args:
         lens: the lens, with the margins of the render.
-        width, height: of the image.
+        width: the width of the image in px.
+        height: its height in px.
 
     Raises:
         ImageError: there is none between 1/8 and 8, or the lens folds the image over.

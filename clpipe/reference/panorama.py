@@ -75,7 +75,8 @@ class Panorama(Protocol):
         """Return the directions of positions of the atlas, of any length above 0.
 
         Args:
-            x, y: the positions, px.
+            x: the columns of the positions, px.
+            y: their rows, px.
             at: positions in the views that select the view; None is the positions themselves. A
                 vector may therefore end outside a view.
         """
@@ -254,7 +255,8 @@ def sample(pixels: Array, x: Array, y: Array, filter_: str) -> Array:
 
     Args:
         pixels: the image, continued by its edge pixels.
-        x, y: the positions, 1-D.
+        x: the columns of the positions, 1-D.
+        y: their rows, 1-D.
         filter_: a key of :data:`FILTERS`, or "linear" or "nearest".
     """
     if filter_ == "nearest":

@@ -204,7 +204,8 @@ def gather(plane: Floats, across: Floats, down: Floats, polynomials: Floats) -> 
 
     Args:
         plane: (height, width) float32.
-        across, down: offset of each pixel of the result from its position, px; float32.
+        across: the horizontal offset of each pixel of the result from its position, px; float32.
+        down: its vertical offset, px; float32.
         polynomials: those of the filter's weights, (tap, power), in :data:`FILTERS`.
     """
     height, width = plane.shape

@@ -113,7 +113,8 @@ class WideLens:
         """Return the directions that positions of the image see.
 
         Args:
-            x, y: in px from the corner, float64 of any shape.
+            x: columns in px from the corner, float64 of any shape.
+            y: rows in px from the corner, float64 of the same shape.
 
         Returns:
             (3, ...): right, down and along the axis, of length 1; NaN outside the field of view.

@@ -99,7 +99,7 @@ def contact_sheet(
         run: the run.
         budget: the budget that thumbnails use.
         label: a prefix of the image names, or "".
-        tell: called with the progress.
+        report_progress: called with the progress.
     """
     pictures = run.pictures
     sheet = Sheet(pictures=len(pictures))
@@ -199,7 +199,7 @@ class ComparedImage:
         """Return an image without views.
 
         Args:
-            made: the picture.
+            picture: the picture.
             pixels: (height, width, 3) uint8.
         """
         height, width = pixels.shape[:2]
@@ -284,7 +284,7 @@ def compared_image(
     Args:
         runs: the run of the image, and a second run that may have the same picture.
         labels: the labels of the runs.
-        made: the picture.
+        picture: the picture.
         budget: the budget that views use.
         problems: gets the errors of views.
     """

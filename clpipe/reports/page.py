@@ -67,7 +67,7 @@ def html(runs: Sequence[Run], report_progress: Callable[[str], None] = lambda _:
 
     Args:
         runs: one or two runs.
-        tell: called with a description of the next step.
+        report_progress: called with a description of the next step.
     """
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),

@@ -83,7 +83,7 @@ def blender_command(program: str | None, request_path: Path) -> list[str]:
 
     Args:
         program: an installed Blender, or a Python with the package bpy; None is this Python.
-        asked: the file with the request.
+        request_path: the file with the request.
 
     Raises:
         RequestError: this Python has no bpy.

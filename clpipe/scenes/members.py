@@ -47,7 +47,7 @@ class Member:
         folder: the folder for its camera and ISO; "" is the dataset's own.
         files: paths in the dataset's folder: "picture", ground truth such as "truth_clean",
             "carried", and the PNG of each layer by its name.
-        facts: the metadata of the picture.
+        metadata: the metadata of the picture.
         render: the path of its render, relative to the dataset's folder.
         layers: the records of carried layers in the sidecar.
     """

@@ -72,7 +72,7 @@ class Source:
 
         Args:
             jobs: the jobs; all jobs of a render are consecutive.
-            tell: prints a line.
+            show: prints a line.
         """
         if not self.renderer:
             yield from jobs

@@ -71,7 +71,9 @@ def diffraction_psf(
     wavelength * f-number (Goodman, Introduction to Fourier Optics, 3rd ed. 2005, eq. 6-31).
 
     Args:
-        sigma, low_pass, pixel_area: in px.
+        sigma: as for :func:`line_spread`.
+        low_pass: as for :func:`line_spread`.
+        pixel_area: as for :func:`line_spread`.
         f_number: of the lens.
         pitch: of the photosites, in um.
     """

@@ -193,7 +193,8 @@ class Rows(Method):
         The frames follow each other without a gap, over all of :meth:`duration`.
 
         Args:
-            frames, rows: their numbers.
+            frames: the number of frames.
+            rows: the number of rows.
             weighted: weight by the flickering light over its mean; shares need not add up to 1
             then.
         """

@@ -121,6 +121,7 @@ def patch_means(picture: NDArray[np.number], patches: int = 24) -> Doubles:
 
     Args:
         picture: (height, 384, 3), in any unit.
+        patches: the number of patches.
 
     >>> bool(np.allclose(patch_means(chart_image()), linear(chart_patches())))
     True

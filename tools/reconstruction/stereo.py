@@ -63,8 +63,10 @@ def match(left: Array, right: Array, lowest: float, highest: float) -> Floats:
     """Compute disparities with OpenCV, px; NaN where it finds none.
 
     Args:
-        left, right: (height, width, 3) uint8, of one size.
-        lowest, highest: the range of the scene's disparities, px.
+        left: (height, width, 3) uint8.
+        right: like ``left``, of the same size.
+        lowest: the smallest disparity of the scene, px.
+        highest: the largest one, px.
     """
     import cv2
 

@@ -42,7 +42,7 @@ class Staggered(Readouts):
 
     @property
     def spans(self) -> tuple[Span, ...]:
-        """Return how many exposures the (resolved) method needs; 1 if all see the same light."""
+        """The span of time that each exposure sees; a single one if all see the same light."""
         lengths = [each.share for each in self.readouts]
         starts = accumulate(lengths, initial=0.0)
         needs_images = self._light_changes and self._later_images is None
