@@ -2,20 +2,36 @@
 
 import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.engine.buffers import HostImages
-from clpipe.engine.flow import Flight
+from clpipe.engine.discovery import DeviceInfo
+from clpipe.engine.flow import Flight, Flow
 from clpipe.engine.options import Timing
+from clpipe.engine.tiles import Tiling
 from clpipe.engine.work import R, Work
 
-if TYPE_CHECKING:
-    from clpipe.engine.device import Device
-
 MAX_FAILURES = 3  # images in a row for which a device may fail before it is no longer used
+
+
+class OpenDevice(Protocol):
+    """A device that can be opened again, :class:`clpipe.engine.device.Device`."""
+
+    info: DeviceInfo
+    flow: Flow
+    memory: int
+
+    def enqueue(self, works: Sequence[Work[Any]], memory: int) -> Flight | Exception:
+        """Enqueue images within ``memory`` bytes, or return the exception of the device."""
+
+    def tiling(self, work: Work[Any], memory: int) -> Tiling:
+        """Return the tiles of an image for a limit of ``memory`` bytes."""
+
+    def reopen(self) -> None:
+        """Open the device again, in a new context."""
 
 
 class Recovery:
@@ -28,7 +44,7 @@ class Recovery:
         generation: a number that increases each time all data on the device is lost.
     """
 
-    def __init__(self, device: "Device") -> None:
+    def __init__(self, device: OpenDevice) -> None:
         import pyopencl as cl
 
         self.generation = 0

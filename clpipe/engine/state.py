@@ -1,6 +1,6 @@
 """State: what the frames of a sequence leave on a device, or in NumPy, for the next frame."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from clpipe.base.errors import DeviceFailedError
 from clpipe.base.types import Floats
@@ -10,10 +10,17 @@ from clpipe.engine.extents import Extent, Extents
 from clpipe.engine.ir import Plan
 from clpipe.stage import PREVIOUS
 
-if TYPE_CHECKING:
-    from clpipe.engine.flow import Flow
-
 Layout = tuple[tuple[str, Extent], ...]
+
+
+class Queue(Protocol):
+    """The commands and buffers of a device, :class:`clpipe.engine.flow.Flow`."""
+
+    def drain(self) -> None:
+        """Wait for all commands."""
+
+    def new_buffer(self, size: int) -> Any:
+        """Return a new buffer of a size in bytes."""
 
 
 def keeps_state(step: Step) -> bool:
@@ -60,7 +67,7 @@ class State:
         self.buffers: dict[str, Any] = {}
         self.is_lost = False
         self._arrays: dict[str, Floats] = {}  # in NumPy, by step
-        self._flow: Flow | None = None
+        self._flow: Queue | None = None
         # The layout of the planes, which is () before the first frame.
         self._layout: Layout = ()
         # A frame reads one set of planes and writes the other, because a stencil reads neighbours.
@@ -86,7 +93,7 @@ class State:
         """Return whether the next frame is the first one, or differs in layout from the last."""
         return self._layout != layout_of(plan, extents)
 
-    def begin_frame(self, flow: "Flow", plan: Plan, extents: Extents) -> None:
+    def begin_frame(self, flow: Queue, plan: Plan, extents: Extents) -> None:
         """Set :attr:`buffers` for a frame that is enqueued next. The next one reads its results.
 
         Raises:

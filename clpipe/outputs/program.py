@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-import clpipe
 from clpipe.base.about import full_version
 from clpipe.engine.cache_folder import cache_folder
 from clpipe.engine.device import Device
@@ -43,7 +42,7 @@ def program_digest() -> str:
 
 
 def _folders() -> list[Path]:
-    return [Path(clpipe.__file__).parent, kernel_folder()]
+    return [Path(__file__).parents[1], kernel_folder()]
 
 
 def _content(folders: list[Path]) -> str:
