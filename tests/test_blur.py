@@ -186,7 +186,7 @@ def test_the_default_has_a_good_lens_and_the_paper_none():
         ),
     ],
 )
-def test_what_is_refused(stages, message, write_exr, monkeypatch, tmp_path):
+def test_rejected_settings(stages, message, write_exr, monkeypatch, tmp_path):
     assert load_camera("sony-imx686").pixel_pitch is None
     monkeypatch.chdir(tmp_path)
     write_exr("even.exr", np.ones((5, 4, 3), np.float32))

@@ -456,7 +456,7 @@ def test_a_missing_linker_is_said_before_it_aborts_the_process(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("arguments", ["--help", "--version", "stages", "cameras --json", "plan"])
-def test_what_cannot_be_printed_is_said_so(arguments):
+def test_text_that_cannot_be_printed_has_a_message(arguments):
     command = [sys.executable, "-m", "clpipe", *arguments.split()]
     with open("/dev/full", "w") as full:
         result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT)

@@ -74,7 +74,7 @@ def folder(write_exr):
         (("explore", "pngs"), "For renders, add --transfer srgb; for photographs, use -c unproc"),
     ],
 )
-def test_what_was_meant_is_said(clpipe, folder, words, message):
+def test_messages_suggest_what_was_meant(clpipe, folder, words, message):
     stderr = clpipe(*words, status=2).stderr
     assert message.format(IS_MISSING) in stderr
     assert not Path("out").exists()

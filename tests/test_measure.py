@@ -333,7 +333,7 @@ def test_a_raws_law_is_pooled_by_its_errors():
     assert pooled.channels[-1].rows.limit < reports[0].channels[-1].rows.limit
 
 
-def test_folders_of_photographs_are_a_burst_each_and_what_is_refused(tmp_path, measured, clpipe):
+def test_folders_of_photographs_are_a_burst_each(tmp_path, measured, clpipe):
     photos = tmp_path / "photos"
     burst(photos / "a", "DSC{}.jpg", 3, 5)
     burst(photos / "b", "DSC{}.jpg", 4, 5)

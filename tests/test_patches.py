@@ -356,7 +356,7 @@ def test_layers_go_along(write_exr, tmp_path):
         api.Dataset(tmp_path / "a.exr", patch=api.Patches(16, augment=True), **given)[0]
 
 
-def test_what_is_refused(renders):
+def test_rejected_patches(renders):
     mosaic = {"until": "normalize"}
     for wrong, message in (
         ({"patch": 0}, "patch: found 0; expected a whole number of 1 or more"),

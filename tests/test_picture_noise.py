@@ -164,7 +164,7 @@ def test_a_report_that_changes_is_read_again(report):
 
 
 @pytest.mark.parametrize("method", ["iid_gaussian", "intensity_dependent"])
-def test_what_is_refused(method, report, tmp_path):
+def test_rejected_baselines(method, report, tmp_path):
     broken = tmp_path / "broken.json"
     broken.write_text("{")
     sigma = [0.1, 0.2, 0.3]

@@ -67,7 +67,7 @@ def test_several_of_one_alone_name_no_folder_for_the_other(clpipe, renders, tmp_
         (["--camera", "sony-a7r2", "--camera", "nikon-f"], "nikon-f"),
     ],
 )
-def test_what_is_refused(clpipe, renders, options, message):
+def test_rejected_options(clpipe, renders, options, message):
     assert message in clpipe("run", "renders", "-o", "out", *NUMPY, *options, status=2).stderr
 
 

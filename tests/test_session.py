@@ -43,7 +43,7 @@ def test_nothing_is_written_before_a_run_is_iterated(renders):
     assert "a.jpg" in written(Path("out"))
 
 
-def test_what_cannot_be_is_refused_at_once(renders):
+def test_impossible_requests_are_rejected_at_once(renders):
     for options, message in (
         ({"iso": [100, 100]}, r"--iso: found \[100, 100\], which lists 100 twice"),
         ({"truth": "cleen"}, r"unknown truth 'cleen' \(did you mean 'clean'"),

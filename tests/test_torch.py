@@ -141,7 +141,7 @@ def test_clipping_stops_a_gradient_and_rounding_does_not():
     ]
 
 
-def test_what_is_wrong_is_said():
+def test_messages_name_what_is_wrong():
     add = RawNoise("sony-a7r2", 3200)
     with pytest.raises(api.ImageError, match=r"shape \(3, 8, 8\)"):
         add(torch.zeros(3, 8, 8))

@@ -50,9 +50,9 @@ class Replay:
             values = read_sidecar(sidecar)
         except FileNotFoundError:
             raise ImageError(f"{sidecar}: this sidecar no longer exists") from None
-        environment, current = digests_in(values), environment_in(values)
+        digests, current = digests_in(values), environment_in(values)
         differing = sorted(
-            n for n in {*self.outputs, *environment} if self.outputs.get(n) != environment.get(n)
+            n for n in {*self.outputs, *digests} if self.outputs.get(n) != digests.get(n)
         )
         if not differing:
             return True, "the same bytes"

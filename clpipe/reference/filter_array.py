@@ -17,7 +17,7 @@ from clpipe.reference.image import mirror
 
 MAX_PERIOD = 8
 MIRRORED = 2  # the longest period that a mirrored border (reflect-101) continues
-# Lanes; the most that a device has. Each row of a table has as many extra entries, so that it loads
+# The most lanes that a device has. Each row of a table has as many extra entries, so that it loads
 # at once.
 LANES = 16
 

@@ -17,9 +17,9 @@ from clpipe.reference.filter_array import FilterArray, periodic_indices
 RADIUS = 3  # px; windows are 7x7
 SIDE = 2 * RADIUS + 1
 # The model. Luma is the same in red, green and blue and has variance 1. Chroma sums to zero, and
-# each colour's chroma has the variance CHROMA. Both are isotropic. The correlation is NEIGHBOURS to
-# the power of the distance in px. We chose the values on eight images of the Kodak set, for RGGB,
-# quad and X-Trans (docs/quality.md).
+# each colour's chroma has the variance CHROMA. Both are isotropic. The correlation is CORRELATION
+# to the power of the distance in px. We chose the values on eight images of the Kodak set, for
+# RGGB, quad and X-Trans (docs/quality.md).
 CORRELATION = 0.95
 CHROMA = 0.05
 NOISE = 1e-4  # variance that the model does not describe

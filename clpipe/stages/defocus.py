@@ -9,6 +9,7 @@ from pydantic import field_validator, model_validator
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Array, Floats
 from clpipe.reference.defocus import aperture_taps, defocus, disc_reach, parse_depth
+from clpipe.reference.filter_array import LANES
 from clpipe.stage import (
     Arguments,
     Context,
@@ -26,7 +27,6 @@ from clpipe.stage import (
 )
 
 MAX_RADIUS = 31  # px, radius of a disc
-MAX_LANES = 16  # lanes at most
 NO_SURFACE = ImageLayer("depth", np.full((1, 1), np.inf, np.float32))
 
 
@@ -238,7 +238,7 @@ class ThinLens(FocalLengthMethod, LayerMethod):
         # Rounded, so that many images share a few tables.
         largest = float(np.ceil(abs(radii).max() * 4)) / 4
         reach = disc_reach(largest)
-        border = ((reach, reach), (reach, reach + MAX_LANES))
+        border = ((reach, reach), (reach, reach + LANES))
         return np.pad(radii, border, "reflect"), reach, aperture_taps(self.blades, largest)
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:

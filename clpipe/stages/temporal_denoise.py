@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from clpipe.base.types import Array, Floats
+from clpipe.reference.filter_array import LANES
 from clpipe.reference.image import tap
 from clpipe.stage import (
     PREVIOUS,
@@ -35,7 +36,6 @@ MOVE, MOVE_BY = 0.5, 0.05
 SMALLEST = 1e-12  # of variances, so that images without noise have a weight, too
 
 NOWHERE = np.float32(1e9)  # the displacement of pixels that the frame before does not show
-MAX_LANES = 16  # lanes at most, by which tables are wider than images
 
 
 class Recursive(Method):
@@ -158,7 +158,7 @@ class OpticalFlow(Recursive, LayerMethod):
     summary: ClassVar = "recursive mean over frames along the render's optical flow"
     layer_kind: ClassVar[Literal["flow"]] = "flow"
     usual_layers: ClassVar = ("Vector", "Flow")
-    no_layer: ClassVar = ImageLayer("flow", np.zeros((2, 1, 1 + MAX_LANES), np.float32))
+    no_layer: ClassVar = ImageLayer("flow", np.zeros((2, 1, 1 + LANES), np.float32))
 
     def passes(self) -> tuple[Pass, ...]:
         follow = Pass(
@@ -174,7 +174,7 @@ class OpticalFlow(Recursive, LayerMethod):
         x, y = np.arange(width) + across, np.arange(height)[:, None] + down
         known = (abs(2 * x + 1 - width) <= width) & (abs(2 * y + 1 - height) <= height)
         table = np.where(known, (across, down), NOWHERE)
-        return np.pad(table, ((0, 0), (0, 0), (0, MAX_LANES)))
+        return np.pad(table, ((0, 0), (0, 0), (0, LANES)))
 
     def arguments(self, context: Context) -> Arguments:
         table = self.layer_in(context).pixels
@@ -183,7 +183,7 @@ class OpticalFlow(Recursive, LayerMethod):
 
     def compensated(self, image: Floats, previous: Floats, context: Context) -> Floats:
         height, width = image.shape[:2]
-        table = self.layer_in(context).pixels[..., :-MAX_LANES]
+        table = self.layer_in(context).pixels[..., :-LANES]
         displacements = np.broadcast_to(table, (2, height, width))
         known = (displacements[0] < NOWHERE)[..., None]
         places = np.where(known[..., 0], displacements, np.float32(0))
