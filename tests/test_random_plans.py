@@ -178,8 +178,8 @@ def random_chain(random: Random, for_device: bool = False) -> Chain:
         reach, stages = random.randint(1, 3), pointwise(random.random() < 0.6)
         stages |= {n: p for n, p in stencils(reach).items() if not for_device or MIXED not in n}
         chosen = random.choice(sorted(stages))
-        method = WithTaps() if chosen.startswith("around") else Composed()
-        method._passes, method._reach = stages[chosen], reach
+        made = WithTaps() if chosen.startswith("around") else Composed()
+        method = made.with_state(_passes=stages[chosen], _reach=reach)
         stage = Stage(name, "A stage of a test.", Kind.RGB, Kind.RGB, (Composed,), folder=FOLDER)
         steps.append(Step(name, stage, method, context))
     names = tuple(step.name for step in steps)
