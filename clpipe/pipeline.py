@@ -1,7 +1,6 @@
 """The Python API: a chain of stages as a callable object."""
 
 import threading
-import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Unpack
@@ -13,6 +12,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import as_texts, unknown_name
 from clpipe.base.types import Array, plain
+from clpipe.base.user_warnings import warn
 from clpipe.base.validation import check_argument_types
 from clpipe.chain.chain import Chain
 from clpipe.chain.entering import prepare_image
@@ -50,12 +50,14 @@ class Prepared(NamedTuple):
         pixels: its pixels.
         own_key: its image key.
         layers: the layers that steps read, by step.
+        warnings: warnings about the image.
     """
 
     runner: Runner
     pixels: Array
     own_key: str
     layers: Mapping[str, ImageLayer]
+    warnings: tuple[str, ...]
 
 
 class Pipeline(ReadOnly):
@@ -206,11 +208,13 @@ class Pipeline(ReadOnly):
         """
         arrays = {} if depth is None else {"depth": depth}
         prepared = self.prepare(image, key, arrays, overscan, settings)
+        for text in prepared.warnings:
+            warn(f"{key}: {text}")
         result, chain = self.develop(prepared), prepared.runner.chain
         share = clipped_share(result, chain) or 0.0
         # Photographs are already clipped.
         if share >= WARNING_SHARE and chain.source is not Kind.DISPLAY:
-            warnings.warn(f"{key}: {clipping_text(share)}", stacklevel=2)
+            warn(f"{key}: {clipping_text(share)}")
         return result
 
     def develop(self, prepared: Prepared, state: State | None = None) -> Result:
@@ -260,17 +264,15 @@ class Pipeline(ReadOnly):
             return layer_of_array(chain, step, cropped, width, height)
 
         entered = prepare_image(runner.chain, checked, margins, layer)
-        for kind in arrays.keys() - {each.kind for each in entered.layers.values()}:
-            message = f"no step reads the {kind}. Set {READERS[kind]} to use it"
-            warnings.warn(f"{key}: {message}", stacklevel=3)
-        for warning in entered.warnings:
-            warnings.warn(f"{key}: {warning}", stacklevel=3)
+        unread = sorted(arrays.keys() - {each.kind for each in entered.layers.values()})
+        notes = [f"no step reads the {kind}. Set {READERS[kind]} to use it" for kind in unread]
+        texts = (*notes, *entered.warnings)
         chain, pixels = entered.chain, entered.pixels
         runner = runner if chain is runner.chain else runner.for_chain(chain)
         if earlier:
-            return Prepared(runner, pixels, earlier.own_key, entered.layers)
+            return Prepared(runner, pixels, earlier.own_key, entered.layers, texts)
         digest = "" if chain.settings.noise_key else digest_of(pixels)
-        return Prepared(runner, pixels, image_key(key, digest), entered.layers)
+        return Prepared(runner, pixels, image_key(key, digest), entered.layers, texts)
 
     __call__ = process
 

@@ -2,7 +2,6 @@
 
 import copy
 import hashlib
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
@@ -13,6 +12,7 @@ from clpipe.base.processors import available_processors
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import as_texts
 from clpipe.base.types import plain
+from clpipe.base.user_warnings import warn
 from clpipe.base.validation import check_argument_types
 from clpipe.chain.rendition import DEVELOPMENT
 from clpipe.chain.request import Request
@@ -321,7 +321,7 @@ class Dataset(ReadOnly):
             except ImageError as error:
                 if not self._skips:
                     raise
-                warnings.warn(f"skipped: {error}", stacklevel=3)
+                warn(f"skipped: {error}")
         raise ImageError("no image of the dataset can be read and developed")
 
     def _batch(self, epoch: int, image: int, numbers: Sequence[int]) -> SampleBatch:
@@ -346,7 +346,7 @@ class Dataset(ReadOnly):
                 except ImageError as error:
                     if not self._skips:
                         raise
-                    warnings.warn(f"skipped: {error}", stacklevel=2)
+                    warn(f"skipped: {error}")
                     self._next += len(batch.numbers)
                     continue
                 for sample in samples:

@@ -2,13 +2,13 @@
 
 import logging
 import os
-import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.memory import parse_size
+from clpipe.base.user_warnings import warn
 from clpipe.chain.isos import draw_note
 from clpipe.inputs.find import Job, find_jobs
 from clpipe.inputs.lenses import lens_notes
@@ -75,7 +75,7 @@ def jobs_of(
     text = f"{_reason(loader, damaged[0])}{others}"
     if not skips or len(damaged) == len(jobs):
         raise RequestError(f"{text}. Remove such files, or set on_error='skip'")
-    warnings.warn(f"skipped: {text}", stacklevel=4)
+    warn(f"skipped: {text}")
     return [job for job, readable in zip(jobs, is_readable, strict=True) if readable]
 
 

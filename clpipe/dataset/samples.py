@@ -2,7 +2,6 @@
 
 import os
 import threading
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from typing import Any
 
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.user_warnings import Issued, warn
 from clpipe.chain.carry import VALID
 from clpipe.chain.identity import frame_key, noise_key
 from clpipe.dataset.developer import Developer, DevelopTask, Sample, SampleSpec
@@ -73,7 +73,7 @@ class SampleLoader:
         self._spec = spec
         self._device = device
         self._open_developer: Developer | None = None
-        self._warned: set[str] = set()
+        self._warned = Issued()
 
     def __getstate__(self) -> Mapping[str, Any]:
         return {**self.__dict__, "_open_developer": None}  # a device cannot leave its process
@@ -118,9 +118,8 @@ class SampleLoader:
                 f"{job.path}: this image was not kept directly before "
                 f"{loader.request.start_at}. Select such images with a glob"
             )
-        for warning in set(loaded.source.warnings) - self._warned:  # warn once, not for each image
-            self._warned.add(warning)
-            warnings.warn(f"{job.path}: {warning}", stacklevel=2)
+        for warning in self._warned.new(loaded.source.warnings):
+            warn(f"{job.path}: {warning}")
         return loaded, carried
 
     def _source(self, job: Job, loader: ImageLoader) -> SourceImage:
