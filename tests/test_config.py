@@ -88,7 +88,7 @@ def test_a_bad_request_is_named(settings, message):
         ("iso = 100\n[sensor_noise]\na = -1\n", "line 3: sensor_noise.a: found -1"),
         ("iso = 100\n\n[sensor_nose]\na = 1\n", "line 3: unknown stage 'sensor_nose'"),
         ("seed = 1\niso = \n", r"not valid TOML: .*line 2"),
-        ("denoise = 3\n", r"line 1: denoise: found 3, but a stage is a table; use \[denoise\]"),
+        ("denoise = 3\n", r"line 1: denoise: found 3, but it is a table; .* in a file \[denoise\]"),
         ("seed = false\n", "line 1: seed: found False, but expected a whole number"),
         ("camra = 'x'\n", "line 1: unknown key 'camra'"),
         ("demosaic.method = 'x'\n", "line 1: demosaic.method: unknown method 'x'"),

@@ -313,10 +313,15 @@ def _check_plain_values(settings: Settings, plain: Mapping[str, Any]) -> dict[st
     """
     checked = dict(plain)
     for key, value in plain.items():
-        if key in all_stages():
-            raise KeyedError(key, f"{key}: found {value!r}, but a stage is a table; use [{key}]")
-        if key in TABLES:
-            raise KeyedError(key, f"{key}: found {value!r}, but this is a table; use [{key}]")
+        if key in TABLES or key in all_stages():
+            entry = (
+                f"'method': {value!r}" if key in all_stages() and isinstance(value, str) else "..."
+            )
+            raise KeyedError(
+                key,
+                f"{key}: found {value!r}, but it is a table; in Python use {key}={{{entry}}}, in a "
+                f"file [{key}]",
+            )
         if key == CODE:
             raise KeyedError(key, f"{key}: set it in a configuration file, or use --stage-file")
         if key not in KEYS:
