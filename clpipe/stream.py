@@ -3,21 +3,22 @@
 import itertools
 import queue
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, Unpack
 
 import numpy as np
 
-from clpipe.base.errors import DeviceFailedError, ImageError, RequestError
+from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError, RequestError
 from clpipe.base.types import Array
+from clpipe.base.user_warnings import Issued, warn
 from clpipe.base.validation import check_argument_types
 from clpipe.chain.options import Transfer
 from clpipe.engine.runner import Result
 from clpipe.engine.state import State
-from clpipe.images.arrays import as_array
+from clpipe.images.arrays import as_array, as_image
 from clpipe.inputs.metering import Meter, merged
 from clpipe.pipeline import Pipeline, Prepared
 from clpipe.reference.geometry import NO_MARGINS
@@ -116,20 +117,57 @@ class Stream:
         self._name = name
         self._is_srgb = transfer == "srgb"
         self._drop = drop
-        self._meter = Meter(lambda: self._pipeline.device)
-        self._state = State()
+        self._meter, self._state = self._new_meter(), State()
+        self._issued = Issued()
         self._numbers = itertools.count()
-        # One frame waits while another is developed, so a picture is at most two frames late.
+        # One frame waits while another is developed.
         self._free = threading.Semaphore(2)
-        self._shots: queue.SimpleQueue[Shot | Exception | None] = queue.SimpleQueue()
+        self._shots: queue.SimpleQueue[tuple[Shot, tuple[str, ...]] | Exception | None]
+        self._shots = queue.SimpleQueue()
         self._thread = ThreadPoolExecutor(1, "stream")
-        self._is_threaded = self._is_closed = False
+        self._lock = threading.Lock()  # lets no frame follow the end
+        self._is_threaded = self._has_ended = self._is_closed = False
 
     def __enter__(self) -> Self:
+        self._check_open()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def warm_up(self, shape: Sequence[int], dtype: Any = np.float32) -> None:
+        """Compile all kernels for frames of a shape and type, so that no frame waits for them.
+
+        The frames that follow have the same numbers, noise and settings as without it. A call with
+        an array whose channels are separate planes needs other kernels, which are not compiled.
+
+        >>> import numpy as np
+        >>> import clpipe
+        >>> with clpipe.Stream(device="numpy", transfer="srgb") as stream:
+        ...     stream.warm_up((24, 32, 3), "uint8")
+        ...     stream(np.zeros((24, 32, 3), np.uint8)).index
+        0
+
+        Args:
+            shape: the shape of frames, (height, width, 3).
+            dtype: the type of their samples.
+
+        Raises:
+            ImageError: frames of this shape or type cannot be developed.
+            RequestError: these are no shape and type, or the stream is closed.
+            DeviceError: a kernel does not compile.
+        """
+        self._check_accepts()
+        try:
+            type_ = np.dtype(dtype)
+            grey = 0.18 if type_.kind == "f" else 118  # 118 is the code of 0.18 in sRGB
+            frame = np.full(shape, grey, type_)
+        except (TypeError, ValueError) as error:
+            raise RequestError(
+                f"found shape {shape!r} and dtype {dtype!r} ({error}); pass those of a frame, such "
+                "as (720, 1280, 3) and 'float32'"
+            ) from None
+        self._in_thread(self._rehearse, frame).result()
 
     def __call__(self, frame: Array, depth: Array | None = None, flow: Array | None = None) -> Shot:
         """Develop the next frame, and return its picture.
@@ -146,9 +184,11 @@ class Stream:
             ImageError, RequestError: as for :meth:`Pipeline.process`. The next frame can still be
                 developed.
         """
+        self._check_accepts()
         if self._is_threaded:
             raise RequestError("this stream develops the frames of put; use get, not a call")
-        return self._develop(next(self._numbers), as_array(frame, "frame"), _by_kind(depth, flow))
+        index, light = next(self._numbers), as_array(frame, "frame")
+        return self._announced(*self._next_shot(index, light, _by_kind(depth, flow)))
 
     def put(self, frame: Array, depth: Array | None = None, flow: Array | None = None) -> bool:
         """Pass the next frame to the stream's thread. The frame is copied.
@@ -161,19 +201,21 @@ class Stream:
 
         Raises:
             ImageError: this is no array.
-            RequestError: the stream is closed.
+            RequestError: the stream is closed, or :meth:`end` was called.
         """
+        self._check_accepts()
         self._is_threaded = True
         image, layers = as_array(frame, "frame"), _by_kind(depth, flow)
         index = next(self._numbers)
-        is_free = self._is_closed or self._free.acquire(blocking=not self._drop)
-        if self._is_closed:
-            raise RequestError("this stream is closed; make another one")
+        is_free = self._free.acquire(blocking=not self._drop)
+        if self._has_ended:
+            self._free.release()  # another thread may wait as well
+            self._check_accepts()
         if not is_free:
             self.dropped += 1
             return False
         copied = {kind: layer.copy() for kind, layer in layers.items()}
-        self._thread.submit(self._deliver, index, image.copy(), copied)
+        self._in_thread(self._deliver, index, image.copy(), copied)
         return True
 
     def get(self, timeout: float | None = None) -> Shot | None:
@@ -185,42 +227,127 @@ class Stream:
         Raises:
             TimeoutError: there is no picture yet.
             ImageError, RequestError: this frame failed. The next one can still be developed.
+            RequestError: the stream is closed.
         """
+        self._check_open()
         try:
-            shot = self._shots.get(timeout=timeout)
+            found = self._shots.get(timeout=timeout)
         except queue.Empty:
             raise TimeoutError("no picture yet") from None
-        if shot is None:
+        if found is None:
             self._shots.put(None)  # for the next call
         self._free.release()
-        if isinstance(shot, Exception):
-            raise shot
-        return shot
+        if isinstance(found, Exception):
+            raise found
+        return None if found is None else self._announced(*found)
 
     def end(self) -> None:
-        """Accept no more frames. The pictures of earlier frames can still be fetched."""
-        if not self._is_closed:
-            self._is_closed = True
-            self._thread.submit(self._shots.put, None)
-            self._free.release()  # a thread that waits in put then learns of it
+        """Accept no more frames. The pictures of earlier frames can still be fetched.
+
+        Raises:
+            RequestError: the stream is closed.
+        """
+        self._check_open()
+        self._end()
 
     def finish(self) -> Iterator[Shot]:
-        """Yield the pictures of all frames that were put; none can be put any more."""
+        """Yield the pictures of all frames that were put; none can be put any more.
+
+        Raises:
+            RequestError: the stream is closed.
+        """
         self.end()
-        while shot := self.get():
-            yield shot
+        return iter(self.get, None)
 
     def close(self) -> None:
-        """Stop the stream, once the frames that were put are developed."""
-        self.end()
+        """Stop the stream, once the frames that were put are developed.
+
+        From then on, every method raises a RequestError, except for this one. Pictures that were
+        not fetched are lost.
+        """
+        self._end()
         self._thread.shutdown()
+        self._is_closed = True
+
+    def _end(self) -> None:
+        with self._lock:
+            if not self._has_ended:
+                self._thread.submit(self._shots.put, None)
+                self._has_ended = True
+                self._free.release()  # a thread that waits in put then learns of it
+
+    def _in_thread(self, function: Callable[..., None], *arguments: Any) -> Future[None]:
+        """Call a function in the stream's thread, after the frames before it.
+
+        Raises:
+            RequestError: the stream accepts no frames.
+        """
+        with self._lock:
+            self._check_accepts()
+            return self._thread.submit(function, *arguments)
+
+    def _check_open(self) -> None:
+        """Check that the stream is not closed.
+
+        Raises:
+            RequestError: it is.
+        """
+        if self._is_closed:
+            raise RequestError("this stream is closed; make another one")
+
+    def _check_accepts(self) -> None:
+        """Check that the stream accepts frames.
+
+        Raises:
+            RequestError: it does not.
+        """
+        self._check_open()
+        if self._has_ended:
+            raise RequestError("this stream was ended and accepts no more frames; make another one")
+
+    def _announced(self, shot: Shot, warnings: Iterable[str]) -> Shot:
+        """Return a picture, and issue the new kinds of warnings about it in the user's thread."""
+        for text in self._issued.new(warnings):
+            self._warn(f"{self._key(shot.index)}: {text}")
+        return shot
+
+    _warn = staticmethod(warn)
+
+    def _key(self, index: int) -> str:
+        """Return the image key of a frame, without the digest of its pixels."""
+        return f"{self._name}/{index:06}"
 
     def _deliver(self, *frame: Any) -> None:
         """Develop a frame for :meth:`get`."""
         try:
-            self._shots.put(self._develop(*frame))
+            self._shots.put(self._next_shot(*frame))
         except Exception as error:
             self._shots.put(error)
+
+    def _rehearse(self, frame: Array) -> None:
+        """Develop frames like those to come, with loops and state that are then dropped.
+
+        The second frame of a sequence needs other kernels than the first one.
+        """
+        as_image(self._light(frame), self._pipeline.chain.source)
+        height, width = frame.shape[:2]
+        layers = _by_kind(np.ones((height, width)), np.zeros((height, width, 2)))
+        meter, state = self._new_meter(), State()
+        for index in range(2) if self._pipeline.device else ():  # NumPy compiles nothing
+            self._develop(index, frame, layers, meter, state)
+
+    def _next_shot(
+        self, index: int, frame: Array, arrays: Mapping[str, Array]
+    ) -> tuple[Shot, tuple[str, ...]]:
+        """Develop the next frame. Arguments and result are those of :meth:`_develop`."""
+        try:
+            return self._develop(index, frame, arrays, self._meter, self._state)
+        except (DeviceError, DeviceFailedError):
+            self._state = State()  # the next frame starts again
+            raise
+
+    def _new_meter(self) -> Meter:
+        return Meter(lambda: self._pipeline.device)
 
     def _light(self, frame: Array) -> Array:
         """Return the light of a frame.
@@ -237,9 +364,21 @@ class Stream:
             )
         return SRGB.take(frame, mode="clip")
 
-    def _develop(self, index: int, frame: Array, arrays: Mapping[str, Array]) -> Shot:
-        """Develop one frame: meter it, and run the chain with its settings."""
-        pipeline, key = self._pipeline, f"{self._name}/{index:06}"
+    def _develop(
+        self, index: int, frame: Array, arrays: Mapping[str, Array], meter: Meter, state: State
+    ) -> tuple[Shot, tuple[str, ...]]:
+        """Meter a frame, run the chain with its settings, and return its picture and warnings.
+
+        Args:
+            index: the number of the frame.
+            frame, arrays: its pixels, and its layers by kind.
+            meter: the loops of the sequence.
+            state: what the frame before has left.
+
+        Raises:
+            ImageError, RequestError, DeviceError: the frame cannot be developed.
+        """
+        pipeline, key = self._pipeline, self._key(index)
         drawn = pipeline.settings.drawn_values(self._name, index)
         first = pipeline.prepare(self._light(frame), key, arrays, NO_MARGINS, drawn)
 
@@ -247,7 +386,7 @@ class Stream:
             settings = merged(drawn, values)
             return pipeline.prepare(first.pixels, key, arrays, NO_MARGINS, settings, first)
 
-        reading = self._meter.read(
+        reading = meter.read(
             first.runner.chain,
             first.pixels,
             first.own_key,
@@ -255,14 +394,11 @@ class Stream:
             lambda values: prepared_with(values).runner.chain,
         )
         prepared = prepared_with(reading.values) if reading.values else first
-        try:
-            result = pipeline.develop(prepared, self._state)
-        except DeviceFailedError:
-            self._state = State()  # the next frame starts again
-            raise
+        result = pipeline.develop(prepared, state)
         is_raw = prepared.runner.chain.result is Kind.RAW
         image = result.image.astype(np.uint16) if is_raw else result.image
-        return Shot(index, image, merged(drawn, reading.values), reading.metered, result)
+        settings = merged(drawn, reading.values)
+        return Shot(index, image, settings, reading.metered, result), prepared.warnings
 
 
 def _by_kind(depth: Array | None, flow: Array | None) -> dict[str, Array]:

@@ -5,14 +5,19 @@ import json
 import subprocess
 import sys
 import threading
+import time
 from multiprocessing import shared_memory
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 import clpipe
-from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError, RequestError
 from clpipe.camera.control import Control, ControlLoop
+from clpipe.engine import programs
+from clpipe.engine.recovery import MAX_FAILURES
+from tests.conftest import fail_launches, run_python
 
 LIGHT = (1, 1, 4, 4, 4, 4, 0.5, 0.5)
 
@@ -92,7 +97,7 @@ def test_frames_are_dropped_and_counted(frames):
         assert taken[0] and len(shots) == sum(taken) <= 4
         assert camera.dropped == len(frames) - len(shots)
         assert [shot.index for shot in shots] == [n for n, each in enumerate(taken) if each]
-        with pytest.raises(RequestError, match="this stream is closed"):
+        with pytest.raises(RequestError, match="was ended and accepts no more frames"):
             camera.put(frames[0])
         assert camera.get() is None
 
@@ -112,6 +117,186 @@ def test_a_wrong_frame_fails_alone(frames):
         camera(frames[0])
     with pytest.raises(TimeoutError), stream() as camera:
         camera.get(timeout=0.01)
+
+
+FEW = {"stages": ["distortion", "exposure", "gamma"]}
+# Shows a share of black that differs from frame to frame.
+BENT = {"method": "brown_conrady", "fx": 30.0, "k1": {"drift": [-0.3, -0.2], "frames": 2}}
+
+
+@pytest.mark.parametrize("way", ["call", "get", "finish"])
+def test_a_kind_of_warning_is_issued_once_at_the_line_of_the_user(frames, way):
+    flow = np.zeros((24, 32, 2), np.float32)
+
+    def use():
+        for number, frame in enumerate(frames[:6]):
+            layers = {"flow": flow} if number > 2 else {}
+            if way == "call":
+                camera(frame, **layers)
+            else:
+                camera.put(frame, **layers)
+            if way == "get" or (way == "finish" and number < 5):
+                camera.get()
+        assert len(list(camera.finish())) == (way == "finish")
+
+    camera = clpipe.Stream(device="numpy", distortion=BENT, **FEW)
+    with camera, pytest.warns(UserWarning, match=".") as caught:
+        use()
+    black, unread = (str(each.message) for each in caught)
+    assert black.startswith("stream/000000: ") and "% of the picture is black" in black
+    assert unread.startswith("stream/000003: no step reads the flow")
+    assert {each.filename for each in caught} == {__file__}
+
+
+def test_a_closed_stream_does_nothing(frames):
+    camera = stream()
+    camera.put(frames[0])
+    camera.close()
+    camera.close()
+    for use in (
+        lambda: camera(frames[0]),
+        lambda: camera.put(frames[0]),
+        camera.get,
+        camera.end,
+        camera.finish,
+        lambda: camera.warm_up((24, 32, 3)),
+        camera.__enter__,
+    ):
+        with pytest.raises(RequestError, match="this stream is closed; make another one"):
+            use()
+    with stream() as camera:
+        pictures = camera.finish()
+        for use in (camera, camera.put, lambda frame: camera.warm_up(frame.shape)):
+            with pytest.raises(RequestError, match="was ended and accepts no more frames"):
+                use(frames[0])
+    with pytest.raises(RequestError, match="this stream is closed"):
+        next(pictures)
+
+
+def test_all_that_wait_in_put_learn_of_the_end(frames):
+    errors = []
+
+    def put():
+        try:
+            while True:
+                camera.put(frames[0])
+        except RequestError as error:
+            errors.append(error)
+
+    with stream() as camera:
+        threads = [threading.Thread(target=put, daemon=True) for _ in range(2)]
+        for thread in threads:
+            thread.start()
+        while len(camera._free._cond._waiters) < 2:
+            time.sleep(0.01)
+        camera.end()
+        for thread in threads:
+            thread.join(120)
+    assert len(errors) == 2
+
+
+def test_a_stream_goes_on_after_its_device_failed(device, frames, monkeypatch):
+    """The frame after a failure starts again, also if that was one too many."""
+    options = {"device": device.info.index, "iso": 800, "stages": ["exposure", "temporal_denoise"]}
+    with clpipe.Stream(**options) as camera:
+        first = camera(frames[0]).image
+        for failure in range(MAX_FAILURES):
+            with monkeypatch.context() as patch:
+                fail_launches(patch, cl.RuntimeError("lost"), *range(9))
+                expected = DeviceFailedError if failure < MAX_FAILURES - 1 else DeviceError
+                with pytest.raises(expected, match="failed"):
+                    camera(frames[0])
+        assert np.array_equal(camera(frames[0]).image, first)
+
+
+LOOPS = {"exposure": {"method": "auto"}, "white_balance": {"method": "gray_world"}}
+NAMES = "exposure mosaic sensor_noise white_balance demosaic temporal_denoise gamma"
+AVERAGED = {"iso": 800, "stages": NAMES.split(), "control": {"iso_max": 3200.0}, **LOOPS}
+
+
+def test_after_warming_up_no_frame_compiles_or_differs(device, frames, monkeypatch):
+    monkeypatch.setattr(programs, "_by_device", {})  # kernels of other tests do not help
+    options = {"device": device.info.index, **AVERAGED}
+    with clpipe.Stream(**options) as camera:
+        compiled = programs.programs_of(camera._pipeline.device.info)
+        assert not len(compiled)
+        camera.warm_up(frames[0].shape)
+        count = len(compiled)
+        warmed = [camera(frame) for frame in frames[:4]]
+        camera.warm_up(frames[0].shape, np.float32)
+        warmed += [camera(frame) for frame in frames[4:]]
+        assert len(compiled) == count > 5
+    with clpipe.Stream(**options) as camera:
+        cold = [camera(frame) for frame in frames]
+    for one, other in zip(warmed, cold, strict=True):
+        assert np.array_equal(one.image, other.image)
+        assert (one.index, one.settings) == (other.index, other.settings)
+        assert (one.metered, one.result.estimates) == (other.metered, other.result.estimates)
+
+
+def test_what_cannot_be_warmed_up_is_told(frames):
+    with stream() as camera:
+        for shape, dtype in (((24, 32, 2), "float32"), ((24, 32), "float32"), ((4, 4, 3), "uint8")):
+            with pytest.raises(ImageError, match="the image has"):
+                camera.warm_up(shape, dtype)
+        for shape, dtype in (((-1, 4, 3), "float32"), ("large", "float32"), ((4, 4, 3), "float7")):
+            with pytest.raises(RequestError, match=r"found shape .* such as \(720, 1280, 3\)"):
+                camera.warm_up(shape, dtype)
+        assert camera(frames[0]).index == 0
+
+
+WARMED = """
+import sys
+from pathlib import Path
+import numpy as np
+import clpipe
+from clpipe.engine.cache_folder import pocl_folder
+from clpipe.engine.programs import programs_of
+
+options, dtype = eval(sys.argv[1]), sys.argv[2]
+depth = np.ones((48, 64), np.float32) * np.linspace(1, 9, 64, dtype=np.float32)
+layers = {"depth": depth} if "defocus" in options else {}
+layers |= {"flow": np.zeros((48, 64, 2))} if "temporal_denoise" in options else {}
+with clpipe.Stream(device=int(sys.argv[3]), **options) as camera:
+    def count():
+        libraries = len([*pocl_folder().rglob("*.so")]) if pocl_folder() else 0
+        return len(programs_of(camera._pipeline.device.info)), libraries
+    before = count()
+    camera.warm_up((48, 64, 3), dtype)
+    warm = count()
+    for number in range(7):
+        light = np.random.default_rng(number).uniform(0, 1 / (1 + number % 3), (48, 64, 3))
+        camera.put((light * (255 if dtype == "uint8" else 1)).astype(dtype), **layers)
+        camera.get()
+    assert before < warm == count(), (before, warm, count())
+"""
+LENS = {"method": "thin_lens", "focal_length": 50.0, "sensor_width": 36.0, "max_radius": 4}
+LAYERS = {"defocus": LENS, "temporal_denoise": {"method": "flow"}}
+WITH_LAYERS = ["defocus", "exposure", "temporal_denoise", "gamma"]
+TWO_GAINS = {"sensor_noise": {"method": "split_dual_gain"}}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("options", "dtype"),
+    [
+        ({"config": "video", **LOOPS, "transfer": "srgb"}, "uint8"),
+        ({"stages": WITH_LAYERS, **LAYERS, "keep": "all"}, "float16"),
+        ({"camera": "sony-imx490", **TWO_GAINS, "until": "quantize"}, "float64"),
+    ],
+)
+def test_a_new_process_compiles_only_while_it_warms_up(device, tmp_path, options, dtype):
+    words = repr(options), dtype, device.info.index
+    run_python("-c", WARMED, *words, CLPIPE_CACHE_DIR=tmp_path)
+
+
+def test_a_table_that_is_none_is_told_as_python_writes_it():
+    for name, value, said in (
+        ("exposure", "auto", r"exposure: found 'auto'.* use exposure=\{'method': 'auto'\}"),
+        ("control", 4, r"control: found 4.* use control=\{\.\.\.\}"),
+    ):
+        with pytest.raises(RequestError, match=said):
+            stream(**{name: value})
 
 
 def test_finished_frames_are_converted_to_light(frames):
