@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -11,13 +12,17 @@ from multiprocessing import shared_memory
 import numpy as np
 import pyopencl as cl
 import pytest
+from click.testing import CliRunner
 
 import clpipe
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError, RequestError
 from clpipe.camera.control import Control, ControlLoop
+from clpipe.commands import stream as command
+from clpipe.commands.main import main
+from clpipe.commands.stream import frames_in
 from clpipe.engine import programs
 from clpipe.engine.recovery import MAX_FAILURES
-from tests.conftest import fail_launches, run_python
+from tests.conftest import fail_launches, run_cli, run_python
 
 LIGHT = (1, 1, 4, 4, 4, 4, 0.5, 0.5)
 
@@ -354,6 +359,70 @@ def npy(*frames):
     for frame in frames:
         np.save(file, frame)
     return file.getvalue()
+
+
+def test_frames_are_read_as_the_simulator_writes_them(frames):
+    """Also a header and samples in pieces, and planes in Fortran order."""
+    data = npy(frames[0], np.asfortranarray(frames[1]))
+    ends, begun = os.pipe(), []
+
+    def write():
+        with open(ends[1], "wb", buffering=0) as pipe:
+            for start in range(0, len(data), 1000):
+                pipe.write(data[start : start + 1000])
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    with open(ends[0], "rb") as pipe:
+        found = list(frames_in(pipe, lambda *kind: begun.append(kind)))
+    writer.join()
+    assert begun == [((24, 32, 3), np.float32)]
+    assert np.array_equal(found, frames[:2])
+
+
+def test_a_stream_is_warm_before_it_reads_the_first_frame(frames, monkeypatch):
+    done = []
+    monkeypatch.setattr(command.Camera, "warm_up", lambda _, *kind: done.append(kind))
+    monkeypatch.setattr(command.Camera, "put", lambda _, frame: done.append(frame.shape))
+    data = io.BufferedReader(io.BytesIO(npy(frames[0], frames[1])))
+    CliRunner().invoke(main, ["stream", "--device", "numpy"], input=data)
+    assert done == [((24, 32, 3), np.float32), (24, 32, 3), (24, 32, 3)]
+
+
+@pytest.mark.parametrize("name", ["__stdin__", "__stdout__"])
+def test_the_command_needs_both_ends_of_a_pipe(monkeypatch, name):
+    monkeypatch.setattr(sys, name, None)
+    assert (
+        f"standard {name.strip('_')[3:]}put is closed; use pipes"
+        in run_cli("stream", status=2).output
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("redirection", [">&-", "<&-", "2>&-", ">&- 2>&- <&-"])
+@pytest.mark.parametrize(("words", "status"), [("stream --device numpy", 2), ("stages", 0)])
+def test_a_closed_stream_of_the_process_is_no_traceback(words, status, redirection):
+    shell = f'exec "$0" -m clpipe {words} {redirection}'
+    done = subprocess.run(
+        ["sh", "-c", shell, sys.executable], stdin=subprocess.DEVNULL, capture_output=True
+    )
+    if redirection == "2>&-":
+        status = {"stream --device numpy": 0}.get(words, status)
+    assert done.returncode == status, done.stderr
+    assert b"Traceback" not in done.stderr
+    assert done.stderr or status == 0 or "2>&-" in redirection
+
+
+@pytest.mark.slow
+def test_the_command_prints_a_kind_of_warning_once(frames, tmp_path):
+    (tmp_path / "bent.toml").write_text(
+        'stages = ["distortion", "exposure", "gamma"]\n[distortion]\n'
+        'method = "brown_conrady"\nfx = 30.0\nk1 = {drift = [-0.3, -0.2], frames = 2}\n'
+    )
+    found = piped(npy(*frames), "-c", tmp_path / "bent.toml")
+    warning, summary = found.stderr.decode().splitlines()
+    assert warning.startswith("clpipe: stream/000000: ") and "% of the picture is black" in warning
+    assert summary.startswith("8 pictures in ")
 
 
 @pytest.mark.slow

@@ -3,23 +3,27 @@
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from io import BufferedIOBase, BufferedReader
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, TextIO, cast
 
 import click
 import numpy as np
 
 from clpipe.base.errors import ClpipeError, ImageError, RequestError
+from clpipe.base.text import one_line
 from clpipe.base.types import Array
 from clpipe.chain.keys import KEYS
 from clpipe.chain.options import Transfer
 from clpipe.commands.chain_options import SETTINGS, device_option, options, set_option, settings_in
 from clpipe.commands.options import Command, OutputPath
 from clpipe.stream import Stream
+
+HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 @click.command("stream", cls=Command)
@@ -64,18 +68,22 @@ def stream(
     no picture.
 
     Exposure and white balance follow the frames like in clpipe run --sequence. The sender waits
-    while a frame is developed and another one is waiting, unless --drop is set.
+    while a frame is developed and another one is waiting, unless --drop is set. It also waits for
+    the kernels, which are compiled when the header of the first frame arrives.
 
     \b
     simulator | clpipe stream --iso 800 --set exposure.method=auto | viewer
     """
     settings = settings_in(others)
-    if sys.stdin.isatty() or sys.stdout.isatty():
-        raise RequestError(
-            "clpipe stream reads frames and writes pictures, but standard input or output is a "
-            "terminal; use pipes: simulator | clpipe stream | viewer"
-        )
-    camera = Stream(
+    streams = {"input": (sys.stdin, sys.__stdin__), "output": (sys.stdout, sys.__stdout__)}
+    for each, (file, at_start) in streams.items():
+        if at_start is None or file.isatty():
+            raise RequestError(
+                "clpipe stream reads frames and writes pictures, but standard "
+                f"{each} is {'a terminal' if at_start else 'closed'}; use pipes: "
+                "simulator | clpipe stream | viewer"
+            )
+    camera = Camera(
         config or "default",
         name=name,
         device=selector,
@@ -92,7 +100,7 @@ def stream(
         output = cast(BufferedIOBase, sys.stdout.buffer)
         written = pool.submit(write_pictures, camera, output, log)
         try:
-            for frame in frames_in(cast(BufferedReader, sys.stdin.buffer)):
+            for frame in frames_in(cast(BufferedReader, sys.stdin.buffer), camera.warm_up):
                 camera.put(frame)
         finally:
             camera.end()
@@ -104,6 +112,14 @@ def stream(
                 err=True,
             )
     sys.exit(1 if failed else 0)
+
+
+class Camera(Stream):
+    """A stream that prints its warnings."""
+
+    @staticmethod
+    def _warn(text: str) -> None:
+        click.echo(f"clpipe: {one_line(text)}", err=True)
 
 
 def write_pictures(stream: Stream, output: BufferedIOBase, log: TextIO | None) -> tuple[int, int]:
@@ -131,7 +147,7 @@ def write_pictures(stream: Stream, output: BufferedIOBase, log: TextIO | None) -
                 continue
             if shot is None:
                 return count, failed
-            np.lib.format.write_array(Pipe(output), shot.image)
+            np.lib.format.write_array(without_position(output), shot.image)
             output.flush()
             count += 1
             if log:
@@ -142,22 +158,27 @@ def write_pictures(stream: Stream, output: BufferedIOBase, log: TextIO | None) -
         stream.end()
 
 
-class Pipe:
-    """A file with only the methods that pipes have. NumPy asks other files for their position."""
-
-    def __init__(self, file: BufferedIOBase) -> None:
-        self.read = file.read
-        self.write = file.write
+def without_position(file: BufferedIOBase) -> Any:
+    """Return a file with only the methods that pipes have. NumPy asks others for their position."""
+    return SimpleNamespace(read=file.read, write=file.write)
 
 
-def frames_in(file: BufferedReader) -> Iterator[Array]:
+def frames_in(
+    file: BufferedReader, begin: Callable[[tuple[int, ...], np.dtype[Any]], None]
+) -> Iterator[Array]:
     """Yield arrays from a file with one .npy after the other, which need not be seekable.
 
     >>> import io
     >>> file = io.BytesIO()
     >>> np.save(file, np.zeros((2, 3), np.float32)); np.save(file, np.ones((1, 2), np.uint8))
-    >>> [frame.shape for frame in frames_in(io.BufferedReader(io.BytesIO(file.getvalue())))]
+    >>> [frame.shape for frame in frames_in(io.BufferedReader(io.BytesIO(file.getvalue())), print)]
+    (2, 3) float32
     [(2, 3), (1, 2)]
+
+    Args:
+        file: the file.
+        begin: receives the shape and the type of the first array before its samples are read. Its
+            errors are ignored, because the array itself then has them.
 
     Raises:
         ImageError: the bytes are no .npy of numbers, end early, or do not fit into memory.
@@ -165,9 +186,32 @@ def frames_in(file: BufferedReader) -> Iterator[Array]:
     number = 0
     while file.peek(1):
         try:
-            yield np.lib.format.read_array(Pipe(file), allow_pickle=False)
-        except (ValueError, MemoryError) as error:
+            frame = empty_like_next(file)
+            if number == 0:
+                with suppress(ClpipeError):
+                    begin(frame.shape, frame.dtype)
+            found = file.readinto(frame.reshape(-1, order="A").view(np.uint8).data)
+            if found < frame.nbytes:
+                raise ValueError(f"EOF: expected {frame.nbytes} bytes of samples, found {found}")
+            yield frame
+        except (TypeError, ValueError, MemoryError) as error:
             raise ImageError(
                 f"frame {number} of standard input: this is no .npy of numbers: {error}"
             ) from None
         number += 1
+
+
+def empty_like_next(file: BufferedReader) -> Array:
+    """Read the header of a .npy, and return an array of its shape, type and order.
+
+    Raises:
+        ValueError, MemoryError: there is no header of numbers, or the array is too large.
+    """
+    pipe = without_position(file)
+    version = np.lib.format.read_magic(pipe)
+    if version not in HEADERS:
+        raise ValueError(f"found version {version}; expected {' or '.join(map(str, HEADERS))}")
+    shape, is_fortran, dtype = HEADERS[version](pipe)
+    if dtype.hasobject:
+        raise ValueError("Object arrays are not allowed")
+    return np.empty(shape, dtype, "F" if is_fortran else "C")
