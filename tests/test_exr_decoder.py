@@ -9,7 +9,7 @@ import OpenEXR
 import pytest
 
 from clpipe.base.errors import ImageError
-from clpipe.images import samples
+from clpipe.images import openexr, samples
 from clpipe.images.exr_header import read_header
 from clpipe.images.openexr import open_exr, read_channels
 from clpipe.images.pixels import BLOCK, HALF_MAX, clip_to_half, make_finite
@@ -194,6 +194,16 @@ def test_standard_output_is_that_of_the_other_threads(tmp_path, capsys):
         thread.join()
     assert capsys.readouterr().out.split() == list(map(str, range(200)))
     assert sys.stdout is stdout
+
+
+def test_a_closed_standard_output_is_left_alone(tmp_path, monkeypatch):
+    """Python's print then does nothing, also while a damaged file is read."""
+    monkeypatch.setattr(sys, "stdout", None)
+    path = save(tmp_path / "a.exr", {"RGB": light()})
+    path.write_bytes(damage(path.read_bytes(), "zeros"))
+    assert len(open_exr(path).parts) == 0
+    with openexr._discard_stdout():
+        assert sys.stdout is None
 
 
 def test_the_digest_of_a_large_file_is_the_same(tmp_path, monkeypatch):

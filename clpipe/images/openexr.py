@@ -137,7 +137,7 @@ _silent: list[threading.Thread] = []
 def _discard_stdout() -> Iterator[None]:
     """Discard what this thread writes to standard output. Other threads are not affected."""
     with _lock:
-        if not _silent:
+        if not _silent and sys.stdout is not None:
             sys.stdout = _FilteredStdout(sys.stdout)
         _silent.append(threading.current_thread())
     _thread.is_silent = True
