@@ -139,6 +139,16 @@ def the_whole_in_shards(folder):
     assert array == ["0003.jpg"]
 
 
+def the_pictures_of_the_pipe(folder):
+    with package.Stream(transfer="srgb", iso=800) as stream:
+        shots = [stream(np.full((72, 128, 3), 20 * step, np.uint8)) for step in range(10)]
+    for shot in shots:
+        with Image.open(folder / f"{shot.index:06}.png") as picture:
+            assert np.array_equal(picture, shot.image)
+    assert len((folder / "frames.jsonl").read_text().splitlines()) == len(shots)
+    assert not (folder / "000010.png").exists()
+
+
 # What is checked of a page's files beyond that its commands succeed.
 CHECKS = {
     "docs/batches.md": burst_from_the_manifest,
@@ -146,6 +156,7 @@ CHECKS = {
     "docs/recipes/blender.md": the_drawn_values,
     "docs/recipes/cluster.md": the_whole_in_shards,
     "docs/recipes/real_camera.md": the_camera_that_was_simulated,
+    "docs/recipes/simulator.md": the_pictures_of_the_pipe,
 }
 
 
