@@ -1,6 +1,7 @@
 """Frames of a simulator that is running: each is developed like a frame of a sequence."""
 
 import itertools
+import os
 import queue
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -126,6 +127,7 @@ class Stream:
         self._shots = queue.SimpleQueue()
         self._thread = ThreadPoolExecutor(1, "stream")
         self._lock = threading.Lock()  # lets no frame follow the end
+        self._process = os.getpid()
         self._is_threaded = self._has_ended = self._is_closed = False
 
     def __enter__(self) -> Self:
@@ -287,13 +289,20 @@ class Stream:
             return self._thread.submit(function, *arguments)
 
     def _check_open(self) -> None:
-        """Check that the stream is not closed.
+        """Check that the stream is not closed, and that its thread and device are of this process.
 
         Raises:
-            RequestError: it is.
+            RequestError, DeviceError: it is closed, or this process was forked.
         """
         if self._is_closed:
             raise RequestError("this stream is closed; make another one")
+        if device := self._pipeline.device:
+            device.check_process()
+        if self._process != os.getpid():
+            raise RequestError(
+                "this process was forked from the one that made this stream, whose thread is "
+                "missing here; make another one"
+            )
 
     def _check_accepts(self) -> None:
         """Check that the stream accepts frames.
@@ -373,7 +382,7 @@ class Stream:
             index: the number of the frame.
             frame, arrays: its pixels, and its layers by kind.
             meter: the loops of the sequence.
-            state: what the frame before has left.
+            state: the results of the frame before.
 
         Raises:
             ImageError, RequestError, DeviceError: the frame cannot be developed.
