@@ -380,7 +380,8 @@ class Stream:
 
         Args:
             index: the number of the frame.
-            frame, arrays: its pixels, and its layers by kind.
+            frame: its pixels.
+            arrays: its layers, by kind.
             meter: the loops of the sequence.
             state: the results of the frame before.
 
