@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, Unpack
+from typing import TYPE_CHECKING, Any, NoReturn, Self, Unpack
 
 import numpy as np
 
@@ -129,6 +129,12 @@ class Stream:
         self._lock = threading.Lock()  # lets no frame follow the end
         self._process = os.getpid()
         self._is_threaded = self._has_ended = self._is_closed = False
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a Stream cannot be pickled, because its thread and its frames belong to this process. "
+            "Create a Stream in each process"
+        )
 
     def __enter__(self) -> Self:
         self._check_open()

@@ -6,7 +6,7 @@ import pickle
 import numpy as np
 import pytest
 
-from clpipe import Pipeline
+from clpipe import Pipeline, Stream
 from tests.conftest import STILL_LIFE, run_python
 from tests.test_registry import OPENCL, PYTHON
 
@@ -109,6 +109,11 @@ def test_a_copy_of_a_pipeline_gives_the_same_bits(device):
     ):
         np.testing.assert_array_equal(shot.image, other.image)
         np.testing.assert_array_equal(shot.kept["mosaic"], other.kept["mosaic"])
+
+
+def test_a_stream_says_why_it_cannot_be_pickled():
+    with Stream(device="numpy") as stream, pytest.raises(TypeError, match="in each process"):
+        pickle.dumps(stream)
 
 
 @pytest.mark.slow
