@@ -182,6 +182,11 @@ def test_an_angle_of_view_and_a_row_of_a_manifest(clpipe, renders):
     made = json.loads(Path("o/a.json").read_text())
     assert made["intrinsics"]["fx"] == pytest.approx(FX)
     assert made["intrinsics"]["fy"] == pytest.approx(FX)
+    # A lens needs the focal length in px, and takes the size from the renders themselves.
+    lens = ("--set", "distortion.method=brown_conrady", "--set", "distortion.k1=-0.1")
+    clpipe("run", renders, "-o", "l", "--poses", "nerf.json", *RUN, "distortion", *lens)
+    made = json.loads(Path("l/a.json").read_text())
+    assert made["intrinsics"]["fx"] == pytest.approx(FX)
     r = POSES["a"][0].tolist()
     row = {"render": {"fx": 9, "rotation": r, "translation": [1, 2, 3]}}
     Path("list.jsonl").write_text(json.dumps({"path": "renders/a.exr", "name": "a", **row}))

@@ -1,5 +1,6 @@
 """Finds the camera of each render of a run, in a file that lists all cameras."""
 
+import contextlib
 import os
 import re
 from bisect import bisect_left
@@ -10,11 +11,12 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from clpipe.base.errors import RequestError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.keys import RENDER
 from clpipe.chain.methods import make_model
 from clpipe.chain.options import Moments
 from clpipe.chain.render_camera import RenderCamera
+from clpipe.images.claims import display_size
 from clpipe.inputs.find import Job
 from clpipe.inputs.render_cameras import View, read_views
 
@@ -79,6 +81,9 @@ def _with_view(job: Job, view: View, settings: RenderCamera) -> Job:
     Raises:
         RequestError: the view is not valid, or contradicts the configuration or the manifest.
     """
+    with contextlib.suppress(ImageError):  # the run reports it; a render at a URL is not here yet
+        if view.needs_size:
+            view = view.with_size(*display_size(job.path))
     try:
         if view.problem:
             raise RequestError(view.problem)

@@ -47,6 +47,22 @@ class View:
     size: tuple[int, int] | None = None
     problem: str = ""
 
+    @property
+    def needs_size(self) -> bool:
+        """Whether its focal length depends on the image size, which the file does not state."""
+        return self.size is None and "camera_angle_x" in self.values and "fx" not in self.values
+
+    def with_size(self, width: int, height: int) -> "View":
+        """Return a copy with an image size in px, and fx from the angle of view if fx is missing.
+
+        >>> View("a", {"camera_angle_x": math.pi / 2}).with_size(400, 300).values["fx"]
+        200.00000000000003
+        """
+        values = dict(self.values)
+        if "fx" not in values and 0 < values.get("camera_angle_x", 0.0) < math.pi:
+            values["fx"] = width / 2 / math.tan(values.pop("camera_angle_x") / 2)
+        return replace(self, values=values, size=(width, height))
+
 
 def read_views(path: Path) -> list[View]:
     """Return the views of a file or of COLMAP's folder.
@@ -155,10 +171,9 @@ def _from_frame(frame: Mapping[str, Any], common: Mapping[str, Any]) -> View:
     listed = number_array("distortion_params", merged.get("distortion_params", []), None).tolist()
     coefficients |= {f"distortion_params[{i}]": value for i, value in enumerate(listed)}
     _check_pinhole(str(merged.get("camera_model") or "PINHOLE"), coefficients)
+    view = View("", values)
     size = _size(merged, "w", "h")
-    if size and "fx" not in values and 0 < values.get("camera_angle_x", 0.0) < math.pi:
-        values["fx"] = size[0] / 2 / math.tan(values.pop("camera_angle_x") / 2)
-    return View("", values, size)
+    return view.with_size(*size) if size else view
 
 
 PARSERS: dict[str, Parser] = {"views": _from_view, "frames": _from_frame}
