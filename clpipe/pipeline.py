@@ -22,6 +22,7 @@ from clpipe.chain.layers import layer_of_array, layer_steps
 from clpipe.chain.making import make_chain
 from clpipe.chain.methods import base_name
 from clpipe.chain.overscan import margins_of_array
+from clpipe.chain.paths import resolve_paths
 from clpipe.chain.registry import load_stage_file, loaded_stage_files
 from clpipe.chain.settings import Settings, overlay, settings_from
 from clpipe.engine.clipping import WARNING_SHARE, clipped_share, clipping_text
@@ -103,7 +104,9 @@ class Pipeline(ReadOnly):
         until: str | None = None,
         **settings: "Unpack[Keywords]",
     ) -> None:
-        self._settings = overlay(load_settings(*as_texts(config)), plain(settings))
+        self._settings = overlay(
+            load_settings(*as_texts(config)), resolve_paths(None, plain(settings))
+        )
         self._chain_range = start_at, until
         self._keep = tuple(as_texts(keep))
         self._selector = None if device is None else str(device)
@@ -339,6 +342,12 @@ class Pipeline(ReadOnly):
         if self.device:
             self.device.check_process()
         image_settings = overlay(self._settings, plain(settings)) if settings else self._settings
+        """Return the runner of an image, with its own draws and settings."""
+        image_settings = (
+            overlay(self._settings, resolve_paths(None, plain(settings)))
+            if settings
+            else self._settings
+        )
         return (
             self._runner.for_chain(self._chain(image_settings.drawn(key)))
             if settings or image_settings.draws

@@ -3,6 +3,7 @@
 import io
 import json
 import random
+import shutil
 import tarfile
 from collections import Counter
 from pathlib import Path
@@ -18,6 +19,7 @@ from clpipe.base import urls
 from clpipe.base.errors import OutputError, RequestError
 from clpipe.base.process_folder import process_folder
 from clpipe.batch.run_log import read_log
+from clpipe.camera.profile import built_in_cameras
 from tests.conftest import contents, written
 
 RUN = ("--iso", 3200, "--device", "numpy", "--skip", "noise")
@@ -146,6 +148,32 @@ def test_files_globs_and_manifests_behind_urls(bucket, clpipe):
     assert found["d"] == ["in/x0/r0.jpg", "r3.jpg"]
 
 
+@pytest.mark.parametrize("kind", ["zip", "tar"])
+def test_files_in_archives_behind_urls(bucket, clpipe, kind):
+    archive = shutil.make_archive("all", kind, ".", "in")
+    bucket.put_file(archive, f"/b/all.{kind}")
+    clpipe("run", "in", "-o", "whole", *RUN)
+    pictures = {n: data for n, data in contents("whole").items() if n.endswith(".jpg")}
+    for where in (f"flaky://b/all.{kind}", f"all.{kind}", Path(archive).as_uri()):
+        shutil.rmtree("o", ignore_errors=True)
+        clpipe("run", f"{kind}://in/x0/r0.exr::{where}", "-o", "o", *RUN)
+        clpipe("run", f"{kind}://in/x1/*.exr::{where}", "-o", "o", *RUN)
+        made = [n for n in written(Path("o")) if n.endswith(".jpg")]
+        assert made == [f"r{n}.jpg" for n in (0, 1, 3, 5)]
+        assert (
+            json.loads(Path("o/r0.json").read_text())["input"] == f"{kind}://in/x0/r0.exr::{where}"
+        )
+        clpipe("run", f"{kind}://::{where}", "-o", "o/all", *RUN)
+        made = [n for n in written(Path("o/all")) if n.endswith(".jpg")]
+        assert made == [f"in/{name}" for name in sorted(pictures)]
+        clpipe("run", f"{kind}://in::{where}", "-o", "o/in", *RUN)
+        # What is drawn for an image belongs to its name among the inputs.
+        made = {n: data for n, data in contents("o/in").items() if n.endswith(".jpg")}
+        assert made == pictures
+    missing = clpipe("run", f"{kind}://none.exr::{where}", "-o", "o", *RUN, status=1).stderr
+    assert f"{kind}://none.exr::{where}: cannot be read: there is no such file" in missing
+
+
 def test_listings_are_urls(bucket):
     assert urls.list_urls("flaky://b/renders/notes.txt") == ["flaky://b/renders/notes.txt"]
     assert urls.list_urls("flaky://b/renders/x1/") == [
@@ -181,8 +209,12 @@ def test_what_is_wrong_with_a_url_is_said(bucket, clpipe, monkeypatch):
     )
     for url in ("nosuch://b/x", "nosuch://b/x.exr"):
         assert f"clpipe: {url}: Protocol not known" in stderr_of(url, "-o", "o", status=2)
+    assert "it needs no cache; use flaky://b/x.exr" in stderr_of(
+        "simplecache::flaky://b/x.exr", "-o", "o", status=2
+    )
     text = stderr_of("flaky://b/gone.exr", "in/x0/r0.exr", "-o", "o", status=1)
-    assert "flaky://b/gone.exr: cannot be read: " in text and "1 of 2 images done" in text
+    assert "flaky://b/gone.exr: cannot be read: there is no such file" in text
+    assert "1 of 2 images done" in text
     assert "'..'" in stderr_of("flaky://b/../x.exr", "-o", "o", status=2)
     text = stderr_of("in", "-o", "flaky://b/set", status=2)
     assert "found flaky://b/set; only tars are written to a URL, so add --webdataset N" in text
@@ -354,3 +386,113 @@ def test_an_input_that_changes_while_its_tar_is_made(bucket, clpipe, monkeypatch
         clpipe(*command)
     assert "already" not in clpipe(*command).stderr  # it is of the old input
     assert "(7 of them were there already)" in clpipe(*command).stderr
+
+
+@pytest.fixture
+def spaced(write_exr, clpipe):
+    """A folder with a space in its name, with a render, and the URL of the folder."""
+    folder = Path("a folder")
+    rng = np.random.default_rng(0)
+    write_exr(folder / "r 0.exr", rng.random((16, 24, 3)).astype(np.float32))
+    (folder / "mine.toml").write_text(Path(built_in_cameras()["canon-6d"]).read_text())
+    (folder / "set.toml").write_text("iso = 800\n")
+    return folder.absolute().as_uri()
+
+
+def test_file_urls_are_paths(spaced, clpipe):
+    assert "%20" in spaced
+    clpipe("run", "a folder", "-o", "whole", *RUN)
+    expected = Path("whole/r 0.jpg").read_bytes()
+    spellings = [
+        f"{spaced}/r%200.exr",
+        f"{spaced}/r 0.exr",
+        f"{spaced}/*.exr",
+        spaced,
+        spaced.replace("file://", "file://localhost"),
+        spaced.replace("file://", "file:"),
+        spaced.replace("file", "FILE", 1),
+    ]
+    for number, text in enumerate(spellings):
+        out = Path(f"o {number}").absolute()
+        clpipe("run", text, "-o", out.as_uri(), *RUN)
+        assert (out / "r 0.jpg").read_bytes() == expected
+    made = json.loads((out / "r 0.json").read_text())
+    assert made["input"] == str(Path("a folder/r 0.exr").absolute())
+    command = ("replay", f"{out.as_uri()}/r%200.json", "-o", "again", *RUN[2:4])
+    assert "the same bytes" in clpipe(*command).output
+
+
+def test_file_urls_in_manifests_and_settings(spaced, clpipe, write_exr):
+    camera, config = f"{spaced}/mine.toml", f"{spaced}/set.toml"
+    Path("list.csv").write_text(f"path,camera\n{spaced}/r%200.exr,{camera}\n")
+    clpipe("run", Path("list.csv").absolute().as_uri(), "-o", "o", *RUN)
+    assert json.loads(Path("o/a folder/r 0.json").read_text())["camera"] == "canon-6d"
+    clpipe("run", "a folder/r 0.exr", "-o", "p", "--camera", camera, "-c", config, *RUN[2:])
+    made = json.loads(Path("p/r 0.json").read_text())
+    assert (made["camera"], made["iso"]) == ("canon-6d", 800)
+    write_exr("a folder/z/r 0.exr", np.ones((16, 24, 1), np.float32))
+    layer = f"Depth={spaced}/z/{{name}}.exr"
+    clpipe("run", "a folder/r 0.exr", "-o", "q", "--carry", layer, *RUN)
+    assert Path("q/r 0.carried.exr").exists()
+
+
+def test_file_urls_in_python(spaced):
+    shots = package.Pipeline(f"{spaced}/set.toml", camera=f"{spaced}/mine.toml", device="numpy")
+    assert (shots.settings.iso, shots.chain.camera.name) == (800, "canon-6d")
+    drawn = package.Pipeline(camera={"choice": [f"{spaced}/mine.toml"]}, device="numpy")
+    assert drawn.chain.camera.name == "canon-6d"
+    assert package.load_camera(f"{spaced}/mine.toml").name == "canon-6d"
+    out = Path("py out").absolute()
+    run = package.run(f"{spaced}/r%200.exr", out.as_uri(), device="numpy", skip=["noise"])
+    assert [outcome.status for outcome in run] == ["done"]
+    assert (out / "r 0.jpg").exists()
+    assert len(package.Dataset(spaced, device="numpy")) == 1
+    with tarfile.open("a folder/r.tar", "w") as tar:
+        tar.add("a folder/r 0.exr", "r.exr")
+    (sample,) = package.StreamingDataset(f"{spaced}/*.tar", device="numpy")
+    assert sample["key"] == "r/r.exr"
+
+
+@pytest.mark.parametrize(
+    ("url", "text"),
+    [
+        ("file://server/a.exr", "found the machine 'server'"),
+        ("file://a.exr", "found the machine 'a.exr'"),
+        ("file://", "this URL has no path"),
+    ],
+)
+def test_wrong_file_urls(spaced, clpipe, url, text):
+    Path("list.csv").write_text(f"path\n{url}\n")
+    for arguments in (
+        (url, "-o", "o"),
+        ("a folder", "-o", url),
+        ("a folder", "-o", "o", "--poses", url),
+        ("a folder", "-o", "o", "--camera", url),
+        ("a folder", "-o", "o", "-c", url),
+        ("a folder", "-o", "o", "--trace", url),
+        ("a folder", "-o", "o", "--set", f"tone_curve.path={url}"),
+        ("list.csv", "-o", "o"),
+    ):
+        stderr = " ".join(clpipe("run", *arguments, status=2).stderr.split())
+        assert text in stderr or (arguments[0] == "list.csv" and "found 'file://'" in stderr)
+    with pytest.raises(RequestError, match=text):
+        package.Pipeline(camera={"choice": [url]})
+
+
+def test_file_urls_of_missing_files(clpipe):
+    missing = clpipe("run", "file:///none.exr", "-o", "o", status=2).stderr
+    assert "/none.exr: there is no such file or folder" in missing
+    for name in ("file:///none%00.exr", "none\0.exr"):
+        with pytest.raises(RequestError, match="no file can have this name"):
+            package.run(name, "o")
+
+
+def test_only_inputs_and_tars_are_at_other_urls(spaced, clpipe):
+    url = "memory://b/x.json"
+    for name in ("--poses", "--trace", "--annotations"):
+        stderr = clpipe("run", "a folder", "-o", "o", name, url, status=2).stderr
+        assert f"found the URL {url}" in stderr
+    for name in ("--camera", "-c"):
+        stderr = clpipe("run", "a folder", "-o", "o", name, "s3://b/x.toml", status=2).stderr
+        assert "found the URL s3://b/x.toml, but only images" in stderr
+    assert not Path("memory:").exists()

@@ -81,13 +81,16 @@ def check_exists(path: Path) -> None:
 
     Raises:
         MissingError: it does not exist. The message suggests a similar existing name.
+        RequestError: no file can have this name.
     """
     try:
         os.stat(path)
         return
     except (FileNotFoundError, NotADirectoryError):
         pass
-    except (OSError, ValueError):  # reading the file later reports the reason
+    except ValueError:  # a NUL, or characters that are not UTF-8
+        raise RequestError(f"{str(path)!r}: no file can have this name; correct it") from None
+    except OSError:  # reading the file later reports the reason
         return
     os.getcwd()  # raises if the working directory is missing, which is then the actual error
     place, rest = path, Path()

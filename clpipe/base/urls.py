@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
+from urllib.parse import quote, unquote
 
 from clpipe.base.errors import ClpipeError, ImageError, OutputError, RequestError
 from clpipe.base.extras import require
@@ -29,8 +30,19 @@ from clpipe.base.text import one_line
 T = TypeVar("T")
 
 SPOOL = "clpipe-spool"
+MAX_NAME = 200  # characters of a folder's name
 
-_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://(.+)")
+# A file in an archive is a chain of URLs, such as zip://a.exr::https://host/b.zip.
+_URL = re.compile(r"(?:[A-Za-z][A-Za-z0-9+.-]+::)*[A-Za-z][A-Za-z0-9+.-]+://.+", re.DOTALL)
+_FILE_URL = re.compile(r"(file|local):(?=/)(?://([^/]*))?(/.*)?", re.IGNORECASE | re.DOTALL)
+
+# The packages of the extra "cloud" that file systems need, by scheme.
+PACKAGES = {
+    **dict.fromkeys(("s3", "s3a"), "s3fs"),
+    **dict.fromkeys(("gs", "gcs"), "gcsfs"),
+    **dict.fromkeys(("az", "abfs", "abfss", "adl"), "adlfs"),
+    **dict.fromkeys(("http", "https"), "aiohttp"),
+}
 
 MAX_TRIES = 6
 FIRST_WAIT = 0.25  # s; each further wait is twice as long
@@ -40,21 +52,81 @@ CHANGE_KEYS = ["ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_m
 CHANGE_KEYS += ["updated", "modified", "created"]
 
 # Errors that are not retried.
-PERMANENT_ERRORS = (FileNotFoundError, PermissionError, IsADirectoryError, NotImplementedError)
+PERMANENT_ERRORS = (
+    FileNotFoundError,
+    PermissionError,
+    IsADirectoryError,
+    NotImplementedError,
+    KeyError,  # of an archive without that file
+)
+
+
+def local(text: str) -> str:
+    """Return the path in a ``file:`` URL, without its percent-encoding. Other texts stay the same.
+
+    >>> local("file:///renders/a%20b.exr"), local("file://localhost/a.exr"), local("s3://b/a.exr")
+    ('/renders/a b.exr', '/a.exr', 's3://b/a.exr')
+
+    Raises:
+        RequestError: the URL contains no absolute path, or names another machine.
+    """
+    found = _FILE_URL.fullmatch(text) if ":/" in text[:7] else None
+    if found is None:
+        return text
+    scheme, host, path = found[1], found[2] or "", found[3] or ""
+    if host.lower() not in ("", "localhost"):
+        raise RequestError(
+            f"{one_line(text)}: found the machine '{one_line(host)}', but a {scheme} URL names a "
+            f"file of this machine; use {scheme}:///PATH with an absolute path, or a plain path"
+        )
+    if not path:
+        raise RequestError(
+            f"{one_line(text)}: this URL has no path; use {scheme}:///PATH with an absolute path"
+        )
+    path = unquote(path, errors="surrogateescape")
+    return path[1:] if os.name == "nt" and path[2:3] == ":" else path
 
 
 def is_url(text: str) -> bool:
-    """Return whether a text is a URL.
+    """Return whether a text is a URL of something other than a file of this machine.
 
-    >>> is_url("s3://renders/a.exr"), is_url("C:/renders"), is_url("a.exr")
+    >>> is_url("s3://renders/a.exr"), is_url("C:/renders"), is_url("file:///a.exr")
     (True, False, False)
     """
-    return _URL.fullmatch(text) is not None
+    return _URL.fullmatch(text) is not None and _FILE_URL.fullmatch(text) is None
 
 
 def is_glob(url: str) -> bool:
     """Return whether a URL is a pattern. A "?" does not make it one: it starts a query."""
-    return any(letter in url for letter in "*[")
+    return any(letter in name_in(url) for letter in "*[")
+
+
+def name_in(url: str) -> str:
+    """Return a URL without the archive that contains its file.
+
+    >>> name_in("zip://a/b.exr::s3://bucket/c.zip")
+    'zip://a/b.exr'
+    """
+    return url.partition("::")[0]
+
+
+def local_path(name: str, text: str | Path) -> Path:
+    """Return the path of a file that must be on this machine.
+
+    Args:
+        name: the option or key, for the message.
+        text: a path, or a ``file:`` URL.
+
+    Raises:
+        RequestError: the text is another URL, or as for :func:`local`.
+    """
+    path = local(str(text))
+    if is_url(path):
+        raise RequestError(
+            f"{name}: found the URL {one_line(path)}, but only images, manifests and tars may be "
+            "at a URL; use a file of this machine"
+        )
+    return Path(path)
 
 
 def path_of(text: str) -> Path:
@@ -62,10 +134,11 @@ def path_of(text: str) -> Path:
 
     Raises:
         RequestError: fsspec or a package that it needs is missing, it does not know the scheme, no
-            path can represent the URL, or there is no folder for temporary files.
+            path can represent the URL, or there is no folder for temporary files. Or as for
+            :func:`local`.
     """
     if not is_url(text):
-        return Path(text)
+        return Path(local(text))
     _check_scheme(text)
     folder = process_folder()
     if folder is None:
@@ -85,8 +158,10 @@ def url_of(path: Path) -> str | None:
     if SPOOL not in str(path):
         return None
     parts = path.parts
-    scheme, *rest = parts[parts.index(SPOOL) + 1 :] if SPOOL in parts else ("",)
-    return f"{scheme}://{'/'.join(rest)}" if rest and ".." not in rest else None
+    first, *rest = parts[parts.index(SPOOL) + 1 :] if SPOOL in parts else ("",)
+    scheme, _, archive = unquote(first).partition("::")
+    container = f"::{archive}" if archive else ""
+    return f"{scheme}://{'/'.join(rest)}{container}" if rest and ".." not in rest else None
 
 
 def join_url(folder: Path, text: str) -> Path:
@@ -96,7 +171,7 @@ def join_url(folder: Path, text: str) -> Path:
         RequestError: the folder represents a URL, and the path leads out of its bucket; or as for
             :func:`path_of`.
     """
-    url = url_of(folder)
+    text, url = local(text), url_of(folder)
     if is_url(text) or url is None:
         return path_of(text) if is_url(text) else folder / text
     scheme, _, rest = url.partition("://")
@@ -118,11 +193,14 @@ def list_urls(url: str) -> list[str]:
     Raises:
         RequestError: the URL cannot be listed.
     """
-    prefix = re.split(r"[*[]", url)[0].rpartition("/")[0] if is_glob(url) else url.rstrip("/")
+    inner = name_in(url)
+    scheme, _, rest = inner.partition("://")
+    fixed = re.split(r"[*[]", rest)[0].rpartition("/")[0] if is_glob(url) else rest.rstrip("/")
+    prefix = f"{scheme}://{fixed}{'/' * bool(fixed)}"
 
     def work(system: Any, path: str) -> list[str]:
         system.invalidate_cache()
-        root = path.removesuffix(url[len(prefix) :]).rstrip("/")
+        root = path.rstrip("/").removesuffix(rest[len(fixed) :].rstrip("/")).rstrip("/")
         found: Iterable[str] = ()
         with contextlib.suppress(FileNotFoundError):
             if is_glob(url):
@@ -131,7 +209,9 @@ def list_urls(url: str) -> list[str]:
             else:
                 found = system.find(path)
         # The URL keeps its scheme, because a file system may have several.
-        return sorted(f"{prefix}{name[len(root) :]}" for name in found)
+        names = (name[len(root) :].lstrip("/") for name in found)
+        # The file of a URL that is no directory has an empty name.
+        return sorted(f"{prefix}{name}".rstrip("/") + url[len(inner) :] for name in names)
 
     return _with_retries(url, work, RequestError, "listed")
 
@@ -219,11 +299,19 @@ def _check_scheme(url: str) -> None:
     Raises:
         RequestError: the scheme is unknown, or a package is missing. The message names the package.
     """
-    require(f"{url}:", "fsspec")
+    schemes = [part.partition("://")[0] for part in url.split("::") if "://" in part]
+    packages = [PACKAGES[scheme] for scheme in schemes if scheme in PACKAGES]
+    require(url, "cloud", "fsspec", *packages)
+    if "://" not in name_in(url):
+        raise RequestError(
+            f"{url}: clpipe fetches each file once, so it needs no cache; use "
+            f"{url.partition('::')[2]}"
+        )
     from fsspec import get_filesystem_class
 
     try:
-        get_filesystem_class(url.partition("://")[0])
+        for scheme in schemes:
+            get_filesystem_class(scheme)
     except (ImportError, ValueError) as error:
         raise RequestError(f"{url}: {one_line(str(error))}") from None
 
@@ -237,12 +325,16 @@ def _spool_path(url: str, folder: Path) -> Path:
     >>> str(_spool_path("s3://bucket/a/b.exr", Path("/tmp/x")))
     '/tmp/x/clpipe-spool/s3/bucket/a/b.exr'
     """
-    scheme, _, rest = url.partition("://")
+    inner = name_in(url)
+    scheme, _, rest = inner.partition("://")
     parts = rest.split("/")
     has_drive = os.name == "nt" and ":" in rest
     if {"..", "."} & {*parts} or "" in parts[:-1] or "\\" in url or has_drive:
         raise RequestError(f"{url}: a URL may not contain '..', '.', backslashes or empty parts")
-    return folder / SPOOL / scheme / rest
+    first = quote(f"{scheme}{url[len(inner) :]}", safe="+")
+    if len(first) > MAX_NAME:
+        raise RequestError(f"{url}: the URL of an archive may have at most {MAX_NAME} characters")
+    return folder / SPOOL / first / rest
 
 
 def _fetch(url: str, path: Path, error_type: type[ClpipeError]) -> None:
@@ -276,6 +368,16 @@ def _stamp(info: Mapping[str, Any]) -> tuple[int, int]:
     return int(info.get("size") or 0), number // 100 * 100  # NTFS stores times in units of 100 ns
 
 
+def _reason(url: str, error: Exception) -> str:
+    """Return the text of an error; if it only repeats a part of the URL, what the error means."""
+    text = one_line(str(error))
+    if text.strip("'/") not in url:
+        return text
+    if isinstance(error, FileNotFoundError | KeyError):
+        return "there is no such file"
+    return "access is denied" if isinstance(error, PermissionError) else type(error).__name__
+
+
 def _with_retries(
     url: str, work: Callable[[Any, str], T], error_type: type[ClpipeError], what: str
 ) -> T:
@@ -296,8 +398,7 @@ def _with_retries(
             return work(*url_to_fs(url))
         except Exception as error:
             if not tries_left or isinstance(error, PERMANENT_ERRORS):
-                reason = one_line(str(error) or type(error).__name__)
-                raise error_type(f"{url}: cannot be {what}: {reason}") from None
+                raise error_type(f"{url}: cannot be {what}: {_reason(url, error)}") from None
             time.sleep(wait * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
             wait *= 2
     raise AssertionError

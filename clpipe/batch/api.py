@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
 from clpipe.base.text import as_texts
 from clpipe.base.types import plain
-from clpipe.base.urls import path_of
+from clpipe.base.urls import local_path, path_of
 from clpipe.base.validation import check_argument_types
 from clpipe.batch.clips import parse_bit_rate, parse_rate, take_clip_options
 from clpipe.batch.execution import ExecutionOptions
@@ -31,11 +32,11 @@ CONVERTERS: dict[str, Callable[[Any], Any]] = {
     "bracket": parse_bracket,
     "bit_rate": lambda rate: parse_bit_rate(str(rate)),
     "fps": lambda rate: parse_rate(str(rate)),
-    "poses": Path,
+    "poses": partial(local_path, "poses"),
     "redo": Redo,
     "shard": parse_shard,
     "memory": lambda size: parse_size(str(size)),
-    "trace": Path,
+    "trace": partial(local_path, "trace"),
 }
 # Options whose fields in Request, Images and ExecutionOptions have other names.
 FIELD_NAMES = {"format": "formats", "webdataset": "per_tar", "device": "devices", "jobs": "threads"}

@@ -13,6 +13,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.reading import check_exists, parse_toml, read_text
 from clpipe.base.text import names_with_words, one_line, similar_names, unknown_name
 from clpipe.base.types import Doubles
+from clpipe.base.urls import local_path
 from clpipe.base.validation import first_fault
 from clpipe.camera.gain_stage import GainStage, NotNegative, Offsets, Positive, TukeyLambda
 from clpipe.camera.noise import NoiseModel
@@ -346,7 +347,7 @@ def load_camera(name: str) -> Camera:
     built_in = built_in_cameras()
     if built_in_path := built_in.get(built_in_name(name) or ""):
         return _built_in(built_in_path)
-    path = Path(name)
+    path = local_path("camera", name)
     if path.suffix != ".toml" and os.path.isfile(path):
         raise RequestError(
             f"{path}: not a camera profile, because these end in .toml; to make one from a DNG "

@@ -11,6 +11,7 @@ from typing import Any
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.reading import check_exists, parse_toml, read_text
 from clpipe.base.text import unknown_name
+from clpipe.base.urls import local_path
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.keys import CODE, KEYS, LENS, TABLES, string_list
 from clpipe.chain.looks import override_settings
@@ -85,7 +86,7 @@ def load_config(name: str) -> Config:
             name or value that is not allowed. The message names the file and, if known, the line.
     """
     built_in = built_in_configs()
-    path = built_in.get(name, Path(name))
+    path = built_in.get(name) or local_path("config", name)
     if path.suffix != ".toml" and not os.path.isfile(path):
         raise RequestError(unknown_name("configuration", name, built_in) + ", or a .toml file")
     check_exists(path)
@@ -101,7 +102,9 @@ def load_config(name: str) -> Config:
     except ValueError as error:
         raise RequestError(f"{path}: the configuration is not valid TOML: {error}") from None
     try:
-        stage_files = [path.parent / file for file in string_list(values, CODE, "files")]
+        stage_files = [
+            path.parent / local_path(CODE, file) for file in string_list(values, CODE, "files")
+        ]
         for file in stage_files:
             load_stage_file(file)
         values.pop(CODE, None)

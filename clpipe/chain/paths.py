@@ -5,21 +5,31 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from clpipe.base.errors import KeyedError, RequestError
+from clpipe.base.urls import local
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.stage import Stage
 
 
-def resolve_paths(folder: Path, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested values with file names joined to the directory that they are relative to."""
+def resolve_paths(folder: Path | None, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested values with file names joined to the directory that they are relative to.
+
+    ``file:`` URLs become paths. If the directory is None, other file names stay the same.
+
+    Raises:
+        KeyedError: a ``file:`` URL has no absolute path, or names another machine.
+    """
     resolved = dict(values)
     for key, value in values.items():
         stage = all_stages().get(base_name(key))
         if key == "camera":
-            resolved[key] = join_path(folder, value, only=".toml")
+            resolved[key] = _joined(folder, key, value, only=".toml")
         elif isinstance(value, Mapping) and stage:
             files = file_parameters(stage)
-            resolved[key] = {n: join_path(folder, v) if n in files else v for n, v in value.items()}
+            resolved[key] = {
+                n: _joined(folder, f"{key}.{n}", v) if n in files else v for n, v in value.items()
+            }
     return resolved
 
 
@@ -31,13 +41,30 @@ def file_parameters(stage: Stage) -> frozenset[str]:
     return frozenset(name for name, extra in extras.items() if extra["file"])
 
 
-def join_path(folder: Path, value: Any, only: str = "") -> Any:
+def _joined(folder: Path | None, key: str, value: Any, only: str = "") -> Any:
+    """Return :func:`join_path` of the value of a key.
+
+    Raises:
+        KeyedError: a ``file:`` URL is wrong.
+    """
+    try:
+        return join_path(folder, value, only)
+    except RequestError as error:
+        raise KeyedError(key, f"{key}: {error}") from None
+
+
+def join_path(folder: Path | None, value: Any, only: str = "") -> Any:
     """Return a file name, or a draw among file names, joined to a directory; else the value.
+
+    Raises:
+        RequestError: a ``file:`` URL has no absolute path, or names another machine.
 
     >>> join_path(Path("a"), {"choice": ["b.toml", "sony-a7r2"]}, only=".toml")
     {'choice': ['a/b.toml', 'sony-a7r2']}
     """
     if isinstance(value, Mapping) and isinstance(value.get("choice"), list):
         return {**value, "choice": [join_path(folder, one, only) for one in value["choice"]]}
-    is_name = isinstance(value, str) and value and value.endswith(only)
-    return str(folder / value) if is_name else value
+    if not isinstance(value, str) or not value.endswith(only) or not value:
+        return value
+    value = local(value)
+    return str(folder / value) if folder else value

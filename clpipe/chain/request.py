@@ -14,6 +14,7 @@ from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
 from clpipe.base.text import as_texts, unknown_name
 from clpipe.base.tracing import with_changes
+from clpipe.base.urls import local_path
 from clpipe.base.validation import first_fault
 from clpipe.chain.carry import AovSpec, parse_carry
 from clpipe.chain.chain import Chain
@@ -22,6 +23,7 @@ from clpipe.chain.formats import ALL_FORMATS, NPY
 from clpipe.chain.keys import KEYS, TABLES
 from clpipe.chain.making import make_chain
 from clpipe.chain.options import MAX_PATCHES, Moments
+from clpipe.chain.paths import resolve_paths
 from clpipe.chain.registry import code_files, load_stage_file
 from clpipe.chain.rendition import BASELINES, MOSAIC
 from clpipe.chain.settings import Settings, overlay
@@ -117,13 +119,14 @@ class Request(RecordedRequest):
         Raises:
             RequestError: a name or value is not allowed.
         """
-        for file in stage_files:
-            load_stage_file(Path(file))
+        files = [local_path("stage_files", file) for file in stage_files]
+        for file in files:
+            load_stage_file(file)
         configuration = load_configs(as_texts(config)) if config else None
-        code = (*(configuration.stage_files if configuration else ()), *map(Path, stage_files))
+        code = (*(configuration.stage_files if configuration else ()), *files)
         request = cls(
             config=configuration.values if configuration else None,
-            options=values or {},
+            options=resolve_paths(None, values or {}),
             stage_files=tuple(dict.fromkeys(str(file.resolve()) for file in code)),
             truths=tuple(each for each in truth if each not in BASELINES),
             baselines=tuple(each for each in truth if each in BASELINES),

@@ -248,7 +248,8 @@ def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Sett
 
     Args:
         values: nested values of the form of a configuration file.
-        folder: the directory that file names are relative to; None is the working directory.
+        folder: the directory that file names are relative to; None is the working directory, and
+            ``file:`` URLs are already resolved.
 
     Raises:
         KeyedError: a key, stage, method or parameter is unknown, or a value has the wrong type or

@@ -21,7 +21,7 @@ from clpipe.chain.settings import Settings
 from clpipe.chain.toml import value_text
 from clpipe.commands.chain_options import device_option, option
 from clpipe.commands.notices import NOTICES
-from clpipe.commands.options import Command, json_option, output_option
+from clpipe.commands.options import Command, OutputPath, json_option, output_option
 from clpipe.commands.printing import Rows, number, show, show_json
 from clpipe.commands.progress import LINE_INTERVAL
 
@@ -109,7 +109,7 @@ class SearchProgress(Watch):
 )
 @click.option(
     "--plot",
-    type=click.Path(path_type=Path),
+    type=OutputPath(path_type=Path),
     metavar="FILE.png",
     help="Draw autocorrelation, power spectrum, noise by intensity and residuals.",
 )
@@ -137,7 +137,7 @@ def match(
     clpipe match a_frame.png b_frame.png --mean a_mean.png --mean b_mean.png -o camera-jpeg.toml
     clpipe run render.exr -o out -c camera-jpeg.toml
     """
-    require("clpipe match", "scipy", *(["matplotlib"] if plot else []))
+    require("clpipe match", "calibrate", "scipy", *(["matplotlib"] if plot else []))
     check_names(output, plot)
     search = SearchProgress(output, Console(stderr=True))
     try:

@@ -19,7 +19,7 @@ from clpipe.analysis.temporal import measure_clip
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
 from clpipe.base.files import check_suffix
-from clpipe.commands.options import EXISTING, Command, json_option
+from clpipe.commands.options import EXISTING, Command, OutputPath, json_option
 from clpipe.commands.printing import Rows, number, show, show_json
 from clpipe.images.video import VIDEO_SUFFIXES
 from clpipe.outputs.noise_areas import FLAT, HALVED, PICTURE
@@ -40,7 +40,7 @@ from clpipe.stages.picture_noise import UNKNOWN
 )
 @click.option(
     "--plot",
-    type=click.Path(path_type=Path),
+    type=OutputPath(path_type=Path),
     metavar="FILE.png",
     help="Plot noise by intensity, autocorrelation and tails.",
 )
@@ -74,7 +74,7 @@ def measure(
     """
     if plot is not None:
         check_suffix("--plot", plot, ".png")
-        require("--plot", "matplotlib")
+        require("--plot", "calibrate", "matplotlib")
     clip = next((path for path in images if path.suffix.lower() in VIDEO_SUFFIXES), None)
     if clip and (len(images) > 1 or truth or snr):
         raise RequestError(

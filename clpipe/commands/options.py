@@ -16,7 +16,7 @@ from click.core import ParameterSource
 
 from clpipe.base.errors import MissingError, RequestError
 from clpipe.base.reading import check_input
-from clpipe.base.urls import is_url
+from clpipe.base.urls import is_url, local, local_path
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -173,6 +173,7 @@ class ExistingPath(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if not (ctx and ctx.resilient_parsing):
+            value = str(local_path(param.opts[-1] if param else "input", value))
             check_input(Path(value))
         return super().convert(value, param, ctx)
 
@@ -187,13 +188,15 @@ class OutputPath(click.Path):
     """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        name = param.opts[-1] if param else "output"
         if not value:
-            raise RequestError("--output: found an empty name; name a file or directory")
+            raise RequestError(f"{name}: found an empty name; name a file or directory")
+        value = local(value)
         if is_url(value) and ctx:
             if ctx.info_name == "run":
                 return value
             raise RequestError(
-                f"--output: found the URL {value}, but only clpipe run writes to URLs; name a "
+                f"{name}: found the URL {value}, but only clpipe run writes to URLs; name a "
                 "local path"
             )
         return super().convert(value, param, ctx)

@@ -12,7 +12,7 @@ from typing import Any
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import as_texts
-from clpipe.base.urls import fetched_files, is_glob, is_url, list_urls, path_of
+from clpipe.base.urls import fetched_files, is_glob, is_url, list_urls, local, path_of
 from clpipe.dataset.dataset import Dataset
 from clpipe.dataset.developer import Sample
 from clpipe.torch.iterable import IterableDataset, worker
@@ -100,6 +100,7 @@ def _tars_of(name: str) -> list[str]:
     Raises:
         RequestError: there is no such tar.
     """
+    name = local(name)
     if is_url(name):
         tars = list_urls(name) if is_glob(name) else [name]
     else:

@@ -10,6 +10,7 @@ from pathlib import Path
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.text import one_line, quote_alternatives, similar_names
+from clpipe.base.urls import local
 from clpipe.chain.carry import AovSpec
 from clpipe.images.kinds import MIN_CHANNELS, flow_directions, flow_vectors, kind_from_name
 from clpipe.images.passes import LayerLocation, find_layers, layer_kind
@@ -224,7 +225,7 @@ def companions_of(path: Path, patterns: Sequence[str] = ()) -> list[Path]:
     Raises:
         ImageError: a file that a pattern names is missing.
     """
-    named = [path.parent / pattern.replace("{name}", path.stem) for pattern in patterns]
+    named = [path.parent / local(pattern).replace("{name}", path.stem) for pattern in patterns]
     for file, pattern in zip(named, patterns, strict=True):
         if not file.is_file():
             raise ImageError(

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_input
 from clpipe.base.text import printable, whole_number
-from clpipe.base.urls import is_glob, is_url, list_urls, path_of, url_of
+from clpipe.base.urls import is_glob, is_url, list_urls, local, name_in, path_of, url_of
 from clpipe.chain.rendition import Rendition
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import PICTURE_SUFFIXES, RENDER_SUFFIXES
@@ -162,7 +162,7 @@ def find_jobs(
     if not inputs:
         raise RequestError("there is no input; give files, folders, globs or manifests")
     excluded = Exclusion(exclude)
-    for text in inputs:
+    for text in map(local, inputs):
         if not text:
             raise RequestError("an input is empty; give files, folders, globs or manifests")
         path = path_of(text)
@@ -236,13 +236,15 @@ def _jobs_at_url(url: str, endings: Sequence[str], excluded: Exclusion) -> list[
     """
     is_pattern = is_glob(url)
     # If the file is missing, only its job fails.
-    if not is_pattern and Path(url).suffix.lower() in endings:
-        return [Job(path_of(url), url.rpartition("/")[2])]
-    root = url.rstrip("/")
+    inner = name_in(url)
+    if not is_pattern and Path(inner).suffix.lower() in endings:
+        return [Job(path_of(url), inner.rpartition("/")[2])]
+    root = inner if inner.endswith("/") else f"{inner}/"
     jobs = []
     for each in list_urls(url):
-        is_below = each.startswith(f"{root}/") and not is_pattern
-        key = each.removeprefix(f"{root}/") if is_below else each.rpartition("/")[2]
+        name = name_in(each)
+        is_below = name.startswith(root) and not is_pattern
+        key = name.removeprefix(root) if is_below else name.rpartition("/")[2]
         hidden = any(part.startswith(".") for part in key.split("/"))
         suffix = Path(key).suffix.lower()
         if (is_below and (hidden or suffix not in endings)) or key in excluded:

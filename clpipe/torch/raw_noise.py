@@ -18,6 +18,7 @@ from clpipe.base.validation import check_argument_types
 from clpipe.chain.chain import Chain
 from clpipe.chain.files import load_settings
 from clpipe.chain.making import make_chain
+from clpipe.chain.paths import resolve_paths
 from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import overlay
 from clpipe.stage import NoiseScope, StageRole
@@ -71,7 +72,8 @@ class RawNoise(ReadOnly):
     ) -> None:
         camera_value = camera if isinstance(camera, Mapping) else str(camera)
         values = {**settings, "camera": camera_value, "iso": iso, "seed": seed or 0}
-        self._settings = overlay(load_settings(*as_texts(config)), plain(values))
+        values = resolve_paths(None, plain(values))
+        self._settings = overlay(load_settings(*as_texts(config)), values)
         self._random = torch.Generator()
         if seed is None:
             self._random.seed()

@@ -12,6 +12,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_input
 from clpipe.base.text import one_line
 from clpipe.base.types import Floats
+from clpipe.base.urls import local
 from clpipe.camera.profile import Matrix
 from clpipe.chain.making import make_chain
 from clpipe.images.attributes import read_attributes
@@ -120,7 +121,7 @@ def find_frames(inputs: Sequence[str]) -> list[Path]:
         RequestError: an input has no such file.
     """
     paths: list[Path] = []
-    for text in inputs:
+    for text in map(local, inputs):
         path = Path(text)
         if path.is_dir():
             files = _frames_among(path.iterdir())

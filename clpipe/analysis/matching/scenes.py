@@ -24,6 +24,7 @@ from clpipe.analysis.signature import BRIGHTEST, DARK, DRIFT, flat_mask, luma
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_input
 from clpipe.base.types import Doubles, Floats, Mask
+from clpipe.base.urls import local
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding
 from clpipe.images.read import read_finished
 from clpipe.reference.image import in_blocks
@@ -118,7 +119,7 @@ def expand(patterns: Sequence[str], what: str) -> list[Path]:
         RequestError: a glob matches no file.
     """
     found: list[Path] = []
-    for pattern in patterns:
+    for pattern in map(local, patterns):
         is_glob = glob.has_magic(pattern) and not os.path.exists(pattern)
         names = sorted(glob.glob(pattern)) if is_glob else [pattern]
         if not names:
