@@ -1,5 +1,6 @@
 """The installed package: used from another folder, with its kernels."""
 
+import itertools
 import re
 import subprocess
 import tomllib
@@ -10,7 +11,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from clpipe import __version__
-from clpipe.base import extras
+from clpipe.base import extras, urls
 from tests.conftest import ROOT, STILL_LIFE, run_python
 
 pytestmark = pytest.mark.slow
@@ -45,18 +46,52 @@ def test_the_sdist_has_all_that_lies_beside_the_package():
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        (("calibrate", "a.dng", "-o", "c.toml"), "clpipe calibrate needs scipy and matplotlib"),
-        (("measure", STILL_LIFE, "--plot", "a.png"), "--plot needs matplotlib"),
-        (("run", STILL_LIFE, "-o", "out", "--dask", "tcp://x:1"), "--dask needs distributed"),
+        (
+            ("calibrate", "a.dng", "-o", "c.toml"),
+            "clpipe calibrate needs matplotlib and scipy, which are in the extra 'calibrate'",
+        ),
+        (
+            ("measure", STILL_LIFE, "--plot", "a.png"),
+            "--plot needs matplotlib and scipy, which are in the extra 'calibrate'",
+        ),
+        (
+            ("explore", STILL_LIFE),
+            "clpipe explore needs matplotlib, scipy, starlette and uvicorn, which are in the extra "
+            "'explore'",
+        ),
+        (
+            ("run", STILL_LIFE, "-o", "out", "--dask", "tcp://x:1"),
+            "--dask needs distributed, which is in the extra 'dask'",
+        ),
+        (
+            ("run", "s3://bucket/a.exr", "-o", "out"),
+            "s3://bucket/a.exr needs fsspec and s3fs, which are in the extra 'cloud'",
+        ),
     ],
 )
 def test_packages_that_are_missing_are_named(clpipe, monkeypatch, command, message):
     found = extras.find_spec
-    absent = ("scipy", "matplotlib", "distributed")
+    absent = {*itertools.chain(*extras.EXTRAS.values()), "s3fs"}
     monkeypatch.setattr(extras, "find_spec", lambda name: None if name in absent else found(name))
     error = clpipe(*command, status=2).stderr
-    packages = message.partition(" needs ")[2].replace(" and ", " ")
+    packages = message.partition(" needs ")[2].partition(", which")[0]
+    packages = packages.replace(" and ", " ").replace(",", "")
     assert f"{message}. Run: pip install {packages}\n" in error
+
+
+def test_extras_have_these_packages():
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    extras_of = listed["optional-dependencies"]
+
+    def packages(extra):
+        for requirement in extras_of[extra]:
+            name, _, inner = re.match(r"([\w-]+)(\[(\w+)\])?", requirement).groups()
+            yield from packages(inner) if inner else [name]
+
+    for extra, modules in extras.EXTRAS.items():
+        if extra != "cloud":
+            assert sorted(packages(extra)) == sorted(modules)
+    assert {*urls.PACKAGES.values(), "fsspec"} == {*packages("cloud")}
 
 
 def test_no_text_installs_another_project_of_that_name():

@@ -336,3 +336,18 @@ def test_kernels_are_not_refused_for_the_image_that_compiles_them(device):
 def test_the_table_of_parameters_has_no_message_where_a_focal_length_is_to_be_set(clpipe):
     shown = clpipe("stages", "distortion").stdout
     assert "the centre" in shown and "set fx (px)" not in " ".join(shown.split())
+
+
+@pytest.mark.parametrize(
+    ("name", "stage"),
+    [("fisheye", "distortion"), ("Brown-Conrady", "distortion"), ("kannala_brandt", "projection")],
+)
+def test_a_lens_model_is_not_a_lens(clpipe, monkeypatch, name, stage):
+    model = name.lower().replace("-", "_")
+    expected = f"lens: '{name}' is a model, not the name of a lens"
+    for is_installed in (True, False):
+        by_name._load_database.cache_clear()
+        if not is_installed:
+            monkeypatch.setitem(sys.modules, "lensfunpy", None)
+        stderr = " ".join(clpipe("plan", "--lens", name, status=2).stderr.split())
+        assert expected in stderr and f"set {stage}.method={model}" in stderr

@@ -4,26 +4,45 @@ from importlib.util import find_spec
 
 from clpipe.base.errors import RequestError
 
+# The modules of clpipe's extras that several features need. Each has the name of its package.
+EXTRAS = {
+    "annotations": ("pycocotools", "shapely"),
+    "calibrate": ("matplotlib", "scipy"),
+    "cloud": ("fsspec",),  # and one for each scheme
+    "dask": ("distributed",),
+    "explore": ("matplotlib", "scipy", "starlette", "uvicorn"),
+    "report": ("jinja2", "matplotlib", "scipy"),
+    "video": ("av",),
+}
 
-def require(purpose: str, *modules: str) -> None:
+
+def require(purpose: str, extra: str, *modules: str) -> None:
     """Check that modules are installed. Each must have the name of its package.
 
     Args:
         purpose: the feature that needs them, for the message, such as "clpipe calibrate".
-        modules: the names of the modules.
+        extra: the extra of clpipe that contains them. If one is missing, the message names all
+            missing modules of this extra.
+        modules: the names of the modules; without any, those of the extra.
 
     Raises:
         RequestError: a module is missing. The message contains the command that installs it.
 
-    >>> require("this example", "json", "no_module")
-    Traceback (most recent call last):
-    clpipe.base.errors.RequestError: this example needs no_module. Run: pip install no_module
+    >>> try:
+    ...     require("this example", "video", "json", "no_module")
+    ... except RequestError as error:
+    ...     print(str(error).partition(" needs ")[0])
+    this example
     """
-    missing = [name for name in modules if not is_installed(name)]
-    if missing:
-        raise RequestError(
-            f"{purpose} needs {' and '.join(missing)}. Run: {install_command(*missing)}"
-        )
+    needed = modules or EXTRAS[extra]
+    if all(map(is_installed, needed)):
+        return
+    missing = [name for name in dict.fromkeys((*EXTRAS[extra], *needed)) if not is_installed(name)]
+    *others, last = missing
+    listed = f"{', '.join(others)} and {last}, which are" if others else f"{last}, which is"
+    raise RequestError(
+        f"{purpose} needs {listed} in the extra '{extra}'. Run: {install_command(*missing)}"
+    )
 
 
 def is_installed(module: str) -> bool:

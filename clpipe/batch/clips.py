@@ -140,7 +140,7 @@ def take_clip_options(options: dict[str, Any]) -> ClipOptions | None:
     name = output.stem if is_file else ""
     clips = ClipOptions(f".{next(iter(formats))}", VideoOptions(**video), decoded, name)
     clips.video.check_suffix(clips.suffix)
-    require("a clip", "av")
+    require("a clip", "video")
     options["output"] = output.parent if is_file else output
     options["format"] = ("png" if clips.video.bits == 8 else "png16",)
     options["sequence"] = True

@@ -59,7 +59,7 @@ def connected(address: str, spec: DaskSpec) -> Iterator["Cluster"]:
         RequestError: distributed is not installed, the scheduler does not answer, it has no
             workers, or they have different versions of clpipe.
     """
-    require("--dask", "distributed")
+    require("--dask", "dask")
     from distributed import Client
 
     try:

@@ -1,9 +1,10 @@
 """Build chains from settings: resolve each parameter, and reject stages that do not fit."""
 
+import re
 from collections.abc import Mapping
 
 from clpipe.base.errors import KeyedError, RequestError
-from clpipe.base.text import unknown_name
+from clpipe.base.text import one_line, unknown_name
 from clpipe.base.tracing import Traced, with_changes
 from clpipe.camera.lens import calibration_of
 from clpipe.camera.optics import IN_PIXELS, Optics
@@ -204,8 +205,31 @@ def optics_of(settings: Settings, camera: Camera, methods: Mapping[str, Method])
     if not settings.lens:
         return optics
     set_to = optics.focal_length, optics.f_number, optics.focus_distance
-    lens = calibration_of(settings.lens, camera, *set_to)
+    try:
+        lens = calibration_of(settings.lens, camera, *set_to)
+    except KeyedError:
+        _check_lens_name(settings.lens)
+        raise
     return optics.with_lens(lens)
+
+
+def _check_lens_name(name: str) -> None:
+    """Check that a lens is not named by a lens model, such as fisheye.
+
+    Raises:
+        KeyedError: it is.
+    """
+    model = "_".join(re.findall(r"[a-z0-9]+", name.lower()))
+    for stage in all_stages().values():
+        models = stage.role is StageRole.VIEW or any(
+            issubclass(m, LensMethod) for m in stage.methods
+        )
+        if models and any(each.method == model for each in stage.methods):
+            raise KeyedError(
+                "lens",
+                f"lens: '{one_line(name)}' is a model, not the name of a lens such as 'Canon EF "
+                f"50mm f/1.8'; remove lens, and set {stage.name}.method={model} and its parameters",
+            )
 
 
 # The optics that each key of the settings sets.

@@ -87,7 +87,7 @@ def compare(
     clpipe run render.exr -o shots --iso 100,3200
     clpipe compare shots/iso100/render.jpg shots/iso3200/render.jpg -o figure.pdf
     """
-    require("clpipe compare", "matplotlib", "scipy")
+    require("clpipe compare", "calibrate")
     from clpipe.analysis.comparison_plot import check_name, draw
 
     for output in outputs:

@@ -72,7 +72,7 @@ def emva(
     clpipe emva --camera nikon-d850 --iso 400 -o series
     clpipe calibrate --emva series/EMVA1288_Data.txt -o again.toml
     """
-    require("clpipe emva", "scipy")
+    require("clpipe emva", "calibrate", "scipy")
     columns, rows = map(whole_number, size.partition("x")[::2])
     least, most = SIDES
     if not least <= min(columns, rows) <= max(columns, rows) <= most:

@@ -50,7 +50,7 @@ def explore(
     clpipe explore render.exr
     clpipe explore renders/ --iso 3200 -c paper
     """
-    require("clpipe explore", "starlette", "uvicorn", "matplotlib")
+    require("clpipe explore", "explore")
     from clpipe.explorer.explorer import Explorer
     from clpipe.explorer.server import Server
 

@@ -42,7 +42,7 @@ def report(folders: tuple[Path, ...], output: Path | None, as_json: bool) -> Non
             f"{path}: clpipe did not write this file, so it is not overwritten; move it, or name "
             "another file with -o"
         )
-    require("clpipe report", "jinja2", "matplotlib", "scipy")
+    require("clpipe report", "report")
     from clpipe.reports.page import html
     from clpipe.reports.run import read_run
 

@@ -73,7 +73,7 @@ def read_annotations(path: Path, images: Images) -> Annotations:
     Raises:
         RequestError: they cannot be read, or the run does not write all pictures as files.
     """
-    require("--annotations", "pycocotools", "shapely")
+    require("--annotations", "annotations")
     if not images.is_whole:
         raise RequestError(
             "--annotations: this option applies only to all pictures of a directory; run "

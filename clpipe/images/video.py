@@ -174,7 +174,7 @@ class VideoWriter:
 
     def __init__(self, path: Path, options: VideoOptions) -> None:
         options.check_suffix(path.suffix)
-        require("a video", "av")
+        require("a video", "video")
         self.path = path
         self.options = options
         self.count = 0
@@ -353,7 +353,7 @@ def _rgb(frame: "av.VideoFrame") -> Array:
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """Open a video file for reading, and yield its container and first video stream."""
-    require(f"{path}: reading a video", "av")
+    require(f"{path}: reading a video", "video")
     import av
 
     with _errors(path, "read"), av.open(path) as container:

@@ -37,7 +37,7 @@ def calibrate_files(
             matplotlib is not installed.
         ImageError: a file cannot be read, or the frames do not allow an estimate.
     """
-    require("clpipe calibrate", "scipy", "matplotlib")
+    require("clpipe calibrate", "calibrate")
     overrides.check()
     dark_paths = find_frames(dark)
     without_light = {os.path.realpath(path) for path in dark_paths}

@@ -23,7 +23,7 @@ def measure_series(path: Path) -> tuple[Moments, Figures]:
         RequestError: the text or a frame cannot be read or does not fit, the series does not allow
             an estimate, or SciPy or matplotlib is not installed.
     """
-    require("clpipe calibrate", "scipy", "matplotlib")
+    require("clpipe calibrate", "calibrate")
     moments = read_moments(read_series(path))
     try:
         return moments, figures(moments)
