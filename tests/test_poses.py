@@ -254,10 +254,10 @@ def test_frames_and_exposures_are_in_it(clpipe, write_exr):
     ]  # without poses
     clpipe(*run, *pose, "--format", "dng", "--format", "png")
     stdout = clpipe("poses", "o").stdout
-    assert (
-        "6 pictures with a space in the name, which images.txt cannot hold" in stdout
-        and "x/a b.ev+0.frame0" in stdout
+    expected = (
+        "a b.ev+0.frame0.png and 5 more are not in images.txt, which allows no spaces in names"
     )
+    assert expected in stdout
     views = json.loads(Path("o/cameras.json").read_text())["views"]
     names = [
         f"x/{n}.ev{e}.frame{f}.png" for n in ("a b", "c") for e in ("+0", "-1") for f in (0, 1)
@@ -423,3 +423,14 @@ def test_quaternions_are_those_of_rotations(q):
     assert np.allclose(r, rotated(*unit), atol=1e-12)
     again = to_quaternion(rotation(r.tolist()))
     assert again[0] >= 0 and np.allclose(np.abs(again @ unit), 1, atol=1e-12)
+
+
+def test_pictures_without_a_focal_length_are_named(clpipe, write_exr):
+    for name in "abc":
+        write_exr(f"in/{name}.exr", np.full((6, 8, 3), 0.2))
+    run = ("run", "-o", "o", "--device", "numpy", "--stages", "exposure")
+    clpipe(*run, "in/a.exr", "in/b.exr")
+    reason = "a.jpg and 1 more are not in these files, because they need the focal length"
+    assert reason in clpipe("poses", "o", status=2).stderr
+    clpipe(*run, "in/c.exr", "--set", "render.fx=9")
+    assert f"warning: {reason}" in clpipe("poses", "o").stdout

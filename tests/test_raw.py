@@ -364,3 +364,10 @@ def test_exif_is_found_in_files_that_are_no_tiff(tmp_path):
         exif = read_exif(tmp_path / "b.raf")
         assert exif.text("Model") == "Canon EOS 5D Mark II"
         assert exif.number("ISOSpeedRatings", 0) == 400
+
+
+def test_a_uniform_raw_is_a_raw(tmp_path):
+    uniform = np.full_like(mosaic(), 512)  # black, like a clean picture of darkness
+    path = write_dng(tmp_path / "a.dng", uniform)
+    assert np.array_equal(read_raw(path, read_raw_info(path)), uniform)
+    clpipe("run", path, "-o", tmp_path, "--device", "numpy")

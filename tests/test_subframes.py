@@ -218,3 +218,11 @@ def test_a_camera_that_stands_still_has_no_motion(clpipe, moving):
     Path("cameras.json").write_text(json.dumps({"views": views}))
     clpipe(*SEVEN, "-o", "o")
     assert "motion" not in json.loads(Path("o/f0.json").read_text())
+
+
+def test_a_sequence_that_does_not_divide_is_named(clpipe, write_exr):
+    for number in range(4):
+        write_exr(f"in/r{number}.exr", np.full((6, 8, 3), 0.2))
+    command = ("run", "in", "-o", "o", "--sequence", "--set", "shutter.subframes=3")
+    stderr = clpipe(*command, status=2).stderr
+    assert "in/r0.exr and others: shutter.subframes is 3, but this sequence has 4 images" in stderr

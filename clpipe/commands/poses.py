@@ -34,8 +34,8 @@ def poses(folder: Path, as_json: bool) -> None:
     if not written.files:
         reasons = "; ".join(written.warnings) or "there is no sidecar of a picture"
         raise RequestError(
-            f"{folder}: no picture has known intrinsics: {reasons}; run with --poses FILE, "
-            "or set render.focal_length and render.sensor_width, or render.fx"
+            f"{folder}: no cameras are known: {reasons}; run with --poses FILE, or set "
+            "render.focal_length and render.sensor_width, or render.fx"
         )
     if as_json:
         named = {"files": written.files, "pictures": written.pictures, "warnings": written.warnings}

@@ -57,7 +57,7 @@ def as_image(value: Any, kind: Kind) -> Array:
             "For DN, pass image.astype(np.uint16)"
             if is_mosaic
             else "For linear values, pass image / np.float32(WHITE), with the value of white. "
-            "For a finished picture, use Pipeline('unprocess')"
+            "For a finished picture, use the configuration 'unprocess'"
         )
         raise ImageError(
             f"the image has samples of type {image.dtype}, but the chain expects "

@@ -163,8 +163,11 @@ def read_raw(path: Path, info: RawInfo, max_pixels: int = DEFAULT_MAX_PIXELS) ->
     with _open_raw(path, max_pixels) as raw:
         mosaic = np.array(raw.raw_image_visible, np.float32)
         blacks = np.array(raw.black_level_per_channel, np.float32)[_colours(raw)]
-    # For a file whose pixels were removed, LibRaw returns whatever was in memory.
-    if path.stat().st_size * 8 < MIN_BITS * mosaic.size or mosaic.min() == mosaic.max():
+    # For a file whose pixels were removed, LibRaw returns whatever was in memory. A clean raw may
+    # be uniform, but it is not below black, and its file contains a sample for each pixel.
+    bits, darkest = path.stat().st_size * 8 / mosaic.size, mosaic.min()
+    is_suspect = bits < 1 or darkest < info.black_level
+    if bits < MIN_BITS or (is_suspect and darkest == mosaic.max()):
         raise ImageError(
             f"{path}: this raw has only metadata and no pixels; use the original file of the camera"
         )

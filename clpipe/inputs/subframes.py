@@ -63,13 +63,15 @@ def exposures(jobs: Sequence[Job], settings: Settings, in_sequences: bool = Fals
     count = shutter.subframes
     joined = []
     by_folder = groupby(jobs, lambda job: job.path.parent)
-    groups = by_pattern(jobs).items() if in_sequences else by_folder
-    for folder, folder_jobs in groups:
-        files = list(folder_jobs)
+    groups = by_pattern(jobs).values() if in_sequences else (each for _, each in by_folder)
+    what = "sequence" if in_sequences else "folder"
+    for group in groups:
+        files = list(group)
+        folder = f"{files[0].label} and others" if in_sequences else files[0].path.parent
         if len(files) % count:
             raise RequestError(
                 f"{folder}: {stage_in(StageRole.SHUTTER).name}.subframes is {count}, but this "
-                f"folder has {len(files)} images; provide a multiple of {count}"
+                f"{what} has {len(files)} images; provide a multiple of {count}"
             )
         for start in range(0, len(files), count):
             first, *others = files[start : start + count]

@@ -105,7 +105,9 @@ def write_camera_files(
         elif texts:
             path.unlink(missing_ok=True)  # describes pictures that have been removed
     reasons = tuple(
-        f"{len(files)} picture{'s' * (len(files) > 1)} {reason}, such as {min(files)}"
+        f"{min(files)} and {len(files) - 1} more are {reason}"
+        if len(files) > 1
+        else f"{files[0]} is {reason}"
         for reason, files in skipped.items()
         if files
     )
@@ -138,7 +140,7 @@ def file_texts(
     prefix = "../" * model.count("/")
     posed = [each for each in pictures if each.pose]
     if posed:
-        skipped[f"without a pose, so not in {TRANSFORMS} and images.txt"] += [
+        skipped[f"not in {TRANSFORMS} and images.txt, because they need a pose"] += [
             each.file for each in pictures if not each.pose
         ]
     texts = {CAMERAS: cameras_json(pictures, prefix), **colmap(pictures, posed, skipped)}

@@ -98,7 +98,7 @@ def colmap(
         images = []
         for number, each in enumerate(posed, 1):
             if any(letter.isspace() for letter in each.file):
-                reason = "with a space in the name, which images.txt cannot hold"
+                reason = "not in images.txt, which allows no spaces in names"
                 skipped[reason].append(each.file)
                 continue
             assert each.pose
@@ -155,7 +155,7 @@ def nerfstudio(
     cameras, frames, responses = [], [], Responses()
     for each in pictures:
         if (each.camera.model == OPENCV_FISHEYE) != is_fisheye:
-            reason = f"with a fisheye lens, which {TRANSFORMS} cannot hold together with others"
+            reason = f"not in {TRANSFORMS}, which allows no fisheyes together with other lenses"
             skipped[reason].append(each.file)
             continue
         assert each.pose

@@ -20,7 +20,7 @@ OTHERS = (*PICTURES, *BASELINES)
 
 MODEL_FOLDERS = {NOISY: "", **{role: f"models/{Rendition(role).label[1:]}/" for role in OTHERS}}
 
-CHANGED = "with a sidecar that was changed after clpipe wrote it"
+CHANGED = "not in these files, because a sidecar was changed after clpipe wrote it"
 
 CAMERA = TypeAdapter(Intrinsics)
 
@@ -72,7 +72,7 @@ def output_pictures(folder: Path, skipped: Mapping[str, list[str]]) -> Iterator[
                 continue
             shown = file.relative_to(folder).as_posix()
             if values["intrinsics"] is None:
-                skipped["without known intrinsics, so in none of the files"].append(shown)
+                skipped["not in these files, because they need the focal length"].append(shown)
                 continue
             camera = CAMERA.validate_python(values["intrinsics"])
             pose = values["pose"]
@@ -83,9 +83,10 @@ def output_pictures(folder: Path, skipped: Mapping[str, list[str]]) -> Iterator[
             remaining = *_photometry_and_motion(values), str(values["name"]), depth
             yield OutputPicture(shown, role, simplest_model(camera), pose_values, *remaining)
         except SidecarError:
-            skipped[f"{CHANGED}, so not used; repeat the same clpipe run"].append(shown)
+            skipped[f"{CHANGED}; repeat the same clpipe run"].append(shown)
         except (KeyError, TypeError, ValueError):
-            skipped["with a sidecar that is damaged or of another version"].append(shown)
+            reason = "not in these files, because a sidecar is damaged or of another version"
+            skipped[reason].append(shown)
 
 
 def _photometry_and_motion(
