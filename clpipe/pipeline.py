@@ -23,6 +23,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.methods import base_name
 from clpipe.chain.overscan import margins_of_array
 from clpipe.chain.paths import resolve_paths
+from clpipe.chain.python_words import errors_in_python
 from clpipe.chain.registry import load_stage_file, loaded_stage_files
 from clpipe.chain.settings import Settings, overlay, settings_from
 from clpipe.engine.clipping import WARNING_SHARE, clipped_share, clipping_text
@@ -93,6 +94,7 @@ class Pipeline(ReadOnly):
         DeviceError: there is no usable device.
     """
 
+    @errors_in_python()
     @check_argument_types
     def __init__(
         self,
@@ -159,6 +161,7 @@ class Pipeline(ReadOnly):
         """The steps of the chain, each with its resolved parameters."""
         return self._runner.chain
 
+    @errors_in_python()
     def process(
         self,
         image: Array,
@@ -279,6 +282,7 @@ class Pipeline(ReadOnly):
 
     __call__ = process
 
+    @errors_in_python()
     def carry(
         self,
         layer: Array,
@@ -341,8 +345,6 @@ class Pipeline(ReadOnly):
         """
         if self.device:
             self.device.check_process()
-        image_settings = overlay(self._settings, plain(settings)) if settings else self._settings
-        """Return the runner of an image, with its own draws and settings."""
         image_settings = (
             overlay(self._settings, resolve_paths(None, plain(settings)))
             if settings

@@ -17,6 +17,7 @@ from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.session import Images, Run
 from clpipe.chain.formats import format_named
 from clpipe.chain.options import DEFAULT_PATCHES, OPTIONS, Moments, RedoName, Transfer, check_option
+from clpipe.chain.python_words import errors_in_python
 from clpipe.chain.rendition import parse_bracket
 from clpipe.chain.request import Request
 from clpipe.images.video import Codec
@@ -44,6 +45,7 @@ FIELD_NAMES = {"format": "formats", "webdataset": "per_tar", "device": "devices"
 Texts = str | Path | Sequence[str | Path]  # one text or several
 
 
+@errors_in_python()
 @check_argument_types
 def run(
     inputs: Texts,
@@ -203,6 +205,12 @@ def run(
             overwrite an input. If one image fails, its outcome says so, and the run continues.
     """
     options = dict(locals())
+    for name, field in (("augment", "augment"), ("patches_per_image", "per_image")):
+        if name in settings:
+            raise RequestError(
+                f"found {name} {settings[name]!r}; set it together with the size, as in "
+                f"patch=clpipe.Patches(64, {field}={settings[name]!r})"
+            )
     if isinstance(patch, Patches):
         options["patch"], options["augment"] = patch.size, patch.augment
         options["patches_per_image"] = patch.per_image

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -40,6 +40,7 @@ from clpipe.batch.threads import Batch
 from clpipe.batch.trace import Trace, check_trace
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.isos import draw_note
+from clpipe.chain.python_words import errors_in_python, python_words
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.state import has_state
@@ -210,7 +211,13 @@ class Run:
             raise RequestError("--dask: Dask cannot write tars; use --webdataset with --shard")
 
     def __iter__(self) -> Iterator[Outcome]:
-        return self.outcomes(self.jobs)
+        with errors_in_python():
+            for outcome in self.outcomes(self.jobs):
+                yield replace(
+                    outcome,
+                    error=python_words(outcome.error),
+                    warnings=tuple(map(python_words, outcome.warnings)),
+                )
 
     def stop(self) -> None:
         """Begin no more images, and finish those in flight. A signal handler may call it."""

@@ -17,6 +17,7 @@ from click.shell_completion import CompletionItem
 
 from clpipe.base.about import full_version
 from clpipe.base.errors import ClpipeError, DeviceError, OutputError, RequestError
+from clpipe.base.interface import command_line
 from clpipe.base.memory import check_address_space
 from clpipe.base.system import max_address_space, processors, use_single_heap
 from clpipe.base.text import one_line, quote_alternatives, similar_names
@@ -84,7 +85,8 @@ class LazyGroup(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
-            return super().invoke(ctx)
+            with command_line():
+                return super().invoke(ctx)
         except ClpipeError as error:
             fail(error)
         except KeyboardInterrupt:

@@ -14,6 +14,7 @@ from clpipe.base.text import as_texts
 from clpipe.base.types import plain
 from clpipe.base.user_warnings import warn
 from clpipe.base.validation import check_argument_types
+from clpipe.chain.python_words import errors_in_python
 from clpipe.chain.rendition import DEVELOPMENT
 from clpipe.chain.request import Request
 from clpipe.dataset.arrays import ArrayFormat, dtype_named
@@ -121,6 +122,7 @@ class Dataset(ReadOnly):
             raw or variance that is requested, or if a type cannot hold the values.
     """
 
+    @errors_in_python()
     @check_argument_types
     def __init__(
         self,
@@ -243,6 +245,7 @@ class Dataset(ReadOnly):
             raise TypeError("a dataset with endless epochs has no length. Set epochs=N")
         return self._numbering().samples_per_epoch * self._epochs
 
+    @errors_in_python()
     def __getitem__(self, index: int) -> Sample:
         """Return a sample. Samples are ordered by epoch, then by image.
 
@@ -253,6 +256,7 @@ class Dataset(ReadOnly):
         """
         return self.__getitems__([index])[0]
 
+    @errors_in_python()
     def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
         """Return the samples of a batch, as PyTorch's ``DataLoader`` requests them.
 

@@ -11,6 +11,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.types import Array
 from clpipe.base.validation import check_argument_types
+from clpipe.chain.python_words import errors_in_python
 from clpipe.chain.registry import stage_in
 from clpipe.dataset.arrays import packed, unpacked
 from clpipe.images.arrays import as_array
@@ -51,6 +52,7 @@ class RawNoise(ReadOnly):
         RequestError: a name or value is not allowed.
     """
 
+    @errors_in_python()
     @check_argument_types
     def __init__(
         self,
@@ -80,6 +82,7 @@ class RawNoise(ReadOnly):
     def __repr__(self) -> str:
         return f"RawNoise({self._settings['camera']!r}, {self._settings['iso']!r})"
 
+    @errors_in_python()
     def __call__(self, mosaic: Array, key: str | np.random.Generator | None = None) -> Array:
         """Return a mosaic with noise.
 

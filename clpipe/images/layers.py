@@ -174,7 +174,7 @@ def _preferred(path: Path, pictures: Sequence[PictureLocation]) -> PictureLocati
         raise NoPictureError(
             f"{path}: has no layer with the finished picture. These layers are AOVs by their "
             f"names: {listed}",
-            f"To read one as the picture, add --layer {printable(first)} (in Python, layer=)",
+            f"To read one as the picture, add --layer {printable(first)}",
         )
     if len(candidates) == 1:
         return candidates[0]
@@ -185,7 +185,7 @@ def _preferred(path: Path, pictures: Sequence[PictureLocation]) -> PictureLocati
         first = next(filter(None, equal.values()))
         raise ImageError(
             f"{path}: {len(equal)} layers may be the picture: {listed}",
-            f"Name one with --layer (in Python, layer=), such as {printable(first)}",
+            f"Name one with --layer, such as {printable(first)}",
         )
     return best
 

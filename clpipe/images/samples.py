@@ -75,8 +75,8 @@ def read_part(
         raise ImageError(
             f"{path}: this {file.format_name().upper()} file has samples of type {spec.format}, "
             "but linear light in floats is expected",
-            "For a render, add --transfer srgb or linear (in Python, transfer='srgb'). For a "
-            "photograph, use -c unprocess (config='unprocess')",
+            "For a render, add --transfer srgb or --transfer linear. For a photograph, use -c "
+            "unprocess",
         )
     width, height = margins.image_size(spec.full_width, spec.full_height)
     check_size(path, width, height, max_pixels)

@@ -19,6 +19,7 @@ from clpipe.chain.chain import Chain
 from clpipe.chain.files import load_settings
 from clpipe.chain.making import make_chain
 from clpipe.chain.paths import resolve_paths
+from clpipe.chain.python_words import errors_in_python
 from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import overlay
 from clpipe.stage import NoiseScope, StageRole
@@ -60,6 +61,7 @@ class RawNoise(ReadOnly):
     (torch.Size([8, 4, 32, 32]), True)
     """
 
+    @errors_in_python()
     @check_argument_types
     def __init__(
         self,
@@ -86,6 +88,7 @@ class RawNoise(ReadOnly):
     def __repr__(self) -> str:
         return f"RawNoise({self._settings.label})"
 
+    @errors_in_python()
     def __call__(self, mosaic: Tensor, key: Sequence[str] | str | None = None) -> Tensor:
         """Return mosaics with noise.
 
