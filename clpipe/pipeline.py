@@ -23,7 +23,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.methods import base_name
 from clpipe.chain.overscan import margins_of_array
 from clpipe.chain.paths import resolve_paths
-from clpipe.chain.python_words import errors_in_python
+from clpipe.chain.python_words import errors_in_python, python_words
 from clpipe.chain.registry import load_stage_file, loaded_stage_files
 from clpipe.chain.settings import Settings, overlay, settings_from
 from clpipe.engine.clipping import WARNING_SHARE, clipped_share, clipping_text
@@ -161,7 +161,6 @@ class Pipeline(ReadOnly):
         """The steps of the chain, each with its resolved parameters."""
         return self._runner.chain
 
-    @errors_in_python()
     def process(
         self,
         image: Array,
@@ -213,10 +212,11 @@ class Pipeline(ReadOnly):
             RequestError: a name or value is not allowed.
         """
         arrays = {} if depth is None else {"depth": depth}
-        prepared = self.prepare(image, key, arrays, overscan, settings)
-        for text in prepared.warnings:
-            warn(f"{key}: {text}")
-        result, chain = self.develop(prepared), prepared.runner.chain
+        with errors_in_python():
+            prepared = self.prepare(image, key, arrays, overscan, settings)
+            for text in prepared.warnings:
+                warn(f"{key}: {python_words(text)}")
+            result, chain = self.develop(prepared), prepared.runner.chain
         share = clipped_share(result, chain) or 0.0
         # Photographs are already clipped.
         if share >= WARNING_SHARE and chain.source is not Kind.DISPLAY:
@@ -258,7 +258,7 @@ class Pipeline(ReadOnly):
         try:
             checked = earlier.pixels if earlier else as_image(image, runner.chain.source)
         except ImageError as error:
-            raise ImageError(f"{key}: {error}") from None
+            raise ImageError(f"{key}: {error}" if key else str(error)) from None
         margins = margins_of_array(overscan, checked)
 
         def layer(chain: Chain, step: str, width: int, height: int, kept: Margins) -> ImageLayer:
@@ -375,6 +375,8 @@ class Pipeline(ReadOnly):
                 is the number of the image ("0", "1", ...), which continues in further calls.
         """
         for item in images:
+            if isinstance(item, tuple) and len(item) != 2:
+                raise ImageError(f"found a tuple of {len(item)}; expected an image and its key")
             image, arguments = item if isinstance(item, tuple) else (item, {})
             keywords = {"key": arguments} if isinstance(arguments, str) else arguments
             with self._lock:

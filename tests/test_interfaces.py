@@ -75,3 +75,70 @@ def test_every_option_has_words_in_python(name):
     assert python_words(f"remove --{option}; see --{option}") == f"remove {name}; see {name}"
     assert python_words(f"clpipe run --{option}") == f"clpipe run --{option}"
     assert not re.search(r"--\w", python_words(f"--{option}: found 3"))
+
+
+IMAGE = np.full((8, 12, 3), 0.2, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("image", "options", "message"),
+    [
+        ([[0.2]], {}, "^image is a list, but an array is expected. Pass numpy.asarray"),
+        ("a.exr", {}, "^image is a str.* Pass a NumPy array. For files, use clpipe.run"),
+        (None, {}, "^image is a NoneType, but an array is expected. Pass a NumPy array$"),
+        (IMAGE[..., 0], {}, r"^the image has shape \(8, 12\)"),
+        (IMAGE[..., 0], {"key": "a"}, r"^a: the image has shape \(8, 12\)"),
+        (IMAGE, {"overscan": 3}, r"found overscan \(3,\); expected four numbers"),
+    ],
+)
+def test_wrong_images_of_a_pipeline(image, options, message):
+    with pytest.raises(package.ImageError, match=message):
+        package.Pipeline(device="numpy").process(image, **options)
+
+
+def test_wrong_arguments_in_python(files):
+    camera = package.Pipeline(device="numpy")
+    with pytest.raises(package.ImageError, match="found a tuple of 3; expected an image and its"):
+        list(camera.process_many([(IMAGE, "a", "b")]))
+    samples = package.Dataset("in", device="numpy")
+    for call in (samples.set_epoch, samples.load_state_dict):
+        with pytest.raises(package.RequestError, match=r"found (epoch|state) 'a'; expected"):
+            call("a")
+    Path("a.tar").write_bytes(b"none")
+    with pytest.raises(package.ImageError, match=r"a.tar: cannot be read; it is damaged, or not a"):
+        next(iter(package.StreamingDataset("a.tar", device="numpy")))
+
+
+def test_a_path_is_a_text(files):
+    path = Path(package.built_in_cameras()["canon-6d"])
+    assert package.Pipeline(camera=path, device="numpy").chain.camera.name == "canon-6d"
+    assert package.load_camera(path).name == "canon-6d"
+
+
+def test_warnings_point_at_the_call_of_the_user(files):
+    camera = package.Pipeline(device="numpy")
+    with pytest.warns(UserWarning, match="no step reads the depth") as caught:
+        camera(IMAGE, "a", depth=IMAGE[..., 0])
+    Path("in/b.exr").write_bytes(b"none")
+    with pytest.warns(UserWarning, match="skipped: in/b.exr") as skipped:
+        package.Dataset("in", on_error="skip", device="numpy")
+    assert {each.filename for each in (*caught, *skipped)} == {__file__}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--memory", "lots"), "clpipe: --memory: 'lots' is not a size"),
+        (("--patch", 8, "--patches-per-image", "few"), "clpipe: --patches-per-image: found 'few'"),
+        (("--set", "denoise=2"), "'clpipe stages denoise' lists the parameters of this stage"),
+        (("--iso", "random"), "write iso = {log_uniform = [100, 6400]} in a configuration"),
+    ],
+)
+def test_wrong_words_of_a_command(files, clpipe, words, message):
+    stderr = " ".join(clpipe("run", "in", "-o", "o", *words, status=2).stderr.split())
+    assert message in stderr and "Invalid value" not in stderr
+
+
+def test_an_archive_is_named_as_a_url(files, clpipe):
+    Path("a.zip").write_bytes(b"none")
+    assert "name zip://::FILE.zip" in clpipe("run", "a.zip", "-o", "o", status=2).stderr

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from types import FrameType
 from typing import cast
 
-# Packages without lines of the user. The last two start threads.
-SKIPPED = __name__.partition(".")[0], "concurrent", "threading"
+# Packages without lines of the user. The last two start threads, and contextlib calls functions.
+SKIPPED = __name__.partition(".")[0], "contextlib", "concurrent", "threading"
 
 
 def warn(text: str) -> None:

@@ -8,6 +8,7 @@ from itertools import groupby
 from clpipe.base.errors import RequestError
 from clpipe.batch.execution import ExecutionOptions
 from clpipe.chain.chain import Chain
+from clpipe.chain.python_words import python_words
 from clpipe.chain.rendition import Rendition
 from clpipe.engine.state import State, has_state, keeps_state
 from clpipe.inputs.find import Job, Place
@@ -34,7 +35,8 @@ def check_frames(
         return
     step = next(step.name for step in chain.steps if keeps_state(step))
     if not is_sequence:
-        log.warning("%s changes only frames of sequences; add --sequence, or remove it", step)
+        text = "%s changes only frames of sequences; add --sequence, or remove it"
+        log.warning(python_words(text), step)
     elif dask is not None or (execution.processes or 1) > 1:
         option = "--processes" if dask is None else "--dask"
         raise RequestError(

@@ -335,7 +335,7 @@ def _cameras_with_iso(camera: Camera, iso: float) -> str:
     return "; no built-in camera comes closer"
 
 
-def load_camera(name: str) -> Camera:
+def load_camera(name: str | Path) -> Camera:
     """Load a built-in camera by :func:`built_in_name`, or a file by its path (ending in .toml).
 
     >>> load_camera("sony-a7r2")
@@ -344,7 +344,7 @@ def load_camera(name: str) -> Camera:
     Raises:
         RequestError: there is no such camera or file, or the file is not a valid profile.
     """
-    built_in = built_in_cameras()
+    built_in, name = built_in_cameras(), str(name)
     if built_in_path := built_in.get(built_in_name(name) or ""):
         return _built_in(built_in_path)
     path = local_path("camera", name)

@@ -33,6 +33,8 @@ def _suggestion(text: str) -> str:
 
     >>> _suggestion("iso=800"), _suggestion("denoise=mean")
     ('; use --iso 800', "; did you mean 'denoise.method=mean'?")
+    >>> _suggestion("denoise=2")
+    "; 'clpipe stages denoise' lists the parameters of this stage"
     >>> _suggestion("iso={choice=[100,800]}")
     '; to draw it, write iso = {choice=[100,800]} in a configuration and use -c'
     >>> _suggestion("luma_strenght=2")
@@ -46,6 +48,8 @@ def _suggestion(text: str) -> str:
             return f"; to draw it, write {name} = {value} in a configuration and use -c"
         return f"; use --{name.replace('_', '-')} {value or 'VALUE'}"
     if name in all_stages():
+        if all(each.method != value for each in all_stages()[name].methods):
+            return f"; 'clpipe stages {name}' lists the parameters of this stage"
         meant = [f"{name}.method"]
     else:
         known = parameter_names()

@@ -40,6 +40,8 @@ def margins_of_array(overscan: Sequence[int], image: Array) -> Margins:
     Raises:
         ImageError: the numbers are no margins, or leave no picture.
     """
+    if not isinstance(overscan, Sequence):
+        overscan = (overscan,)
     if not any(overscan):
         return NO_MARGINS
     if len(overscan) == len(NO_MARGINS) and min(overscan) >= 0 and image.ndim > 1:

@@ -29,6 +29,17 @@ class FormatName(click.Choice[str]):
         return super().convert(format_named(value), param, ctx)
 
 
+class Parsed(click.ParamType[Any]):
+    """A value that a function parses. Its errors are not those of click."""
+
+    def __init__(self, parse: Callable[[str], Any]) -> None:
+        self.name = "text"
+        self._parse = parse
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return self._parse(value) if isinstance(value, str) else value
+
+
 def patch_count(text: str) -> int | str:
     """Return the number of patches per image, or "grid".
 
@@ -45,8 +56,8 @@ def patch_count(text: str) -> int | str:
 FLAGS = {"config": ("-c", "--config"), CODE: ("--stage-file",)}
 TYPES: dict[str, Any] = {
     "stages": lambda text: [name.strip() for name in text.split(",") if name.strip()],
-    "patches_per_image": patch_count,
-    "memory": parse_size,
+    "patches_per_image": Parsed(patch_count),
+    "memory": Parsed(parse_size),
     "poses": EXISTING,
     CODE: EXISTING,
 }

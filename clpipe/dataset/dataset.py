@@ -14,7 +14,7 @@ from clpipe.base.text import as_texts
 from clpipe.base.types import plain
 from clpipe.base.user_warnings import warn
 from clpipe.base.validation import check_argument_types
-from clpipe.chain.python_words import errors_in_python
+from clpipe.chain.python_words import errors_in_python, python_words
 from clpipe.chain.rendition import DEVELOPMENT
 from clpipe.chain.request import Request
 from clpipe.dataset.arrays import ArrayFormat, dtype_named
@@ -192,6 +192,7 @@ class Dataset(ReadOnly):
         epochs = "endless epochs" if self._epochs is None else f"{self._epochs} epochs"
         return f"Dataset({len(self._jobs)} images, {epochs}, {self._label})"
 
+    @check_argument_types
     def set_epoch(self, epoch: int) -> None:
         """Continue with the start of an epoch. Use it to resume a training run.
 
@@ -207,6 +208,7 @@ class Dataset(ReadOnly):
         """Return the position of the iteration as plain values for :meth:`load_state_dict`."""
         return {"epoch": self._epoch, "sample": self._next, "images": self._digest()}
 
+    @check_argument_types
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Start the next iteration after the last sample of a saved state.
 
@@ -221,6 +223,7 @@ class Dataset(ReadOnly):
         self.set_epoch(state["epoch"])
         self._first = self._next = state["sample"]
 
+    @check_argument_types
     def shard(self, index: int, of: int) -> Self:
         """Return one of ``of`` parts of the dataset: every ``of``-th image, starting at ``index``.
 
@@ -245,7 +248,6 @@ class Dataset(ReadOnly):
             raise TypeError("a dataset with endless epochs has no length. Set epochs=N")
         return self._numbering().samples_per_epoch * self._epochs
 
-    @errors_in_python()
     def __getitem__(self, index: int) -> Sample:
         """Return a sample. Samples are ordered by epoch, then by image.
 
@@ -325,7 +327,7 @@ class Dataset(ReadOnly):
             except ImageError as error:
                 if not self._skips:
                     raise
-                warn(f"skipped: {error}")
+                warn(python_words(f"skipped: {error}"))
         raise ImageError("no image of the dataset can be read and developed")
 
     def _batch(self, epoch: int, image: int, numbers: Sequence[int]) -> SampleBatch:
@@ -343,14 +345,14 @@ class Dataset(ReadOnly):
         self._next, self._first = self._first, 0
         together = PATCHES_TOGETHER if self._draws_by_patch else 1
         pending = prefetched(self._loader, self._batches(self._next), self._threads, together)
-        with closing(pending):
+        with closing(pending), errors_in_python():
             for batch, wait in pending:
                 try:
                     samples = wait()
                 except ImageError as error:
                     if not self._skips:
                         raise
-                    warn(f"skipped: {error}")
+                    warn(python_words(f"skipped: {error}"))
                     self._next += len(batch.numbers)
                     continue
                 for sample in samples:

@@ -10,6 +10,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.memory import parse_size
 from clpipe.base.user_warnings import warn
 from clpipe.chain.isos import draw_note
+from clpipe.chain.python_words import python_words
 from clpipe.inputs.find import Job, find_jobs
 from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
@@ -75,7 +76,7 @@ def jobs_of(
     text = f"{_reason(loader, damaged[0])}{others}"
     if not skips or len(damaged) == len(jobs):
         raise RequestError(f"{text}. Remove such files, or set on_error='skip'")
-    warn(f"skipped: {text}")
+    warn(python_words(f"skipped: {text}"))
     return [job for job, readable in zip(jobs, is_readable, strict=True) if readable]
 
 

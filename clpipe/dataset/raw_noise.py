@@ -82,7 +82,6 @@ class RawNoise(ReadOnly):
     def __repr__(self) -> str:
         return f"RawNoise({self._settings['camera']!r}, {self._settings['iso']!r})"
 
-    @errors_in_python()
     def __call__(self, mosaic: Array, key: str | np.random.Generator | None = None) -> Array:
         """Return a mosaic with noise.
 

@@ -13,6 +13,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.user_warnings import Issued, warn
 from clpipe.chain.carry import VALID
 from clpipe.chain.identity import frame_key, noise_key
+from clpipe.chain.python_words import python_words
 from clpipe.dataset.developer import Developer, DevelopTask, Sample, SampleSpec
 from clpipe.dataset.render_cache import RenderCache
 from clpipe.engine.device import open_device
@@ -119,7 +120,7 @@ class SampleLoader:
                 f"{loader.request.start_at}. Select such images with a glob"
             )
         for warning in self._warned.new(loaded.source.warnings):
-            warn(f"{job.path}: {warning}")
+            warn(f"{job.path}: {python_words(warning)}")
         return loaded, carried
 
     def _source(self, job: Job, loader: ImageLoader) -> SourceImage:

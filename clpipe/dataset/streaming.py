@@ -130,5 +130,7 @@ def _unpack(tar: str, folder: Path) -> None:
                 assert content
                 with target.open("wb") as written:
                     shutil.copyfileobj(content, written)
+    except tarfile.ReadError:
+        raise ImageError(f"{tar}: cannot be read; it is damaged, or not a tar") from None
     except (tarfile.TarError, OSError, EOFError) as error:
         raise ImageError(f"{tar}: cannot be read as a tar: {error}") from None

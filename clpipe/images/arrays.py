@@ -1,5 +1,6 @@
 """Arrays as images: converted if their meaning is unambiguous, otherwise rejected with advice."""
 
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -23,9 +24,10 @@ def as_array(value: Any, what: str) -> Array:
         return value
     kind = type(value).__name__
     if not hasattr(value, "__dlpack__"):
-        raise ImageError(
-            f"{what} is a {kind}, but an array is expected. Pass numpy.asarray({what})"
-        )
+        way = f"numpy.asarray({what})" if isinstance(value, list | tuple) else "a NumPy array"
+        if isinstance(value, str | PurePath):
+            way += ". For files, use clpipe.run or clpipe.Dataset"
+        raise ImageError(f"{what} is a {kind}, but an array is expected. Pass {way}")
     if getattr(value, "requires_grad", False):
         raise ImageError(f"{what} is a {kind} with a gradient. Pass {what}.detach()")
     try:

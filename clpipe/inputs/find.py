@@ -15,6 +15,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_input
 from clpipe.base.text import printable, whole_number
 from clpipe.base.urls import is_glob, is_url, list_urls, local, name_in, path_of, url_of
+from clpipe.chain.python_words import python_words
 from clpipe.chain.rendition import Rendition
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import PICTURE_SUFFIXES, RENDER_SUFFIXES
@@ -29,6 +30,8 @@ log = logging.getLogger(__name__)
 NON_IMAGES = {
     ".json": "this is JSON, not an image; to recompute a sidecar's picture, use 'clpipe replay'",
     ".toml": "this is a configuration or a camera, not an image; pass it with -c or --camera",
+    ".zip": "this is an archive; to develop all images in it, name zip://::FILE.zip",
+    ".tar": "this is an archive; to develop all images in it, name tar://::FILE.tar",
     ".blend": "this is a Blender scene, not an image; to render it, use 'clpipe dataset'",
 }
 
@@ -187,7 +190,7 @@ def find_jobs(
                 raise RequestError(f"{path}: {reason}")
             jobs.append(Job(path, path.name))
     for pattern in excluded.unused:
-        log.warning("--exclude %s matches no file", pattern)
+        log.warning(python_words("--exclude %s matches no file"), pattern)
     jobs = without_companions(jobs)
     if not jobs:
         raise RequestError("every file is excluded by --exclude; use a narrower pattern")
@@ -205,7 +208,8 @@ def without_companions(jobs: Sequence[Job]) -> list[Job]:
     if found:
         are = "1 file is a companion" if len(found) == 1 else f"{len(found)} files are companions"
         first = printable(str(found[0].path))
-        log.info("%s of another image, such as %s; to warp layers, use --carry", are, first)
+        text = python_words("%s of another image, such as %s; to warp layers, use --carry")
+        log.info(text, are, first)
     skipped_types = {id(job) for job in found}
     return [job for job in jobs if id(job) not in skipped_types]
 

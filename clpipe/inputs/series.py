@@ -145,7 +145,8 @@ def check_isos(isos: float | str | Sequence[float]) -> tuple[float, ...]:
     if not all(math.isfinite(iso) and iso > 0 for iso in numbers):
         raise RequestError(
             f"--iso: found {found}; expected numbers above 0 with commas between them, such as "
-            "100,800,3200"
+            "100,800,3200. For a random ISO of each image, write iso = {log_uniform = [100, 6400]} "
+            "in a configuration, and pass it with -c"
         )
     names = [f"{iso:g}" for iso in numbers]
     for name in names:

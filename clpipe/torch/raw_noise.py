@@ -88,7 +88,6 @@ class RawNoise(ReadOnly):
     def __repr__(self) -> str:
         return f"RawNoise({self._settings.label})"
 
-    @errors_in_python()
     def __call__(self, mosaic: Tensor, key: Sequence[str] | str | None = None) -> Tensor:
         """Return mosaics with noise.
 
