@@ -188,9 +188,10 @@ class Pipeline(ReadOnly):
 
         Args:
             image: a NumPy array, or a CPU tensor of any library with DLPack. If the chain starts on
-                RGB, it is (height, width, 3), linear, and 1 is full scale of the sensor. If the
-                chain starts on a mosaic or a raw, it is (height, width). The type is float16,
-                float32 or float64, also uint16 for raws and uint8 for display values.
+                RGB, it is (height, width, 3), linear, and 1 is white. The sensor saturates at 2,
+                unless ``exposure`` is changed. If the chain starts on a mosaic or a raw, it is
+                (height, width). The type is float16, float32 or float64, also uint16 for raws and
+                uint8 for display values.
             key: the name of the image. Draws depend on the key and the seed. Noise also depends on
                 the pixels and the ISO. To give several images or ISOs the same noise, pass them one
                 ``noise_key``, which replaces all of these. To repeat the noise of a picture of

@@ -356,5 +356,5 @@ def test_tars_that_cannot_be_streamed(renders):
     with pytest.raises(RequestError, match="each pass over a StreamingDataset is an epoch"):
         api.StreamingDataset("no*.tar", epochs=2)
     Path("bad.tar").write_bytes(b"no tar at all")
-    with pytest.raises(ImageError, match=r"bad\.tar: cannot be read as a tar"):
+    with pytest.raises(ImageError, match=r"bad\.tar: cannot be read; it is damaged"):
         list(api.StreamingDataset("bad.tar"))

@@ -5,6 +5,7 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
+import clpipe as package
 from clpipe.chain.files import load_config
 from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
@@ -330,3 +331,12 @@ def test_denoising_the_mosaic_keeps_what_is_below_black(develop):
     before, after = result.kept["normalize"], result.final
     assert before.min() < 0 and after.min() < 0
     assert abs(after.mean() - before.mean()) < before.std() / 20
+
+
+@pytest.mark.filterwarnings("ignore:.* clipped")
+def test_white_is_one_and_the_sensor_saturates_at_two():
+    """The docstring of process says so."""
+    camera = package.Pipeline(skip=["noise"], keep="normalize", device="numpy")
+    for value, signal in ((1.0, 0.5), (1.9, 0.95), (2.0, 1.0), (3.0, 1.0)):
+        shot = camera(np.full((8, 8, 3), value, np.float32))
+        assert shot.kept["normalize"][::2, 1::2] == pytest.approx(signal, abs=1e-3)

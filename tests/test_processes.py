@@ -145,7 +145,7 @@ def test_errors_of_a_process_are_the_runs(renders):
         list(run)
     with pytest.raises(RequestError, match="processes: a tar is packed by one process"):
         package.run("in", "out", processes=2, webdataset=2)
-    with pytest.raises(RequestError, match="processes: with --dask the cluster"):
+    with pytest.raises(RequestError, match="processes: with dask the cluster"):
         package.run("in", "out", processes=2, dask="tcp://127.0.0.1:1")
 
 

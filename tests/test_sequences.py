@@ -222,7 +222,7 @@ def test_a_drawn_iso_may_exceed_the_range_of_the_camera(frames, tmp_path):
 def test_shards_are_whole_sequences(frames, tmp_path):
     assert len(run(tmp_path, "out", sequence=True, shard="2/2")) == 9
     assert {name[0] for name in pictures(tmp_path / "out")} == {"b"}
-    with pytest.raises(RequestError, match="--shard: a tar may hold frames of two sequences"):
+    with pytest.raises(RequestError, match="shard: a tar may hold frames of two sequences"):
         run(tmp_path, "tars", sequence=True, shard="1/2", webdataset=4)
 
 

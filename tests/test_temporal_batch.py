@@ -134,12 +134,12 @@ def test_patches_of_frames_are_parts_of_the_pictures(frames):
 
 
 def test_several_processes_are_rejected_and_single_images_warn(frames, caplog):
-    with pytest.raises(RequestError, match="--processes: temporal_denoise needs the frames"):
+    with pytest.raises(RequestError, match="processes: temporal_denoise needs the frames"):
         run(frames, "out", processes=2)
-    with pytest.raises(RequestError, match="--dask: temporal_denoise needs the frames"):
+    with pytest.raises(RequestError, match="dask: temporal_denoise needs the frames"):
         run(frames, "out", dask="tcp://localhost:1")
     run(frames, "out", sequence=False)
-    assert "temporal_denoise changes only frames of sequences; add --sequence" in caplog.text
+    assert "temporal_denoise changes only frames of sequences; add sequence" in caplog.text
 
 
 def test_turns_are_taken_in_order_and_end_with_the_run():

@@ -312,7 +312,7 @@ def test_from_python(bucket, monkeypatch):
     made = package.run("flaky://b/renders", "flaky://b/set", device="numpy", webdataset=4)
     assert Counter(each.status for each in made) == {"done": 7}
     assert sorted(tars(bucket)) == ["000000.tar", "000001.tar"]
-    with pytest.raises(RequestError, match="add --webdataset N"):
+    with pytest.raises(RequestError, match="add webdataset=N"):
         package.run("in", "flaky://b/set")
     monkeypatch.setattr(urls, "MAX_TRIES", 1)
     Flaky.forbidden = "000000.index"

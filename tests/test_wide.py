@@ -32,6 +32,7 @@ LENSES = {
     "double_sphere": {"fx": 55.0, "xi": -0.2, "alpha": 0.59, "field_of_view": 220.0},
     "f_theta": {"k1": 55.0, "k2": -3.0, "k3": 2.0, "field_of_view": 200.0},
 }
+STAGES = ("--stages", "shutter,projection")
 RUN = ("--stages", "projection", "--format", "exr", "--device", "numpy")
 
 
@@ -487,3 +488,33 @@ def test_a_map_without_a_border_is_an_image_as_well(device):
     assert off_by(seen, lens_of("unified", field_of_view=100.0)).max() < 0.03
     with pytest.raises(ImageError, match="focal length of the render"):
         Runner(make_chain(settings_from(settings_of("unified"))), None).run(image, "k")
+
+
+def test_a_single_render_may_have_subframes_and_annotations(write_exr, clpipe):
+    """The page on lenses says so; panoramas may not."""
+    one, two = (np.full((32, 48, 3), value, np.float32) for value in (0.1, 0.3))
+    for name, pixels in (("in/f1", one), ("in/f2", two), ("mean/f1", (one + two) / 2)):
+        write_exr(f"{name}.exr", pixels, half=False)
+    wide = {"method": "kannala_brandt", "fx": 40, "field_of_view": 30}
+    lens = [x for k, v in wide.items() for x in ("--set", f"projection.{k}={v}")]
+    lens += ["--set", "render.fx=60", "--device", "numpy"]
+    subframes = ("--set", "shutter.subframes=2", *STAGES)
+    clpipe("run", "in", "-o", "o", *lens, *subframes, "--format", "exr")
+    clpipe("run", "mean", "-o", "p", *lens, *STAGES, "--format", "exr")
+    assert np.allclose(
+        read_image(Path("o/f1.exr")).pixels, read_image(Path("p/f1.exr")).pixels, atol=1e-3
+    )
+    box = {"id": 1, "image_id": 1, "category_id": 1, "bbox": [20, 12, 8, 8], "area": 64}
+    images = [{"id": 1, "file_name": "f1.exr", "width": 48, "height": 32}]
+    coco = {"images": images, "categories": [{"id": 1, "name": "a"}], "annotations": [box]}
+    Path("coco.json").write_text(json.dumps(coco))
+    pytest.importorskip("pycocotools", reason="needs pycocotools, in the extra annotations")
+    clpipe(
+        "run", "mean", "-o", "q", *lens, *STAGES, "--format", "exr", "--annotations", "coco.json"
+    )
+    (made,) = json.loads(Path("q/annotations.json").read_text())["annotations"]
+    x, y, width, height = made["bbox"]
+    size = json.loads(Path("q/annotations.json").read_text())["images"][0]
+    centre = size["width"] / 2, size["height"] / 2
+    assert (x + width / 2, y + height / 2) == pytest.approx(centre, abs=0.1)
+    assert width == pytest.approx(8 * 40 / 60, rel=0.02)

@@ -194,6 +194,7 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
         values=request.image,
         renditions=(rendition,),
         subframes=differing,
+        is_panorama="panorama" in values,
     )
     return Replay(request, job, environment_in(values), digests_in(values))
 

@@ -39,7 +39,13 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.kept import KeptLoader, kind_message
 from clpipe.inputs.layers import read_step_layer
 from clpipe.inputs.manifest import check_rows
-from clpipe.inputs.panoramas import CUBE_MAP, group_panoramas, read_panorama, wide_lens_of
+from clpipe.inputs.panoramas import (
+    CUBE_MAP,
+    check_subframes,
+    group_panoramas,
+    read_panorama,
+    wide_lens_of,
+)
 from clpipe.inputs.raw import RawImage, RawLoader, may_be_dump
 from clpipe.inputs.subframes import average, exposures, shutter_of
 from clpipe.reference.geometry import Margins
@@ -221,15 +227,18 @@ class ImageLoader:
             ImageError: it cannot be read, has another kind or size than expected, or changes while
                 it is read.
         """
-        wide = None if self.kept else wide_lens_of(self.settings)
-        shutter = None if wide else self.shutter(job)
-        if wide and not self.raw.is_raw(job.path):
+        is_render = self.kept is None and not self.raw.is_raw(job.path)
+        wide = wide_lens_of(self.settings) if is_render else None
+        if wide and (job.is_panorama or not job.subframes):
             return read_panorama(job, self._read, wide)
+        shutter = self.shutter(job)
         if shutter:
             resolved = shutter.with_defaults(exposure_time=self.chain.optics.exposure_time)
             exposures = exposures_of(self.chain)
             spans = exposures.spans if exposures else (Span(),)
             source = average(job, self._read, resolved, spans)
+            if wide:
+                check_subframes(job, source, wide, resolved.line_time > 0)
         else:
             with check_unchanged(job.path):
                 source = self._read(job.path)

@@ -191,6 +191,31 @@ def read_panorama(job: Job, read: Callable[[Path], SourceImage], wide: WideAngle
     return with_file_records(replace(first, pixels=atlas, panorama=panorama), job, sources)
 
 
+def check_subframes(job: Job, source: SourceImage, wide: WideAngle, is_rolling: bool) -> None:
+    """Check that a wide lens can view the mean of an exposure's sub-frames.
+
+    Args:
+        job: the job.
+        source: the mean.
+        wide: the lens.
+        is_rolling: whether rows are exposed one after the other.
+
+    Raises:
+        ImageError: the sub-frames are views of a panorama, or the shutter is rolling.
+    """
+    shutter = stage_in(StageRole.SHUTTER).name
+    if panorama_of((job.path,), wide, source.envmap, *source.pixels.shape[1::-1]):
+        raise ImageError(
+            f"{job.path}: a view of a panorama cannot also be a sub-frame; set "
+            f"{shutter}.subframes=1"
+        )
+    if is_rolling:
+        raise ImageError(
+            f"{job.path}: a rolling shutter exposes the rows of a picture, but a wide lens mixes "
+            f"the rows of the sub-frames; set {shutter}.line_time=0"
+        )
+
+
 def panorama_of(
     paths: Sequence[Path], wide: WideAngle, envmap: str, width: int, height: int
 ) -> Panorama | None:
