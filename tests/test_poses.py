@@ -5,7 +5,9 @@ COLMAP's and NeRF's files are read here with readers of their own, written after
 
 import json
 import math
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import OpenImageIO as oiio
@@ -15,7 +17,9 @@ from hypothesis import strategies as st
 
 from clpipe.base.errors import RequestError
 from clpipe.reference.intrinsics import Intrinsics
-from clpipe.reference.pose import from_quaternion, rotation, to_quaternion
+from clpipe.reference.pose import from_opengl, from_quaternion, rotation, to_quaternion
+from tests.conftest import ROOT
+from tests.markdown import blocks
 
 WIDTH, HEIGHT = 240, 160
 FX, FY, CX, CY = 230.0, 232.0, 121.5, 79.0
@@ -434,3 +438,35 @@ def test_pictures_without_a_focal_length_are_named(clpipe, write_exr):
     assert reason in clpipe("poses", "o", status=2).stderr
     clpipe(*run, "in/c.exr", "--set", "render.fx=9")
     assert f"warning: {reason}" in clpipe("poses", "o").stdout
+
+
+def test_the_script_of_the_page_writes_cameras_that_the_page_can_use(
+    clpipe, write_exr, monkeypatch
+):
+    """The recipe's script for Blender, with a scene of two frames in place of Blender's."""
+    page = ROOT / "docs" / "recipes" / "views.md"
+    (script,) = (block.text for block in blocks(page) if "import bpy" in block.text)
+    (command,) = (block.text for block in blocks(page) if "--poses cameras.json" in block.text)
+
+    class Matrix(list):
+        def normalized(self):
+            return self
+
+    matrices = [np.eye(4), np.eye(4)]
+    matrices[1][0, 3] = 0.2
+    camera = SimpleNamespace(matrix_world=None, data=SimpleNamespace(angle_x=0.98))
+    scene = SimpleNamespace(frame_start=1, frame_end=2, camera=camera)
+    scene.frame_set = lambda number: setattr(
+        camera, "matrix_world", Matrix(matrices[number - 1].tolist())
+    )
+    bpy = SimpleNamespace(context=SimpleNamespace(scene=scene))
+    monkeypatch.setitem(sys.modules, "bpy", bpy)
+    for number in (1, 2):
+        write_exr(f"renders/000{number}.exr", np.full((64, 96, 3), 0.2))
+    exec(compile(script, "views.md", "exec"), {})
+    words = command.replace("\\\n", " ").replace("cameras.json", "renders/transforms.json").split()
+    clpipe(*words[1:], "--device", "numpy")
+    views = json.loads(Path("views/cameras.json").read_text())["views"]
+    assert [view["file"] for view in views] == ["0001.png", "0002.png"]
+    assert np.allclose(views[1]["t"], from_opengl(matrices[1])[1])
+    assert views[0]["K"][0][0] == pytest.approx(48 / math.tan(0.49), rel=0.2)

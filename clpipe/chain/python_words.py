@@ -13,15 +13,16 @@ from clpipe.chain.registry import all_stages
 KEY_BY_OPTION = {name.replace("_", "-"): key for name, key in (KEYS | OPTIONS).items()}
 KEY_BY_OPTION["stage-file"] = KEYS[CODE]
 
-# A command with its options stays as it is. The other groups are --set, -c, -o and options.
-WORDS = re.compile(
-    r"clpipe [a-z]+(?: --[a-z-]+(?: [\w.]+)?)+"
-    r"|--set (?P<step>\w+)\.(?P<parameter>\w+)=(?P<setting>[^\s,;)]+\b)"
-    r"|-c (?P<config>(?!or\b|and\b)[\w-]+)"
-    r"|(?P<bare>-c\b(?! [\w-]*\.))"
-    r"|-o (?P<output>[\w./]+\w)"
-    r"|--(?P<option>[a-z][a-z-]*)(?:(?P<space>[ =])(?P<value>[\w./+-]*\w))?"
-)
+# A command with its options stays as it is. The others are --set, -c, -o and further options.
+PATTERNS = [
+    r"clpipe [a-z]+(?: --[a-z-]+(?: [\w.]+)?)+",
+    r"--set (?P<step>\w+)\.(?P<parameter>\w+)=(?P<setting>[^\s,;)]+\b)",
+    r"-c (?P<config>(?!or\b|and\b)[\w-]+)",
+    r"(?P<bare>-c\b(?! [\w-]*\.))",
+    r"-o (?P<output>[\w./]+\w)",
+    r"--(?P<option>[a-z][a-z-]*)(?:(?P<space>[ =])(?P<value>[\w./+-]*\w))?",
+]
+WORDS = re.compile("|".join(PATTERNS))
 
 
 def python_words(text: str) -> str:
