@@ -5,6 +5,7 @@ import json
 import os
 import re
 import tarfile
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.batch import tar_sink
 from clpipe.batch.run_log import read_log
 from clpipe.batch.tars import split_into_tars
+from clpipe.batch.work import ImageWorker
 from clpipe.inputs.find import Job
 from clpipe.outputs import folder as output_folders
 from clpipe.outputs import writer
@@ -95,9 +97,21 @@ def test_an_image_is_done_when_its_tar_exists(clpipe, renders):
     assert max(waiting) >= 4 and waiting[-1] == 0
 
 
-def test_a_stopped_run_says_what_waits_for_its_tar(clpipe, renders):
+def test_a_stopped_run_says_what_waits_for_its_tar(clpipe, renders, monkeypatch):
     run = api.run(renders(), "out", iso=3200, device="numpy", webdataset=8, jobs=1)
-    run.watch = lambda: run.stop() if run.summary.waiting == 3 else None
+    stopped, decode = threading.Event(), ImageWorker.decode
+
+    def held(worker, job, *rest):
+        assert job.key < "r.004.exr" or stopped.wait(120)
+        return decode(worker, job, *rest)
+
+    def watch():
+        if run.summary.waiting == 3:
+            run.stop()
+            stopped.set()
+
+    monkeypatch.setattr(ImageWorker, "decode", held)
+    run.watch = watch
     assert list(run) == [] and not (OUT / "000000.tar").exists()
     assert run.summary.made >= 3 and run.summary.interrupted
     kept = run.summary.made
