@@ -2,6 +2,8 @@
 
 import json
 import os
+import tracemalloc
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,10 @@ import OpenEXR
 import pytest
 from PIL import Image
 
+from clpipe.chain.request import Request
 from clpipe.dataset import Dataset
+from clpipe.inputs import loader
+from clpipe.inputs.find import find_jobs
 from clpipe.stages.shutter import Rows
 from tests.conftest import written
 
@@ -226,3 +231,29 @@ def test_a_sequence_that_does_not_divide_is_named(clpipe, write_exr):
     command = ("run", "in", "-o", "o", "--sequence", "--set", "shutter.subframes=3")
     stderr = clpipe(*command, status=2).stderr
     assert "in/r0.exr and others: shutter.subframes is 3, but this sequence has 4 images" in stderr
+
+
+def test_one_frame_at_a_time_is_in_memory(write_exr, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for number in range(8):
+        write_exr(f"in/f{number}.exr", np.full((300, 400, 3), number / 8, np.float16))
+    arrays, alive, read = [], [], loader.read_source
+
+    def noted(*arguments):
+        alive.append(sum(array() is not None for array in arrays))
+        source = read(*arguments)
+        arrays.append(weakref.ref(source.pixels))
+        return source
+
+    monkeypatch.setattr(loader, "read_source", noted)
+    images = loader.ImageLoader(Request({"shutter": {"subframes": 8}}))
+    (job,) = images.exposures(find_jobs(["in"], Path("out"), images.endings()))
+    images.read(job)  # the chain is made here, and not counted below
+    assert alive == [0] * 8
+    tracemalloc.start()
+    try:
+        sum_bytes = images.read(job).pixels.nbytes
+        # The sum in floats, a frame in halves, and a few rows.
+        assert tracemalloc.get_traced_memory()[1] < 1.9 * sum_bytes
+    finally:
+        tracemalloc.stop()
