@@ -878,7 +878,7 @@ def test_waiting_for_memory_is_not_time_of_decoding(renders, tmp_path, monkeypat
 
     def slow(*arguments):
         waited[0] += 1e6  # s
-        enter(*arguments)
+        return enter(*arguments)
 
     for module in (threads, job_state):
         monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=clock, time=time.time))

@@ -97,37 +97,46 @@ class Entering:
 def test_what_never_fits_is_refused_and_what_fits_is_let_in():
     budget = budget_of(100 * MIB)
     for _ in range(2):
-        budget.acquire("small", 10 * MIB)
-        budget.release("small")
+        budget.acquire(10 * MIB).release()
         with pytest.raises(
             ImageError, match=r"about 233\.0 MiB of memory, but only 100\.0 MiB is available"
         ):
-            budget.acquire("large", 200 * MIB)
+            budget.acquire(200 * MIB)
 
 
 def test_what_fits_alone_waits_for_the_others():
     budget = budget_of(200 * MIB, size=100 * MIB)
-    budget.acquire("small", 10 * MIB)
-    large = Entering(budget, "large", 120 * MIB)
+    small = budget.acquire(10 * MIB)
+    large = Entering(budget, 120 * MIB)
     assert large.has_to_wait
-    budget.release("small")
+    small.release()
     large.finish()
 
 
 def test_for_a_large_image_devices_hold_little():
     device, dropped = SharingDevice(150 * MIB, held=100 * MIB), []
     budget = budget_of(300 * MIB, device, drop=lambda: dropped.append(1))
-    budget.acquire("fits", 100 * MIB)
-    budget.release("fits")
+    budget.acquire(100 * MIB).release()
     assert not device.limits
-    budget.acquire("large", 200 * MIB)
-    assert device.limits == [MIN_DEVICE_MEMORY]
-    assert dropped
-    budget.release("large")
+    with budget.acquire(200 * MIB):
+        assert device.limits == [MIN_DEVICE_MEMORY]
+        assert dropped
     assert device.memory == 150 * MIB
     with pytest.raises(ImageError, match=r"only 268\.0 MiB is available"):
-        budget.acquire("too large", 280 * MIB)
+        budget.acquire(280 * MIB)
     assert device.limits == [MIN_DEVICE_MEMORY]  # it would not have helped
+
+
+def test_devices_hold_little_until_the_large_image_ends():
+    device = SharingDevice(150 * MIB)
+    budget = budget_of(300 * MIB, device)
+    large = budget.acquire(200 * MIB)
+    small = budget.acquire(MIB)
+    for _ in range(2):
+        small.release()
+        assert device.memory == MIN_DEVICE_MEMORY
+    large.release()
+    assert device.memory == 150 * MIB
 
 
 def test_what_was_taken_before_may_be_freed_late(clock):
@@ -135,10 +144,9 @@ def test_what_was_taken_before_may_be_freed_late(clock):
     budget = MemoryBudget(
         None, (), left=lambda: FreeMemory((60 if 0 < clock[0] < freed else 200) * MIB, "")
     )
-    budget.acquire("a", 150 * MIB)
-    budget.release("a")
+    budget.acquire(150 * MIB).release()
     clock[0] = 1e-3
-    budget.acquire("b", 150 * MIB)
+    budget.acquire(150 * MIB)
     assert clock[0] >= freed
 
 
@@ -146,9 +154,8 @@ def test_large_images_wait_for_the_compiler():
     budget = MemoryBudget(
         None, (SharingDevice(0),), left=lambda: FreeMemory(COMPILE_MEMORY + 100 * MIB, "")
     )
-    budget.acquire("small", 10 * MIB)
-    budget.release("small")
-    large = Entering(budget, "large", 150 * MIB)
+    budget.acquire(10 * MIB).release()
+    large = Entering(budget, 150 * MIB)
     assert large.has_to_wait
     budget.device_ready()
     large.finish()
@@ -156,20 +163,20 @@ def test_large_images_wait_for_the_compiler():
 
 def test_nothing_is_let_in_at_the_end():
     budget = budget_of(100 * MIB)
-    budget.acquire("a", 50 * MIB)
+    budget.acquire(50 * MIB)
     budget.close()
     with pytest.raises(ImageError, match="ended"):
-        budget.acquire("b", 60 * MIB)
+        budget.acquire(60 * MIB)
 
 
 def test_small_images_are_not_slowed_by_measuring(clock):
     count = []
     budget = MemoryBudget(None, (), left=lambda: count.append(1) or FreeMemory(2**34, ""))
     for number in range(100):
-        budget.acquire(str(number), MIB)
+        budget.acquire(MIB)
     assert len(count) == 1
     clock[0] += 2 * memory_budget.MEASUREMENT_SECONDS
-    budget.acquire("later", MIB)
+    budget.acquire(MIB)
     assert len(count) == 2
 
 

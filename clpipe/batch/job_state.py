@@ -12,6 +12,7 @@ import numpy as np
 
 from clpipe.base.errors import ClpipeError
 from clpipe.base.files import FileGroup
+from clpipe.batch.memory_budget import Lease
 from clpipe.batch.outcome import DONE, FAILED, Outcome, Span
 from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import CarriedLayers
@@ -45,12 +46,19 @@ class JobState:
     # Patches that are written instead of pictures.
     patches: list[Patch] = field(default_factory=list)
     old: int = 0  # existing renditions that another version of the program made
+    leases: Sequence[Lease] = ()  # the memory that its image takes; () if it is not loaded
 
     def drop_pixels(self) -> None:
         """Free the memory of the image, but keep its size."""
         if self.source:
             empty = np.broadcast_to(np.float16(0), self.source.pixels.shape)
             self.source = replace(self.source, pixels=empty, later=())
+
+    def free(self) -> None:
+        """Free the memory of the image, and let the next image take it."""
+        self.drop_pixels()
+        for lease in self.leases:
+            lease.release()
 
     @contextmanager
     def timed(self, step: str) -> Iterator[None]:

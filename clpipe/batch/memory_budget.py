@@ -3,8 +3,9 @@
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from math import prod
+from typing import Self
 
 from clpipe.base.errors import ImageError
 from clpipe.base.memory import FreeMemory, available_memory, format_bytes, free_memory
@@ -76,6 +77,31 @@ def host_bytes(
     return peak + pixels * (FLOAT_PIXEL * extra_images + NUMPY_PIXEL * in_numpy)
 
 
+@dataclass(eq=False)
+class Lease:
+    """The memory of an image in flight; :meth:`MemoryBudget.acquire` returns it.
+
+    Args:
+        budget: the budget that the memory is part of.
+        size: bytes.
+        limits: the usual memory limits of devices whose limit is lowered for this image.
+    """
+
+    budget: "MemoryBudget"
+    size: int
+    limits: "dict[Device, int]" = field(default_factory=dict)
+
+    def release(self) -> None:
+        """Release the memory. A second call does nothing."""
+        self.budget.take_back(self)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+
 class MemoryBudget:
     """A memory budget that admits images in order, as soon as they fit.
 
@@ -104,19 +130,17 @@ class MemoryBudget:
         self._compiling = len(devices)
         self._drop = drop
         self._left = left or free_memory
-        # The usual memory limits of devices whose limit is lowered for a large image.
-        self._limits: dict[Device, int] = {}
         self._max_free = 0  # the most bytes that were ever free for one image and the devices
         self._measured: tuple[float, FreeMemory | None] = 0.0, FreeMemory(0, "")
-        self._taken: dict[str, int] = {}  # bytes by the stem of an image
+        self._leases: set[Lease] = set()
         # Lets one image wait at a time, so that no image overtakes it.
         self._queue = threading.Lock()
         # Guards the attributes above, and is notified when one changes.
         self._changed = threading.Condition()
         self._is_closed = False
 
-    def acquire(self, name: str, size: int) -> None:
-        """Wait until an image fits, and take its memory.
+    def acquire(self, size: int) -> Lease:
+        """Wait until an image of ``size`` bytes fits, and take its memory.
 
         Raises:
             ImageError: the image does not fit even alone, or the run has ended.
@@ -125,20 +149,22 @@ class MemoryBudget:
             self._changed.wait_for(lambda: self._is_closed or self._fits(size) or self._is_alone)
             if self._is_closed:
                 raise ImageError("the run ended before this image was started")
+            lease = Lease(self, size)
             if not self._fits(size):
-                self._shrink_devices(size)
-            self._taken[name] = size
+                self._shrink_devices(lease)
+            self._leases.add(lease)
+            return lease
 
     def fits(self, size: int) -> bool:
         """Return whether an image of ``size`` bytes fits now."""
         with self._changed:
             return self._fits(size)
 
-    def release(self, name: str) -> None:
-        """Release the memory of an image, if it has any."""
+    def take_back(self, lease: Lease) -> None:
+        """Do the work of :meth:`Lease.release`."""
         with self._changed:
-            self._taken.pop(name, None)
-            self._restore()
+            self._leases.discard(lease)
+            _restore(lease)
             self._changed.notify_all()
 
     def device_ready(self) -> None:
@@ -155,12 +181,12 @@ class MemoryBudget:
 
     @property
     def _is_alone(self) -> bool:
-        return not self._taken and self._compiling <= 0
+        return not self._leases and self._compiling <= 0
 
     def _fits(self, size: int) -> bool:
         """Return whether an image fits: into the free memory, and with others into the budget."""
-        total = sum(self._taken.values()) + size
-        if self._size is not None and self._taken and total > self._size:
+        total = sum(lease.size for lease in self._leases) + size
+        if self._size is not None and self._leases and total > self._size:
             return False
         free = self._free(size)
         return free is None or needed(size) <= free.bytes
@@ -180,12 +206,13 @@ class MemoryBudget:
             self._measured = now, free
         return free
 
-    def _shrink_devices(self, size: int) -> None:
+    def _shrink_devices(self, lease: Lease) -> None:
         """Reduce the memory of devices for a single image. No device is working at that time.
 
         Raises:
             ImageError: there is not enough memory.
         """
+        size = lease.size
         self._drop()
         trim_memory()
         free = self._free(size)
@@ -195,7 +222,7 @@ class MemoryBudget:
         if needed(size) <= possible:
             for device in self._sharing:
                 if device.memory > min_memory:
-                    self._limits[device] = device.memory
+                    lease.limits[device] = device.memory
                     device.limit_memory(min_memory)
             deadline = time.monotonic() + WAIT_SECONDS
             while not (fits := self._fits(size)) and time.monotonic() < deadline:
@@ -204,7 +231,7 @@ class MemoryBudget:
                 return
             free = self._free(size)
             possible = free.bytes if free else 0
-            self._restore()
+            _restore(lease)
         left = format_bytes(max(possible, 0))
         raise ImageError(
             f"it takes about {format_bytes(needed(size))} of memory, but only {left} "
@@ -212,10 +239,12 @@ class MemoryBudget:
             "or use less with --jobs 1 or fewer pictures per image"
         )
 
-    def _restore(self) -> None:
-        for device, memory in self._limits.items():
-            device.memory = memory
-        self._limits.clear()
+
+def _restore(lease: Lease) -> None:
+    """Restore the memory limits of devices that were lowered for an image."""
+    for device, memory in lease.limits.items():
+        device.memory = memory
+    lease.limits.clear()
 
 
 def needed(size: int) -> int:

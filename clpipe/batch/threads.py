@@ -23,7 +23,7 @@ from clpipe.base.processors import available_processors
 from clpipe.batch.developing import MAX_STACK, Developers, depth_of
 from clpipe.batch.frames import Turns
 from clpipe.batch.job_state import JobState, Written, failure_text
-from clpipe.batch.memory_budget import MemoryBudget, default_budget
+from clpipe.batch.memory_budget import Lease, MemoryBudget, default_budget
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.work import ImageWorker
 from clpipe.engine.device import Device
@@ -226,8 +226,9 @@ class Batch:
         """
         state = JobState(job, self._worker.loader)
         waits: list[float] = []
+        leases: list[Lease] = []
         try:
-            state = self._worker.decode(job, partial(self._admit, waiting_states, waits))
+            state = self._worker.decode(job, partial(self._admit, waiting_states, waits, leases))
         except OutputError as error:
             state.error = failure_text(job, error)
             self._fail(error)
@@ -235,14 +236,23 @@ class Batch:
             state.error = failure_text(job, error)
         finally:
             self._admitting.end(job)
+        state.leases = leases
         state.spans = [  # subtracts the wait for memory
             replace(span, start=span.start + sum(waits), seconds=span.seconds - sum(waits))
             for span in state.spans
         ]
         return state
 
-    def _admit(self, waiting_states: list[JobState], waits: list[float], job: Job) -> None:
-        """Wait until a job's image fits into memory, and append the seconds to ``waits``.
+    def _admit(
+        self, waiting_states: list[JobState], waits: list[float], leases: list[Lease], job: Job
+    ) -> None:
+        """Wait until a job's image fits into memory, and take the memory.
+
+        Args:
+            waiting_states: as for :meth:`_decoded`.
+            waits: gets the seconds of the wait.
+            leases: gets the memory.
+            job: the job, with local files.
 
         Raises:
             OutputError: the output directory cannot be written to.
@@ -257,7 +267,7 @@ class Batch:
         self._admitting.wait(job)
         if waiting_states and not self._budget.fits(size):
             self._make(waiting_states)  # frees the memory of the waiting images
-        self._budget.acquire(job.stem, size)
+        leases.append(self._budget.acquire(size))
         self._admitting.end(job)
         waits.append(time.perf_counter() - start)
 
@@ -281,8 +291,7 @@ class Batch:
         finally:
             end_turns()
         for state, orders in zip(decoded, developed, strict=True):
-            state.drop_pixels()
-            self._budget.release(state.job.stem)
+            state.free()
             try:
                 results = [develop.written.result() for develop in orders]
             except Exception as error:
