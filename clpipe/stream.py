@@ -362,7 +362,7 @@ class Stream:
             raise
 
     def _new_meter(self) -> Meter:
-        return Meter(lambda: self._pipeline.device)
+        return Meter(lambda work: work(self._pipeline.device))
 
     def _light(self, frame: Array) -> Array:
         """Return the light of a frame.

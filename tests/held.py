@@ -25,12 +25,12 @@ HOLDING = f"""
 import os, pathlib, time
 from clpipe.batch.work import ImageWorker
 decode = ImageWorker.decode
-def held(self, job, admit):
+def held(self, job, *arguments):
     if job.path.stem.replace(".", "") >= {HOLD!r}:
         pathlib.Path("held." + str(os.getpid())).touch()
         while not os.path.exists({GO!r}):
             time.sleep(0.01)
-    return decode(self, job, admit)
+    return decode(self, job, *arguments)
 ImageWorker.decode = held
 """
 # In the processes that a run starts, not in the run's own process.

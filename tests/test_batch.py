@@ -208,9 +208,9 @@ def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, m
     batch = Batch(worker, [None], threads=2)
     decode, decoded = ImageWorker.decode, []
 
-    def counted(self, job, admit):
+    def counted(self, job, *arguments):
         decoded.append(job)
-        return decode(self, job, admit)
+        return decode(self, job, *arguments)
 
     monkeypatch.setattr(ImageWorker, "decode", counted)
     assert batch.in_flight == 4

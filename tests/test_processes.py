@@ -28,10 +28,10 @@ DEADLY = """
 import os, signal
 from clpipe.batch.work import ImageWorker
 decode = ImageWorker.decode
-def planted(self, job, admit):
+def planted(self, job, *arguments):
     if job.path.name == "deadly.exr":
         os.kill(os.getpid(), signal.SIGKILL)
-    return decode(self, job, admit)
+    return decode(self, job, *arguments)
 ImageWorker.decode = planted
 """
 

@@ -7,10 +7,10 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from itertools import chain
+from typing import Any, Generic, TypeVar
 
 from clpipe.base.cpu_time import CpuTimer
-from clpipe.base.errors import DeviceError, OutputError
+from clpipe.base.errors import DeviceError, ImageError, OutputError
 from clpipe.batch.job_state import JobState, Written, failure_text
 from clpipe.batch.memory_budget import MemoryBudget
 from clpipe.batch.runners import Runners
@@ -20,9 +20,13 @@ from clpipe.engine.runner import Result
 from clpipe.engine.state import has_state
 from clpipe.outputs.recipes import Recipe
 
+ENDED = "the run ended before this image was metered"
+
 MAX_STACK = 16  # the most small images that share launches
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 
 @dataclass
@@ -43,6 +47,38 @@ class RenditionTask:
         """Remove its files."""
         if not self.written.exception() and (written := self.written.result()):
             written.group.discard()
+
+
+class DeviceCall(Generic[T]):
+    """Some work for the thread of a device.
+
+    Args:
+        work: gets the device; None is NumPy.
+
+    Attributes:
+        written: resolves to its result, or to its error.
+    """
+
+    def __init__(self, work: Callable[[Device | None], T]) -> None:
+        self._work: Callable[[Device | None], T] | None = work
+        self.written: Future[T] = Future()
+
+    def run(self, device: Device | None) -> None:
+        """Do the work.
+
+        Raises:
+            DeviceError: the device cannot be used any more. Another one can do the work.
+        """
+        assert self._work
+        try:
+            result = self._work(device)
+        except DeviceError:
+            raise
+        except BaseException as error:
+            self.written.set_exception(error)
+        else:
+            self.written.set_result(result)
+        self._work = None  # it may hold an image
 
 
 # Groups of orders that were started together. Each group has a function that waits for its result.
@@ -87,18 +123,14 @@ class Developers:
         self._on_compiled = compiled
         self._fail = fail
         # Small renditions are put together.
-        self._tasks: queue.SimpleQueue[list[RenditionTask] | None] = queue.SimpleQueue()
+        self._tasks: queue.SimpleQueue[list[RenditionTask] | DeviceCall[Any] | None]
+        self._tasks = queue.SimpleQueue()
         self._encoders = ThreadPoolExecutor(threads, "encode")
         # Set when the first image has to be developed, and at the end.
         self._is_needed = threading.Event()
         self._is_closing = False
         self._usable = len(devices)
-        self._usable_lock = threading.Lock()  # guards the number of usable devices
-
-    @property
-    def is_needed(self) -> bool:
-        """Whether an image has asked for kernels."""
-        return self._is_needed.is_set()
+        self._lock = threading.Lock()  # guards the last two attributes
 
     def begin(self) -> None:
         """Let the devices compile their kernels. A run that skips all images never calls it."""
@@ -106,11 +138,26 @@ class Developers:
 
     def close(self) -> None:
         """Let the threads end once all orders are made."""
-        self._is_closing = True
+        with self._lock:
+            self._is_closing = True
+            for _ in self.devices:
+                self._tasks.put(None)
         self._is_needed.set()
-        for _ in self.devices:
-            self._tasks.put(None)
         self._encoders.shutdown()
+
+    def on_device(self, work: Callable[[Device | None], T]) -> T:
+        """Do some work in the thread of a device, and return its result.
+
+        Raises:
+            ImageError: the run has ended.
+            DeviceError: no device is usable any more.
+        """
+        call = DeviceCall(work)
+        with self._lock:
+            if self._is_closing:
+                raise ImageError(ENDED)
+            self._tasks.put(call)
+        return call.written.result()
 
     def is_small(self, state: JobState) -> bool:
         """Return whether a small image may share launches with others. With state, it may not."""
@@ -161,6 +208,7 @@ class Developers:
         """Develop orders until there are no more, or the device fails."""
         self._is_needed.wait()  # if a run skips all images, nothing is compiled
         if self._is_closing:
+            self._fail_tasks(ImageError(ENDED))
             return
         pending: list[RenditionTask] = []
         started: Started = deque()
@@ -177,7 +225,7 @@ class Developers:
                 pending = []
         except BaseException as error:
             unfinished = [task for stack in started for task, _ in stack]
-            with self._usable_lock:
+            with self._lock:
                 self._usable -= 1
                 is_last = not self._usable
             if isinstance(error, DeviceError) and not is_last:
@@ -186,16 +234,21 @@ class Developers:
                     self._tasks.put([task])
                 return
             self._fail(error)
-            for task in chain(
-                unfinished, pending, chain.from_iterable(iter(self._tasks.get, None))
-            ):
+            for task in (*unfinished, *pending):
                 task.written.set_exception(error)
+            self._fail_tasks(error)
         finally:
             if device:
                 device.drain()
 
+    def _fail_tasks(self, error: BaseException) -> None:
+        """Fail all orders and calls, until the end."""
+        for tasks in iter(self._tasks.get, None):
+            for task in [tasks] if isinstance(tasks, DeviceCall) else tasks:
+                task.written.set_exception(error)
+
     def _next_tasks(self, started: Started, device: Device | None) -> list[RenditionTask]:
-        """Return the next orders: one, several small ones, or none at the end.
+        """Return the next orders: one, several small ones, or none at the end. Calls are done.
 
         While no order is queued, those that were started are finished.
 
@@ -220,6 +273,15 @@ class Developers:
                 while started:
                     self._finish(started, device)
                 return []
+            if isinstance(tasks, DeviceCall):
+                try:
+                    tasks.run(device)
+                except DeviceError:
+                    for left in (tasks, taken):
+                        if left:
+                            self._tasks.put(left)
+                    raise
+                continue
             taken += tasks
             is_waiting = False
             if not self.is_small(tasks[-1].state):

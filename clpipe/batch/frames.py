@@ -70,6 +70,16 @@ class Turns:
                 self._changed.wait()
         return True
 
+    def is_first(self, job: Job) -> bool:
+        """Return whether all turns of the jobs before a job have ended."""
+        with self._changed:
+            return next(iter(self._waiting), job.place) == job.place
+
+    def wait_for_all(self) -> None:
+        """Wait until all turns have ended, or the run has."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._is_closed or not self._waiting)
+
     def end(self, job: Job) -> None:
         """End a job's turn, if it has not ended."""
         if not job.place:

@@ -4,8 +4,9 @@ import logging
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,33 @@ from clpipe.outputs.recipes import Recipe
 log = logging.getLogger(__name__)
 
 
+# The size and the modification time of each file of a job.
+Stamps = Sequence[tuple[int, int]]
+
+
+@dataclass
+class DecodedFrame:
+    """The image of a frame that was decoded to be metered.
+
+    Args:
+        paths: its files on this machine.
+        stamps: the stamps of the files when they were read.
+        source: the image.
+        span: the time of decoding.
+        lease: the memory.
+        files: removes files that were fetched.
+        is_queued: whether a thread that develops frames will take it.
+    """
+
+    paths: Sequence[Path]
+    stamps: Stamps
+    source: SourceImage
+    span: Span
+    lease: Lease
+    files: ExitStack
+    is_queued: bool = False
+
+
 @dataclass
 class JobState:
     """The state of a job, from the start of its decoding to its outcome."""
@@ -33,7 +61,7 @@ class JobState:
     began: float = field(default_factory=time.time)
     spans: list[Span] = field(default_factory=list)
     source: SourceImage | None = None
-    stamps: Sequence[tuple[int, int]] = ()  # size and modification time of each file of the job
+    stamps: Stamps = ()
     request: Mapping[str, Any] = field(default_factory=dict)  # record of the job's request
     recipes: list[Recipe] = field(default_factory=list)
     unwritten: int = 0  # number of renditions that are not yet written

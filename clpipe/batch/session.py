@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
 from clpipe.base.about import full_version
@@ -28,6 +27,7 @@ from clpipe.batch.clip_sink import Clips
 from clpipe.batch.clips import ClipOptions
 from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.frames import check_frames
+from clpipe.batch.metering import metering_ahead
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.processes import Processes, default_processes
 from clpipe.batch.remote_tars import RemoteTars
@@ -49,7 +49,7 @@ from clpipe.inputs.find import Job, Shard, find_jobs
 from clpipe.inputs.flow import check_flow
 from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
-from clpipe.inputs.metering import metered_jobs, write_exposures
+from clpipe.inputs.metering import write_exposures
 from clpipe.inputs.poses import assign_views
 from clpipe.inputs.sequences import in_sequences, sequence_of
 from clpipe.inputs.series import Series
@@ -240,8 +240,6 @@ class Run:
             return
         images, execution = self.images, self.execution
         frames: list[Job] = []
-        if images.sequence:
-            jobs = self._metered(jobs, frames)
         start = {"arguments": list(self._arguments), "images": len(self.jobs)}
         with ExitStack() as stack:
             sink = self.sink()
@@ -249,6 +247,8 @@ class Run:
             executor = self._running = stack.enter_context(self._executor(sink, jobs))
             if self._is_stopped:
                 executor.stop()
+            if images.sequence:
+                jobs = self._metered(executor, sink, jobs, frames)
             stack.enter_context(output_folder(execution.output, images.shard))
             folders = (
                 images.series.folders_in(execution.output)
@@ -276,16 +276,26 @@ class Run:
                 name = Path(log_name(images.shard)).with_suffix(".csv")
                 write_exposures(execution.output / name, frames)
 
-    def _metered(self, jobs: Iterable[Job], frames: list[Job]) -> Iterator[Job]:
+    def _metered(
+        self, executor: Executor, sink: Folder, jobs: Iterable[Job], frames: list[Job]
+    ) -> Iterator[Job]:
         """Yield frames with the settings of their sequence, and append them to a list."""
-        opened = partial(open_devices, self.execution.devices[:1], self.execution.memory)
-        for job, _ in metered_jobs(self._loader, jobs, lambda: next(iter(opened()), None)):
+        metered = (
+            executor.metered(jobs)
+            if isinstance(executor, Batch)
+            else metering_ahead(self._worker(sink), self.execution).jobs(jobs)
+        )
+        for job in metered:
             frames.append(job)
             yield job
 
     def _wait(self, change: int) -> None:
         self.summary.waiting += change
         self.watch()
+
+    def _worker(self, sink: Folder) -> ImageWorker:
+        """Return what does the work of each image."""
+        return ImageWorker(self._loader, sink, self._chain, self.execution.trace is not None)
 
     def _send_log(self, url: str) -> None:
         """Upload the log next to the tars, under a unique name."""
@@ -377,8 +387,8 @@ class Run:
             count = 1
         elif execution.processes:
             count = execution.processes
-        elif jobs is not self.jobs:  # the length of a lazy iterable is unknown
-            count = 1
+        elif self.images.sequence or jobs is not self.jobs:
+            count = 1  # frames are metered in order; the length of a lazy iterable is unknown
         else:
             count = default_processes(len(self.jobs), claim, available_processors())
         if count > 1:
@@ -389,5 +399,4 @@ class Run:
         ]
         if self.images.sequence and has_state(self._chain):
             del devices[1:]
-        worker = ImageWorker(self._loader, sink, self._chain, execution.trace is not None)
-        return nullcontext(Batch(worker, devices, execution.threads))
+        return nullcontext(Batch(self._worker(sink), devices, execution.threads))

@@ -12,7 +12,7 @@ image, which takes a third of a small image's time.
 import queue
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Sequence, Sized
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence, Sized
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -22,8 +22,9 @@ from clpipe.base.errors import OutputError, RequestError
 from clpipe.base.processors import available_processors
 from clpipe.batch.developing import MAX_STACK, Developers, depth_of
 from clpipe.batch.frames import Turns
-from clpipe.batch.job_state import JobState, Written, failure_text
+from clpipe.batch.job_state import DecodedFrame, JobState, Written, failure_text
 from clpipe.batch.memory_budget import Lease, MemoryBudget, default_budget
+from clpipe.batch.metering import Metering
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.work import ImageWorker
 from clpipe.engine.device import Device
@@ -69,12 +70,14 @@ class Batch:
         worker.reserve(results)
         size = default_budget() if memory is None else memory
         self._budget = MemoryBudget(size, self.devices, partial(worker.reserve, results))
+        self._is_checked = False  # whether the output directory can be written to
         self._failure: Exception | None = None
         self._stopping = threading.Event()
         self._decoding = threading.Semaphore(self.threads)  # limits the threads that decode
         self._developers = Developers(
             worker, self.devices, self.threads, self._budget, compiled, self._fail
         )
+        self._metering = Metering(worker, self._acquire_for_metering, self._developers.on_device)
         self._jobs: Jobs = queue.SimpleQueue()
         # Frames of sequences get memory, and then their device, in the order of the jobs.
         self._admitting, self._developing = self._turns = Turns(), Turns()
@@ -91,6 +94,13 @@ class Batch:
     def is_stopping(self) -> bool:
         """Whether no more images are begun."""
         return self._stopping.is_set()
+
+    def metered(self, jobs: Iterable[Job]) -> Iterator[Job]:
+        """Yield frames of sequences with the settings of their sequence, for :meth:`run`.
+
+        Frames are metered with the devices and the memory of this run, and decoded once.
+        """
+        return self._metering.jobs(jobs)
 
     def run(self, jobs: Iterable[Job] | Jobs) -> Generator[Outcome, None, None]:
         """Do every job, and yield outcomes as jobs finish, in any order. A batch runs once.
@@ -130,6 +140,8 @@ class Batch:
         finally:
             self.stop()
             self._budget.close()
+            self._admitting.close()
+            self._metering.close()
             for _ in range(self.in_flight - started):  # for threads that could not be started
                 self._made.put(None)
             while not is_over and self._outcomes.get() is not None:
@@ -165,6 +177,14 @@ class Batch:
                     break
                 for turns in self._turns:
                     turns.expect(job)
+                if decoded := self._metering.kept(job):
+                    # Memory is taken in the order of the jobs. Otherwise, frames that have memory
+                    # would wait for others that do not.
+                    if self._admitting.is_first(job):
+                        decoded.is_queued = True
+                        self._admitting.end(job)
+                    else:
+                        self._metering.drop(job)
                 self._jobs.put(job)
         except Exception as error:
             self._jobs.put(error)
@@ -227,15 +247,19 @@ class Batch:
         state = JobState(job, self._worker.loader)
         waits: list[float] = []
         leases: list[Lease] = []
-        try:
-            state = self._worker.decode(job, partial(self._admit, waiting_states, waits, leases))
-        except OutputError as error:
-            state.error = failure_text(job, error)
-            self._fail(error)
-        except BaseException as error:  # an error of an image must not end the thread
-            state.error = failure_text(job, error)
-        finally:
-            self._admitting.end(job)
+        with self._metering.taken(job) as decoded:
+            admit = partial(self._admit, waiting_states, waits, leases, decoded)
+            try:
+                state = self._worker.decode(job, admit, decoded)
+            except OutputError as error:
+                state.error = failure_text(job, error)
+                self._fail(error)
+            except BaseException as error:  # an error of an image must not end the thread
+                state.error = failure_text(job, error)
+            finally:
+                self._admitting.end(job)
+        if decoded and not leases:  # no picture of the frame is made
+            decoded.lease.release()
         state.leases = leases
         state.spans = [  # subtracts the wait for memory
             replace(span, start=span.start + sum(waits), seconds=span.seconds - sum(waits))
@@ -244,7 +268,12 @@ class Batch:
         return state
 
     def _admit(
-        self, waiting_states: list[JobState], waits: list[float], leases: list[Lease], job: Job
+        self,
+        waiting_states: list[JobState],
+        waits: list[float],
+        leases: list[Lease],
+        decoded: DecodedFrame | None,
+        job: Job,
     ) -> None:
         """Wait until a job's image fits into memory, and take the memory.
 
@@ -252,17 +281,21 @@ class Batch:
             waiting_states: as for :meth:`_decoded`.
             waits: gets the seconds of the wait.
             leases: gets the memory.
+            decoded: the image, if it was decoded to be metered. It has its memory.
             job: the job, with local files.
 
         Raises:
             OutputError: the output directory cannot be written to.
             ImageError: the image does not even fit alone.
         """
-        worker, developers = self._worker, self._developers
-        if not developers.is_needed:
-            worker.writer.check_folder()
-        developers.begin()
-        size = worker.bytes_of(job, developers.max_in_flight, None in self.devices)
+        if not self._is_checked:
+            self._worker.writer.check_folder()
+            self._is_checked = True
+        self._developers.begin()
+        if decoded:
+            leases.append(decoded.lease)
+            return
+        size = self._bytes_of(job)
         start = time.perf_counter()
         self._admitting.wait(job)
         if waiting_states and not self._budget.fits(size):
@@ -270,6 +303,20 @@ class Batch:
         leases.append(self._budget.acquire(size))
         self._admitting.end(job)
         waits.append(time.perf_counter() - start)
+
+    def _acquire_for_metering(self, job: Job) -> Lease:
+        """Wait until a frame's image fits into memory, after all frames before, and take it.
+
+        Raises:
+            ImageError: the image does not even fit alone, or the run has ended.
+        """
+        self._developers.begin()
+        self._admitting.wait_for_all()
+        return self._budget.acquire(self._bytes_of(job))
+
+    def _bytes_of(self, job: Job) -> int:
+        """Return the bytes that a job's image takes."""
+        return self._worker.bytes_of(job, self._developers.max_in_flight, None in self.devices)
 
     def _make(self, decoded: list[JobState]) -> None:
         """Have the renditions of decoded jobs made, and hand the jobs to the committing thread.

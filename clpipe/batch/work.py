@@ -13,7 +13,7 @@ from clpipe.base.files import FileGroup, deferred_files
 from clpipe.base.types import Array
 from clpipe.base.urls import fetched_files
 from clpipe.batch.frames import Frames
-from clpipe.batch.job_state import JobState, Written
+from clpipe.batch.job_state import DecodedFrame, JobState, Stamps, Written
 from clpipe.batch.memory_budget import host_bytes
 from clpipe.batch.outcome import LEFT_OUT, SKIPPED, Span
 from clpipe.batch.runners import Runners, SpareArrays
@@ -29,7 +29,7 @@ from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.runner import Result, Runner, submit_batch
 from clpipe.inputs.find import Job
-from clpipe.inputs.loader import ImageLoader
+from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.outputs.existing import ExistingFiles, Redo
 from clpipe.outputs.patches import all_patches
 from clpipe.outputs.recipes import Recipe, recipes
@@ -108,13 +108,16 @@ class ImageWorker:
         half = self.loader.kept is None and self.chain.source is Kind.RGB
         return Runners(self.writer, device, self.chain, half)
 
-    def decode(self, job: Job, admit: Callable[[Job], None]) -> JobState:
+    def decode(
+        self, job: Job, admit: Callable[[Job], None], decoded: DecodedFrame | None = None
+    ) -> JobState:
         """Load a job's image, unless all of its pictures exist already.
 
         Args:
             job: the image.
             admit: called before the image is loaded. Gets the job with local files; may raise
                 ImageError.
+            decoded: the image, if it was decoded to be metered.
         """
         state, here = JobState(job, self.loader), job
         with state.timed("decode"):
@@ -124,11 +127,11 @@ class ImageWorker:
                 renditions = self._missing(state)
                 if renditions:
                     state.loader = self.loader.for_job(job)
-                    with fetched_files(job.paths) as (first, *others):
+                    with fetched_files(decoded.paths if decoded else job.paths) as (first, *others):
                         if first != job.path:
                             here = replace(job, path=first, subframes=tuple(others))
                         admit(here)
-                        self._load(state, here, renditions)
+                        self._load(state, here, renditions, decoded)
                 else:
                     state.status = SKIPPED
             except (ImageError, RequestError, MemoryError) as error:
@@ -171,21 +174,42 @@ class ImageWorker:
         missing = [e for e, existing in found.items() if is_recomputed or not redo.keeps(existing)]
         return self.writer.needed(state.job, missing)
 
-    def _load(self, state: JobState, job: Job, renditions: Sequence[Rendition]) -> None:
+    @staticmethod
+    def read(loader: ImageLoader, job: Job) -> tuple[Stamps, LoadedImage | None]:
+        """Return the image of a job with local files, and the stamps of the files.
+
+        Raises:
+            ImageError, RequestError, MemoryError: the image cannot be read, or does not fit the
+                chain.
+        """
+        stamps = [stamp_of(path) for path in job.paths]
+        return stamps, loader.enter(job, loader.read(job))
+
+    def _load(
+        self,
+        state: JobState,
+        job: Job,
+        renditions: Sequence[Rendition],
+        decoded: DecodedFrame | None,
+    ) -> None:
         """Load a state's image, and set the recipes of its renditions.
 
         Args:
             state: the state.
             job: its job, with local files.
             renditions: the renditions to make.
+            decoded: the image, if it was decoded to be metered.
 
         Raises:
             ImageError, RequestError, MemoryError: the image cannot be read, or does not fit the
                 chain.
         """
-        state.stamps = [stamp_of(path) for path in job.paths]
-        source = state.loader.read(job)
-        loaded = state.loader.enter(job, source)
+        loaded: LoadedImage | None
+        if decoded:
+            state.stamps, state.spans = decoded.stamps, [decoded.span]
+            loaded = state.loader.enter(job, decoded.source)
+        else:
+            state.stamps, loaded = self.read(state.loader, job)
         if loaded is None:
             state.status = LEFT_OUT
             return

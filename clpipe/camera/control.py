@@ -53,7 +53,7 @@ class ControlLoop:
         self._control = control
         self._share = -math.expm1(-1 / control.smoothing) if control.smoothing else 1.0
         self._metered: deque[float] = deque(maxlen=control.delay + 1)
-        self._target = self._value = math.nan
+        self._target = self._value = 0.0
 
     def next(self, metered: float) -> float:
         """Return the value of the next frame, whose metered value is ``metered``."""
@@ -71,10 +71,14 @@ class ControlLoop:
         self._value += step
         return self._value
 
-    def hold(self, frames: int) -> None:
-        """Let frames pass that are missing, as if each had the last metered value."""
+    def hold(self, frames: int = 1) -> float:
+        """Let frames pass as if each had the last metered value, and return the last one's value.
+
+        Without a frame that was metered, the value is 0.
+        """
         for _ in range(frames if self._metered else 0):
             self.next(self._metered[-1])
+        return self._value
 
 
 class AutoIso:

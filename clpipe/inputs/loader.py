@@ -278,7 +278,7 @@ class ImageLoader:
     def enter(self, job: Job, source: SourceImage) -> LoadedImage | None:
         """Return an image with the chain for it.
 
-        A source that was entered before keeps the layers that steps read. Return None for a kept
+        A source that was entered before stays as it is, with the layers that steps read. Return None for a kept
         image from a folder that was not kept right before ``start_at``.
 
         Raises:
@@ -313,7 +313,7 @@ class ImageLoader:
             later=later,
             margins=entry_.margins,
             layers=entry_.layers,
-            warnings=(*source.warnings, *entry_.warnings),
+            warnings=tuple(dict.fromkeys((*source.warnings, *entry_.warnings))),
         )
         return LoadedImage(entry_.chain, source, loaded.key)
 
@@ -331,7 +331,7 @@ class ImageLoader:
                 f"this image was kept after {stage}, but is processed as a render; to resume from "
                 "it, use --start-at"
             )
-            source = replace(source, warnings=(*source.warnings, warning))
+            source = replace(source, warnings=tuple(dict.fromkeys((*source.warnings, warning))))
         return LoadedImage(self.chain, source, key)
 
     def carried_layers(self, job: Job, loaded: LoadedImage, orientation: int = 1) -> CarriedLayers:

@@ -6,11 +6,13 @@ were developed. The frames can then be processed in any order.
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cache
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import write_new
@@ -18,12 +20,13 @@ from clpipe.base.types import Array
 from clpipe.camera.control import AutoIso, ControlLoop
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.identity import noise_key
+from clpipe.chain.photometry import METERED
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.options import RunOptions
-from clpipe.engine.runner import Runner
+from clpipe.engine.runner import Result, Runner
 from clpipe.inputs.find import Job
-from clpipe.inputs.loader import ImageLoader
+from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.inputs.manifest import Row, key_of, manifest_text
 from clpipe.inputs.sequences import sequence_of
 from clpipe.stage import StageRole
@@ -32,7 +35,18 @@ from clpipe.stages.white_balance.gains import EstimatedGains
 
 CORNER = Box(0, 0, 1, 1)
 
+GAINS = ("red_gain", "blue_gain")  # what estimated white balance estimates
+
 DIGITS = 4  # decimal places of an EV and of a gain
+
+
+T = TypeVar("T")
+
+
+class OnDevice(Protocol):
+    """Runs work on a device, in the thread that may use it, and returns the result."""
+
+    def __call__(self, work: Callable[[Device | None], T], /) -> T: ...
 
 
 @dataclass(frozen=True)
@@ -41,13 +55,12 @@ class Reading:
 
     Args:
         values: the settings, nested like a configuration.
-        metered: the EV or gain that was metered for this frame only, by name.
-        error: why the frame could not be metered.
+        metered: the EV or gain that was metered for this frame only, by name. Nothing is metered in
+            a frame without light.
     """
 
-    values: Mapping[str, Any] = field(default_factory=dict)
-    metered: Mapping[str, float] = field(default_factory=dict)
-    error: Exception | None = None
+    values: Mapping[str, Any]
+    metered: Mapping[str, float]
 
 
 def loops_of(chain: Chain) -> tuple[Step | None, Step | None]:
@@ -62,16 +75,19 @@ def loops_of(chain: Chain) -> tuple[Step | None, Step | None]:
 class Meter:
     """Meters the frames of one sequence, in temporal order.
 
+    A frame that is black or cannot be metered holds the loops, like a missing one: for them, it has
+    the metered values of the frame before. Until a frame is metered, the loops are at 0 EV.
+
     Args:
-        open_device: returns the device; None is NumPy. It is called for the first frame.
+        on_device: runs work on the device that meters; None is NumPy.
     """
 
-    def __init__(self, open_device: Callable[[], Device | None]) -> None:
-        self._open_device = open_device
-        self._runner: Runner | None = None
-        self._loops: dict[str, ControlLoop] = {}
+    def __init__(self, on_device: OnDevice) -> None:
+        self._on_device = on_device
+        self._runners: dict[Device | None, Runner] = {}
+        # Each loop, and the place of the last frame that it followed.
+        self._loops: dict[str, tuple[ControlLoop, int]] = {}
         self._iso: AutoIso | None = None
-        self._last = 0  # the place of the last frame
 
     def read(
         self,
@@ -90,107 +106,139 @@ class Meter:
             chain: the chain of the frame.
             image: the frame, as for :meth:`clpipe.engine.runner.Runner.run`.
             image_key: the key of its noise.
-            place: its place in the sequence. For the loops, missing frames have the metered values
-                of the frame before.
+            place: its place in the sequence.
             chain_of: returns the chain of the frame with further settings.
 
         Raises:
-            ImageError, DeviceError: as for :meth:`clpipe.engine.runner.Runner.run`.
+            RequestError: a setting of the loops is not allowed.
+            DeviceError: no device is usable any more.
         """
         exposure, balance = loops_of(chain)
         control = chain.settings.control
-        for loop in self._loops.values():
-            loop.hold(place - self._last - 1)
-        self._last = place
         values: dict[str, Any] = {}
         metered: dict[str, float] = {}
 
-        def follow(name: str, ev: float) -> float:
-            return self._loops.setdefault(name, ControlLoop(control)).next(ev)
+        def measure(step: Step, chain: Chain) -> Mapping[str, float]:
+            try:
+                return self._measure(chain, step, image, image_key)
+            except (ImageError, MemoryError):  # the frame may fail for the same reason
+                return {}
+
+        def follow(name: str, ev: float | None) -> float:
+            loop, last = self._loops.get(name) or (ControlLoop(control), place - 1)
+            self._loops[name] = loop, place
+            loop.hold(place - last - 1)
+            return loop.hold() if ev is None else loop.next(ev)
 
         if exposure:
             method = exposure.method
             assert isinstance(method, Auto)
-            metered["metered_ev"] = self._measure(chain, exposure, image, image_key)["metered_ev"]
-            ev = round(follow(exposure.name, metered["metered_ev"]) + method.ev, DIGITS) + 0.0
+            metered |= measure(exposure, chain)
+            metered.pop("gain", None)
+            # Without light, the result is 0 EV, even if the limits do not allow it.
+            limits = {exposure.name: {"min_ev": 1.0, "max_ev": 20.0}}
+            if metered == {METERED: 0} and not measure(exposure, chain_of(limits)).get(METERED):
+                metered.clear()
+            is_lit = bool(metered)
+            ev = round(follow(exposure.name, metered.get(METERED)) + method.ev, DIGITS) + 0.0
             values[exposure.name] = {"method": "gain", "ev": ev}
             if method.headroom != Auto.model_fields["headroom"].default:
                 values[exposure.name]["headroom"] = method.headroom
-            if control.iso_max is not None:
+            if control.iso_max is not None and (is_lit or self._iso):
                 self._iso = self._iso or AutoIso(chain.iso, chain.camera.iso_range, control)
                 values["iso"] = round(self._iso.next(ev), DIGITS)
+        else:
+            is_lit = bool(np.any(image))
         if balance:
-            chain = chain_of(values) if values else chain
-            gains = self._measure(chain, balance, image, image_key)
+            gains: Mapping[str, float] = {}
+            if is_lit:
+                gains = measure(balance, chain_of(values) if values else chain)
             metered |= gains
-            followed = {k: round(2 ** follow(k, math.log2(v)), DIGITS) for k, v in gains.items()}
+            followed = {
+                name: round(
+                    2 ** follow(name, math.log2(gains[name]) if gains else None), DIGITS
+                )
+                for name in GAINS
+            }
             values[balance.name] = {"method": "gains", **followed}
         return Reading(values, metered)
 
     def _measure(
         self, chain: Chain, step: Step, image: Array, image_key: str
     ) -> Mapping[str, float]:
-        """Return the numbers that a step estimates from a frame."""
-        part = chain.up_to([step.name])
-        known = self._runner
-        self._runner = known.for_chain(part) if known else Runner(part, self._open_device())
-        options = RunOptions(boxes=[CORNER])  # the picture itself is not needed
-        result = self._runner.run(image, noise_key(chain.settings, image_key), options)
-        return result.estimates[step.name]
+        """Return the numbers that a step estimates from a frame.
+
+        Raises:
+            ImageError, DeviceError: as for :meth:`clpipe.engine.runner.Runner.run`.
+        """
+        part, key = chain.up_to([step.name]), noise_key(chain.settings, image_key)
+
+        def run(device: Device | None) -> Result:
+            known = self._runners.get(device)
+            runner = known.for_chain(part) if known else Runner(part, device)
+            self._runners[device] = runner
+            # The picture itself is not needed.
+            return runner.run(image, key, RunOptions(boxes=[CORNER]))
+
+        return self._on_device(run).estimates[step.name]
 
 
 def metered_jobs(
-    loader: ImageLoader, jobs: Iterable[Job], open_device: Callable[[], Device | None]
-) -> Iterator[tuple[Job, Reading]]:
-    """Yield the frames of sequences with the settings of their sequence, and what was metered.
+    loader: ImageLoader,
+    jobs: Iterable[Job],
+    on_device: OnDevice,
+    load: Callable[[ImageLoader, Job], LoadedImage],
+) -> Iterator[Job]:
+    """Yield the frames of sequences with the settings of their sequence.
 
     Draws get one value for each sequence, unless they drift, and exposure and white balance follow
-    their control loops. A frame that cannot be metered keeps its settings. For the loops, it and
-    missing frames have the metered values of the frame before.
+    their control loops, see :class:`Meter`. A frame that cannot be read keeps its settings.
 
     Args:
         loader: the loader of the run.
         jobs: the frames, each with its place, in the order of
             :func:`~clpipe.inputs.sequences.in_sequences`.
-        open_device: opens the device that meters. It is called only if a frame is metered.
+        on_device: as for :class:`Meter`.
+        load: loads a frame that is metered, with its own loader.
     """
-    opened = cache(open_device)
     for _, frames in groupby(jobs, key=sequence_of):
-        meter = Meter(opened)
+        meter = Meter(on_device)
         for job in frames:
-            drawn, reading = job, Reading()
-            try:
+            drawn, values = job, {}
+            # The run reads the frame again, and reports the error.
+            with suppress(ImageError, RequestError, MemoryError):
                 drawn = with_drawn(loader, job)
                 own = loader.for_job(drawn)
                 is_fixed = own.kept or own.raw.is_raw(job.path)
                 if not is_fixed and any(loops_of(own.chain)):
-                    reading = read_job(own, drawn, meter)
-            except (ImageError, RequestError, MemoryError) as error:
-                reading = Reading(error=error)
-            yield with_values(drawn, reading.values), reading
+                    values = read_frame(own, drawn, meter, load(own, drawn))
+            yield with_values(drawn, values)
 
 
-def read_job(loader: ImageLoader, job: Job, meter: Meter) -> Reading:
-    """Meter a frame.
+def read_frame(
+    loader: ImageLoader, job: Job, meter: Meter, loaded: LoadedImage
+) -> Mapping[str, Any]:
+    """Meter a frame, and return what the loops set.
 
     Args:
         loader: the loader of the frame.
         job: the frame.
         meter: the meter of its sequence.
+        loaded: its image.
 
     Raises:
-        ImageError, RequestError: the frame cannot be read or metered.
+        RequestError, DeviceError: as for :meth:`Meter.read`.
     """
-    loaded = loader.enter(job, loader.read(job))
-    assert loaded and job.place  # None is possible only with --start-at
+    assert job.place
 
     def chain_of(values: Mapping[str, Any]) -> Chain:
         request = loader.request.for_image(job.key, merged(job.values, values))
         entered = replace(loader, request=request).enter(job, loaded.source)  # it has the layers
-        assert entered
+        assert entered  # None is possible only with --start-at
         return entered.chain
 
-    return meter.read(loaded.chain, loaded.source.pixels, loaded.key, job.place.index, chain_of)
+    source = loaded.source
+    return meter.read(loaded.chain, source.pixels, loaded.key, job.place.index, chain_of).values
 
 
 def with_drawn(loader: ImageLoader, job: Job) -> Job:
