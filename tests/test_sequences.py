@@ -9,12 +9,18 @@ import numpy as np
 import pytest
 
 import clpipe
-from clpipe.base.errors import RequestError
+from clpipe.base.errors import DeviceFailedError, RequestError
+from clpipe.base.memory import FreeMemory
+from clpipe.batch import memory_budget, metering, threads
+from clpipe.batch.memory_budget import MemoryBudget
 from clpipe.camera.control import AutoIso, Control, ControlLoop
 from clpipe.chain.drawing import draw_values
 from clpipe.chain.draws import Drift
 from clpipe.chain.limits import Limits
+from clpipe.engine.device import Device, open_devices
+from clpipe.engine.runner import Runner
 from clpipe.inputs.find import Job
+from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.sequences import in_sequences
 from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import ROOT
@@ -232,3 +238,161 @@ def test_a_frame_that_cannot_be_read_fails_alone(frames, tmp_path):
     failed = [outcome.job.key for outcome in made if outcome.status == "failed"]
     assert failed == ["a/4.exr"]
     assert len(pictures(tmp_path / "out")) == 17
+
+
+@pytest.fixture
+def reads(monkeypatch):
+    """The keys of the images that were read, in order; each is checked to have memory."""
+    found, budgets, read = [], [], ImageLoader.read
+
+    def budget(*arguments):
+        budgets.append(MemoryBudget(*arguments))
+        return budgets[-1]
+
+    def reading(self, job):
+        leases = list(budgets[-1]._leases)
+        assert leases
+        assert sum(lease.size for lease in leases) <= budgets[-1]._size or len(leases) == 1
+        found.append(job.key)
+        return read(self, job)
+
+    monkeypatch.setattr(threads, "MemoryBudget", budget)
+    monkeypatch.setattr(metering, "MemoryBudget", budget)
+    monkeypatch.setattr(ImageLoader, "read", reading)
+    return found
+
+
+@pytest.mark.parametrize("budget", [1, 2**30], ids=["small", "large"])
+@pytest.mark.parametrize("has_state", [False, True])
+def test_each_frame_is_decoded_once(frames, reads, tmp_path, monkeypatch, budget, has_state):
+    monkeypatch.setattr(threads, "default_budget", lambda: budget)
+    options = {"sequence": True, **LOOPS}
+    if has_state:
+        options["config"] = "video"
+    keys = [f"{camera}/{n}.exr" for camera in "ab" for n in range(10) if n != 6]
+    assert run(tmp_path, "out", **options) == ["done"] * 18
+    assert reads == keys
+    first = pictures(tmp_path / "out")
+    reads.clear()
+    assert run(tmp_path, "out", **options) == ["skipped"] * 18
+    assert reads == keys
+    reads.clear()
+    (tmp_path / "out/a/5.jpg").unlink()
+    statuses = run(tmp_path, "out", **options)
+    assert pictures(tmp_path / "out") == first
+    # With state, the frames before the missing one are made again. They did not stay in memory.
+    again = keys[:6] if has_state else []
+    assert statuses.count("done") == (9 if has_state else 1)
+    assert sorted(reads) == sorted([*keys, *again])
+
+
+def test_frames_are_metered_by_the_devices_of_the_run(frames, tmp_path, monkeypatch):
+    opened, init = [], Device.__init__
+
+    def counted(self, *arguments):
+        opened.append(self)
+        init(self, *arguments)
+
+    monkeypatch.setattr(Device, "__init__", counted)
+    assert {o.status for o in clpipe.run(tmp_path / "frames", tmp_path / "out", sequence=True, **LOOPS)} == {"done"}
+    assert len(opened) == len(open_devices())
+
+
+def test_a_frame_that_no_memory_suffices_for_fails_alone(frames, reads, tmp_path, monkeypatch, write_exr):
+    write_exr("frames/a/4.exr", np.full((900, 1200, 3), 0.1, np.float32))
+    monkeypatch.setattr(memory_budget, "free_memory", lambda: FreeMemory(150 * 2**20, "a limit"))
+    made = clpipe.run(tmp_path / "frames", tmp_path / "out", device="numpy", sequence=True, **LOOPS)
+    failed = [outcome for outcome in made if outcome.status == "failed"]
+    assert [outcome.job.key for outcome in failed] == ["a/4.exr"]
+    assert "a limit" in failed[0].error
+    assert "a/4.exr" not in reads
+
+
+def test_a_run_that_stops_keeps_no_frame(frames, tmp_path):
+    made = clpipe.run(tmp_path / "frames", tmp_path / "out", device="numpy", sequence=True, **LOOPS)
+    for _ in made:
+        made.stop()
+    assert made.summary.interrupted
+    assert not (tmp_path / "out/run.csv").exists()
+    run(tmp_path, "out", sequence=True, **LOOPS)
+    run(tmp_path, "whole", sequence=True, **LOOPS)
+    assert pictures(tmp_path / "out") == pictures(tmp_path / "whole")
+
+
+def evs(folder):
+    """The exposure and the gain of red that the loops have set, by frame of camera a."""
+    found = {}
+    for path in sorted((folder / "a").glob("*.json")):
+        steps = chain_of(path)
+        ev = steps["exposure"]["parameters"]["ev"]
+        found[path.stem] = ev, steps["white_balance"]["parameters"]["red_gain"]
+    return found
+
+
+def black(tmp_path, write_exr, monkeypatch):
+    write_exr("frames/a/4.exr", np.zeros((24, 32, 3)))
+
+
+def unmetered(tmp_path, write_exr, monkeypatch):
+    run_ = Runner.run
+
+    def failing(self, image, noise_key, options):
+        if noise_key.startswith("a/4.exr") and options.boxes:
+            raise DeviceFailedError("it failed")
+        return run_(self, image, noise_key, options)
+
+    monkeypatch.setattr(Runner, "run", failing)
+
+
+def unreadable(tmp_path, write_exr, monkeypatch):
+    (tmp_path / "frames/a/4.exr").write_bytes(b"no picture")
+
+
+@pytest.mark.parametrize("fault", [black, unmetered, unreadable])
+def test_a_frame_that_cannot_be_metered_holds_the_loops(
+    frames, tmp_path, write_exr, monkeypatch, fault
+):
+    control = {"delay": 1, "smoothing": 2.0, "iso_max": 3200.0}
+    options = {"device": "numpy", "sequence": True, "control": control, **LOOPS}
+    fault(tmp_path, write_exr, monkeypatch)
+    list(clpipe.run(tmp_path / "frames", tmp_path / "out", **options))
+    monkeypatch.undo()
+    (tmp_path / "frames/a/4.exr").unlink()
+    list(clpipe.run(tmp_path / "frames", tmp_path / "without", **options))
+    found, expected = evs(tmp_path / "out"), evs(tmp_path / "without")
+    if fault is not unreadable:
+        held = ControlLoop(Control(**control))
+        metered = [levels(tmp_path)[name] for name in "01233"]
+        assert found.pop("4")[0] == pytest.approx([held.next(ev) for ev in metered][-1], abs=1e-4)
+    assert found == expected
+    assert len({ev for ev, _ in found.values()}) > 4  # the loop has moved
+
+
+def levels(tmp_path):
+    """The EV that is metered for each frame of camera a, by itself."""
+    run(tmp_path, "single", exposure={"method": "auto"})
+    steps = {path.stem: chain_of(path) for path in (tmp_path / "single/a").glob("*.json")}
+    return {name: each["exposure"]["estimates"]["metered_ev"] for name, each in steps.items()}
+
+
+@pytest.mark.parametrize("rule", ["log_average", "percentile"])
+def test_loops_start_at_the_first_frame_with_light(rule):
+    exposure = {"method": "auto", "rule": rule, "target": 0.18}
+    control = {"delay": 0, "smoothing": 0.0, "speed": 0.0, "hysteresis": 0.0, "iso_max": 6400.0}
+    dark, grey = np.zeros((24, 32, 3), np.float32), np.full((24, 32, 3), 0.1799, np.float32)
+    with clpipe.Stream(device="numpy", iso=200, exposure=exposure, control=control) as stream:
+        shots = [stream(frame) for frame in (dark, grey / 4, dark, grey, dark)]
+    assert [round(shot.settings["exposure"]["ev"], 2) for shot in shots] == [0, 2, 2, 0, 0]
+    assert [shot.settings.get("iso") for shot in shots] == [None, 800, 800, 200, 200]
+    assert [round(shot.metered.get("metered_ev", 9), 2) for shot in shots] == [9, 2, 9, 0, 9]
+
+
+def test_without_light_white_balance_waits():
+    control = {"delay": 0, "smoothing": 0.0, "speed": 0.0, "hysteresis": 0.0}
+    balance = {"method": "gray_world"}
+    red = np.full((24, 32, 3), (0.4, 0.1, 0.1), np.float32)
+    with clpipe.Stream(device="numpy", white_balance=balance, control=control) as stream:
+        gains = [stream(red * light).settings["white_balance"] for light in (0, 1, 0, 0.5)]
+    assert gains[0] == {"method": "gains", "red_gain": 1.0, "blue_gain": 1.0}
+    assert gains[2] == gains[1]
+    assert gains[1]["red_gain"] < gains[1]["blue_gain"] and gains[3] != gains[2]
