@@ -396,3 +396,28 @@ def test_without_light_white_balance_waits():
     assert gains[0] == {"method": "gains", "red_gain": 1.0, "blue_gain": 1.0}
     assert gains[2] == gains[1]
     assert gains[1]["red_gain"] < gains[1]["blue_gain"] and gains[3] != gains[2]
+
+
+@pytest.mark.parametrize(
+    ("options", "own"),
+    [
+        ({"iso": 800, "camera": "nikon-d800"}, LOOPS),
+        ({"camera": "nikon-d800"}, {**LOOPS, "iso": [200, 800]}),
+        ({"shutter": {"subframes": 3}}, LOOPS),
+        # A chain with state needs the order of the frames.
+        ({"config": "video", "sequence": True}, {"iso": {"choice": [200, 800, 3200]}}),
+    ],
+    ids=["single", "series", "subframes", "video"],
+)
+def test_a_run_of_the_manifest_makes_the_same_pictures(frames, tmp_path, options, own):
+    run(tmp_path, "out", **{"sequence": True, **options, **own})
+    list(clpipe.run(tmp_path / "out/run.csv", tmp_path / "again", device="numpy", **options))
+    made = pictures(tmp_path / "out")
+    assert len(made) == {"shutter": 6, "camera": 36}.get(next(iter(options)), 18)
+    assert pictures(tmp_path / "again") == made
+
+
+def test_a_key_stays_in_the_output_directory(tmp_path):
+    (tmp_path / "a.csv").write_text("path,key\na.exr,../a.exr\n")
+    with pytest.raises(RequestError, match=r"key: found '\.\./a.exr', but expected a path in the"):
+        clpipe.run(tmp_path / "a.csv", tmp_path / "out")

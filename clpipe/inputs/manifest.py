@@ -70,13 +70,13 @@ def read_manifest(path: Path) -> list[Row]:
     text if it is not valid TOML. An empty cell sets nothing. A .jsonl file has one object per line,
     nested like a configuration or with dotted keys, and null sets nothing.
 
-    Columns are ``path``, ``name``, ``frames``, ``iso``, ``camera``, ``lens``, ``focal_length``,
+    Columns are ``path``, ``key``, ``name``, ``frames``, ``iso``, ``camera``, ``lens``, ``focal_length``,
     ``aperture``, ``focus_distance``, ``seed``, ``noise_key`` and ``skip`` (a list, or names with
     spaces between them). Any ``stage.parameter`` is a column, including those of loaded stage
     files. File names are relative to the manifest.
 
-    The key of a row is its name. Without one, it is the path relative to the manifest's folder, or
-    the file's name if the file is outside that folder.
+    Without the column ``key``, the key of a row is its name. Without either, it is the path relative
+    to the manifest's folder, or the file's name if the file is outside that folder.
 
     Args:
         path: the manifest.
@@ -122,7 +122,8 @@ def manifest_text(folder: Path, rows: Sequence[Row]) -> bytes:
     for row in rows:
         path = os.path.abspath(row.path)
         below = os.path.relpath(path, os.path.abspath(folder))
-        cells = {"path": path if below.startswith("../") else below, "name": row.name}
+        key = "" if row.key == (row.name or key_of(folder, row.path)) else row.key
+        cells = {"path": path if below.startswith("../") else below, "key": key, "name": row.name}
         cells["frames"] = "" if row.frames is None else str(row.frames)
         for key, value in resolve_paths(Path.cwd(), row.values).items():
             table = value if key not in TOP_LEVEL_KEYS and isinstance(value, Mapping) else None
@@ -278,8 +279,10 @@ def _row(
     for column in TEXT_COLUMNS:
         _check_text(column, record.get(column, ""))
     path, name, frames = record.get("path", ""), record.get("name", ""), record.get("frames")
+    key = record.get("key", "")
     if os.path.basename(path) in ("", ".", ".."):
         raise RequestError(f"path: found {path!r}, but expected the path of an image")
+    check_output_name(key, "key")
     _check_name(name)
     if frames is not None and not OPTIONS["frames"].allows(frames):
         raise RequestError(f"frames: found {frames!r}, but expected {OPTIONS['frames'].allowed}")
@@ -293,13 +296,17 @@ def _row(
         elif column in TOP_LEVEL_KEYS:
             values[column] = value
     image_path = join_url(folder, path)
-    key = name or (image_path.name if is_url(path) else key_of(folder, image_path))
+    key = key or name or (image_path.name if is_url(path) else key_of(folder, image_path))
     values = resolve_paths(folder, values)
     return Row(image_path, key, name, shared.setdefault(repr(values), values), frames, location)
 
 
-def check_output_name(name: str) -> None:
+def check_output_name(name: str, column: str = "name") -> None:
     """Check that a name of outputs stays in the output directory; "" is allowed.
+
+    Args:
+        name: the name.
+        column: what sets it, for the message.
 
     Raises:
         RequestError: it does not.
@@ -308,7 +315,7 @@ def check_output_name(name: str) -> None:
     has_drive = os.path.splitdrive(name)[0]  # for example C:name, on Windows
     if name and ("\0" in name or has_drive or not {"", ".", ".."}.isdisjoint(parts)):
         raise RequestError(
-            f"name: found {name!r}, but expected a path in the output directory, such as "
+            f"{column}: found {name!r}, but expected a path in the output directory, such as "
             "a/frame_0001"
         )
 

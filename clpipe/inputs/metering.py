@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import groupby
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -27,7 +27,7 @@ from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result, Runner
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader, LoadedImage
-from clpipe.inputs.manifest import Row, key_of, manifest_text
+from clpipe.inputs.manifest import Row, manifest_text
 from clpipe.inputs.sequences import sequence_of
 from clpipe.stage import StageRole
 from clpipe.stages.exposure.auto import Auto
@@ -271,14 +271,17 @@ def merged(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, An
 def write_exposures(path: Path, jobs: Sequence[Job]) -> None:
     """Write frames as a manifest with their settings. All files of an exposure have the same.
 
+    The rows have the frames' keys, so a run of the manifest makes the same noise.
+
     Raises:
         ImageError: the manifest cannot be written.
     """
     rows = []
     for job in jobs:
-        name = job.name or (job.stem if key_of(path.parent, job.path) != job.key else "")
         own = job.values, job.frames, job.location
-        rows.append(Row(job.path, job.key, name, *own))
-        for file in job.subframes:
-            rows.append(Row(file, "", f"{name}.{file.stem}" if name else "", *own))
+        for file in job.paths:
+            is_named = file is job.path and not job.is_panorama  # a panorama's key names no view
+            key = job.key if is_named else str(PurePosixPath(job.key).with_name(file.name))
+            name = f"{job.name}.{file.stem}" if job.name and file is not job.path else job.name
+            rows.append(Row(file, key, name, *own))
     write_new(path, manifest_text(path.parent, rows))

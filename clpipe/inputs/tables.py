@@ -20,7 +20,7 @@ from clpipe.chain.toml import toml_value
 # Returns the values of a row by column, or raises RequestError.
 Record = Callable[[], dict[str, Any]]
 
-TEXT_COLUMNS = ("path", "name")  # columns that are not parsed as TOML values
+TEXT_COLUMNS = ("path", "key", "name")  # columns that are not parsed as TOML values
 
 NON_SETTINGS = (*TEXT_COLUMNS, "frames")  # columns that are not settings
 
