@@ -216,36 +216,33 @@ def sequence(write_exr, scene):
             write_exr(f"frames/{folder}/{number}.exr", scene[:20, :30] * gain)
 
 
-METER = ("meter", "frames", "--device", "numpy")
-
-
 def control(**values):
     """The options for control loops without delay, hysteresis and limit, and other values."""
     values = {"delay": 0, "hysteresis": 0, "speed": 0, "smoothing": 0} | values
     return [word for k, v in values.items() for word in ("--set", f"control.{k}={v}")]
 
 
-def test_meter_smooths_each_sequence_by_itself(clpipe, sequence, tmp_path):
-    result = clpipe(
-        *METER,
-        *("-o", "a/exposures.csv", "--set", "exposure.ev=-1", "--json"),
-        *control(smoothing=2),
-    )
-    frames = json.loads(result.stdout)["frames"]
-    found = [frame["metered_ev"] for frame in frames]
+METERED = (*NUMPY, "--sequence", "--set", "exposure.method=auto")
+
+
+def test_each_sequence_is_smoothed_by_itself(clpipe, sequence, tmp_path):
+    clpipe("run", "frames", "-o", "single", *NUMPY, "--set", "exposure.method=auto")
+    clpipe("run", "frames", "-o", "out", *METERED, *control(smoothing=2))
+    names = [*(f"day/{n}" for n in range(4)), *(f"night/{n}" for n in range(2))]
+    single = [exposure_of(tmp_path / f"single/{name}.json")["estimates"] for name in names]
+    found = [estimates["metered_ev"] for estimates in single]
     assert found[2] == pytest.approx(found[0] - 3, abs=0.01)
     share = 1 - math.exp(-1 / 2)
     third = found[1] + share * (found[2] - found[1])
     fourth = third + share * (found[3] - third)
     expected = [found[0], found[0], third, fourth, found[4], found[4]]
-    assert [frame["ev"] + 1 for frame in frames] == pytest.approx(expected, abs=1e-4)
-    at_once = json.loads(clpipe(*METER, "-o", "b.csv", "--json", *control()).stdout)["frames"]
-    assert [frame["ev"] for frame in at_once] == pytest.approx(found, abs=1e-4)
+    set_ = [exposure_of(tmp_path / f"out/{name}.json")["parameters"]["ev"] for name in names]
+    assert set_ == pytest.approx(expected, abs=1e-4)
 
 
-def test_a_run_takes_the_exposures_that_meter_writes(clpipe, sequence, tmp_path):
-    clpipe(*METER, "-o", "exposures.csv", *control(), "--set", "exposure.headroom=0.5")
-    clpipe("run", "exposures.csv", "-o", "out", *NUMPY, "-c", "paper")
+def test_a_run_takes_the_exposures_that_a_sequence_writes(clpipe, sequence, tmp_path):
+    clpipe("run", "frames", "-o", "film", *METERED, *control(), "--set", "exposure.headroom=0.5")
+    clpipe("run", "film/run.csv", "-o", "out", *NUMPY, "-c", "paper")
     clpipe("run", "frames", "-o", "auto", *NUMPY, "--set", "exposure.method=auto")
     for name in ("day/0", "day/3", "night/1"):
         mine = exposure_of(tmp_path / f"out/{name}.json")["parameters"]
@@ -253,45 +250,21 @@ def test_a_run_takes_the_exposures_that_meter_writes(clpipe, sequence, tmp_path)
         assert mine["ev"] == pytest.approx(theirs["metered_ev"], abs=1e-4)
         assert mine["headroom"] == 0.5
     # The manifest of a manifest keeps what it says of other things.
-    rows = "path,iso,frames,mosaic.pattern,exposure.ev\nframes/day/2.exr,200,3,GRBG,7\n"
+    rows = "path,iso,frames,mosaic.pattern\nframes/day/2.exr,200,3,GRBG\n"
     (tmp_path / "rows.csv").write_text(rows)
-    clpipe("meter", "rows.csv", "-o", "metered.csv", "--device", "numpy")
-    (row,) = read_manifest(tmp_path / "metered.csv")
+    clpipe("run", "rows.csv", "-o", "metered", *METERED)
+    (row,) = read_manifest(tmp_path / "metered/run.csv")
     assert (row.key, row.frames) == ("frames/day/2.exr", 3)
     own = row.values["exposure"]
     assert row.values == {"iso": 200, "mosaic": {"pattern": "GRBG"}, "exposure": own}
     assert own["method"] == "gain" and own["ev"] < 4
 
 
-def test_meter_takes_sub_frames_as_one_exposure(clpipe, sequence, tmp_path):
+def test_sub_frames_are_metered_as_one_exposure(clpipe, sequence, tmp_path):
     two = ("--set", "shutter.subframes=2")
-    found = json.loads(
-        clpipe(*METER, "-o", "films/exposures.csv", *control(), *two, "--json").stdout
-    )
-    assert [frame["frame"] for frame in found["frames"]] == [
-        f"frames/{name}.exr" for name in ("day/0", "day/2", "night/0")
-    ]
-    clpipe("run", "films/exposures.csv", "-o", "out", *NUMPY, *two)
+    clpipe("run", "frames", "-o", "film", *METERED, *control(), *two)
     clpipe("run", "frames", "-o", "auto", *NUMPY, "--set", "exposure.method=auto", *two)
     for name in ("day/0", "day/2", "night/0"):
-        mine = exposure_of(tmp_path / f"out/{name}.json")["parameters"]
+        mine = exposure_of(tmp_path / f"film/{name}.json")["parameters"]
         theirs = exposure_of(tmp_path / f"auto/{name}.json")["estimates"]
         assert mine["ev"] == pytest.approx(theirs["metered_ev"], abs=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["frames", "-o", "a.txt"], "found a.txt; expected a name that ends in .csv"),
-        (["frames/day/0.exr", "no.exr", "-o", "a.csv"], "no.exr: there is no such file"),
-        (["a.csv", "-o", "./a.csv"], "found a.csv, but this file is an input; choose another name"),
-        (["frames", "-o", "a.csv", "--set", "exposure.method=gain"], "but only auto measures"),
-        (["a.dng", "-o", "a.csv"], "a.dng: this is a raw, and its exposure is fixed"),
-        (["frames", "-o", "a.csv", "--set", "exposure.key=1"], "unknown parameter of exposure"),
-    ],
-)
-def test_meter_says_what_is_wrong(clpipe, sequence, tmp_path, words, message):
-    (tmp_path / "a.dng").touch()
-    result = clpipe("meter", "--device", "numpy", *words, status=(1, 2))
-    assert message in result.stderr
-    assert not (tmp_path / "a.csv").exists()

@@ -102,7 +102,6 @@ def test_a_part_of_a_name_lists_the_cameras(clpipe):
 INPUTS = {
     "run": "run {} -o out",
     "explore": "explore {}",
-    "meter": "meter {} -o a.csv",
     "measure": "measure {}",
     "measure --truth": "measure render.exr --truth {}",
     "replay": "replay {} -o out",

@@ -172,7 +172,7 @@ def test_nothing_is_let_in_at_the_end():
 def test_small_images_are_not_slowed_by_measuring(clock):
     count = []
     budget = MemoryBudget(None, (), left=lambda: count.append(1) or FreeMemory(2**34, ""))
-    for number in range(100):
+    for _ in range(100):
         budget.acquire(MIB)
     assert len(count) == 1
     clock[0] += 2 * memory_budget.MEASUREMENT_SECONDS

@@ -294,11 +294,15 @@ def test_frames_are_metered_by_the_devices_of_the_run(frames, tmp_path, monkeypa
         init(self, *arguments)
 
     monkeypatch.setattr(Device, "__init__", counted)
-    assert {o.status for o in clpipe.run(tmp_path / "frames", tmp_path / "out", sequence=True, **LOOPS)} == {"done"}
+    assert {
+        o.status for o in clpipe.run(tmp_path / "frames", tmp_path / "out", sequence=True, **LOOPS)
+    } == {"done"}
     assert len(opened) == len(open_devices())
 
 
-def test_a_frame_that_no_memory_suffices_for_fails_alone(frames, reads, tmp_path, monkeypatch, write_exr):
+def test_a_frame_that_no_memory_suffices_for_fails_alone(
+    frames, reads, tmp_path, monkeypatch, write_exr
+):
     write_exr("frames/a/4.exr", np.full((900, 1200, 3), 0.1, np.float32))
     monkeypatch.setattr(memory_budget, "free_memory", lambda: FreeMemory(150 * 2**20, "a limit"))
     made = clpipe.run(tmp_path / "frames", tmp_path / "out", device="numpy", sequence=True, **LOOPS)

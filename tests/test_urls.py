@@ -218,7 +218,7 @@ def test_what_is_wrong_with_a_url_is_said(bucket, clpipe, monkeypatch):
     assert "'..'" in stderr_of("flaky://b/../x.exr", "-o", "o", status=2)
     text = stderr_of("in", "-o", "flaky://b/set", status=2)
     assert "found flaky://b/set; only tars are written to a URL, so add --webdataset N" in text
-    text = clpipe("meter", "in", "-o", "flaky://b/m.csv", status=2).stderr
+    text = clpipe("emva", "-o", "flaky://b/m", status=2).stderr
     assert "only clpipe run writes to URLs" in text
     Flaky.forbidden = "r3"
     text = stderr_of("flaky://b/renders", "-o", "o", status=1)

@@ -26,7 +26,7 @@ from clpipe.commands.notices import NOTICES
 # Commands by heading of the help. Each is a module of this package that defines a function of its
 # name.
 GROUPS = {
-    "Make pictures": ("run", "replay", "dataset", "meter", "stream"),
+    "Make pictures": ("run", "replay", "dataset", "stream"),
     "View and measure results": ("report", "explore", "compare", "measure", "poses"),
     "Cameras": ("cameras", "calibrate", "emva", "match"),
     "Stages and devices": ("stages", "plan", "devices", "check", "bench"),

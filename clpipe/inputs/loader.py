@@ -278,8 +278,8 @@ class ImageLoader:
     def enter(self, job: Job, source: SourceImage) -> LoadedImage | None:
         """Return an image with the chain for it.
 
-        A source that was entered before stays as it is, with the layers that steps read. Return None for a kept
-        image from a folder that was not kept right before ``start_at``.
+        A source that was entered before stays as it is, with the layers that steps read. Return
+        None for a kept image from a folder that was not kept right before ``start_at``.
 
         Raises:
             ImageError: the image cannot enter the chain, or lacks a layer that a step reads.

@@ -70,13 +70,13 @@ def read_manifest(path: Path) -> list[Row]:
     text if it is not valid TOML. An empty cell sets nothing. A .jsonl file has one object per line,
     nested like a configuration or with dotted keys, and null sets nothing.
 
-    Columns are ``path``, ``key``, ``name``, ``frames``, ``iso``, ``camera``, ``lens``, ``focal_length``,
-    ``aperture``, ``focus_distance``, ``seed``, ``noise_key`` and ``skip`` (a list, or names with
-    spaces between them). Any ``stage.parameter`` is a column, including those of loaded stage
-    files. File names are relative to the manifest.
+    Columns are ``path``, ``key``, ``name``, ``frames``, ``iso``, ``camera``, ``lens``,
+    ``focal_length``, ``aperture``, ``focus_distance``, ``seed``, ``noise_key`` and ``skip`` (a
+    list, or names with spaces between them). Any ``stage.parameter`` is a column, including those
+    of loaded stage files. File names are relative to the manifest.
 
-    Without the column ``key``, the key of a row is its name. Without either, it is the path relative
-    to the manifest's folder, or the file's name if the file is outside that folder.
+    Without the column ``key``, the key of a row is its name. Without either, it is the path
+    relative to the manifest's folder, or the file's name if the file is outside that folder.
 
     Args:
         path: the manifest.

@@ -155,9 +155,7 @@ class Meter:
                 gains = measure(balance, chain_of(values) if values else chain)
             metered |= gains
             followed = {
-                name: round(
-                    2 ** follow(name, math.log2(gains[name]) if gains else None), DIGITS
-                )
+                name: round(2 ** follow(name, math.log2(gains[name]) if gains else None), DIGITS)
                 for name in GAINS
             }
             values[balance.name] = {"method": "gains", **followed}
@@ -204,7 +202,8 @@ def metered_jobs(
     for _, frames in groupby(jobs, key=sequence_of):
         meter = Meter(on_device)
         for job in frames:
-            drawn, values = job, {}
+            drawn = job
+            values: Mapping[str, Any] = {}
             # The run reads the frame again, and reports the error.
             with suppress(ImageError, RequestError, MemoryError):
                 drawn = with_drawn(loader, job)
