@@ -250,9 +250,9 @@ def reads(monkeypatch):
         return budgets[-1]
 
     def reading(self, job):
-        leases = list(budgets[-1]._leases)
-        assert leases
-        assert sum(lease.size for lease in leases) <= budgets[-1]._size or len(leases) == 1
+        taken = budgets[-1]._taken.values()
+        assert taken
+        assert sum(taken) <= budgets[-1]._size or len(taken) == 1
         found.append(job.key)
         return read(self, job)
 

@@ -40,7 +40,6 @@ class DecodedFrame:
         span: the time of decoding.
         lease: the memory.
         files: removes files that were fetched.
-        is_queued: whether a thread that develops frames will take it.
     """
 
     paths: Sequence[Path]
@@ -49,7 +48,11 @@ class DecodedFrame:
     span: Span
     lease: Lease
     files: ExitStack
-    is_queued: bool = False
+
+    def free(self) -> None:
+        """Remove the files, and let the next image take the memory."""
+        self.files.close()
+        self.lease.release()
 
 
 @dataclass

@@ -132,7 +132,7 @@ class MemoryBudget:
         self._left = left or free_memory
         self._max_free = 0  # the most bytes that were ever free for one image and the devices
         self._measured: tuple[float, FreeMemory | None] = 0.0, FreeMemory(0, "")
-        self._leases: set[Lease] = set()
+        self._taken: dict[Lease, int] = {}  # bytes
         # Lets one image wait at a time, so that no image overtakes it.
         self._queue = threading.Lock()
         # Guards the attributes above, and is notified when one changes.
@@ -152,7 +152,7 @@ class MemoryBudget:
             lease = Lease(self, size)
             if not self._fits(size):
                 self._shrink_devices(lease)
-            self._leases.add(lease)
+            self._taken[lease] = size
             return lease
 
     def fits(self, size: int) -> bool:
@@ -163,7 +163,7 @@ class MemoryBudget:
     def take_back(self, lease: Lease) -> None:
         """Do the work of :meth:`Lease.release`."""
         with self._changed:
-            self._leases.discard(lease)
+            self._taken.pop(lease, None)
             _restore(lease)
             self._changed.notify_all()
 
@@ -181,12 +181,12 @@ class MemoryBudget:
 
     @property
     def _is_alone(self) -> bool:
-        return not self._leases and self._compiling <= 0
+        return not self._taken and self._compiling <= 0
 
     def _fits(self, size: int) -> bool:
         """Return whether an image fits: into the free memory, and with others into the budget."""
-        total = sum(lease.size for lease in self._leases) + size
-        if self._size is not None and self._leases and total > self._size:
+        total = sum(self._taken.values()) + size
+        if self._size is not None and self._taken and total > self._size:
             return False
         free = self._free(size)
         return free is None or needed(size) <= free.bytes

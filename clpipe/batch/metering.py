@@ -7,7 +7,7 @@ their request. Its image is therefore decoded first, and kept for the thread tha
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import cache
 
@@ -48,6 +48,7 @@ class Metering:
         self._kept: dict[str, DecodedFrame] = {}  # one at most, by the stem of its job
         self._is_closed = False
         self._changed = threading.Condition()  # guards the attributes above
+        self._last_queued = ""  # the stem of a job
 
     def jobs(self, jobs: Iterable[Job]) -> Iterator[Job]:
         """Yield frames with the settings of their sequence; see :func:`metered_jobs`.
@@ -59,35 +60,38 @@ class Metering:
             if not self._keeps:
                 self.drop(job)
             yield job
-            if (kept := self.kept(job)) and not kept.is_queued:
+            if job.stem != self._last_queued:
                 self.drop(job)
 
-    def kept(self, job: Job) -> DecodedFrame | None:
-        """Return the image that is kept for a frame, if there is one."""
-        with self._changed:
-            return self._kept.get(job.stem)
+    def queue(self, job: Job, has_turn: bool) -> bool:
+        """Note that the thread that develops a frame will take its image.
 
-    @contextmanager
-    def taken(self, job: Job) -> Iterator[DecodedFrame | None]:
-        """Yield the image that is kept for a frame, if there is one, and keep it no longer.
+        Args:
+            job: the frame.
+            has_turn: whether all frames before have memory. Otherwise, the image is dropped: frames
+                that have memory would wait for others that do not.
 
-        Its files are removed when the context ends. Its memory then belongs to whoever has taken
-        ``lease`` over, and is released by them.
+        Returns:
+            Whether the image is kept.
         """
+        self._last_queued = job.stem
+        if not has_turn:
+            self.drop(job)
+        return job.stem in self._kept
+
+    def take(self, job: Job) -> DecodedFrame | None:
+        """Return the image that is kept for a frame, if there is one, and keep it no longer."""
+        if not self._kept:  # most runs meter nothing
+            return None
         with self._changed:
             decoded = self._kept.pop(job.stem, None)
             self._changed.notify_all()
-        try:
-            yield decoded
-        finally:
-            if decoded:
-                decoded.files.close()
+            return decoded
 
     def drop(self, job: Job) -> None:
         """Free the image that is kept for a frame, if there is one."""
-        with self.taken(job) as decoded:
-            if decoded:
-                decoded.lease.release()
+        if decoded := self.take(job):
+            decoded.free()
 
     def close(self) -> None:
         """End the run: free the image that is kept, and load no others."""
@@ -95,8 +99,7 @@ class Metering:
             self._is_closed = True
             self._changed.notify_all()
             for decoded in self._kept.values():
-                decoded.files.close()
-                decoded.lease.release()
+                decoded.free()
             self._kept.clear()
 
     def _load(self, loader: ImageLoader, job: Job) -> LoadedImage:

@@ -177,14 +177,8 @@ class Batch:
                     break
                 for turns in self._turns:
                     turns.expect(job)
-                if decoded := self._metering.kept(job):
-                    # Memory is taken in the order of the jobs. Otherwise, frames that have memory
-                    # would wait for others that do not.
-                    if self._admitting.is_first(job):
-                        decoded.is_queued = True
-                        self._admitting.end(job)
-                    else:
-                        self._metering.drop(job)
+                if job.place and self._metering.queue(job, self._admitting.is_first(job)):
+                    self._admitting.end(job)
                 self._jobs.put(job)
         except Exception as error:
             self._jobs.put(error)
@@ -247,19 +241,21 @@ class Batch:
         state = JobState(job, self._worker.loader)
         waits: list[float] = []
         leases: list[Lease] = []
-        with self._metering.taken(job) as decoded:
-            admit = partial(self._admit, waiting_states, waits, leases, decoded)
-            try:
-                state = self._worker.decode(job, admit, decoded)
-            except OutputError as error:
-                state.error = failure_text(job, error)
-                self._fail(error)
-            except BaseException as error:  # an error of an image must not end the thread
-                state.error = failure_text(job, error)
-            finally:
-                self._admitting.end(job)
-        if decoded and not leases:  # no picture of the frame is made
-            decoded.lease.release()
+        decoded = self._metering.take(job)
+        admit = partial(self._admit, waiting_states, waits, leases, decoded)
+        try:
+            state = self._worker.decode(job, admit, decoded)
+        except OutputError as error:
+            state.error = failure_text(job, error)
+            self._fail(error)
+        except BaseException as error:  # an error of an image must not end the thread
+            state.error = failure_text(job, error)
+        finally:
+            self._admitting.end(job)
+        if decoded:
+            decoded.files.close()
+            if not leases:  # no picture of the frame is made
+                decoded.lease.release()
         state.leases = leases
         state.spans = [  # subtracts the wait for memory
             replace(span, start=span.start + sum(waits), seconds=span.seconds - sum(waits))
