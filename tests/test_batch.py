@@ -907,3 +907,18 @@ def test_what_images_take(tmp_path, write_exr):
     # What is refused for its size takes nothing, and its message is that of reading.
     few = ImageLoader(Request(max_pixels=199))
     assert few.claim(Job(tmp_path / "a.exr", "a")).reading == 0
+
+
+def test_only_images_that_were_loaded_release_memory(renders, tmp_path, monkeypatch):
+    renders(4)
+    (tmp_path / "out").mkdir()
+    leases, release = [], MemoryBudget.take_back
+    monkeypatch.setattr(
+        MemoryBudget, "take_back", lambda self, lease: (leases.append(lease), release(self, lease))
+    )
+    for done in (4, 1):
+        leases.clear()
+        worker, jobs = worker_of(tmp_path)
+        statuses = [outcome.status for outcome in Batch(worker, [None]).run(jobs)]
+        assert statuses.count("done") == len(set(leases)) == len(leases) == done
+        next((tmp_path / "out").glob("r002.*")).unlink()
