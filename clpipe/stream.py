@@ -48,7 +48,8 @@ class Shot:
         image: the picture, (height, width, 3) uint8; the raw, (height, width) uint16, if the chain
             ends with it; else float32.
         settings: what the sequence's draws and control loops set, nested like a configuration.
-        metered: what was metered for this frame only, by name.
+        metered: what was metered for this frame only, by name. A frame without light has nothing,
+            and holds the control loops.
         result: the kept images, and the numbers that stages estimated.
     """
 

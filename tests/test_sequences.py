@@ -21,6 +21,8 @@ from clpipe.engine.device import Device, open_devices
 from clpipe.engine.runner import Runner
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
+from clpipe.inputs.manifest import read_manifest
+from clpipe.inputs.metering import write_exposures
 from clpipe.inputs.sequences import in_sequences
 from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import ROOT
@@ -419,6 +421,18 @@ def test_a_run_of_the_manifest_makes_the_same_pictures(frames, tmp_path, options
     made = pictures(tmp_path / "out")
     assert len(made) == {"shutter": 6, "camera": 36}.get(next(iter(options)), 18)
     assert pictures(tmp_path / "again") == made
+
+
+def test_the_manifest_has_the_keys_of_all_files(tmp_path):
+    files = [tmp_path / f"in/a_{view}.exr" for view in ("front", "back", "left")]
+    panorama = Job(files[0], "v/a.exr", subframes=(files[1],), is_panorama=True)
+    write_exposures(tmp_path / "out/run.csv", [panorama, Job(files[2], "v/a_left.exr", "iso100/b")])
+    rows = read_manifest(tmp_path / "out/run.csv")
+    assert [(row.path.resolve(), row.key, row.stem) for row in rows] == [
+        (files[0], "v/a_front.exr", "v/a_front"),
+        (files[1], "v/a_back.exr", "v/a_back"),
+        (files[2], "v/a_left.exr", "iso100/b"),
+    ]
 
 
 def test_a_key_stays_in_the_output_directory(tmp_path):
