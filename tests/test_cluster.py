@@ -97,9 +97,9 @@ def note_folders():
     """On a worker: record the working directory at each following image."""
     decode, work.folders = work.ImageWorker.decode, set()
 
-    def noting(this, job, begin):
+    def noting(this, job, *arguments):
         work.folders.add(os.getcwd())
-        return decode(this, job, begin)
+        return decode(this, job, *arguments)
 
     work.ImageWorker.decode = noting
 
@@ -113,10 +113,10 @@ class DieOf(WorkerPlugin):
     def setup(self, worker):
         decode = work.ImageWorker.decode
 
-        def planted(this, job, begin):
+        def planted(this, job, *arguments):
             if job.path.name == self.name:
                 os.kill(os.getpid(), signal.SIGKILL)
-            return decode(this, job, begin)
+            return decode(this, job, *arguments)
 
         work.ImageWorker.decode = planted
 
@@ -238,12 +238,12 @@ def hold(name, reached, go):
     """On a worker: create a file at an image of this name, and wait there for another file."""
     decode = work.ImageWorker.decode
 
-    def planted(this, job, begin):
+    def planted(this, job, *arguments):
         if job.path.name == name:
             Path(reached).touch()
             while not Path(go).exists():
                 time.sleep(0.01)
-        return decode(this, job, begin)
+        return decode(this, job, *arguments)
 
     work.ImageWorker.decode = planted
 
