@@ -305,7 +305,7 @@ def test_renders_in_whole_numbers_with_a_stated_transfer(tmp_path, ending, trans
     run_cli("run", tmp_path, "-o", tmp_path / "out", "--transfer", transfer)
     assert (tmp_path / "out" / "render.jpg").is_file()
     without = run_cli("run", path, "-o", tmp_path / "out", status=1)
-    assert "--transfer srgb or linear" in without.output
+    assert "add --transfer srgb or --transfer linear" in without.output
 
 
 def test_a_transfer_is_that_of_a_render(tmp_path):

@@ -45,7 +45,7 @@ def test_nothing_is_written_before_a_run_is_iterated(renders):
 
 def test_impossible_requests_are_rejected_at_once(renders):
     for options, message in (
-        ({"iso": [100, 100]}, r"--iso: found \[100, 100\], which lists 100 twice"),
+        ({"iso": [100, 100]}, r"^iso: found \[100, 100\], which lists 100 twice"),
         ({"truth": "cleen"}, r"unknown truth 'cleen' \(did you mean 'clean'"),
         ({"patch": 0}, "found patch 0; expected a whole number from 1"),
         ({"patch": package.Patches(8, 10**4)}, "found patches_per_image 10000; expected a whole"),
@@ -54,16 +54,16 @@ def test_impossible_requests_are_rejected_at_once(renders):
         ({"jobs": -1}, "found jobs -1; expected a whole number from 1 to 1024"),
         ({"webdataset": 0}, "found webdataset 0; expected a whole number from 1 to"),
         ({"max_pixels": 0}, "found max_pixels 0; expected a whole number from 1 to"),
-        ({"memory": 0}, "--memory: '0' is not a size"),
+        ({"memory": 0}, "^memory: '0' is not a size"),
         ({"format": "gif"}, "unknown format 'gif'"),
         ({"transfer": "x"}, "found transfer 'x'; expected 'srgb', 'linear' or None"),
-        ({"bracket": [1, 1]}, r"--bracket: found \[1, 1\], which repeats \+1 EV"),
-        ({"bracket": [float("nan")]}, r"--bracket: found \[nan\]; expected EVs"),
+        ({"bracket": [1, 1]}, r"^bracket: found \[1, 1\], which repeats \+1 EV"),
+        ({"bracket": [float("nan")]}, r"^bracket: found \[nan\]; expected EVs"),
         ({"redo": "some"}, "found redo 'some'"),
         ({"frames": "2"}, "found frames '2'; expected a whole number or None"),
         (
             {"layer": "a", "stages": ["normalize", "demosaic"], "start_at": "normalize"},
-            "--layer: this option is only for renders",
+            "^layer: this option is only for renders",
         ),
         ({"nosuch": 1}, "nosuch"),
     ):

@@ -43,7 +43,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
-from clpipe.engine.check import ISO, NOISE, chain_for
+from clpipe.engine.check import ISO, chain_for, sensor_parameters
 from clpipe.engine.codegen import write_kernel
 from clpipe.engine.ir import Kernel, Launch
 from clpipe.engine.plan import make_plan
@@ -229,7 +229,7 @@ def chains() -> Iterator[tuple[str, Chain]]:
     names = list(all_stages())
     until_raw = tuple(names[: names.index("quantize") + 1])
     for noise in all_stages()["sensor_noise"].by_name:
-        parameters = {**NOISE, "sensor_noise": {"method": noise}}
+        parameters = {**sensor_parameters(), "sensor_noise": {"method": noise}}
         settings = Settings(iso=ISO, stages=until_raw, parameters=parameters)
         yield f"{RAW}{noise}, all noise", make_chain(settings)
     for config in ("default", "paper"):
