@@ -21,6 +21,7 @@ from clpipe.dataset.arrays import ArrayFormat, dtype_named
 from clpipe.dataset.developer import Sample, SampleSpec
 from clpipe.dataset.inputs import cache_size, jobs_of
 from clpipe.dataset.numbering import Numbering
+from clpipe.dataset.passes import Passes, part_of
 from clpipe.dataset.prefetch import PATCHES_TOGETHER, BatchSize, prefetched
 from clpipe.dataset.samples import SampleBatch, SampleLoader
 from clpipe.inputs.loader import ImageLoader, LoadedImage
@@ -186,22 +187,29 @@ class Dataset(ReadOnly):
         self._epochs = epochs
         self._threads = threads or available_processors()
         self._numbered: Numbering | None = None
+        self._passes = Passes(0)
         self.set_epoch(epoch)
 
     def __repr__(self) -> str:
         epochs = "endless epochs" if self._epochs is None else f"{self._epochs} epochs"
         return f"Dataset({len(self._jobs)} images, {epochs}, {self._label})"
 
+    @property
+    def _epoch(self) -> int:
+        return self._passes.epoch
+
     @check_argument_types
     def set_epoch(self, epoch: int) -> None:
-        """Continue with the start of an epoch. Use it to resume a training run.
+        """Continue with the start of an epoch. Use it before each epoch, or to resume a run.
+
+        Workers of a ``DataLoader`` follow, also persistent ones.
 
         Raises:
             RequestError: the epoch is negative.
         """
         if epoch < 0:
             raise RequestError(f"found epoch {epoch}; expected 0 or more")
-        self._epoch = epoch
+        self._passes.set(epoch)
         self._first = self._next = 0
 
     def state_dict(self) -> dict[str, Any]:
@@ -224,16 +232,19 @@ class Dataset(ReadOnly):
         self._first = self._next = state["sample"]
 
     @check_argument_types
-    def shard(self, index: int, of: int) -> Self:
+    def shard(self, index: int | None = None, of: int | None = None) -> Self:
         """Return one of ``of`` parts of the dataset: every ``of``-th image, starting at ``index``.
+
+        By default, these are the rank and the number of ranks of ``torch.distributed`` if it runs.
+        Use either this or PyTorch's ``DistributedSampler``.
 
         Raises:
             RequestError: ``index`` is not from 0 to ``of`` - 1.
         """
-        if not 0 <= index < of:
-            raise RequestError(f"found shard {index} of {of}; expected 0 to {of - 1}")
+        index, of = part_of(index, of)
         part = copy.copy(self)
         part._jobs = self._jobs[index::of]
+        part._passes = self._passes.copy()
         part._numbered = None
         return part
 
