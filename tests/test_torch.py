@@ -145,8 +145,8 @@ def test_messages_name_what_is_wrong():
     add = RawNoise("sony-a7r2", 3200)
     with pytest.raises(api.ImageError, match=r"shape \(3, 8, 8\)"):
         add(torch.zeros(3, 8, 8))
-    with pytest.raises(api.ImageError, match="float64"):
-        add(torch.zeros(1, 8, 8, dtype=torch.float64))
+    with pytest.raises(api.ImageError, match=r"torch.int32; expected floats"):
+        add(torch.zeros(1, 8, 8, dtype=torch.int32))
     with pytest.raises(api.RequestError, match="2, one for each mosaic"):
         add(torch.zeros(2, 1, 8, 8), ["a"])
     with pytest.raises(api.RequestError, match="sony-a7r9"):

@@ -1,12 +1,10 @@
 """The epochs of the passes over a dataset, which workers of a ``DataLoader`` share."""
 
 import os
-import sys
 import tempfile
 import weakref
 from collections.abc import Sequence
 from contextlib import suppress
-from multiprocessing import parent_process
 from pathlib import Path
 
 import numpy as np
@@ -16,23 +14,9 @@ from clpipe.base.errors import RequestError
 from clpipe.base.files import discard
 from clpipe.base.process_folder import process_folder
 from clpipe.base.system import lock_file
+from clpipe.base.workers import rank, trainer
 
 MAX_WORKERS = 1024
-
-
-def worker() -> tuple[int, int]:
-    """Return the number of this worker of a ``DataLoader``, and how many there are."""
-    data = sys.modules.get("torch.utils.data")  # a worker has imported it
-    info = data.get_worker_info() if data else None
-    return (info.id, info.num_workers) if info else (0, 1)
-
-
-def rank() -> tuple[int, int]:
-    """Return the rank of this process in ``torch.distributed``, and how many ranks there are."""
-    distributed = sys.modules.get("torch.distributed")
-    if distributed and distributed.is_available() and distributed.is_initialized():
-        return distributed.get_rank(), distributed.get_world_size()
-    return 0, 1
 
 
 def part_of(index: int | None, of: int | None) -> tuple[int, int]:
@@ -47,12 +31,6 @@ def part_of(index: int | None, of: int | None) -> tuple[int, int]:
         expected = f"0 to {of - 1}" if of else "both numbers, or none"
         raise RequestError(f"found shard {index} of {of}; expected {expected}")
     return index, of
-
-
-def _trainer() -> int:
-    """Return the id of the process that iterates: of this one, or of a worker's parent."""
-    data, parent = sys.modules.get("torch.utils.data"), parent_process()
-    return parent.pid or 0 if parent and data and data.get_worker_info() else os.getpid()
 
 
 class Passes:
@@ -75,7 +53,7 @@ class Passes:
 
     def _create(self, numbers: Sequence[int]) -> None:
         """Create the file: the number of workers, and the epoch of the next pass of each."""
-        self._trainer = _trainer()
+        self._trainer = trainer()
         self._path: Path | None = None
         self._numbers: NDArray[np.int64] = np.array(numbers, np.int64)
         if folder := process_folder():
@@ -96,7 +74,7 @@ class Passes:
 
     def _own(self) -> NDArray[np.int64]:
         """Return the numbers of this process and its workers."""
-        if self._trainer != _trainer():
+        if self._trainer != trainer():
             self._create(self._numbers.tolist())
         return self._numbers
 
@@ -125,10 +103,10 @@ class Passes:
             return int(numbers[1 + number]) - 1
 
 
-def _reopened(path: Path | None, trainer: int, numbers: Sequence[int]) -> Passes:
+def _reopened(path: Path | None, owner: int, numbers: Sequence[int]) -> Passes:
     """Return the passes of another process, for its worker, or a copy of them."""
     passes = Passes.__new__(Passes)
-    passes._path, passes._trainer, passes._numbers = path, trainer, np.array(numbers, np.int64)
+    passes._path, passes._trainer, passes._numbers = path, owner, np.array(numbers, np.int64)
     if path:
         with suppress(OSError, ValueError):
             passes._numbers = np.memmap(path, np.int64, "r+")

@@ -11,6 +11,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.types import Array
 from clpipe.base.validation import check_argument_types
+from clpipe.base.workers import Place, seed_at
 from clpipe.chain.python_words import errors_in_python
 from clpipe.chain.registry import stage_in
 from clpipe.dataset.arrays import packed, unpacked
@@ -44,7 +45,8 @@ class RawNoise(ReadOnly):
         camera: a name from ``clpipe cameras``, or the TOML file of a profile.
         iso: the ISO. ``{"log_uniform": [800, 12800]}`` or another draw is made for each mosaic.
         seed: None gives other noise in each process and at each call without a key. With a number,
-            calls without a key give the same sequence of noise in each process.
+            calls without a key give the same sequence of noise in each main process. Workers of a
+            ``DataLoader`` then have their own sequences, which ``torch.manual_seed`` determines.
         device: as for :class:`~clpipe.Pipeline`.
         **settings: as for :class:`~clpipe.Pipeline`, such as ``sensor_noise={"a": 1e-3}``.
 
@@ -74,10 +76,13 @@ class RawNoise(ReadOnly):
         self._seed = seed
         self._device = device
         self._pattern = self._pipeline("numpy").chain.filter_array.pattern
-        self._opened: tuple[int, Pipeline, np.random.Generator] | None = None
+        self._opened: tuple[int, Pipeline] | None = None
+        self._place = Place()
+        self._generator: tuple[tuple[str, ...], np.random.Generator] | None = None
 
     def __getstate__(self) -> Mapping[str, Any]:
-        return {**self.__dict__, "_opened": None}  # a device cannot leave its process
+        # A device cannot leave its process.
+        return {**self.__dict__, "_opened": None, "_generator": None}
 
     def __repr__(self) -> str:
         return f"RawNoise({self._settings['camera']!r}, {self._settings['iso']!r})"
@@ -102,7 +107,7 @@ class RawNoise(ReadOnly):
             RequestError: the key has a wrong type.
             DeviceError: there is no usable device.
         """
-        pipeline, random = self._open()
+        pipeline = self._open()
         mosaic = as_array(mosaic, "mosaic")
         shape = mosaic.shape
         channels = MOSAIC if len(shape) == 2 else shape[-3] if len(shape) in (3, 4) else 0
@@ -117,7 +122,7 @@ class RawNoise(ReadOnly):
                 "from DN, and divide by the white level minus the black level"
             )
         if key is None or isinstance(key, np.random.Generator):
-            key = f"{(key or random).integers(2**63):016x}"
+            key = f"{(key or self._random()).integers(2**63):016x}"
         if not isinstance(key, str):
             raise RequestError(f"found key {key!r}; expected a text, a generator or None")
         if mosaic.ndim == 4:
@@ -138,16 +143,23 @@ class RawNoise(ReadOnly):
         noisy = packed(noisy, self._pattern) if is_packed else noisy.reshape(clean.shape)
         return noisy.astype(clean.dtype, copy=False)
 
-    def _open(self) -> tuple[Pipeline, np.random.Generator]:
-        """Return the pipeline of this process, and its generator of names.
+    def _random(self) -> np.random.Generator:
+        """Return the generator of names in this process."""
+        words = self._place.words()
+        if self._generator is None or self._generator[0] != words:
+            seed = None if self._seed is None else seed_at(self._seed, words)
+            self._generator = words, np.random.default_rng(seed)
+        return self._generator[1]
+
+    def _open(self) -> Pipeline:
+        """Return the pipeline of this process.
 
         Raises:
             DeviceError: there is no usable device, or a parent process has opened it.
         """
         if self._opened is None or self._opened[0] != os.getpid():
-            pipeline = self._pipeline(self._device)
-            self._opened = os.getpid(), pipeline, np.random.default_rng(self._seed)
-        return self._opened[1:]
+            self._opened = os.getpid(), self._pipeline(self._device)
+        return self._opened[1]
 
     def _pipeline(self, device: str | int | None) -> Pipeline:
         return Pipeline(device=device, **self._settings)

@@ -17,9 +17,10 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import as_texts
 from clpipe.base.urls import fetched_files, is_glob, is_url, list_urls, local, path_of
+from clpipe.base.workers import worker
 from clpipe.dataset.dataset import Dataset
 from clpipe.dataset.developer import Sample
-from clpipe.dataset.passes import Passes, part_of, worker
+from clpipe.dataset.passes import Passes, part_of
 from clpipe.torch.iterable import IterableDataset
 
 

@@ -1,27 +1,29 @@
 """The raw noise of a camera as a transform of tensors."""
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
+from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import as_texts
 from clpipe.base.types import plain
 from clpipe.base.validation import check_argument_types
+from clpipe.base.workers import Place, seed_at
 from clpipe.chain.chain import Chain
 from clpipe.chain.files import load_settings
 from clpipe.chain.making import make_chain
 from clpipe.chain.paths import resolve_paths
 from clpipe.chain.python_words import errors_in_python
 from clpipe.chain.registry import stage_in
-from clpipe.chain.settings import overlay
+from clpipe.chain.settings import overlay, settings_from
 from clpipe.stage import NoiseScope, StageRole
 from clpipe.torch.table import SampleDraws, Table
 
@@ -29,23 +31,27 @@ MAX_CHAINS = 1024  # number of chains if values are drawn
 POSITION_RANGE = 512  # px; positions are drawn from a sensor that is this much larger than a sample
 
 
-class RawNoise(ReadOnly):
-    """A transform that adds the raw noise of a camera to clean mosaics, on their device.
+class RawNoise(ReadOnly, nn.Module):
+    """A module that adds the raw noise of a camera to clean mosaics, on their device.
 
     Like :class:`clpipe.RawNoise`, it runs from ``crosstalk`` to ``normalize``: sensor noise, row,
     column and pixel defects, clipping and rounding to DN. Each sample gets its own noise, and its
     own camera, ISO and other values if these are drawn. On a CPU, a sample with a key gets the same
     bits as from the chain with this ``noise_key``.
 
-    The transform is differentiable in the clean mosaic. Noise grows with the signal, clipping stops
+    Each call draws new noise, also in workers of a ``DataLoader``, in processes that were forked or
+    spawned, and in ranks. The module has no weights, and training and evaluation mode are the same.
+
+    It is differentiable in the clean mosaic. Noise grows with the signal, clipping stops
     the gradient, and rounding passes it. Poisson noise passes it, and its own derivative is 0.
 
     Args:
         camera: a name from ``clpipe cameras``, or the TOML file of a profile.
             ``{"choice": [...]}`` is drawn.
         iso: the ISO. ``{"log_uniform": [800, 12800]}`` or another draw is made for each sample.
-        seed: None gives other noise in each object. With a number, the calls of an object give the
-            same sequence of noise.
+        seed: None draws from PyTorch's generator, so that ``torch.manual_seed`` determines the
+            noise. With a number, the calls of an object give the same sequence of noise. In
+            workers of a ``DataLoader``, the sequence also depends on the worker's seed.
         config: a built-in configuration or a TOML file, or several.
         **settings: as for :class:`clpipe.Pipeline`, such as ``sensor_noise={"method": "poisson"}``.
 
@@ -74,34 +80,55 @@ class RawNoise(ReadOnly):
     ) -> None:
         camera_value = camera if isinstance(camera, Mapping) else str(camera)
         values = {**settings, "camera": camera_value, "iso": iso, "seed": seed or 0}
+        super().__init__()
         values = resolve_paths(None, plain(values))
         self._settings = overlay(load_settings(*as_texts(config)), values)
-        self._random = torch.Generator()
-        if seed is None:
-            self._random.seed()
-        else:
-            self._random.manual_seed(seed)
-        self._table: Table | None = None
-        self._cached_chain = lru_cache(maxsize=MAX_CHAINS)(self._chain)
+        self._seed = seed
+        self._place = Place()
+        self._start()
         Table([self._chain("")])  # raises an error for stages without a PyTorch version
+
+    def _start(self) -> None:
+        """Begin the sequence of noise, without any chain."""
+        self._random = torch.Generator()
+        self._seeded: tuple[str, ...] | None = None  # the place for which the generator is seeded
+        self._table: Table | None = None
+        self._chains: BoundedCache[Chain] = BoundedCache(MAX_CHAINS)
+
+    def __getstate__(self) -> dict[str, Any]:
+        caches = ("_random", "_seeded", "_table", "_chains")
+        state = {name: value for name, value in vars(self).items() if name not in caches}
+        return {**state, "_settings": self._settings.record()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._settings = settings_from(state["_settings"])
+        self._start()
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "training":  # set by train() and eval()
+            nn.Module.__setattr__(self, name, value)
+        else:
+            super().__setattr__(name, value)
 
     def __repr__(self) -> str:
         return f"RawNoise({self._settings.label})"
 
-    def __call__(self, mosaic: Tensor, key: Sequence[str] | str | None = None) -> Tensor:
+    def forward(self, mosaic: Tensor, key: Sequence[str] | str | None = None) -> Tensor:
         """Return mosaics with noise.
 
         Args:
-            mosaic: linear signal, where 0 is black and 1 is white, float32. It is (batch, 1,
-                height, width) with the camera's CFA pattern. Or it is packed as planes R, Gr, Gb,
-                B, (batch, 4, height / 2, width / 2). Gr is green in the rows of red. The batch axis
-                may be absent.
+            mosaic: linear signal, where 0 is black and 1 is white, in float16, bfloat16, float32 or
+                float64. Noise is computed in float32. The mosaic is (batch, 1, height, width) with
+                the camera's CFA pattern. Or it is packed as planes R, Gr, Gb, B, (batch, 4,
+                height / 2, width / 2). Gr is green in the rows of red. The batch axis may be
+                absent.
             key: a name for each mosaic of the batch, for repeatable noise. Pass others in each
                 epoch. Fixed patterns are then taken from the upper left corner of the sensor. None
                 draws new noise and a position on the sensor for each mosaic.
 
         Returns:
-            The noisy mosaics, of the same shape, on the same device.
+            The noisy mosaics, of the same shape and type, on the same device.
 
         Raises:
             ImageError: the tensor has a wrong shape or type.
@@ -113,8 +140,14 @@ class RawNoise(ReadOnly):
                 f"found a tensor of shape {shape}; expected mosaics, (batch, 1, height, width), "
                 "or their planes, (batch, 4, height / 2, width / 2), or one of these"
             )
+        if not mosaic.dtype.is_floating_point:
+            raise ImageError(
+                f"found {mosaic.dtype}; expected floats in signal units. Subtract the black level "
+                "from DN, and divide by the white level minus the black level"
+            )
         if mosaic.dtype != torch.float32:
-            raise ImageError(f"found {mosaic.dtype}; expected torch.float32 in signal units")
+            noisy: Tensor = self(mosaic.float(), key)
+            return noisy.to(mosaic.dtype)
         if len(shape) == 3:
             single: Tensor = self(mosaic[None], [key] if isinstance(key, str) else key)[0]
             return single
@@ -128,7 +161,8 @@ class RawNoise(ReadOnly):
             raise RequestError(
                 f"{self!r}: the cameras have several CFA patterns. Pass planes, (batch, 4, ...)"
             )
-        noisy = table.noisy(mosaics, draws)
+        with torch.autocast(mosaic.device.type, enabled=False):
+            noisy = table.noisy(mosaics, draws)
         return noisy[:, None] if shape[1] == 1 else _packed(noisy, order)
 
     def _draw(self, mosaic: Tensor, keys: Sequence[str] | None) -> "SampleDraws":
@@ -138,6 +172,7 @@ class RawNoise(ReadOnly):
         if keys is None:
             self._table = self._table or self._all_chains()
             table = self._table
+            self._seed_generator()
 
             def random(high: int, *shape: int) -> Tensor:
                 return torch.randint(high, shape, generator=self._random)
@@ -147,7 +182,7 @@ class RawNoise(ReadOnly):
             positions = [(row, column) for row, column in offsets]
             area = size[0] + POSITION_RANGE, size[1] + POSITION_RANGE
             return SampleDraws(table, chains, random(1 << 32, 2, count), positions, area)
-        chains_by_key = [self._cached_chain(key) for key in keys]
+        chains_by_key = [self._chains.get(key, partial(self._chain, key)) for key in keys]
         unique_chains = list({id(chain): chain for chain in chains_by_key}.values())
         table = Table(unique_chains)
         chains = np.array(
@@ -159,6 +194,16 @@ class RawNoise(ReadOnly):
         ]
         words = torch.tensor([[s.key0 for s in streams], [s.key1 for s in streams]])
         return SampleDraws(table, chains, words, [(0, 0)] * count, size)
+
+    def _seed_generator(self) -> None:
+        """Seed the generator for a call, or once in each place if the object has a seed."""
+        words = self._place.words()
+        if self._seed is None:
+            number = int(torch.randint(1 << 62, ()))  # a worker's generator has its own seed
+            self._random.manual_seed(seed_at(number, words))
+        elif words != self._seeded:
+            self._random.manual_seed(seed_at(self._seed, words))
+            self._seeded = words
 
     def _all_chains(self) -> "Table":
         """Return the chains to draw from: a single chain if no value is drawn."""
