@@ -5,6 +5,7 @@ import itertools
 import multiprocessing
 import os
 import pickle
+import shutil
 import tarfile
 import threading
 from concurrent.futures import ProcessPoolExecutor
@@ -16,12 +17,13 @@ from PIL import Image
 
 import clpipe as api
 from clpipe.base.errors import DeviceError, ImageError, RequestError
-from clpipe.dataset import prefetch
+from clpipe.dataset import prefetch, render_cache
 from clpipe.dataset.render_cache import RenderCache
 from clpipe.dataset.samples import SampleLoader
 from clpipe.engine.buffers import is_planar
 from clpipe.images.read import SourceImage
 from clpipe.inputs.loader import ImageLoader
+from tests.conftest import run_python
 from tests.conftest import same_samples as same
 
 ISO = 3200  # a chain that other tests compile too
@@ -325,6 +327,63 @@ def test_a_render_in_planes_stays_in_planes(tmp_path):
     for pixels in (found[0], found[1].pixels):
         assert is_planar(pixels) and np.array_equal(pixels, image.pixels)
         assert not pixels.flags.writeable
+
+
+def test_a_miss_costs_the_same_however_much_is_cached(monkeypatch):
+    image = SourceImage(np.ones((2, 3, 3), np.float16), "", "", (), {})
+    kept = RenderCache(20 * image.pixels.nbytes)
+    other = pickle.loads(pickle.dumps(kept))  # a worker's
+    calls = []
+    for name in ("stat", "listdir", "scandir"):
+        real = getattr(os, name)
+        monkeypatch.setattr(os, name, lambda *a, real=real, **k: calls.append(a) or real(*a, **k))
+    counts = []
+    for number in range(15):
+        calls.clear()
+        kept.get(number, lambda: image)
+        counts.append(len(calls))
+    assert len(set(counts)) == 1
+    for number in range(10, 30):
+        assert other.get(number, lambda: image).pixels.shape == (2, 3, 3)
+    assert kept.size_in_bytes == other.size_in_bytes == 20 * image.pixels.nbytes
+    assert len(list(kept._folder.glob("*.npy"))) == 20
+
+
+def test_a_render_that_cannot_be_written_does_not_count(monkeypatch):
+    image = SourceImage(np.ones((2, 3, 3), np.float16), "", "", (), {})
+    kept = RenderCache(1000)
+    with monkeypatch.context() as patch:
+        patch.setattr(render_cache, "_write", lambda *_: False)
+        kept.get("a", lambda: image)
+    assert kept.size_in_bytes == 0
+    assert kept.get("a", lambda: image).pixels.flags.writeable is False  # mapped now
+    shutil.rmtree(kept._folder)
+    assert kept.get("b", lambda: image) is image
+
+
+KILLED = """
+import os, signal, clpipe
+data = clpipe.StreamingDataset("a.tar", device="numpy", stages=["exposure"])
+samples = iter(data)
+next(samples)
+for folder, _, names in os.walk(os.environ["TMPDIR"]):
+    print(folder, names)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.slow
+def test_what_a_killed_process_leaves_the_next_one_removes(renders, tmp_path):
+    with tarfile.open("a.tar", "w") as tar:
+        tar.add("in/r0.exr", "r0.exr")
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    left = run_python("-c", KILLED, TMPDIR=temporary, status=-9).stdout
+    assert "r0.exr" in left and ".npy" in left
+    assert [path for path in temporary.rglob("*") if path.suffix in (".exr", ".npy")]
+    following = "from clpipe.base.process_folder import process_folder; process_folder()"
+    run_python("-c", following, TMPDIR=temporary)
+    assert [path for path in temporary.rglob("*") if path.is_file()] == []
 
 
 def test_tars_are_streamed(renders, monkeypatch):

@@ -6,6 +6,7 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Hashable
+from contextlib import suppress
 from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
@@ -14,10 +15,13 @@ import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import atomic_file, unsynced_files
+from clpipe.base.process_folder import process_folder
+from clpipe.base.system import lock_file
 from clpipe.engine.buffers import is_planar
 from clpipe.images.read import SourceImage
 
 MAX_OPEN = 4096  # files that a process maps at a time
+TOTAL = "total"  # a file with the bytes of all pixels, so that a miss need not list the others
 
 
 class RenderCache:
@@ -25,8 +29,8 @@ class RenderCache:
 
     Each worker of a ``DataLoader`` gets a copy of the dataset with the path of the cache. Workers
     share decoded renders, whose pages are in memory once. When the files take ``size`` bytes,
-    further renders are decoded each time. The cache is a temporary directory. It belongs to the
-    process that created it, and is removed with the dataset there.
+    further renders are decoded each time. The cache is a temporary directory of the process that
+    created it, and is removed with the dataset. If the process is killed, a later one removes it.
 
     Args:
         size: the bytes of all files. 0 keeps none.
@@ -45,13 +49,13 @@ class RenderCache:
         self._folder: Path | None = None
         self._opened: dict[Hashable, SourceImage] = {}
         if size:
-            try:
-                self._folder = Path(tempfile.mkdtemp(prefix="clpipe-renders-"))
-            except OSError as error:
+            if not (place := process_folder()):
                 raise RequestError(
-                    f"cache: the temporary directory for decoded renders cannot be created "
-                    f"({error.strerror}). Set TMPDIR to a writable directory, or cache=0"
-                ) from None
+                    "cache: the temporary directory for decoded renders cannot be created. Set "
+                    "TMPDIR to a writable directory with free space, or cache=0"
+                )
+            self._folder = Path(tempfile.mkdtemp(prefix="renders-", dir=place))
+            np.zeros(1, np.int64).tofile(self._folder / TOTAL)
             weakref.finalize(self, _remove, self._folder, os.getpid())
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -60,9 +64,34 @@ class RenderCache:
     @property
     def size_in_bytes(self) -> int:
         """The bytes of all pixels in the cache."""
-        # Names with a leading dot are unfinished files.
-        files = list(self._folder.glob("[!.]*.npy")) if self._folder else []
-        return sum(file.stat().st_size - HEADER for file in files)
+        return int(np.fromfile(self._folder / TOTAL, np.int64)[0]) if self._folder else 0
+
+    def _add(self, size: int) -> bool:
+        """Add bytes to the total, and return whether they fit."""
+        assert self._folder
+        with open(self._folder / TOTAL, "r+b") as file:
+            lock_file(file.fileno(), exclusive=True)
+            total = int(np.fromfile(file, np.int64)[0]) + size
+            if total > self._size:
+                return False
+            file.seek(0)
+            file.write(np.int64(total).tobytes())
+        return True
+
+    def _store(self, path: Path, source: SourceImage) -> None:
+        """Write a render to a path in the cache, if it fits and no process has begun to."""
+        if source.pixels.nbytes > self._size - self.size_in_bytes:
+            return
+        marker = path.with_suffix(".begun")
+        try:
+            marker.touch(exist_ok=False)
+        except OSError:
+            return
+        if not self._add(source.pixels.nbytes):
+            marker.unlink()
+        elif not _write(path, source):
+            self._add(-source.pixels.nbytes)
+            marker.unlink()
 
     def get(self, key: Hashable, decode: Callable[[], SourceImage]) -> SourceImage:
         """Return a render.
@@ -79,16 +108,15 @@ class RenderCache:
         path = self._folder / name
         if (opened := _open_mapped(path)) is None:
             source = decode()
-            if self.size_in_bytes + source.pixels.nbytes > self._size or not _write(path, source):
+            with suppress(OSError):  # another program may remove temporary files
+                self._store(path, source)
+            opened = _open_mapped(path)
+            if opened is None:
                 return source
-            opened = _open_mapped(path) or source
         if len(self._opened) >= MAX_OPEN:
             self._opened.clear()
         self._opened[key] = opened
         return opened
-
-
-HEADER = 128  # bytes; the header of .npy files
 
 
 def _open_mapped(path: Path) -> SourceImage | None:

@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Self
 
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.process_folder import process_folder
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import as_texts
 from clpipe.base.urls import fetched_files, is_glob, is_url, list_urls, local, path_of
@@ -163,7 +164,7 @@ class StreamingDataset(ReadOnly, IterableDataset):
             )
         first = start.get("tar", 0)
         with (
-            tempfile.TemporaryDirectory(prefix="clpipe-tars-") as folder,
+            tempfile.TemporaryDirectory(prefix="tars-", dir=process_folder()) as folder,
             ThreadPoolExecutor(1, "unpack") as unpacker,
         ):
             tars = self._tars[rank::ranks][number::count]
