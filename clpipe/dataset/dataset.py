@@ -236,7 +236,7 @@ class Dataset(ReadOnly):
         """Return one of ``of`` parts of the dataset: every ``of``-th image, starting at ``index``.
 
         By default, these are the rank and the number of ranks of ``torch.distributed`` if it runs.
-        Use either this or PyTorch's ``DistributedSampler``.
+        Use either this or PyTorch's sampler for distributed runs.
 
         Raises:
             RequestError: ``index`` is not from 0 to ``of`` - 1.
