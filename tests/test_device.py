@@ -1,10 +1,13 @@
 """The choice of a device, and the limits of devices."""
 
+import ctypes.util
+import json
 import struct
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +18,7 @@ from clpipe.base.errors import DeviceError, ImageError
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.commands.devices import device_rows
-from clpipe.engine import hardware
+from clpipe.engine import hardware, vendors
 from clpipe.engine.buffers import Pool
 from clpipe.engine.cpu_target import Target
 from clpipe.engine.device import Device, open_devices
@@ -25,6 +28,7 @@ from clpipe.engine.hardware import Hardware, hardware_of
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Runner
 from clpipe.engine.runtimes import lanes_for
+from tests.conftest import STILL_LIFE
 
 
 @pytest.fixture
@@ -77,6 +81,8 @@ def test_lanes(type_, platform, target, width, lanes):
         ("pocl", "slow"),
         ("portable", "slow"),
         ("FAST", "fast"),
+        ("cpu", "slow"),
+        ("GPU", "fast"),
         ("oclgrind", "grind"),
     ],
 )
@@ -89,6 +95,9 @@ def test_devices_that_cannot_be_used(devices, monkeypatch):
         choose("broken", devices)
     with pytest.raises(DeviceError, match=r"no usable OpenCL device .*an emulator.*no compiler"):
         choose(None, devices[1:3])
+    named_gpu = replace(devices[0], name="a CPU, no GPU")
+    with pytest.raises(DeviceError, match=r"no OpenCL runtime offers a GPU\. Install the GPU's"):
+        choose("gpu", [named_gpu])
     with pytest.raises(DeviceError, match=r"unknown device 'x'.*0: slow.*numpy"):
         choose("x", devices)
     with pytest.raises(DeviceError, match="no OpenCL platform"):
@@ -98,6 +107,24 @@ def test_devices_that_cannot_be_used(devices, monkeypatch):
         DeviceError, match=r"was found .OCL_ICD_VENDORS is '/nowhere'.. On this machine, try"
     ):
         choose(None, [])
+
+
+def test_drivers_that_do_not_load_are_named(monkeypatch, clpipe):
+    library = Path(ctypes.util.find_library("c") or "libc.so.6")
+    files = {
+        "good.icd": f"{library}\n",
+        "gone.icd": "libclpipe-none.so\n",
+        "empty.icd": "",
+    }
+    monkeypatch.setattr(vendors, "icd_files", lambda: [(Path(n), t) for n, t in files.items()])
+    found = vendors.unloadable_drivers()
+    assert found.keys() == {"gone.icd", "empty.icd"}
+    assert "libclpipe-none.so: cannot open shared object file" in found["gone.icd"]
+    output = clpipe("devices").stdout
+    assert "gone.icd: its library cannot be loaded" in output and "empty.icd: it is" in output
+    assert json.loads(clpipe("devices", "--json").stdout)["unloadable_drivers"] == found
+    failed = clpipe("run", STILL_LIFE, "-o", "out", "--device", "gpu", status=3).stderr
+    assert "no OpenCL runtime offers a GPU. gone.icd: its library" in failed
 
 
 def test_several_devices_are_chosen(devices):

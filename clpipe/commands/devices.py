@@ -12,6 +12,7 @@ from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.discovery import DeviceInfo, choose, find_devices
 from clpipe.engine.programs import CacheState, cache_state
+from clpipe.engine.vendors import unloadable_drivers
 
 
 @click.command("devices", cls=Command)
@@ -23,8 +24,9 @@ def devices(as_json: bool) -> None:
     """
     found = find_devices(retest=True)
     rows, cache = device_rows(found), cache_state(found)
+    broken = unloadable_drivers()
     if as_json:
-        show_json({"devices": rows, "kernel_cache": asdict(cache)})
+        show_json({"devices": rows, "unloadable_drivers": broken, "kernel_cache": asdict(cache)})
         return
     shown = [{key: v for key, v in row.items() if key != "target_reason"} for row in rows]
     show([key.replace("_", " ") for key in shown[0]], [[*map(str, r.values())] for r in shown])
@@ -32,6 +34,8 @@ def devices(as_json: bool) -> None:
         if row["target"]:
             lanes = f"{row['lanes']} lanes"
             click.echo(f"{row['index']}: for {row['target']}, {lanes}: {row['target_reason']}")
+    for path, reason in broken.items():
+        click.echo(f"{path}: {reason}")
     click.echo(cache_text(cache))
 
 

@@ -25,7 +25,7 @@ from clpipe.engine.runtimes import (
     platform_id,
     type_of,
 )
-from clpipe.engine.vendors import platforms
+from clpipe.engine.vendors import platforms, unloadable_drivers
 from clpipe.engine.verdicts import Verdicts, verdicts
 
 # Bytes of address space: of PoCL while it compiles, and of one thread per processor.
@@ -33,6 +33,7 @@ POCL_ADDRESS_SPACE = 256 << 20
 THREAD_ADDRESS_SPACE = 8 << 20
 
 NO_TARGET = Target("", "")
+TYPES = ("GPU", "CPU")  # selectors that demand a type of device
 
 _process: int | None = None  # the process id that first used OpenCL, here or before a fork
 
@@ -203,8 +204,8 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
     """Return the device that a selector names, or by default the usable device of least rank.
 
     Args:
-        selector: an index from ``clpipe devices``, or a part of a device's or platform's name.
-            None is the default.
+        selector: an index from ``clpipe devices``, "gpu" or "cpu", or a part of a device's or
+            platform's name. None is the default.
         devices: the devices of this machine.
 
     Raises:
@@ -220,6 +221,13 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
             for d in devices
             if (selector == str(d.index) if selector.isdecimal() else matches(selector, d))
         ]
+        if not matching and selector.upper() in TYPES:
+            broken = "".join(f" {p}: {reason}." for p, reason in unloadable_drivers().items())
+            driver = "the GPU's driver" if selector.upper() == "GPU" else "an OpenCL runtime"
+            raise DeviceError(
+                f"no OpenCL runtime offers a {selector.upper()}.{broken} Install {driver}, or "
+                "choose another device. To list all, run clpipe devices."
+            )
         if not matching:
             names = [f"{d.index}: {d.label}" for d in devices]
             raise DeviceError(unknown_name("device", selector, [*names, "numpy"]))
@@ -292,7 +300,9 @@ def devices_of_process(devices: list[DeviceInfo], index: int, count: int) -> lis
 
 
 def matches(selector: str, device: DeviceInfo) -> bool:
-    """Return whether a selector is a part of a device's name, type or platform, or "pocl"."""
+    """Return whether a selector is a device's type, a part of its name or platform, or "pocl"."""
+    if selector.upper() in TYPES:
+        return device.type == selector.upper()
     alias = " pocl" if is_pocl(device.platform) else ""
     names = f"{device.name} {device.platform} {device.type}{alias}"
     return bool(selector) and selector.lower() in names.lower()

@@ -5,6 +5,7 @@ package is in a folder that loaders do not search, and names a missing path.
 """
 
 import os
+import subprocess
 import sys
 import tempfile
 from collections.abc import Collection, Iterator
@@ -18,6 +19,7 @@ from clpipe.base.extras import install_command
 from clpipe.base.process_folder import process_folder
 from clpipe.engine.cache_folder import prepare_environment
 
+LIMIT = 60  # seconds to load a driver's library
 PACKAGE, LIBRARY = "intel-opencl-rt", "libintelocl.so"
 # Each of these variables names the folders or files of platforms. clpipe sets the first one.
 VARIABLES = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES", "OPENCL_VENDOR_PATH")
@@ -45,6 +47,29 @@ def icd_files() -> list[tuple[Path, str]]:
             found.append((path, path.read_text("utf-8")))
         except (OSError, UnicodeDecodeError):
             found.append((path, ""))
+    return found
+
+
+def unloadable_drivers() -> dict[str, str]:
+    """Return the .icd files whose library cannot be loaded, with the reason.
+
+    Loaders skip such files without a message. A child process loads each library, because a broken
+    one may crash it.
+    """
+    found = {}
+    for path, text in icd_files():
+        if not text.strip():
+            found[str(path)] = "it is empty or cannot be read"
+            continue
+        command = [sys.executable, "-c", "import ctypes, sys; ctypes.CDLL(sys.argv[1])"]
+        with suppress(OSError, subprocess.TimeoutExpired):
+            done = subprocess.run(  # noqa: S603 - the file that the loader itself loads
+                [*command, text.strip()], capture_output=True, timeout=LIMIT, check=False
+            )
+            if done.returncode:
+                lines = done.stderr.decode("utf-8", "replace").strip().splitlines()
+                reason = lines[-1].removeprefix("OSError: ") if lines else "it crashes the process"
+                found[str(path)] = f"its library cannot be loaded: {reason}"
     return found
 
 
