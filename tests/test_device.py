@@ -123,6 +123,8 @@ def test_drivers_that_do_not_load_are_named(monkeypatch, clpipe):
     output = clpipe("devices").stdout
     assert "gone.icd: its library cannot be loaded" in output and "empty.icd: it is" in output
     assert json.loads(clpipe("devices", "--json").stdout)["unloadable_drivers"] == found
+    if any(each.type == "GPU" for each in find_devices()):
+        return
     failed = clpipe("run", STILL_LIFE, "-o", "out", "--device", "gpu", status=3).stderr
     assert "no OpenCL runtime offers a GPU. gone.icd: its library" in failed
 

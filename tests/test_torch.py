@@ -70,6 +70,15 @@ def test_every_camera_has_its_bits():
         assert np.array_equal(found, of_chain(raw, camera, iso, "k")), camera
 
 
+def test_neighbours_of_a_larger_array_have_its_bits():
+    raw, effects = mosaics(2, 16, 13), {name: ALL[name] for name in ("crosstalk", "blooming")}
+    for camera in ("fujifilm-x-t3", "sony-a7r2", "sony-imx686-quad"):
+        iso = api.load_camera(camera).iso_range[1]
+        found = RawNoise(camera, iso, **effects)(torch.from_numpy(raw)[:, None], ["k", "l"])
+        for mosaic, noisy, key in zip(raw, found.numpy()[:, 0], "kl", strict=True):
+            assert np.array_equal(noisy, of_chain(mosaic, camera, iso, key, **effects)), camera
+
+
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_planes_are_their_mosaic(pattern):
     raw = mosaics(12, 8)

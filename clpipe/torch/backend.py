@@ -15,7 +15,7 @@ from torch import Tensor
 
 from clpipe.base.types import Floats
 from clpipe.chain.chain import Step
-from clpipe.reference.image import mirror
+from clpipe.reference.filter_array import periodic_indices
 from clpipe.reference.random import Stream
 from clpipe.stage.signal import Backend, ExtraArguments, no_arguments
 from clpipe.torch import numbers
@@ -23,17 +23,6 @@ from clpipe.torch.numbers import Streams, f32
 from clpipe.torch.poisson import poisson_of
 
 MAX_CACHED_MAPS = 256  # cached sensor maps, each a few MB at most
-
-
-def tapped(y: Tensor, dx: int, dy: int) -> Tensor:
-    """The counterpart of :func:`clpipe.reference.image.tap`."""
-    if dx:
-        columns = mirror(np.arange(y.shape[2]) + dx, y.shape[2])
-        y = y[:, :, torch.from_numpy(columns).to(y.device)]
-    if dy:
-        rows = mirror(np.arange(y.shape[1]) + dy, y.shape[1])
-        y = y[:, torch.from_numpy(rows).to(y.device)]
-    return y
 
 
 def tukey_lambda_of(words: Tensor, shape: Tensor, scale: Tensor) -> Tensor:
@@ -98,7 +87,22 @@ class TorchBackend(Backend):
     rounded = staticmethod(StraightThroughRound.apply)
     photons = staticmethod(PoissonNumbers.apply)
     tukey_lambda = staticmethod(tukey_lambda_of)
-    tap = staticmethod(tapped)
+
+    def tap(self, image: Tensor, dx: int, dy: int) -> Tensor:
+        """The counterpart of :meth:`clpipe.stage.signal.NumpyBackend.tap`."""
+        for axis, distance in ((1, dy), (2, dx)):
+            if not distance:
+                continue
+            size, reach = image.shape[axis], abs(distance)
+            rows = {
+                period: periodic_indices(size, period, reach)[reach + distance :][:size]
+                for period in {step.context.filter_array.period[axis - 1] for step in self.steps}
+            }
+            each = [rows[step.context.filter_array.period[axis - 1]] for step in self.steps]
+            indices = torch.from_numpy(np.array(each if len(rows) > 1 else each[:1]))
+            shape = (len(indices), size, 1) if axis == 1 else (len(indices), 1, size)
+            image = torch.take_along_dim(image, indices.reshape(shape).to(image.device), axis)
+        return image
 
     @staticmethod
     def in_upper_half(words: Tensor) -> Tensor:
