@@ -236,7 +236,8 @@ if __name__ == "__main__":
     expected = None
     every = ((0, False), (1, False), (1, True), (2, False), (2, True))
     # Other methods than fork start slowly.
-    for count, persistent in every if method == "fork" else every[-2:]:
+    settings = {"fork": every, "spawn": every[3:4], "forkserver": every[4:]}[method]
+    for count, persistent in settings:
         setting = method, count, persistent
         stream = loader(clpipe.StreamingDataset("t-*.tar", **OPTIONS), count, persistent, method)
         dataset = clpipe.Dataset("in", **OPTIONS)
