@@ -151,6 +151,27 @@ def test_a_stream_continues_where_its_state_was_saved(tars, stop):
         api.StreamingDataset("t-00.tar", **OPTIONS).load_state_dict(state)
 
 
+def test_workers_load_states_of_their_own(tars, monkeypatch):
+    """As torchdata's StatefulDataLoader calls them, one after the other begins."""
+    dataset, states, parts, expected = api.StreamingDataset(tars, epoch=4, **OPTIONS), [], [], []
+    for number in range(2):
+        worker = pickle.loads(pickle.dumps(dataset))
+        in_worker(monkeypatch, number, 2)
+        iteration = iter(worker)
+        parts += [next(iteration)]
+        states.append(worker.state_dict())
+        expected += [*parts[-1:], *iteration]
+    for number, state in enumerate(states):
+        worker = pickle.loads(pickle.dumps(dataset))
+        in_worker(monkeypatch, number, 2)
+        worker.load_state_dict(state)
+        parts += list(worker)
+    assert sorted(keys(parts)) == sorted(keys(expected)) and noise(parts) == noise(expected)
+    for number in range(2):
+        in_worker(monkeypatch, number, 2)
+        assert {epoch for _, epoch in keys(dataset)} == {5}
+
+
 def test_a_state_belongs_to_its_worker(tars, monkeypatch):
     dataset = api.StreamingDataset(tars, **OPTIONS)
     next(iter(dataset))

@@ -199,8 +199,8 @@ def list_urls(url: str) -> list[str]:
     prefix = f"{scheme}://{fixed}{'/' * bool(fixed)}"
 
     def work(system: Any, path: str) -> list[str]:
-        system.invalidate_cache()
         root = path.rstrip("/").removesuffix(rest[len(fixed) :].rstrip("/")).rstrip("/")
+        _forget_listing(system, root)
         found: Iterable[str] = ()
         with contextlib.suppress(FileNotFoundError):
             if is_glob(url):
@@ -214,6 +214,19 @@ def list_urls(url: str) -> list[str]:
         return sorted(f"{prefix}{name}".rstrip("/") + url[len(inner) :] for name in names)
 
     return _with_retries(url, work, RequestError, "listed")
+
+
+def _forget_listing(system: Any, folder: str) -> None:
+    """Make a file system list a folder and all folders in it again. It keeps other listings.
+
+    A run lists its inputs before its output, and the listing of inputs has all their stamps.
+    """
+    if not folder:
+        system.invalidate_cache()
+        return
+    system.invalidate_cache(folder)
+    for name in [each for each in system.dircache if each.startswith(f"{folder}/")]:
+        system.dircache.pop(name, None)
 
 
 def stamp_of_url(url: str) -> tuple[int, int]:
@@ -271,7 +284,7 @@ def upload(path: Path, url: str) -> None:
 
     def work(system: Any, remote: str) -> None:
         system.put_file(str(path), remote)
-        system.invalidate_cache()
+        system.invalidate_cache(remote)
         if (size := system.info(remote).get("size")) != path.stat().st_size:
             raise OSError(f"only {size} of {path.stat().st_size} bytes were written")
 

@@ -3,8 +3,8 @@
 import os
 import tempfile
 import weakref
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -84,9 +84,19 @@ class Passes:
         numbers = self._own()
         return int(numbers[1 : 1 + max(int(numbers[0]), 1)].max())
 
-    def set(self, epoch: int) -> None:
-        """Set the epoch of the next pass of every worker."""
-        self._own()[:] = [0, *[epoch] * MAX_WORKERS]
+    def set(self, epoch: int, number: int = 0, count: int = 1) -> None:
+        """Set the epoch of the next pass: of every worker, or of one of several."""
+        numbers = self._own()
+        with self._locked():
+            if count == 1 or numbers[0] != count:
+                numbers[:] = [count if count > 1 else 0, *[epoch] * MAX_WORKERS]
+            numbers[1 + number] = epoch
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        with open(self._path or os.devnull, "rb") as file:
+            lock_file(file.fileno(), exclusive=True)
+            yield
 
     def begin(self, number: int, count: int) -> int:
         """Count a pass of one of ``count`` workers, and return its epoch.
@@ -95,8 +105,7 @@ class Passes:
         start with the epoch after the last one.
         """
         numbers = self._own()
-        with open(self._path or os.devnull, "rb") as file:
-            lock_file(file.fileno(), exclusive=True)
+        with self._locked():
             if numbers[0] != count:
                 numbers[:] = [count, *[self.epoch] * MAX_WORKERS]
             numbers[1 + number] += 1

@@ -137,8 +137,8 @@ class StreamingDataset(ReadOnly, IterableDataset):
                 "the state belongs to a dataset with other tars. Create the dataset with the tars "
                 "that it had when the state was saved"
             )
-        self.set_epoch(state["epoch"])
-        self._start = dict(state)
+        self._passes.set(state["epoch"], *worker())  # each worker has its own state
+        self._start, self._samples = dict(state), None
 
     def _digest(self) -> str:
         return hashlib.sha256("\0".join(self._tars).encode()).hexdigest()
