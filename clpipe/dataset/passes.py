@@ -62,7 +62,7 @@ class Passes:
                 with open(file, "wb") as opened:
                     self._numbers.tofile(opened)
                 self._path = Path(name)
-                self._numbers = np.memmap(name, np.int64, "r+")
+                self._numbers = _mapped(self._path)
                 weakref.finalize(self, _remove, self._path, os.getpid())
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -82,7 +82,8 @@ class Passes:
     def epoch(self) -> int:
         """The epoch of the next pass."""
         numbers = self._own()
-        return int(numbers[1 : 1 + max(int(numbers[0]), 1)].max())
+        count = int(numbers[0])
+        return int(numbers[1] if count <= 1 else numbers[1 : 1 + count].max())
 
     def set(self, epoch: int, number: int = 0, count: int = 1) -> None:
         """Set the epoch of the next pass: of every worker, or of one of several."""
@@ -112,13 +113,17 @@ class Passes:
             return int(numbers[1 + number]) - 1
 
 
+def _mapped(path: Path) -> NDArray[np.int64]:
+    return np.memmap(path, np.int64, "r+").view(np.ndarray)  # its items cost fewer calls
+
+
 def _reopened(path: Path | None, owner: int, numbers: Sequence[int]) -> Passes:
     """Return the passes of another process, for its worker, or a copy of them."""
     passes = Passes.__new__(Passes)
     passes._path, passes._trainer, passes._numbers = path, owner, np.array(numbers, np.int64)
     if path:
         with suppress(OSError, ValueError):
-            passes._numbers = np.memmap(path, np.int64, "r+")
+            passes._numbers = _mapped(path)
     return passes
 
 
