@@ -95,6 +95,69 @@ def bucket(write_exr, clpipe, monkeypatch):
     Flaky.rate, Flaky.forbidden = 0.0, ""
 
 
+class Listed(Flaky):
+    """A bucket that answers from listings, like those of S3, and counts requests."""
+
+    protocol = "listed"
+    async_impl = True  # one instance for all threads, like that of S3
+    requests: ClassVar = Counter()
+
+    @classmethod
+    def _strip_protocol(cls, path):
+        return MemoryFileSystem._strip_protocol(path.replace("listed://", "memory://"))
+
+    def unstrip_protocol(self, name):
+        return f"listed:/{name}"
+
+    def find(self, path, *arguments, **more):
+        self.requests["list"] += 1
+        found = super().find(path, detail=True)
+        for name in found:
+            parent = self._parent(name)
+            if parent not in self.dircache:
+                self.dircache[parent] = [
+                    each for each in found.values() if self._parent(each["name"]) == parent
+                ]
+        return sorted(found)
+
+    def info(self, path, **more):
+        path = self._strip_protocol(path)
+        known = self.dircache.get(self._parent(path), ())
+        for info in known:
+            if info["name"] == path:
+                return info
+        self.requests[f"head {path}"] += 1
+        return super().info(path, **more)
+
+    def invalidate_cache(self, path=None):
+        if path is None:
+            self.dircache.clear()
+        while path:
+            path = path.rstrip("/")
+            self.dircache.pop(path, None)
+            path = self._parent(path) if path.strip("/") else ""
+
+
+def test_inputs_of_a_listing_need_no_request_each(bucket, clpipe):
+    fsspec.register_implementation("listed", Listed, clobber=True)
+    command = ("run", "listed://b/renders", "-o", "listed://b/set", "--webdataset", 4, *RUN)
+
+    def requests():
+        Listed.requests.clear()
+        done = clpipe(*command)
+        heads = [name for name in Listed.requests if name.startswith("head /b/renders")]
+        return done.stderr, heads
+
+    assert requests()[1] == []
+    assert requests() == (requests()[0], [])
+    assert "(7 of them were there already)" in requests()[0]
+    assert sum(Listed.requests.values()) <= 10
+    # The next listing sees what has changed.
+    bucket.pipe_file("/b/renders/x0/r0.exr", bucket.cat_file("/b/renders/x1/r1.exr"))
+    stderr, heads = requests()
+    assert "already" in stderr and "(7 of them" not in stderr and heads == []
+
+
 def tars(system, folder="/b/set"):
     """The members of each tar, with their bytes."""
     found = {}
