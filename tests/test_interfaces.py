@@ -1,5 +1,6 @@
 """Messages speak in the interface that the user used: Python, or the command line."""
 
+import ast
 import re
 import warnings
 from pathlib import Path
@@ -142,3 +143,19 @@ def test_wrong_words_of_a_command(files, clpipe, words, message):
 def test_an_archive_is_named_as_a_url(files, clpipe):
     Path("a.zip").write_bytes(b"none")
     assert "name zip://::FILE.zip" in clpipe("run", "a.zip", "-o", "o", status=2).stderr
+
+
+@pytest.mark.parametrize(
+    ("settings", "draw"),
+    [
+        ({"iso": (100, 6400)}, "iso={'log_uniform': [100, 6400]}"),
+        ({"iso": [100, 800, 3200]}, "iso={'choice': [100, 800, 3200]}"),
+        ({"camera": ["sony-a7r2", "canon-6d"]}, "camera={'choice': ['sony-a7r2', 'canon-6d']}"),
+    ],
+)
+def test_a_list_instead_of_a_draw(settings, draw):
+    with pytest.raises(package.RequestError) as caught:
+        package.Pipeline(device="numpy", **settings)
+    assert str(caught.value).endswith(f"; to draw it for each image, use {draw}")
+    name, values = draw.split("=", 1)
+    package.Pipeline(device="numpy", **{name: ast.literal_eval(values)})

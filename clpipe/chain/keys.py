@@ -156,7 +156,12 @@ def check_type(key: str, value: Any) -> None:
         KeyedError: it is not.
     """
     if (known := KEYS.get(key)) and not known.allows(value):
-        raise KeyedError(key, f"{key}: found {value!r}, but expected {known.allowed}")
+        hint = ""
+        if known.is_drawn and isinstance(value, list | tuple):
+            is_range = known.type_ is float and len(value) == 2
+            draw = {"log_uniform" if is_range else "choice": list(value)}
+            hint = f"; to draw it for each image, use {key}={draw}"
+        raise KeyedError(key, f"{key}: found {value!r}, but expected {known.allowed}{hint}")
 
 
 def set_dotted(values: dict[str, Any], key: str, value: Any) -> None:

@@ -73,7 +73,8 @@ def exposures(jobs: Sequence[Job], settings: Settings, in_sequences: bool = Fals
         if len(files) % count:
             raise RequestError(
                 f"{folder}: {stage_in(StageRole.SHUTTER).name}.subframes is {count}, but this "
-                f"{what} has {len(files)} images; provide a multiple of {count}"
+                f"{what} has {len(files)} image{'s' * (len(files) != 1)}; provide a multiple of "
+                f"{count}"
             )
         for start in range(0, len(files), count):
             first, *others = files[start : start + count]
