@@ -8,11 +8,13 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, lru_cache
 from importlib import import_module
+from importlib.machinery import SourceFileLoader
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from threading import RLock
 from types import ModuleType
+from typing import Never
 
 import numpy as np
 from pydantic import ValidationError
@@ -98,9 +100,21 @@ def code_files(stage_files: Iterable[Path]) -> list[Path]:
     return files
 
 
+class _SourceLoader(SourceFileLoader):
+    """Loads a stage file from its text.
+
+    Python's bytecode may be that of an earlier text with the same size, of the same second.
+    """
+
+    def path_stats(self, path: str) -> Never:
+        raise OSError("no bytecode")  # the loader then neither reads nor writes it
+
+
 def _load_file(path: Path, real_path: Path) -> Stage:
     if real_path not in _from_files:
-        spec = spec_from_file_location(f"clpipe_stage_{path.stem}", real_path)
+        name = f"clpipe_stage_{path.stem}"
+        loader = _SourceLoader(name, str(real_path))
+        spec = spec_from_file_location(name, real_path, loader=loader)
         if path.suffix != ".py" or spec is None or spec.loader is None:
             raise RequestError(f"{path}: a stage file is a Python file; use one that ends in .py")
         check_exists(path)
