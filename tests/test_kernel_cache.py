@@ -157,11 +157,12 @@ def test_a_program_that_cannot_be_stored_is_named_once(tmp_path, monkeypatch, ca
 
 def test_the_key_has_all_that_determines_compiled_kernels(device, monkeypatch):
     info = device.info
-    key = partial(runtimes.compiler_key, info.handle.platform, info.handle, info.target)
+    driver = info.handle.platform
+    key = partial(runtimes.compiler_key, driver, info.handle, info.target)
     first = key()
-    library = runtimes.library_of(info.handle.platform.int_ptr)
     if sys.platform == "linux":
-        assert library.is_file() and str(library) in first[1]
+        path = runtimes.library_of(driver.int_ptr)
+        assert path.is_file() and str(path) in first[1]
     for name in ("POCL_EXTRA_BUILD_FLAGS", "POCL_WORK_GROUP_METHOD", "CL_CONFIG_CPU_TARGET_ARCH"):
         with monkeypatch.context() as patch:
             patch.setenv(name, "-DX")

@@ -81,7 +81,7 @@ def load_stage_file(path: Path) -> Stage:
 
 
 def loaded_stage_files(stages: Iterable[str]) -> list[Path]:
-    """Return the files of those of the named stages that stage files define."""
+    """Return the loaded stage files whose stage is one of the named stages."""
     names = set(stages)
     return [path for path, stage in _from_files.items() if stage.name in names]
 
