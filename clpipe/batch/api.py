@@ -10,7 +10,8 @@ from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
 from clpipe.base.text import as_texts
 from clpipe.base.types import plain
-from clpipe.base.urls import local_path, path_of
+from clpipe.base.url_text import local_path
+from clpipe.base.urls import path_of
 from clpipe.base.validation import check_argument_types
 from clpipe.batch.clips import parse_bit_rate, parse_rate, take_clip_options
 from clpipe.batch.execution import ExecutionOptions

@@ -13,7 +13,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.reading import check_exists, parse_toml, read_text
 from clpipe.base.text import names_with_words, one_line, similar_names, unknown_name
 from clpipe.base.types import Doubles
-from clpipe.base.urls import local_path
+from clpipe.base.url_text import local_path
 from clpipe.base.validation import first_fault
 from clpipe.camera.gain_stage import GainStage, NotNegative, Offsets, Positive, TukeyLambda
 from clpipe.camera.noise import NoiseModel

@@ -11,7 +11,7 @@ from typing import Any
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.reading import check_exists, parse_toml, read_text
 from clpipe.base.text import unknown_name
-from clpipe.base.urls import local_path
+from clpipe.base.url_text import local_path
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.keys import CODE, KEYS, LENS, TABLES, string_list
 from clpipe.chain.looks import override_settings

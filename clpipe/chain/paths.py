@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import KeyedError, RequestError
-from clpipe.base.urls import local
+from clpipe.base.url_text import local
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.stage import Stage

@@ -14,7 +14,7 @@ from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
 from clpipe.base.text import as_texts, unknown_name
 from clpipe.base.tracing import with_changes
-from clpipe.base.urls import local_path
+from clpipe.base.url_text import local_path
 from clpipe.base.validation import first_fault
 from clpipe.chain.carry import AovSpec, parse_carry
 from clpipe.chain.chain import Chain

@@ -16,7 +16,7 @@ from click.core import ParameterSource
 
 from clpipe.base.errors import MissingError, RequestError
 from clpipe.base.reading import check_input
-from clpipe.base.urls import is_url, local, local_path
+from clpipe.base.url_text import is_url, local, local_path
 
 F = TypeVar("F", bound=Callable[..., Any])
 

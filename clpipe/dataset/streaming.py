@@ -17,7 +17,8 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.process_folder import process_folder
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import as_texts
-from clpipe.base.urls import fetched_files, is_glob, is_url, list_urls, local, path_of
+from clpipe.base.url_text import is_glob, is_url, local
+from clpipe.base.urls import fetched_files, list_urls, path_of
 from clpipe.base.workers import worker
 from clpipe.dataset.dataset import Dataset
 from clpipe.dataset.developer import Sample

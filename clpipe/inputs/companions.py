@@ -10,7 +10,7 @@ from pathlib import Path
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.text import one_line, quote_alternatives, similar_names
-from clpipe.base.urls import local
+from clpipe.base.url_text import local
 from clpipe.chain.carry import AovSpec
 from clpipe.images.kinds import MIN_CHANNELS, flow_directions, flow_vectors, kind_from_name
 from clpipe.images.passes import LayerLocation, find_layers, layer_kind

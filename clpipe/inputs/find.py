@@ -14,7 +14,8 @@ from typing import Any, TypeVar
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_input
 from clpipe.base.text import printable, whole_number
-from clpipe.base.urls import is_glob, is_url, list_urls, local, name_in, path_of, url_of
+from clpipe.base.url_text import is_glob, is_url, local, name_in
+from clpipe.base.urls import list_urls, path_of, url_of
 from clpipe.chain.python_words import python_words
 from clpipe.chain.rendition import Rendition
 from clpipe.images.raw import RAW_SUFFIXES

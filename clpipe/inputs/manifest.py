@@ -11,7 +11,8 @@ from typing import Any, Protocol
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import check_exists, read_bytes
 from clpipe.base.text import unknown_name
-from clpipe.base.urls import fetch, is_url, join_url
+from clpipe.base.url_text import is_url
+from clpipe.base.urls import fetch, join_url
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import TABLES, check_type
 from clpipe.chain.methods import TABLE_MODELS, base_name

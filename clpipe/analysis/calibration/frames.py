@@ -12,7 +12,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_input
 from clpipe.base.text import one_line
 from clpipe.base.types import Floats
-from clpipe.base.urls import local
+from clpipe.base.url_text import local
 from clpipe.camera.profile import Matrix
 from clpipe.chain.making import make_chain
 from clpipe.images.attributes import read_attributes

@@ -24,7 +24,7 @@ from clpipe.analysis.signature import BRIGHTEST, DARK, DRIFT, flat_mask, luma
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_input
 from clpipe.base.types import Doubles, Floats, Mask
-from clpipe.base.urls import local
+from clpipe.base.url_text import local
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding
 from clpipe.images.read import read_finished
 from clpipe.reference.image import in_blocks
