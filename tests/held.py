@@ -24,14 +24,14 @@ HOLD, GO = "r020", "go"
 HOLDING = f"""
 import os, pathlib, time
 from clpipe.batch.work import ImageWorker
-decode = ImageWorker.decode
+decode = ImageWorker.begin
 def held(self, job, *arguments):
     if job.path.stem.replace(".", "") >= {HOLD!r}:
         pathlib.Path("held." + str(os.getpid())).touch()
         while not os.path.exists({GO!r}):
             time.sleep(0.01)
     return decode(self, job, *arguments)
-ImageWorker.decode = held
+ImageWorker.begin = held
 """
 # In the processes that a run starts, not in the run's own process.
 HOLDING_PROCESSES = f"""

@@ -206,13 +206,13 @@ def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, m
     monkeypatch.setattr("clpipe.batch.threads.MAX_COMMIT", 2)
     worker, jobs = worker_of(tmp_path)
     batch = Batch(worker, [None], threads=2)
-    decode, decoded = ImageWorker.decode, []
+    decode, decoded = ImageWorker.begin, []
 
     def counted(self, job, *arguments):
         decoded.append(job)
         return decode(self, job, *arguments)
 
-    monkeypatch.setattr(ImageWorker, "decode", counted)
+    monkeypatch.setattr(ImageWorker, "begin", counted)
     assert batch.in_flight == 4
     for taken, _ in enumerate(batch.run(jobs), 1):
         # Those in flight, two that are to be committed, two that are, and two outcomes.

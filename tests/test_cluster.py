@@ -95,13 +95,13 @@ def die_at_sidecar(number):
 
 def note_folders():
     """On a worker: record the working directory at each following image."""
-    decode, work.folders = work.ImageWorker.decode, set()
+    decode, work.folders = work.ImageWorker.begin, set()
 
     def noting(this, job, *arguments):
         work.folders.add(os.getcwd())
         return decode(this, job, *arguments)
 
-    work.ImageWorker.decode = noting
+    work.ImageWorker.begin = noting
 
 
 class DieOf(WorkerPlugin):
@@ -111,14 +111,14 @@ class DieOf(WorkerPlugin):
         self.name = name
 
     def setup(self, worker):
-        decode = work.ImageWorker.decode
+        decode = work.ImageWorker.begin
 
         def planted(this, job, *arguments):
             if job.path.name == self.name:
                 os.kill(os.getpid(), signal.SIGKILL)
             return decode(this, job, *arguments)
 
-        work.ImageWorker.decode = planted
+        work.ImageWorker.begin = planted
 
 
 @pytest.mark.slow
@@ -236,7 +236,7 @@ def test_workers_of_another_make(clpipe, renders, workers, address, name, value,
 
 def hold(name, reached, go):
     """On a worker: create a file at an image of this name, and wait there for another file."""
-    decode = work.ImageWorker.decode
+    decode = work.ImageWorker.begin
 
     def planted(this, job, *arguments):
         if job.path.name == name:
@@ -245,7 +245,7 @@ def hold(name, reached, go):
                 time.sleep(0.01)
         return decode(this, job, *arguments)
 
-    work.ImageWorker.decode = planted
+    work.ImageWorker.begin = planted
 
 
 def test_a_log_that_cannot_be_written_ends_the_run(

@@ -27,12 +27,12 @@ TWO = (*RUN, "--processes", 2)
 DEADLY = """
 import os, signal
 from clpipe.batch.work import ImageWorker
-decode = ImageWorker.decode
+decode = ImageWorker.begin
 def planted(self, job, *arguments):
     if job.path.name == "deadly.exr":
         os.kill(os.getpid(), signal.SIGKILL)
     return decode(self, job, *arguments)
-ImageWorker.decode = planted
+ImageWorker.begin = planted
 """
 
 
@@ -187,7 +187,7 @@ def test_a_kernel_that_does_not_compile_ends_the_run(write_exr, clpipe, monkeypa
 ALWAYS = """
 import os
 from clpipe.batch.work import ImageWorker
-ImageWorker.decode = lambda *arguments: os._exit(9)
+ImageWorker.begin = lambda *arguments: os._exit(9)
 """
 
 

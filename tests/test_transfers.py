@@ -1,206 +1,299 @@
-"""Transfers to and from a device: zero-copy, or through staging buffers."""
+"""Requests to file systems that fail, stall or are stopped."""
 
-from dataclasses import replace
-from typing import Any
+import json
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+from typing import ClassVar
 
+import fsspec
 import numpy as np
-import pyopencl as cl
 import pytest
+from fsspec.implementations.memory import MemoryFileSystem
 
-from clpipe.base.errors import DeviceFailedError
-from clpipe.chain.making import make_chain
-from clpipe.chain.settings import settings_from
-from clpipe.engine import programs
-from clpipe.engine.buffers import crop_patches
-from clpipe.engine.check import example
-from clpipe.engine.device import Device
-from clpipe.engine.extents import Box
-from clpipe.engine.options import RunOptions, Timing
-from clpipe.engine.runner import Runner
-from clpipe.stage import Kind
-from tests.conftest import fail_launches
+from clpipe.base import transfers, urls
+from clpipe.base.errors import ImageError, OutputError, RequestError
+from clpipe.base.transfers import TRANSFERS, class_of
+from clpipe.batch import downloads
+from clpipe.batch.job_state import JobState
+from clpipe.inputs.find import Job
+from tests.conftest import written
 
-IMAGES = [example(Kind.RGB, (40, 48), half=True, seed=seed) for seed in range(5)]
+RUN = ("--iso", 3200, "--device", "numpy", "--skip", "noise")
 
 
-def planes_of(image: np.ndarray) -> np.ndarray:
-    """Return the channels of an image as planes, (3, height, width)."""
-    return np.ascontiguousarray(image.transpose(2, 0, 1))
+class ServiceError(Exception):
+    """An error like botocore's, which has the answer of the service."""
+
+    def __init__(self, code, message=""):
+        super().__init__(f"An error occurred ({code})")
+        self.response = {"Error": {"Code": code, "Message": message}}
 
 
-@pytest.fixture
-def runner(device: Device) -> Runner:
-    """A single launch on its own device."""
-    return Runner(make_chain(settings_from({"stages": ["exposure", "gamma"]})), Device(device.info))
+class Faulty(MemoryFileSystem):
+    """A bucket in memory that calls ``fault`` before each transfer."""
 
+    protocol = "faulty"
+    async_impl = True  # one instance for all threads, like that of S3
+    store: ClassVar = {}
+    pseudo_dirs: ClassVar = [""]
+    requests: ClassVar = Counter()
 
-@pytest.fixture
-def copied(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The sizes of the host's copies of sources and results."""
-    sizes: list[int] = []
-    copy = np.copyto
+    @classmethod
+    def _strip_protocol(cls, path):
+        return MemoryFileSystem._strip_protocol(path.replace("faulty://", "memory://"))
 
-    def counted(to: np.ndarray, *arguments: Any, **options: Any) -> None:
-        sizes.append(to.size)
-        copy(to, *arguments, **options)
+    def unstrip_protocol(self, name):
+        return f"faulty:/{name}"
 
-    monkeypatch.setattr(np, "copyto", counted)
-    return sizes
+    @staticmethod
+    def fault(path):
+        """Raise an error, or block."""
 
+    def get_file(self, remote, local, **more):
+        self.requests[remote] += 1
+        self.fault(remote)
+        super().get_file(remote, local, **more)
 
-def test_a_cpu_uses_an_image_where_it_is(runner, copied):
-    image = IMAGES[0].copy()
-    image.setflags(write=False)
-    into = np.zeros(image.shape, np.uint8)
-    runner.compile()
-    copied.clear()
-    assert runner.run(image, "k", RunOptions(into=into)).encoded is into
-    expected = Runner(runner.chain, None).run(image, "k").encoded
-    assert np.abs(into.astype(int) - expected).max() <= 1
-    assert not copied
-    padded = np.zeros((60, 40, 3), np.float16)  # with rows after the image, for whole blocks
-    padded[:37] = image[:37, :40]
-    whole = runner.run(padded[:37].copy(), "k").encoded
-    assert len(copied) == 1
-    assert np.array_equal(runner.run(padded[:37], "k").encoded, whole)
-    assert len(copied) == 1
+    def put_file(self, local, remote, **more):
+        self.requests[remote] += 1
+        self.fault(remote)
+        super().put_file(local, remote, **more)
 
-
-@pytest.mark.parametrize(
-    "changed",
-    [
-        pytest.param(lambda image: image[::-1].copy()[::-1], id="rows upside down"),
-        pytest.param(lambda image: np.concatenate([image] * 2, axis=1)[:, :48], id="part of rows"),
-        pytest.param(np.asfortranarray, id="columns first"),
-        pytest.param(lambda image: planes_of(image).transpose(1, 2, 0), id="planes"),
-    ],
-)
-@pytest.mark.parametrize("type_", ["CPU", "GPU"])
-def test_an_image_may_lie_in_memory_in_any_way(runner, type_, changed):
-    runner.device = Device(replace(runner.device.info, type=type_))
-    expected = runner.run(IMAGES[0], "k").encoded
-    assert np.array_equal(runner.run(changed(IMAGES[0]), "k").encoded, expected)
-
-
-@pytest.mark.parametrize("dtype", [np.float16, np.float32])
-def test_planes_are_read_where_they_are(runner, copied, dtype):
-    image = IMAGES[0].astype(dtype)
-    expected = runner.run(image, "k").encoded
-    planar = planes_of(image).transpose(1, 2, 0)
-    assert np.array_equal(runner.run(planar, "k").encoded, expected)
-    copied.clear()
-    assert np.array_equal(runner.run(planar, "k").encoded, expected)
-    assert not copied
-    for memory in (20_000, 9_000):  # in tiles
-        runner.device.memory = memory
-        assert np.array_equal(runner.run(planar, "k").encoded, expected)
-
-
-@pytest.mark.parametrize("type_", ["CPU", "GPU"])
-@pytest.mark.parametrize("memory", [None, 300_000])  # whole, and in tiles
-def test_both_ways_give_the_same(device, type_, memory):
-    chain = make_chain(settings_from({"iso": 3200, "white_balance": {"method": "gray_world"}}))
-    one, two = (
-        Runner(chain, Device(replace(device.info, type=kind), size), ("normalize",), final=True)
-        for kind, size in (("CPU", None), (type_, memory))
-    )
-    for image in (example(Kind.RGB, (90, 200), half=True, seed=seed) for seed in range(3)):
-        expected, found = one.run(image, "k"), two.run(image, "k")
-        for name in ("final", "encoded", "kept", "estimates"):
-            np.testing.assert_equal(getattr(found, name), getattr(expected, name))
-        boxes = [Box(x, 2 * x, x + 20, 2 * x + 16) for x in (0, 7, 25)]
-        patches = two.submit(image, "k", RunOptions(boxes=boxes))()
-        np.testing.assert_equal(patches.encoded, crop_patches(expected.encoded, boxes))
-
-
-def queued(device: Device, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
-    """Record the following enqueued operations and their queues."""
-    seen = []
-
-    def watched(name: str) -> None:
-        real = getattr(cl, name)
-
-        def call(queue: cl.CommandQueue, *arguments: Any, **options: Any) -> cl.Event:
-            seen.append((name, queue.int_ptr))
-            return real(queue, *arguments, **options)
-
-        monkeypatch.setattr(cl, name, call)
-
-    watched("enqueue_copy")
-    watched("enqueue_nd_range_kernel")
-    return seen
+    def find(self, path, *arguments, **more):
+        self.requests["find"] += 1
+        self.fault("find")
+        return super().find(path, *arguments, **more)
 
 
 @pytest.fixture
-def gpu_runner(runner: Runner) -> Runner:
-    """The same on a device with memory of its own, as far as clpipe knows."""
-    runner.device = Device(replace(runner.device.info, type="GPU"))
-    runner.compile()
-    return runner
+def bucket(monkeypatch, clpipe, write_exr):
+    """Six renders in a bucket. Requests have no fault."""
+    monkeypatch.setattr(transfers, "FIRST_WAIT", 0.0)
+    fsspec.register_implementation("faulty", Faulty, clobber=True)
+    Faulty.store.clear()
+    Faulty.pseudo_dirs[:] = [""]
+    Faulty.requests.clear()
+    monkeypatch.setattr(Faulty, "fault", staticmethod(lambda path: None))
+    system = fsspec.filesystem("faulty")
+    for number in range(6):
+        rng = np.random.default_rng(number)
+        write_exr(f"in/r{number}.exr", rng.random((16, 24, 3)).astype(np.float32))
+        system.put_file(f"in/r{number}.exr", f"/b/in/r{number}.exr")
+    Faulty.requests.clear()
+    yield system
+    TRANSFERS.allow()
 
 
-def test_transfers_of_an_image_run_beside_the_kernels_of_its_neighbours(gpu_runner, monkeypatch):
-    expected = [gpu_runner.run(image, "k").encoded for image in IMAGES]
-    device, gate = gpu_runner.device, cl.UserEvent(gpu_runner.device.flow.context)
-    seen = queued(device, monkeypatch)
-    # Kernels are held back: the first one's, and so all that follow.
-    cl._enqueue_marker_with_wait_list(device.flow.queue, [gate])
-    timings: list[list[Timing]] = [[], []]
-    begun = [gpu_runner.submit(IMAGES[i], "k", RunOptions(timings[i])) for i in range(2)]
-    target = ["enqueue_copy", "enqueue_nd_range_kernel", "enqueue_copy"] * 2
-    assert [name for name, _ in seen] == target  # and the host did not wait
-    up, run, down = (queue for _, queue in seen[:3])
-    assert len({up, run, down}) == 3
-    assert [queue for _, queue in seen[3:]] == [up, run, down]
-    gate.set_status(cl.command_execution_status.COMPLETE)
-    results = [wait().encoded for wait in begun]
-    assert all(np.array_equal(a, b) for a, b in zip(results, expected, strict=False))
-    (sent, _, _), (sent_next, launched_next, _) = timings
-    assert sent.start <= sent_next.start <= launched_next.start
-    # More than can be on the way: the oldest is waited for.
-    waits = [gpu_runner.submit(image, "k") for image in IMAGES]
-    assert [np.array_equal(wait().encoded, e) for wait, e in zip(waits, expected, strict=True)] == [
-        True
-    ] * 5
+def answering(code, error_type=OSError, text="", only=""):
+    """Return a fault: an error as s3fs raises it for a service's code."""
+
+    def fault(path):
+        if only in path:
+            raise error_type(text) from ServiceError(code, text)
+
+    return staticmethod(fault)
 
 
-@pytest.mark.slow
-def test_images_that_are_only_floats_do_not_mix(gpu_runner):
-    runner = Runner(gpu_runner.chain, gpu_runner.device, encode=False, final=True)
-    expected = [runner.run(image, "k").final for image in IMAGES]
-    waits = [runner.submit(image, "k") for image in IMAGES]
-    for wait, image in zip(waits, expected, strict=True):
-        assert np.array_equal(wait().final, image)
+def images(folder="o"):
+    lines = map(json.loads, Path(folder, "run.jsonl").read_text().splitlines())
+    return {line["name"]: line for line in lines if line["event"] == "image"}
 
 
-def test_a_source_that_is_there_is_not_sent_again(gpu_runner):
-    image = IMAGES[0].copy()
-
-    def sent(unchanged: bool) -> tuple[int, np.ndarray]:
-        timings: list[Timing] = []
-        result = gpu_runner.submit(image, "k", RunOptions(timings, unchanged=unchanged))()
-        return [t.name for t in timings].count("upload"), result.encoded
-
-    (first, pixels), (again, same) = sent(True), sent(True)
-    assert (first, again) == (1, 0) and np.array_equal(pixels, same)
-    image[:] = IMAGES[1]
-    changed, other = sent(False)
-    assert changed == 1 and np.array_equal(other, gpu_runner.run(IMAGES[1], "k").encoded)
-    image = image.copy()
-    assert sent(True)[0] == 1  # another array
+ANSWERS = [
+    ("AccessDenied", PermissionError, "auth", "access is denied (AccessDenied). Renew or correct"),
+    ("ExpiredToken", PermissionError, "auth", "access is denied (ExpiredToken). Renew or correct"),
+    ("400", OSError, "auth", "access is denied (400). Renew or correct the credentials"),
+    ("NoSuchBucket", FileNotFoundError, "not_found", "there is no such bucket (NoSuchBucket)"),
+    ("NoSuchKey", FileNotFoundError, "not_found", "there is no such file (NoSuchKey)"),
+    ("SlowDown", OSError, "throttled", "OSError (SlowDown), in 3 tries. Repeat the command later"),
+    ("503", OSError, "throttled", "OSError (503), in 3 tries. Repeat the command later"),
+    ("InternalError", OSError, "network", "OSError (InternalError), in 3 tries"),
+]
 
 
-@pytest.mark.parametrize("fails", [0, 1])
-def test_an_error_of_one_image_leaves_the_others_whole(gpu_runner, monkeypatch, fails):
-    monkeypatch.setattr(programs, "_by_device", {})
-    expected = [gpu_runner.run(image, "k").encoded for image in IMAGES]
-    # And when that image is tried again.
-    fail_launches(monkeypatch, cl.RuntimeError("INVALID_OPERATION"), fails, 2)
-    begun = [gpu_runner.submit(image, "k") for image in IMAGES[:2]]
-    for number, wait in enumerate(begun):
-        if number == fails:
-            with pytest.raises(DeviceFailedError, match="INVALID_OPERATION"):
-                wait()
-        else:
-            assert np.array_equal(wait().encoded, expected[number])
-    assert np.array_equal(gpu_runner.run(IMAGES[2], "k").encoded, expected[2])
+@pytest.mark.parametrize(("code", "error_type", "error_class", "text"), ANSWERS)
+def test_an_answer_has_a_class_and_a_message(
+    bucket, clpipe, monkeypatch, code, error_type, error_class, text
+):
+    monkeypatch.setattr(transfers, "MAX_TRIES", 3)
+    monkeypatch.setattr(Faulty, "fault", answering(code, error_type, only="r3"))
+    stderr = clpipe("run", "faulty://b/in", "-o", "o", *RUN, status=1).stderr
+    assert f"faulty://b/in/r3.exr: cannot be read: {text}" in stderr
+    assert "5 of 6 images done, 1 failed" in stderr
+    assert images()["r3.exr"]["error_class"] == error_class
+    assert images()["r2.exr"]["error_class"] is None
+    assert Faulty.requests["/b/in/r3.exr"] == (1 if error_class in transfers.FINAL else 3)
+
+
+def test_what_the_service_says_is_in_the_message(bucket, clpipe, monkeypatch):
+    text = "The provided token has expired."
+    monkeypatch.setattr(Faulty, "fault", answering("ExpiredToken", PermissionError, text, "put"))
+    monkeypatch.setattr(Faulty, "fault", answering("ExpiredToken", PermissionError, text))
+    with pytest.raises(OutputError, match=r"The provided token has expired \(ExpiredToken\)\. R"):
+        urls.upload(Path("in/r0.exr"), "faulty://b/x")
+    with pytest.raises(RequestError, match=r"cannot be listed: .*expired \(ExpiredToken\)"):
+        urls.list_urls("faulty://b/in")
+
+
+def test_a_missing_bucket_is_no_empty_one(bucket, clpipe, monkeypatch):
+    gone = answering("NoSuchBucket", FileNotFoundError, only="find")
+    monkeypatch.setattr(Faulty, "fault", gone)
+    stderr = clpipe("run", "faulty://b/in", "-o", "o", *RUN, status=2).stderr
+    assert "cannot be listed: there is no such bucket (NoSuchBucket). Create it" in stderr
+    command = ("run", "in", "-o", "faulty://none/set", "--webdataset", 3, *RUN)
+    assert "no such bucket" in clpipe(*command, status=2).stderr
+
+
+def test_error_types_that_have_no_code():
+    class NoCredentialsError(Exception):
+        pass
+
+    assert class_of(NoCredentialsError()) == "auth"
+    assert class_of(TimeoutError()) == "network"
+
+
+def test_errors_of_files_have_a_class(clpipe, write_exr):
+    write_exr("in/good.exr", np.ones((8, 8, 3), np.float32))
+    Path("in/bad.exr").write_bytes(Path("in/good.exr").read_bytes()[:200])
+    Path("in/gone.exr").symlink_to("nowhere.exr")
+    write_exr("in/tall.exr", np.ones((1024, 8, 3), np.float32))
+    clpipe("run", "in", "-o", "o", *RUN, "--max-pixels", 4096, status=1)
+    classes = {name: line["error_class"] for name, line in images().items()}
+    assert classes == {
+        "good.exr": None,
+        "bad.exr": "damaged",
+        "gone.exr": "not_found",
+        "tall.exr": "damaged",
+    }
+
+
+def test_a_transfer_that_stalls_is_abandoned(bucket, clpipe, monkeypatch):
+    """The next try is right, whatever the abandoned one still writes."""
+    monkeypatch.setattr(transfers, "TRY_SECONDS", 0.2)
+    go, ended = threading.Event(), threading.Event()
+    get = MemoryFileSystem.get_file
+
+    def stalling(self, remote, local, **more):
+        if "r3" in remote and not go.is_set():
+            self.requests[remote] += 1
+            Path(local).write_bytes(b"half")
+            if self.requests[remote] == 1:
+                go.wait(60)
+                Path(local).write_bytes(b"late, and of the same file")
+                ended.set()
+                return
+        get(self, remote, local, **more)
+
+    monkeypatch.setattr(Faulty, "get_file", stalling)
+    stderr = clpipe("run", "faulty://b/in", "-o", "o", *RUN).stderr
+    go.set()
+    assert "6 of 6 images done, 0 failed" in stderr
+    assert ended.wait(60) and Faulty.requests["/b/in/r3.exr"] == 2
+    clpipe("run", "in", "-o", "whole", *RUN)
+    assert Path("o/r3.jpg").read_bytes() == Path("whole/r3.jpg").read_bytes()
+
+
+def test_a_stall_without_end_is_an_error(bucket, monkeypatch):
+    monkeypatch.setattr(transfers, "TRY_SECONDS", 0.1)
+    monkeypatch.setattr(transfers, "MAX_TRIES", 2)
+    go = threading.Event()
+    monkeypatch.setattr(Faulty, "fault", staticmethod(lambda path: go.wait(60)))
+    with (
+        pytest.raises(ImageError, match="it took more than 0 s, in 2 tries"),
+        urls.fetched_files([urls.path_of("faulty://b/in/r0.exr")]),
+    ):
+        pass
+    go.set()
+
+
+def test_large_files_have_more_time(bucket, monkeypatch):
+    monkeypatch.setattr(transfers, "TRY_SECONDS", 0.0)
+    monkeypatch.setattr(Faulty, "fault", staticmethod(lambda path: time.sleep(0.3)))
+    size = Path("in/r0.exr").stat().st_size
+    monkeypatch.setattr(transfers, "MIN_SPEED", size / 60)
+    urls.upload(Path("in/r0.exr"), "faulty://b/x")
+    assert bucket.cat_file("/b/x") == Path("in/r0.exr").read_bytes()
+    with urls.fetched_files([urls.path_of("faulty://b/x")]) as (path,):
+        assert path.read_bytes() == Path("in/r0.exr").read_bytes()
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("kind", ["stalls", "fails"])
+def test_nothing_is_retried_after_a_stop(bucket, clpipe, monkeypatch, kind):
+    """Images whose files did not arrive are left to the next run."""
+    monkeypatch.setattr(transfers, "STOP_SECONDS", 0.2)
+    go = threading.Event()
+
+    def fault(path):
+        if "r3" in path:
+            TRANSFERS.stop()
+            if kind == "stalls":
+                go.wait(60)
+            raise OSError("cut off")
+
+    monkeypatch.setattr(Faulty, "fault", staticmethod(fault))
+    stderr = clpipe("run", "faulty://b/in/r3.exr", "-o", "o", *RUN, "--jobs", 1, status=130).stderr
+    go.set()
+    assert "0 failed, 1 not begun" in stderr
+    assert Faulty.requests["/b/in/r3.exr"] == 1
+    assert not Path("o/run.jsonl").exists() or images() == {}
+    monkeypatch.setattr(Faulty, "fault", staticmethod(lambda path: None))
+    clpipe("run", "faulty://b/in/r3.exr", "-o", "o", *RUN)  # the stop is forgotten
+    assert images()["r3.exr"]["status"] == "done"
+
+
+def test_files_are_fetched_before_a_thread_takes_them(bucket, clpipe, monkeypatch):
+    together = threading.Barrier(2, timeout=60)
+
+    def fault(path):
+        if path[-6:] in ("r1.exr", "r2.exr"):
+            together.wait()
+
+    monkeypatch.setattr(transfers, "MAX_TRIES", 1)
+    monkeypatch.setattr(Faulty, "fault", staticmethod(fault))
+    stderr = clpipe("run", "faulty://b/in", "-o", "o", *RUN, "--jobs", 1).stderr
+    assert "6 of 6 images done, 0 failed" in stderr and "fetch" in stderr
+    assert all(line["fetch_seconds"] > 0 for line in images().values())
+    clpipe("run", "in", "-o", "whole", *RUN)
+    names = [name for name in written(Path("o")) if name.endswith(".jpg")]
+    assert len(names) == 6
+    for name in names:
+        assert Path("o", name).read_bytes() == Path("whole", name).read_bytes()
+    assert images("whole")["r0.exr"]["fetch_seconds"] == 0
+
+
+@pytest.mark.parametrize(("largest", "ahead"), [(1, 16), (100 << 20, 2), (1 << 30, 1)])
+def test_large_files_are_not_all_fetched_at_once(bucket, largest, ahead):
+    begun = []
+    found = downloads.Downloads(lambda job: begun.append(job.key) or JobState(job, None, job))
+    found._largest = largest
+    jobs: downloads.Jobs = downloads.queue.SimpleQueue()
+    for number in range(40):
+        jobs.put(Job(urls.path_of(f"faulty://b/{number}.exr"), f"{number}.exr"))
+    first = found.take(jobs, is_waiting=True)
+    assert first.key == "0.exr"
+    found.close()
+    assert jobs.qsize() == 39 - ahead and set(begun) <= {f"{n}.exr" for n in range(1, ahead + 1)}
+
+
+def test_skipped_keys_are_counted(bucket, clpipe, monkeypatch):
+    names = ["r0.exr", "a//b.exr", "../up.exr", ".hidden.exr", ".tmp/c.exr", "notes.txt"]
+    monkeypatch.setattr(Faulty, "find", lambda *_, **__: [f"/b/in/{name}" for name in names])
+    stderr = clpipe("run", "faulty://b/in", "-o", "o", *RUN).stderr
+    assert "1 of 1 image" in stderr or "r0.exr ->" in stderr
+    text = "2 hidden, 2 with '..', '.' or empty parts in the key, 1 .txt"
+    assert f"faulty://b/in: other files were skipped: {text}" in " ".join(stderr.split())
+    names[:] = [".hidden.exr", "notes.txt"]
+    stderr = clpipe("run", "faulty://b/in", "-o", "p", *RUN, status=2).stderr
+    assert "and found 1 .txt, 1 hidden" in " ".join(stderr.split())
+
+
+def test_s3_has_one_layer_of_retries():
+    s3fs = pytest.importorskip("s3fs", reason="needs s3fs, in the extra cloud")
+    system, _ = transfers._system_of("s3://bucket/key")
+    assert system.retries == 1
+    assert system.config_kwargs["retries"] == {"total_max_attempts": 1}
+    others = s3fs.S3FileSystem()
+    assert others.retries == s3fs.S3FileSystem.retries > 1  # what the user's own code uses

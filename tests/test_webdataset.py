@@ -99,7 +99,7 @@ def test_an_image_is_done_when_its_tar_exists(clpipe, renders):
 
 def test_a_stopped_run_says_what_waits_for_its_tar(clpipe, renders, monkeypatch):
     run = api.run(renders(), "out", iso=3200, device="numpy", webdataset=8, jobs=1)
-    stopped, decode = threading.Event(), ImageWorker.decode
+    stopped, decode = threading.Event(), ImageWorker.begin
 
     def held(worker, job, *rest):
         assert job.key < "r.004.exr" or stopped.wait(120)
@@ -110,7 +110,7 @@ def test_a_stopped_run_says_what_waits_for_its_tar(clpipe, renders, monkeypatch)
             run.stop()
             stopped.set()
 
-    monkeypatch.setattr(ImageWorker, "decode", held)
+    monkeypatch.setattr(ImageWorker, "begin", held)
     run.watch = watch
     assert list(run) == [] and not (OUT / "000000.tar").exists()
     assert run.summary.made >= 3 and run.summary.interrupted

@@ -18,9 +18,14 @@ class ClpipeError(Exception):
     ... except clpipe.ClpipeError as error:
     ...     print(error)
     denoise.luma_strength: found -1: should be greater than or equal to 0
+
+    Attributes:
+        exit_status: the exit status of a command.
+        error_class: the class of the cause, see :func:`error_class`.
     """
 
     exit_status = 2
+    error_class = "request"  # the class of its cause in run.jsonl
 
     def __str__(self) -> str:
         text = super().__str__()
@@ -82,6 +87,7 @@ class ImageError(ClpipeError):
     """
 
     exit_status = 1
+    error_class = "image"
 
     def __init__(self, message: str = "", way: str = "") -> None:
         super().__init__(message)
@@ -107,8 +113,16 @@ class KindError(ImageError):
         self.attributes = attributes
 
 
+class MemoryLimitError(ImageError):
+    """One image needs more memory than this machine, the device or an option allows."""
+
+    error_class = "memory"
+
+
 class DeviceFailedError(ImageError):
     """A device failed for one image, also at the second try. Other images may succeed."""
+
+    error_class = "device"
 
 
 class DeviceError(ClpipeError):
@@ -123,15 +137,33 @@ class DeviceError(ClpipeError):
     """
 
     exit_status = 3
+    error_class = "device"
 
 
 class OutputError(ClpipeError):
     """No more files can be written: the disk is full, or the output directory is missing."""
 
     exit_status = 1
+    error_class = "output"
 
 
 class ClusterError(ClpipeError):
     """The cluster was lost during a run. The images finished before are written."""
 
     exit_status = 1
+
+
+def error_class(error: BaseException) -> str:
+    """Return the class of an error's cause, for run.jsonl.
+
+    "not_found", "auth", "throttled" and "network" are errors of a URL; "stopped" means that the run
+    was stopped before its file arrived. "damaged" is a file that
+    cannot be read as an image, and "image" another problem of one image. "memory", "device" and
+    "output" name what failed, "request" is a wrong setting, and "unexpected" a defect of clpipe.
+
+    >>> error_class(MemoryError()), error_class(DeviceError("lost")), error_class(KeyError("a"))
+    ('memory', 'device', 'unexpected')
+    """
+    if isinstance(error, MemoryError):
+        return "memory"
+    return error.error_class if isinstance(error, ClpipeError) else "unexpected"

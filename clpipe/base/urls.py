@@ -10,52 +10,32 @@ fsspec finds the credentials, in the environment and in its own configuration.
 
 import contextlib
 import hashlib
+import itertools
 import os
 import posixpath
-import random
 import re
 import secrets
-import tempfile
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import threading
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 from urllib.parse import quote, unquote
 
 from clpipe.base.errors import ClpipeError, ImageError, OutputError, RequestError
-from clpipe.base.extras import require
 from clpipe.base.process_folder import MIN_FREE_SPACE, process_folder
-from clpipe.base.text import one_line
+from clpipe.base.transfers import NO_BUCKET, check_scheme, service_code, with_retries
 from clpipe.base.url_text import is_glob, is_url, local, name_in
-
-T = TypeVar("T")
 
 SPOOL = "clpipe-spool"
 MAX_NAME = 200  # characters of a folder's name
-
-# The packages of the extra "cloud" that file systems need, by scheme.
-PACKAGES = {
-    **dict.fromkeys(("s3", "s3a"), "s3fs"),
-    **dict.fromkeys(("gs", "gcs"), "gcsfs"),
-    **dict.fromkeys(("az", "abfs", "abfss", "adl"), "adlfs"),
-    **dict.fromkeys(("http", "https"), "aiohttp"),
-}
-
-MAX_TRIES = 6
-FIRST_WAIT = 0.25  # s; each further wait is twice as long
 
 # Names that file systems use for a file's checksum or modification time, in order of preference.
 CHANGE_KEYS = ["ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime"]
 CHANGE_KEYS += ["updated", "modified", "created"]
 
-# Errors that are not retried.
-PERMANENT_ERRORS = (
-    FileNotFoundError,
-    PermissionError,
-    IsADirectoryError,
-    NotImplementedError,
-    KeyError,  # of an archive without that file
-)
+
+_in_use: set[Path] = set()  # copies of files
+_choosing = threading.Lock()  # guards the set
 
 
 def path_of(text: str) -> Path:
@@ -68,14 +48,8 @@ def path_of(text: str) -> Path:
     """
     if not is_url(text):
         return Path(local(text))
-    _check_scheme(text)
-    folder = process_folder()
-    if folder is None:
-        raise RequestError(
-            f"{text}: no folder for temporary files has {MIN_FREE_SPACE >> 20} MiB free and allows "
-            "programs to run. Set TMPDIR to such a folder."
-        )
-    return _spool_path(text, folder)
+    check_scheme(text)
+    return _spool_path(text)
 
 
 def url_of(path: Path) -> str | None:
@@ -131,18 +105,21 @@ def list_urls(url: str) -> list[str]:
         root = path.rstrip("/").removesuffix(rest[len(fixed) :].rstrip("/")).rstrip("/")
         _forget_listing(system, root)
         found: Iterable[str] = ()
-        with contextlib.suppress(FileNotFoundError):
+        try:
             if is_glob(url):
                 infos = system.glob(path, detail=True)
                 found = [name for name, info in infos.items() if info["type"] != "directory"]
             else:
                 found = system.find(path)
+        except FileNotFoundError as error:
+            if NO_BUCKET.search(service_code(error)):
+                raise
         # The URL keeps its scheme, because a file system may have several.
         names = (name[len(root) :].lstrip("/") for name in found)
         # The file of a URL that is no directory has an empty name.
         return sorted(f"{prefix}{name}".rstrip("/") + url[len(inner) :] for name in names)
 
-    return _with_retries(url, work, RequestError, "listed")
+    return with_retries(url, work, RequestError, "listed")
 
 
 def _forget_listing(system: Any, folder: str) -> None:
@@ -161,9 +138,7 @@ def _forget_listing(system: Any, folder: str) -> None:
 def stamp_of_url(url: str) -> tuple[int, int]:
     """Return a file's size in bytes, and a number that changes with it; zeros if it is missing."""
     with contextlib.suppress(ClpipeError):
-        return _with_retries(
-            url, lambda system, path: _stamp(system.info(path)), ImageError, "read"
-        )
+        return with_retries(url, lambda system, path: _stamp(system.info(path)), ImageError, "read")
     return 0, 0
 
 
@@ -177,17 +152,31 @@ def fetched_files(paths: Iterable[Path]) -> Iterator[list[Path]]:
     Raises:
         ImageError: a file cannot be fetched.
     """
-    with contextlib.ExitStack() as stack:
-        found: list[Path] = []
+    found: list[Path] = []
+    copies: list[Path] = []
+    try:
         for path in paths:
             found.append(path)
             if (url := url_of(path)) and not path.exists():
-                folder = tempfile.TemporaryDirectory(
-                    prefix="fetched-", dir=process_folder(), ignore_cleanup_errors=True
-                )
-                found[-1] = _spool_path(url, Path(stack.enter_context(folder)))
+                found[-1] = _unused_path(url)
+                copies.append(found[-1])
                 _fetch(url, found[-1], ImageError)
         yield found
+    finally:
+        for path in copies:
+            path.unlink(missing_ok=True)
+            _in_use.discard(path)
+
+
+def _unused_path(url: str) -> Path:
+    """Return a path for a copy of a file that no other copy has, and mark it as in use."""
+    with _choosing:
+        for number in itertools.count():
+            path = _spool_path(url, f"fetched-{number}")
+            if path not in _in_use:
+                _in_use.add(path)
+                return path
+    raise AssertionError
 
 
 def fetch(path: Path) -> Path:
@@ -211,13 +200,15 @@ def upload(path: Path, url: str) -> None:
         OutputError: it cannot be written.
     """
 
+    size = path.stat().st_size
+
     def work(system: Any, remote: str) -> None:
         system.put_file(str(path), remote)
         system.invalidate_cache(remote)
-        if (size := system.info(remote).get("size")) != path.stat().st_size:
-            raise OSError(f"only {size} of {path.stat().st_size} bytes were written")
+        if (written := system.info(remote).get("size")) != size:
+            raise OSError(f"{written} of {size} bytes were written")
 
-    _with_retries(url, work, OutputError, "written")
+    with_retries(url, work, OutputError, "written", lambda: size)
 
 
 def read_url(url: str) -> bytes | None:
@@ -232,41 +223,24 @@ def read_url(url: str) -> bytes | None:
             return bytes(system.cat_file(path))
         return None
 
-    return _with_retries(url, work, OutputError, "read")
+    return with_retries(url, work, OutputError, "read")
 
 
-def _check_scheme(url: str) -> None:
-    """Check that fsspec knows a URL's scheme, without contacting a server.
+def _spool_path(url: str, folder: str = "") -> Path:
+    """Return a path that represents a URL, in a folder below this process's folder.
 
     Raises:
-        RequestError: the scheme is unknown, or a package is missing. The message names the package.
+        RequestError: no path can, or there is no folder for temporary files.
+
+    >>> _spool_path("s3://bucket/a/b.exr").relative_to(process_folder()).as_posix()
+    'clpipe-spool/s3/bucket/a/b.exr'
     """
-    schemes = [part.partition("://")[0] for part in url.split("::") if "://" in part]
-    packages = [PACKAGES[scheme] for scheme in schemes if scheme in PACKAGES]
-    require(url, "cloud", "fsspec", *packages)
-    if "://" not in name_in(url):
+    below = process_folder()
+    if below is None:
         raise RequestError(
-            f"{url}: clpipe fetches each file once, so it needs no cache; use "
-            f"{url.partition('::')[2]}"
+            f"{url}: no folder for temporary files has {MIN_FREE_SPACE >> 20} MiB free and allows "
+            "programs to run. Set TMPDIR to such a folder."
         )
-    from fsspec import get_filesystem_class
-
-    try:
-        for scheme in schemes:
-            get_filesystem_class(scheme)
-    except (ImportError, ValueError) as error:
-        raise RequestError(f"{url}: {one_line(str(error))}") from None
-
-
-def _spool_path(url: str, folder: Path) -> Path:
-    """Return the path that represents a URL, below a folder for temporary files.
-
-    Raises:
-        RequestError: no path can.
-
-    >>> str(_spool_path("s3://bucket/a/b.exr", Path("/tmp/x")))
-    '/tmp/x/clpipe-spool/s3/bucket/a/b.exr'
-    """
     inner = name_in(url)
     scheme, _, rest = inner.partition("://")
     parts = rest.split("/")
@@ -276,7 +250,7 @@ def _spool_path(url: str, folder: Path) -> Path:
     first = quote(f"{scheme}{url[len(inner) :]}", safe="+")
     if len(first) > MAX_NAME:
         raise RequestError(f"{url}: the URL of an archive may have at most {MAX_NAME} characters")
-    return folder / SPOOL / first / rest
+    return below / folder / SPOOL / first / rest
 
 
 def _fetch(url: str, path: Path, error_type: type[ClpipeError]) -> None:
@@ -285,22 +259,29 @@ def _fetch(url: str, path: Path, error_type: type[ClpipeError]) -> None:
     Raises:
         ClpipeError: it cannot be fetched. The error has the given type.
     """
-    part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")  # other threads may fetch it
 
-    def work(system: Any, remote: str) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        info = system.info(remote)
-        size, modified = _stamp(info)
-        system.get_file(remote, str(part))
-        if info.get("size") is not None and part.stat().st_size != size:
-            raise OSError(f"only {part.stat().st_size} of {size} bytes were received")
-        os.utime(part, ns=(modified, modified))
-        part.replace(path)
+    info: Mapping[str, Any] = {}
 
-    try:
-        _with_retries(url, work, error_type, "read")
-    finally:
-        part.unlink(missing_ok=True)
+    def work(system: Any, remote: str) -> Path:
+        nonlocal info
+        with contextlib.suppress(PermissionError):  # reading the file tells the service's reason
+            info = system.info(remote)
+        # Other threads may fetch the file, and an abandoned try may still write its part.
+        part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
+        try:
+            system.get_file(remote, str(part))
+            if info.get("size") not in (None, received := part.stat().st_size):
+                raise OSError(f"{received} of {info['size']} bytes were received")
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
+        return part
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = with_retries(url, work, error_type, "read", lambda: info.get("size") or 0)
+    _, modified = _stamp(info)
+    os.utime(part, ns=(modified, modified))
+    part.replace(path)
 
 
 def _stamp(info: Mapping[str, Any]) -> tuple[int, int]:
@@ -308,39 +289,3 @@ def _stamp(info: Mapping[str, Any]) -> tuple[int, int]:
     version = next((str(v) for name in CHANGE_KEYS if (v := info.get(name)) is not None), "")
     number = int.from_bytes(hashlib.sha256(version.encode()).digest()[:7]) if version else 0
     return int(info.get("size") or 0), number // 100 * 100  # NTFS stores times in units of 100 ns
-
-
-def _reason(url: str, error: Exception) -> str:
-    """Return the text of an error; if it only repeats a part of the URL, what the error means."""
-    text = one_line(str(error))
-    if text.strip("'/") not in url:
-        return text
-    if isinstance(error, FileNotFoundError | KeyError):
-        return "there is no such file"
-    return "access is denied" if isinstance(error, PermissionError) else type(error).__name__
-
-
-def _with_retries(
-    url: str, work: Callable[[Any, str], T], error_type: type[ClpipeError], what: str
-) -> T:
-    """Return the result of a function for a URL's file system and the path in it.
-
-    The function is retried after errors that may be temporary.
-
-    Raises:
-        RequestError: as for :func:`_check_scheme`.
-        ClpipeError: all tries failed. The error has the type ``error_type``.
-    """
-    _check_scheme(url)
-    from fsspec.core import url_to_fs
-
-    wait = FIRST_WAIT
-    for tries_left in reversed(range(MAX_TRIES)):
-        try:
-            return work(*url_to_fs(url))
-        except Exception as error:
-            if not tries_left or isinstance(error, PERMANENT_ERRORS):
-                raise error_type(f"{url}: cannot be {what}: {_reason(url, error)}") from None
-            time.sleep(wait * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
-            wait *= 2
-    raise AssertionError

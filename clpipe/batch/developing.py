@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.errors import DeviceError, ImageError, OutputError
-from clpipe.batch.job_state import JobState, Written, failure_text
+from clpipe.batch.job_state import JobState, Written
 from clpipe.batch.memory_budget import MemoryBudget
 from clpipe.batch.runners import Runners
 from clpipe.batch.work import ImageWorker
@@ -305,7 +305,7 @@ class Developers:
                     task.recipe = self._worker.with_matched_noise(state, task.recipe)
                     pending.append((place, (state, task.recipe, runners.of(task.recipe))))
             except BaseException as error:
-                state.error = failure_text(state.job, error)
+                state.fail(error)
         try:
             finish_functions = self._worker.start([each for _, each in pending])
             for (place, _), finish in zip(pending, finish_functions, strict=True):
@@ -314,7 +314,7 @@ class Developers:
             raise
         except BaseException as error:
             for _, (state, *_) in pending:
-                state.error = failure_text(state.job, error)
+                state.fail(error)
         return deque(zip(tasks, finishers, strict=True))
 
     def _finish(self, started: Started, device: Device | None) -> None:
@@ -332,7 +332,7 @@ class Developers:
             except DeviceError:
                 raise
             except BaseException as error:
-                task.state.error = failure_text(task.state.job, error)
+                task.state.fail(error)
             if result:
                 self._encoders.submit(self._encode, task, result, device)
             else:
@@ -346,8 +346,8 @@ class Developers:
             with CpuTimer("Python"):
                 written = self._worker.encode(task.state, task.recipe, result, device)
         except OutputError as error:
-            task.state.error = failure_text(task.state.job, error)
+            task.state.fail(error)
             self._fail(error)
         except BaseException as error:  # an error of an image must not end the thread
-            task.state.error = failure_text(task.state.job, error)
+            task.state.fail(error)
         task.written.set_result(written)

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.base.errors import ClpipeError
+from clpipe.base.errors import ClpipeError, ImageError, RequestError, error_class
 from clpipe.base.files import FileGroup
 from clpipe.batch.memory_budget import Lease
 from clpipe.batch.outcome import DONE, FAILED, Outcome, Span
+from clpipe.chain.rendition import Rendition
 from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import CarriedLayers
 from clpipe.inputs.find import Job
@@ -61,6 +62,7 @@ class JobState:
 
     job: Job
     loader: ImageLoader
+    here: Job  # the job, with files of this machine
     began: float = field(default_factory=time.time)
     spans: list[Span] = field(default_factory=list)
     source: SourceImage | None = None
@@ -70,6 +72,7 @@ class JobState:
     unwritten: int = 0  # number of renditions that are not yet written
     status: str = DONE
     error: str = ""
+    error_class: str = ""
     reason: str = ""
     outputs: list[str] = field(default_factory=list)
     carried_layers: CarriedLayers | None = None  # None after they are written
@@ -78,6 +81,9 @@ class JobState:
     patches: list[Patch] = field(default_factory=list)
     old: int = 0  # existing renditions that another version of the program made
     leases: Sequence[Lease] = ()  # the memory that its image takes; () if it is not loaded
+    renditions: Sequence[Rendition] = ()  # the renditions to make
+    decoded: DecodedFrame | None = None  # the image, if it was decoded to be metered
+    files: ExitStack = field(default_factory=ExitStack)  # removes files that were fetched
 
     def drop_pixels(self) -> None:
         """Free the memory of the image, but keep its size."""
@@ -85,11 +91,30 @@ class JobState:
             empty = np.broadcast_to(np.float16(0), self.source.pixels.shape)
             self.source = replace(self.source, pixels=empty, later=())
 
+    def close(self) -> None:
+        """Free what was prepared for an image that is not decoded."""
+        self.files.close()
+        if self.decoded:
+            self.decoded.free()
+
     def free(self) -> None:
         """Free the memory of the image, and let the next image take it."""
         self.drop_pixels()
         for lease in self.leases:
             lease.release()
+
+    def fail(self, error: BaseException) -> None:
+        """Note why the job fails. The traceback of an unexpected error is logged at level DEBUG."""
+        job = self.here
+        self.error_class = error_class(error)
+        if isinstance(error, ImageError | RequestError | MemoryError):
+            self.error = self.loader.error_text(job, error)
+        else:
+            is_known = isinstance(error, ClpipeError)
+            text = str(error) if is_known else f"unexpected {type(error).__name__}: {error}"
+            text = text.removesuffix(": ").replace(str(job.path), job.display_name)
+            self.error = f"{job.display_name}: {text}"
+            log.debug("%s", self.error, exc_info=error)
 
     @contextmanager
     def timed(self, step: str) -> Iterator[None]:
@@ -122,6 +147,7 @@ class JobState:
             self.old,
             self.source.layer if self.source else "",
             self.source.part if self.source else 0,
+            self.error_class,
         )
 
 
@@ -136,15 +162,3 @@ class Written:
 
     group: FileGroup
     files: Sequence[str]
-
-
-def failure_text(job: Job, error: BaseException) -> str:
-    """Return the message for an image that failed. The traceback is logged at level DEBUG."""
-    if isinstance(error, MemoryError):
-        reason = "there is not enough memory for it"
-    elif isinstance(error, ClpipeError):
-        reason = str(error)
-    else:
-        reason = f"unexpected {type(error).__name__}: {error}".removesuffix(": ")
-    log.debug("%s: %s", job.display_name, reason, exc_info=error)
-    return f"{job.display_name}: {reason.replace(str(job.path), job.display_name)}"

@@ -20,9 +20,11 @@ from clpipe.base.errors import ClpipeError
 from clpipe.base.files import discard, remove_temporary_files
 from clpipe.base.process_folder import process_folder
 from clpipe.base.system import bind_to_processors
+from clpipe.base.transfers import TRANSFERS
+from clpipe.batch.downloads import Jobs
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.spec import RunSpec
-from clpipe.batch.threads import Batch, Jobs
+from clpipe.batch.threads import Batch
 from clpipe.engine.device import Device, open_devices
 
 COLLECT_SECONDS = 0.005  # s; outcomes of this time are sent in one message
@@ -139,6 +141,7 @@ def _listen(pipe: _PipeToRun, jobs: Jobs, batch: Batch) -> None:
         for job in values[0] if kind == "jobs" else ():
             jobs.put(job)
         if kind == "stop":
+            TRANSFERS.stop()
             batch.stop()
         if kind != "jobs":
             jobs.put(None)

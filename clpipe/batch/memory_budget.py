@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from math import prod
 from typing import Self
 
-from clpipe.base.errors import ImageError
+from clpipe.base.errors import ImageError, MemoryLimitError
 from clpipe.base.memory import FreeMemory, available_memory, format_bytes, free_memory
 from clpipe.base.system import trim_memory
 from clpipe.chain.chain import Chain
@@ -233,7 +233,7 @@ class MemoryBudget:
             possible = free.bytes if free else 0
             _restore(lease)
         left = format_bytes(max(possible, 0))
-        raise ImageError(
+        raise MemoryLimitError(
             f"it takes about {format_bytes(needed(size))} of memory, but only {left} "
             f"is available ({free.limit if free else 'this machine'}); allow more memory, "
             "or use less with --jobs 1 or fewer pictures per image"

@@ -7,7 +7,7 @@ from clpipe.inputs.find import Job
 DONE, SKIPPED, LEFT_OUT, FAILED = "done", "skipped", "left out", "failed"
 
 
-STEPS = ("decode", "device", "encode")
+STEPS = ("fetch", "decode", "device", "encode")
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ class Outcome:
         megapixels: the size of the image that was read.
         warnings: warnings about the image.
         error: why it failed, or "".
+        error_class: the class of the error, see :func:`clpipe.base.errors.error_class`; or "".
         reason: the content of a file that was left out, or "".
         outputs: the files that were written, relative to the output directory.
         began: its begin, in s since 1970.
@@ -68,6 +69,7 @@ class Outcome:
     old: int = 0
     layer: str = ""
     part: int = 0
+    error_class: str = ""
 
     def seconds(self, step: str) -> float:
         """Return the seconds that a step took, summed over all renditions."""

@@ -336,7 +336,10 @@ class Processes:
             self._processes.append(self._start(process.config.number))
         end = _exit_text(status)
         text = f"killed the process that took it, {MAX_DEATHS} times; the last one {end}"
-        return [Outcome(job, FAILED, error=f"{job.display_name}: {text}") for job in given_up]
+        return [
+            Outcome(job, FAILED, error=f"{job.display_name}: {text}", error_class="unexpected")
+            for job in given_up
+        ]
 
     def _stop_processes(self) -> None:
         for process in self._processes:

@@ -91,13 +91,14 @@ class Summary:
         return time.perf_counter() - self.began
 
     def shares(self) -> str:
-        """Return the share of each step in the time of all threads.
+        """Return the share of each step in the time of all threads. Files of URLs are fetched.
 
-        >>> Summary(1, seconds={"decode": 1.0, "device": 2.0, "encode": 1.0}).shares()
+        >>> Summary(1, seconds={"fetch": 0.0, "decode": 1.0, "device": 2.0, "encode": 1.0}).shares()
         'decode 25 %, device 50 %, encode 25 %'
         """
         total = sum(self.seconds.values()) or 1.0
-        return ", ".join(f"{s} {100 * t / total:.0f} %" for s, t in self.seconds.items())
+        shares = {s: t for s, t in self.seconds.items() if t or s != "fetch"}
+        return ", ".join(f"{s} {100 * t / total:.0f} %" for s, t in shares.items())
 
     def record(self) -> dict[str, Any]:
         """Return the counts as JSON values."""
@@ -186,6 +187,7 @@ class RunLog:
                 "warnings": list(outcome.warnings),
                 "clipped": round(outcome.clipped, 4),
                 "error": outcome.error or None,
+                "error_class": outcome.error_class or None,
                 **({"reason": outcome.reason} if outcome.reason else {}),
             },
         )

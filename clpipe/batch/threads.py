@@ -18,11 +18,12 @@ from dataclasses import replace
 from functools import partial
 
 from clpipe.base.cpu_time import CpuTimer
-from clpipe.base.errors import OutputError, RequestError
+from clpipe.base.errors import ImageError, OutputError, RequestError
 from clpipe.base.processors import available_processors
 from clpipe.batch.developing import MAX_STACK, Developers, depth_of
+from clpipe.batch.downloads import Downloads, Jobs
 from clpipe.batch.frames import Turns
-from clpipe.batch.job_state import DecodedFrame, JobState, Written, failure_text
+from clpipe.batch.job_state import DecodedFrame, JobState, Written
 from clpipe.batch.memory_budget import Lease, MemoryBudget, default_budget
 from clpipe.batch.metering import Metering
 from clpipe.batch.outcome import Outcome
@@ -30,8 +31,6 @@ from clpipe.batch.work import ImageWorker
 from clpipe.engine.device import Device
 from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.find import Job
-
-Jobs = queue.SimpleQueue[Job | Exception | None]  # None marks the end; an error ends the run
 
 Made = tuple[JobState, list[Written]]  # a job, and its renditions under temporary names
 
@@ -79,6 +78,7 @@ class Batch:
         )
         self._metering = Metering(worker, self._acquire_for_metering, self._developers.on_device)
         self._jobs: Jobs = queue.SimpleQueue()
+        self._downloads = Downloads(self._begin)
         # Frames of sequences get memory, and then their device, in the order of the jobs.
         self._admitting, self._developing = self._turns = Turns(), Turns()
         # None means that one of the threads has ended.
@@ -149,6 +149,7 @@ class Batch:
             developers.close()
             for thread in (committer, *threads):
                 thread.join()
+            self._downloads.close()
         if self._failure:
             raise self._failure
 
@@ -195,7 +196,7 @@ class Batch:
     def _next(self, is_waiting: bool) -> Job | None:
         """Return the next job. None is the end, or an empty queue if ``is_waiting`` is False."""
         try:
-            job = self._jobs.get(is_waiting)
+            job = self._downloads.take(self._jobs, is_waiting)
         except queue.Empty:
             return None
         if isinstance(job, Exception):
@@ -238,30 +239,35 @@ class Batch:
             job: the job.
             waiting_states: jobs that this thread has decoded and not yet developed.
         """
-        state = JobState(job, self._worker.loader)
+        state = JobState(job, self._worker.loader, job)
         waits: list[float] = []
         leases: list[Lease] = []
-        decoded = self._metering.take(job)
-        admit = partial(self._admit, waiting_states, waits, leases, decoded)
         try:
-            state = self._worker.decode(job, admit, decoded)
+            state = self._downloads.begun(job)
+            admit = partial(self._admit, waiting_states, waits, leases, state.decoded)
+            self._worker.decode(state, admit)
         except OutputError as error:
-            state.error = failure_text(job, error)
+            state.fail(error)
             self._fail(error)
         except BaseException as error:  # an error of an image must not end the thread
-            state.error = failure_text(job, error)
+            state.fail(error)
         finally:
             self._admitting.end(job)
-        if decoded:
-            decoded.files.close()
-            if not leases:  # no picture of the frame is made
-                decoded.lease.release()
-        state.leases = leases
+        if leases:
+            state.leases = leases
+        else:  # no picture is made
+            state.close()
+        state.decoded = None
         state.spans = [  # subtracts the wait for memory
             replace(span, start=span.start + sum(waits), seconds=span.seconds - sum(waits))
+            if span.step == "decode"
+            else span
             for span in state.spans
         ]
         return state
+
+    def _begin(self, job: Job) -> JobState:
+        return self._worker.begin(job, self._metering.take(job))
 
     def _admit(
         self,
@@ -328,7 +334,7 @@ class Batch:
 
         if not self._developing.wait(decoded[0].job):
             for state in decoded:
-                state.error = f"{state.job.display_name}: the run ended before it was developed"
+                state.fail(ImageError("the run ended before it was developed"))
         try:
             developed = self._developers.develop(decoded, end_turns)
         finally:
@@ -360,7 +366,8 @@ class Batch:
                 ended += taken.count(None)
                 self._commit(made)
                 for state, _ in made:
-                    self._outcomes.put(state.outcome())
+                    if state.error_class != "stopped":  # the next run does it
+                        self._outcomes.put(state.outcome())
         except BaseException as error:  # an error of the run, not of one image
             self._fail(error)
             while ended < self.in_flight:
@@ -380,4 +387,4 @@ class Batch:
             self._fail(error)
         except BaseException as error:
             for state, _ in made:
-                state.error = failure_text(state.job, error)
+                state.fail(error)

@@ -108,39 +108,57 @@ class ImageWorker:
         half = self.loader.kept is None and self.chain.source is Kind.RGB
         return Runners(self.writer, device, self.chain, half)
 
-    def decode(
-        self, job: Job, admit: Callable[[Job], None], decoded: DecodedFrame | None = None
-    ) -> JobState:
-        """Load a job's image, unless all of its pictures exist already.
+    def begin(self, job: Job, decoded: DecodedFrame | None = None) -> JobState:
+        """Find what a job's image needs, and fetch its files if they are at URLs.
 
         Args:
             job: the image.
+            decoded: the image, if it was decoded to be metered.
+
+        Returns:
+            The state of the job, for :meth:`decode`. A skipped or failed job has no renditions.
+        """
+        state = JobState(job, self.loader, job, decoded=decoded)
+        if decoded:
+            state.files.push(decoded.files)
+        try:
+            job.check()
+            state.request = self._request_of(job)
+            if renditions := self._missing(state):
+                start = time.perf_counter()
+                paths = decoded.paths if decoded else job.paths
+                first, *others = state.files.enter_context(fetched_files(paths))
+                if first != job.path:
+                    state.here = replace(job, path=first, subframes=tuple(others))
+                    state.note("fetch", start)
+                state.renditions = renditions
+            else:
+                state.status = SKIPPED
+        except Exception as error:  # an error of an image must not end the thread
+            state.fail(error)
+        return state
+
+    def decode(self, state: JobState, admit: Callable[[Job], None]) -> None:
+        """Load a job's image, if renditions of it are made.
+
+        Args:
+            state: what :meth:`begin` returned.
             admit: called before the image is loaded. Gets the job with local files; may raise
                 ImageError.
-            decoded: the image, if it was decoded to be metered.
         """
-        state, here = JobState(job, self.loader), job
-        with state.timed("decode"):
+        job = state.job
+        with state.files, state.timed("decode"):
             try:
-                job.check()
-                state.request = self._request_of(job)
-                renditions = self._missing(state)
-                if renditions:
+                if state.renditions:
                     state.loader = self.loader.for_job(job)
-                    with fetched_files(decoded.paths if decoded else job.paths) as (first, *others):
-                        if first != job.path:
-                            here = replace(job, path=first, subframes=tuple(others))
-                        admit(here)
-                        self._load(state, here, renditions, decoded)
-                else:
-                    state.status = SKIPPED
+                    admit(state.here)
+                    self._load(state)
             except (ImageError, RequestError, MemoryError) as error:
                 if state.loader.is_skipped(job, error):
                     state.status = LEFT_OUT
                     state.reason = str(error) if isinstance(error, NoPictureError) else ""
                 else:
-                    state.error = state.loader.error_text(here, error)
-        return state
+                    state.fail(error)
 
     def _request_of(self, job: Job) -> Mapping[str, Any]:
         """Return the record of the request for a job's image."""
@@ -156,7 +174,7 @@ class ImageWorker:
     def _is_done(self, job: Job) -> bool:
         """Return whether nothing of a job is made: its pictures are kept, or it will fail."""
         try:
-            return not self._missing(JobState(job, self.loader, request=self._request_of(job)))
+            return not self._missing(JobState(job, self.loader, job, request=self._request_of(job)))
         except (ImageError, RequestError):
             return True
 
@@ -185,25 +203,14 @@ class ImageWorker:
         stamps = [stamp_of(path) for path in job.paths]
         return stamps, loader.enter(job, loader.read(job))
 
-    def _load(
-        self,
-        state: JobState,
-        job: Job,
-        renditions: Sequence[Rendition],
-        decoded: DecodedFrame | None,
-    ) -> None:
+    def _load(self, state: JobState) -> None:
         """Load a state's image, and set the recipes of its renditions.
-
-        Args:
-            state: the state.
-            job: its job, with local files.
-            renditions: the renditions to make.
-            decoded: the image, if it was decoded to be metered.
 
         Raises:
             ImageError, RequestError, MemoryError: the image cannot be read, or does not fit the
                 chain.
         """
+        job, renditions, decoded = state.here, state.renditions, state.decoded
         loaded: LoadedImage | None
         if decoded:
             state.stamps, state.spans = decoded.stamps, [decoded.span]
@@ -325,7 +332,7 @@ class ImageWorker:
         try:
             return work()
         except (ImageError, RequestError, MemoryError) as error:
-            state.error = state.loader.error_text(state.job, error)
+            state.fail(error)
             return None
 
     def encode(
@@ -365,7 +372,8 @@ class ImageWorker:
             try:
                 self.fail(state, error)
             except OutputError as reason:
-                state.error, failure = f"{state.job.display_name}: {reason}", reason
+                state.fail(reason)
+                failure = reason
         if failure:
             raise failure
 
@@ -376,7 +384,7 @@ class ImageWorker:
             OutputError: nothing more can be written.
         """
         self.writer.check_folder()
-        state.error = state.loader.error_text(state.job, error)
+        state.fail(error)
 
     def _encode(
         self, state: JobState, recipe: Recipe, result: Result, device: Device | None

@@ -218,7 +218,8 @@ class Reporter:
         if not self._quiet:
             self._print_left_out()
         failed = summary.failures
-        if self._quiet or not (self._several or failed or counts[SKIPPED]):
+        is_done = summary.made == summary.total and not failed and not counts[SKIPPED]
+        if self._quiet or (is_done and not self._several):
             return
         were = "was" if counts[SKIPPED] == 1 else "were"
         existing = f" ({counts[SKIPPED]} of them {were} there already)" if counts[SKIPPED] else ""

@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
-from clpipe.base.errors import DeviceError, ImageError
+from clpipe.base.errors import DeviceError, MemoryLimitError
 from clpipe.base.memory import format_bytes
 from clpipe.engine.discovery import (
     DeviceInfo,
@@ -213,7 +213,7 @@ class Device:
         tiling = tiling_of(work.plan, *work.size, lanes, memory, largest, self.depth)
         if work.options.state and len(tiling.tiles) > 1:
             (width, height), step = work.size, work.plan.states[0][0]
-            raise ImageError(
+            raise MemoryLimitError(
                 f"{width}x{height} pixels: {step} cannot process a frame in tiles, and the whole "
                 f"frame does not fit into {format_bytes(memory)} of {self.info.label}. Allow more "
                 f"memory with --memory, or skip {step}."

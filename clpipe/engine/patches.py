@@ -7,7 +7,7 @@ part of the whole result, bit for bit.
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from clpipe.base.errors import ImageError
+from clpipe.base.errors import ImageError, MemoryLimitError
 from clpipe.base.memory import format_bytes
 from clpipe.engine.extents import Box, enclosing
 from clpipe.engine.ir import Plan
@@ -70,7 +70,7 @@ def check_memory(sizes: Mapping[str, int], memory: int) -> None:
         ImageError: the buffers do not fit.
     """
     if sum(sizes.values()) > memory:
-        raise ImageError(
+        raise MemoryLimitError(
             f"a patch needs {format_bytes(sum(sizes.values()))} of device memory, but the limit is "
             f"{format_bytes(memory)}. Raise the memory limit, or use smaller patches."
         )

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-from clpipe.base.errors import ImageError
+from clpipe.base.errors import MemoryLimitError
 from clpipe.base.memory import format_bytes
 from clpipe.engine.bands import ring_bytes
 from clpipe.engine.bindings import RINGS, slot_buffer, step_buffer
@@ -333,7 +333,7 @@ def tiling_of(
     if best is None:
         smallest = cutter.largest_tile(column_step, 4)
         least, full = (buffer_sizes(plan, extents, depth) for extents in (smallest, whole))
-        raise ImageError(
+        raise MemoryLimitError(
             f"{width}x{height} pixels need {format_bytes(sum(full.values()))} of device memory, or "
             f"{format_bytes(sum(least.values()))} in the smallest tiles, with a buffer of "
             f"{format_bytes(max(least.values()))}. The limit is {format_bytes(memory)}, with "

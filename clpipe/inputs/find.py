@@ -245,26 +245,32 @@ def _jobs_at_url(url: str, endings: Sequence[str], excluded: Exclusion) -> list[
     if not is_pattern and Path(inner).suffix.lower() in endings:
         return [Job(path_of(url), inner.rpartition("/")[2])]
     root = inner if inner.endswith("/") else f"{inner}/"
-    jobs = []
+    jobs: list[Job] = []
+    skipped: Counter[str] = Counter()
     for each in list_urls(url):
         name = name_in(each)
         is_below = name.startswith(root) and not is_pattern
         key = name.removeprefix(root) if is_below else name.rpartition("/")[2]
-        hidden = any(part.startswith(".") for part in key.split("/"))
         suffix = Path(key).suffix.lower()
-        if (is_below and (hidden or suffix not in endings)) or key in excluded:
+        if key in excluded:
             continue
         try:
             path = path_of(each)
-        except RequestError as error:
-            log.warning("%s; this file is skipped", error)
+            is_hidden = any(part.startswith(".") for part in key.split("/"))
+            if is_below and (is_hidden or suffix not in endings):
+                skipped["hidden" if is_hidden else suffix or "without suffix"] += 1
+                continue
+        except RequestError:
+            skipped["with '..', '.' or empty parts in the key"] += 1
             continue
         jobs.append(Job(path, key, named_by_user=not is_below))
+    summary = _summary(skipped)
     if not jobs:
-        raise RequestError(
-            f"{url}: there are no images at this URL; clpipe looked for {', '.join(endings[:6])} "
-            "and more"
-        )
+        text = f"{url}: there are no images at this URL; clpipe looked for "
+        text += f"{', '.join(endings[:6])} and more"
+        raise RequestError(text + f", and found {summary}" * bool(summary))
+    if skipped:
+        log.info("%s: other files were skipped: %s", url, summary)
     return jobs
 
 
@@ -294,10 +300,7 @@ def images_in(
                 skipped_types[
                     "pipe or device" if suffix in endings else suffix or "without suffix"
                 ] += 1
-    ranked = sorted(skipped_types.items(), key=lambda item: (-item[1], item[0]))
-    kinds = [f"{count} {suffix}" for suffix, count in ranked[:5]]
-    kinds += ["others"] * (len(skipped_types) > len(kinds))
-    summary = printable(", ".join(kinds))
+    summary = _summary(skipped_types)
     if not images:
         qualifier = " that are not excluded" if excluded else ""
         types = ", ".join(e for e in endings if e not in RAW_SUFFIXES)
@@ -315,6 +318,13 @@ def images_in(
             "%s: %d %s and %s skipped: %s", folder, skipped_types.total(), not_images, were, summary
         )
     return sorted(images)
+
+
+def _summary(skipped: Counter[str]) -> str:
+    """Return the most frequent kinds of skipped files, with their numbers; "" for none."""
+    ranked = sorted(skipped.items(), key=lambda item: (-item[1], item[0]))
+    kinds = [f"{count} {kind}" for kind, count in ranked[:5]]
+    return printable(", ".join(kinds + ["others"] * (len(skipped) > len(kinds))))
 
 
 def _walk(folder: Path, output: Path, excluded: Exclusion) -> Iterator[tuple[str, list[str]]]:

@@ -264,16 +264,21 @@ class ImageLoader:
         return shutter if job.subframes or is_lit else None
 
     def _read(self, path: Path, layer: str | None = None) -> SourceImage:
-        if self.raw.is_raw(path):
-            return self.raw.read(path)
         request = self.request
-        options = ReadOptions(
-            layer or request.layer,
-            request.max_pixels or DEFAULT_MAX_PIXELS,
-            request.transfer,
-            self.reads_overscan,
-        )
-        return read_source(path, self.reads, options)
+        try:
+            if self.raw.is_raw(path):
+                return self.raw.read(path)
+            options = ReadOptions(
+                layer or request.layer,
+                request.max_pixels or DEFAULT_MAX_PIXELS,
+                request.transfer,
+                self.reads_overscan,
+            )
+            return read_source(path, self.reads, options)
+        except ImageError as error:
+            if type(error) is ImageError:  # a subclass says more
+                error.error_class = "damaged" if path.exists() else "not_found"
+            raise
 
     def enter(self, job: Job, source: SourceImage) -> LoadedImage | None:
         """Return an image with the chain for it.
