@@ -394,7 +394,7 @@ def test_one_render_by_several_isos_and_processes(bucket, clpipe):
     Path("twice.csv").write_text(f"path,name,seed\n{rows}")
     assert "12 of 12 images done" in clpipe("run", "twice.csv", "-o", "p", *RUN).stderr
     left = process_folder()
-    assert left and not [each for each in left.glob("fetched-*/**/r1.exr")]
+    assert left and not list(left.glob("fetched-*/**/r1.exr"))
 
 
 def test_manifests_behind_urls_do_not_lead_out_of_their_bucket(bucket, clpipe, tmp_path):

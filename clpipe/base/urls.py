@@ -264,8 +264,11 @@ def _fetch(url: str, path: Path, error_type: type[ClpipeError]) -> None:
 
     def work(system: Any, remote: str) -> Path:
         nonlocal info
-        with contextlib.suppress(PermissionError):  # reading the file tells the service's reason
+        try:
             info = system.info(remote)
+        except OSError as error:
+            if service_code(error) not in ("400", "403"):  # reading tells the service's reason
+                raise
         # Other threads may fetch the file, and an abandoned try may still write its part.
         part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
         try:

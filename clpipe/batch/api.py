@@ -14,8 +14,9 @@ from clpipe.base.url_text import local_path
 from clpipe.base.urls import path_of
 from clpipe.base.validation import check_argument_types
 from clpipe.batch.clips import parse_bit_rate, parse_rate, take_clip_options
-from clpipe.batch.execution import ExecutionOptions
-from clpipe.batch.session import Images, Run
+from clpipe.batch.execution import ExecutionOptions, parse_failures
+from clpipe.batch.images import Images
+from clpipe.batch.session import Run
 from clpipe.chain.formats import format_named
 from clpipe.chain.options import DEFAULT_PATCHES, OPTIONS, Moments, RedoName, Transfer, check_option
 from clpipe.chain.python_words import errors_in_python
@@ -37,6 +38,7 @@ CONVERTERS: dict[str, Callable[[Any], Any]] = {
     "poses": partial(local_path, "poses"),
     "redo": Redo,
     "shard": parse_shard,
+    "max_failures": lambda limit: parse_failures(str(limit)),
     "memory": lambda size: parse_size(str(size)),
     "trace": partial(local_path, "trace"),
 }
@@ -80,6 +82,7 @@ def run(
     max_pixels: int | None = None,
     redo: RedoName | None = None,
     webdataset: int | None = None,
+    max_failures: int | str | None = None,
     shard: str | None = None,
     device: str | int | Sequence[str | int] | None = None,
     memory: int | str | None = None,
@@ -182,6 +185,8 @@ def run(
             are missing or whose request has changed are always made. damaged reads all files. The
             choices are "missing", "old", "damaged", "all". None is old.
         webdataset: the number of images per tar for WebDataset, OUT/000000.tar and so on.
+        max_failures: the most images of this run that may fail, as a number or a percentage. If
+            more fail, the run stops and has exit status 1. None is no limit.
         shard: the part of the images to make, such as 2/8, for job arrays.
         device: an index or part of a name from 'clpipe devices', or numpy. None is the first GPU
             and all GPUs like it, else the CPU.

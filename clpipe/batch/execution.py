@@ -3,7 +3,43 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from clpipe.base.errors import RequestError
 from clpipe.outputs.existing import Redo
+
+
+@dataclass(frozen=True)
+class FailureLimit:
+    """The most images of a run that may fail: a number, or a percentage of all."""
+
+    value: float
+    is_percentage: bool
+
+    def count(self, images: int) -> int:
+        """Return the most failures among a number of images.
+
+        >>> FailureLimit(2.5, True).count(1000), FailureLimit(3, False).count(1000)
+        (25, 3)
+        """
+        return int(self.value * images / 100 if self.is_percentage else self.value)
+
+
+def parse_failures(text: str) -> FailureLimit:
+    """Return the limit in a text such as "10" or "2.5%".
+
+    Raises:
+        RequestError: the text does not have that form.
+    """
+    is_percentage = text.endswith("%")
+    try:
+        value = float(text[:-1]) if is_percentage else int(text)
+    except ValueError:
+        value = -1
+    if not 0 <= value <= (100 if is_percentage else 10**9):
+        raise RequestError(
+            f"--max-failures: found {text!r}; expected a number of images such as 10, or a "
+            "percentage from 0% to 100%"
+        )
+    return FailureLimit(value, is_percentage)
 
 
 @dataclass(frozen=True)
@@ -22,6 +58,7 @@ class ExecutionOptions:
         trace: the file for a timeline, or None.
         processes: the number of processes that share the work on this machine. None chooses it
             from the number and size of the images.
+        max_failures: the most images that may fail before the run stops. None is no limit.
     """
 
     output: Path
@@ -31,3 +68,4 @@ class ExecutionOptions:
     redo: Redo = Redo.OLD
     trace: Path | None = None
     processes: int | None = None
+    max_failures: FailureLimit | None = None

@@ -73,6 +73,7 @@ class JobState:
     status: str = DONE
     error: str = ""
     error_class: str = ""
+    device: str = ""  # the name of the device that developed it
     reason: str = ""
     outputs: list[str] = field(default_factory=list)
     carried_layers: CarriedLayers | None = None  # None after they are written
@@ -148,6 +149,7 @@ class JobState:
             self.source.layer if self.source else "",
             self.source.part if self.source else 0,
             self.error_class,
+            self.device,
         )
 
 

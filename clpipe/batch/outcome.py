@@ -1,11 +1,16 @@
 """The outcome of one image, and the time that each step took."""
 
-from dataclasses import dataclass
+import os
+import socket
+from dataclasses import dataclass, field
+from functools import cache
 
 from clpipe.inputs.find import Job
 
 DONE, SKIPPED, LEFT_OUT, FAILED = "done", "skipped", "left out", "failed"
 
+
+host_name = cache(socket.gethostname)
 
 STEPS = ("fetch", "decode", "device", "encode")
 
@@ -46,6 +51,9 @@ class Outcome:
         warnings: warnings about the image.
         error: why it failed, or "".
         error_class: the class of the error, see :func:`clpipe.base.errors.error_class`; or "".
+        device: the name of the device that developed it; "" if none did.
+        host: the machine that worked on it.
+        pid: the id of the process that worked on it.
         reason: the content of a file that was left out, or "".
         outputs: the files that were written, relative to the output directory.
         began: its begin, in s since 1970.
@@ -70,6 +78,9 @@ class Outcome:
     layer: str = ""
     part: int = 0
     error_class: str = ""
+    device: str = ""
+    host: str = field(default_factory=host_name)
+    pid: int = field(default_factory=os.getpid)
 
     def seconds(self, step: str) -> float:
         """Return the seconds that a step took, summed over all renditions."""

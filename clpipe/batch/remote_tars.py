@@ -9,6 +9,7 @@ made again.
 import glob
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -39,6 +40,9 @@ class RemoteTars(Tars):
         redo: which of the tars are made again.
         tars: the tars of the run's part.
 
+    Attributes:
+        names: the files at the URL.
+
     Raises:
         RequestError: a tar there belongs to another run, or is not ours.
     """
@@ -49,9 +53,9 @@ class RemoteTars(Tars):
         url = url_of(tars[0].folder)
         assert url
         below = [each.removeprefix(f"{url}/") for each in list_urls(url)]
-        self._there = {name for name in below if "/" not in name}
+        self.names = {name for name in below if "/" not in name}
         self._keys = {tar.name: self._key(tar) for tar in tars}  # digests of the current inputs
-        for name in sorted(self._there):
+        for name in sorted(self.names):
             match = NUMBERED.fullmatch(name)
             if match and int(match[2]) >= tars[0].of:
                 raise RequestError(
@@ -59,7 +63,7 @@ class RemoteTars(Tars):
                     "would be read with them; remove it, or choose another URL"
                 )
         for tar in tars if redo is not Redo.ALL else ():
-            if tar.name in self._there and f"{_stem(tar)}{INDEX}" not in self._there:
+            if tar.name in self.names and f"{_stem(tar)}{INDEX}" not in self.names:
                 raise RequestError(
                     f"{url}/{tar.name}: has no index, so clpipe did not write it, and it would be "
                     "overwritten; move it, choose another URL, or say --redo all"
@@ -96,7 +100,7 @@ class RemoteTars(Tars):
         Raises:
             OutputError: its index cannot be read.
         """
-        if self.redo is Redo.ALL or tar.name not in self._there:
+        if self.redo is Redo.ALL or tar.name not in self.names:
             return False
         index = self._index_of(tar)
         if index.get("key") != self._keys[tar.name] or index.get("failed") != []:
@@ -125,7 +129,8 @@ class RemoteTars(Tars):
         url = url_of(tar.path)
         assert url
         upload(tar.path, url)
-        self._write(tar, {"size": size, "sha256": digest, "failed": failed})
+        counts = Counter(statuses.values())
+        self._write(tar, {"size": size, "sha256": digest, "failed": failed, "counts": counts})
         discard(tar.path)
 
     def _key(self, tar: Tar) -> str:

@@ -3,7 +3,9 @@
 import contextlib
 import errno
 import json
+import logging
 import os
+import secrets
 import stat
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,10 +18,16 @@ from clpipe.base.about import full_version
 from clpipe.base.errors import OutputError
 from clpipe.base.memory import peak_memory
 from clpipe.base.system import open_plain
+from clpipe.base.urls import upload
 from clpipe.batch.interrupt import INTERRUPTED
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS, Outcome
 from clpipe.engine.clipping import WARNING_SHARE
 from clpipe.inputs.find import Shard
+
+log = logging.getLogger(__name__)
+
+SEND_SECONDS = 60.0  # s; the interval between uploads of a log
+START = b'{"event": "start"'  # the beginning of the first line
 
 
 def log_name(shard: Shard) -> str:
@@ -47,6 +55,7 @@ class Summary:
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STEPS, 0.0))
     began: float = field(default_factory=time.perf_counter)
     interrupted: bool = False
+    gave_up: str = ""  # why the run stopped itself
     much_clipped: int = 0  # images with a clipped share of MUCH or more
     most_clipped: tuple[float, str] = (0.0, "")  # the largest clipped share, and its image
     old: int = 0  # existing pictures that another version of the program made
@@ -69,6 +78,15 @@ class Summary:
         for step in STEPS:
             self.seconds[step] += outcome.seconds(step)
 
+    def exceeds(self, most: int) -> bool:
+        """Return whether more images have failed than are allowed, and note that the run stops."""
+        failed = self.counts[FAILED]
+        if failed > most and not self.gave_up:
+            self.gave_up = (
+                f"the run stopped, because more than {most} image{'s' * (most != 1)} failed"
+            )
+        return bool(self.gave_up)
+
     @property
     def finished(self) -> int:
         """The number of images that have an outcome."""
@@ -82,6 +100,8 @@ class Summary:
     @property
     def exit_status(self) -> int:
         """The exit status of a command: 130 after an interruption, 1 if something is missing."""
+        if self.gave_up:
+            return 1
         has_no_result = self.counts[LEFT_OUT] > 0 == self.counts[DONE] + self.counts[SKIPPED]
         return INTERRUPTED if self.interrupted else int(bool(self.failures or has_no_result))
 
@@ -106,6 +126,7 @@ class Summary:
             "images": self.total,
             **{status.replace(" ", "_"): n for status, n in self.counts.items()},
             "interrupted": self.interrupted,
+            "gave_up": self.gave_up or None,
             "of_another_program": self.old,
             "megapixels": round(self.megapixels, 3),
             "seconds": round(self.elapsed, 3),
@@ -120,27 +141,58 @@ def _line(event: str, at: float, values: Mapping[str, Any]) -> bytes:
 
 
 class RunLog:
-    """Writes the log of a run after the logs of earlier runs. It begins with the first image.
+    """Writes the log of a run after the logs of earlier runs.
+
+    It begins with the first image, or with :meth:`begin`.
 
     Args:
         path: the file.
         start: the values of the first line.
         echo: also called with each line.
+        url: the directory in a bucket to which the log is uploaded, under a unique name, when it
+            begins, at intervals, and when it is closed. None is none.
     """
 
     def __init__(
-        self, path: Path, start: Mapping[str, Any], echo: Callable[[bytes], None] | None = None
+        self,
+        path: Path,
+        start: Mapping[str, Any],
+        echo: Callable[[bytes], None] | None = None,
+        url: str | None = None,
     ) -> None:
         self._path = path
         self._echo = echo
         self._file: int | None = None
-        self._start = _line("start", time.time(), {"clpipe": full_version(), **start})
+        self._start = {"clpipe": full_version(), "attempt": 1, **start}
+        self._began = time.time()
+        began = time.strftime("%Y%m%dT%H%M%S", time.gmtime(self._began))
+        self._url = url and f"{url}/{path.stem}.{began}-{secrets.token_hex(2)}.jsonl"
+        self._sent = 0.0  # when it was uploaded last, in s of time.monotonic()
+
+    def begin(self) -> None:
+        """Write the first line, and upload it.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        self._write(b"")
+        self._send()
+
+    def _send(self) -> None:
+        """Upload the log, if it has a URL.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        if self._url and self._file is not None:
+            self._sent = time.monotonic()
+            upload(self._path, self._url)
 
     def _write(self, line: bytes) -> None:
         try:
             if self._file is None:
                 self._file = self._open()
-                line = self._start + line
+                line = _line("start", self._began, self._start) + line
             _append(self._file, line)
         except OSError as error:
             raise OutputError(f"{self._path}: cannot be written: {error.strerror}") from None
@@ -159,6 +211,7 @@ class RunLog:
             os.close(file)
             raise OSError(errno.EINVAL, "not a regular file")
         if status.st_size:
+            self._start["attempt"] = 1 + self._path.read_bytes().count(START)
             os.lseek(file, -1, os.SEEK_END)
             if os.read(file, 1) != b"\n":
                 _append(file, b"\n")  # the last line is incomplete
@@ -179,6 +232,9 @@ class RunLog:
                 "name": job.key,
                 "stem": job.stem,
                 "status": outcome.status,
+                "host": outcome.host,
+                "pid": outcome.pid,
+                "device": outcome.device or None,
                 "layer": outcome.layer,
                 "part": outcome.part,
                 "megapixels": round(outcome.megapixels, 6),
@@ -192,6 +248,8 @@ class RunLog:
             },
         )
         self._write(line)
+        if time.monotonic() - self._sent > SEND_SECONDS:
+            self._send()
 
     def end(self, summary: Summary) -> None:
         """Write the last line, if there is a first one.
@@ -203,8 +261,12 @@ class RunLog:
             self._write(_line("end", time.time(), summary.record()))
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file. This writes no error, because it might hide one of the run."""
         if self._file is not None:
+            try:
+                self._send()
+            except OutputError as error:
+                log.warning("%s; the end of this run's log is lost", error)
             with contextlib.suppress(OSError):
                 os.fsync(self._file)
             os.close(self._file)
@@ -233,8 +295,13 @@ def read_log(path: Path) -> Sequence[dict[str, Any]]:
     Raises:
         OSError: it cannot be read.
     """
+    return parse_log(path.read_bytes())
+
+
+def parse_log(data: bytes) -> Sequence[dict[str, Any]]:
+    """Return the lines of a log's bytes, without one that is cut off."""
     lines = []
-    for line in path.read_text("utf-8").splitlines():
+    for line in data.splitlines():
         try:
             lines.append(json.loads(line))
         except ValueError:

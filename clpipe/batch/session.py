@@ -4,19 +4,19 @@
 """
 
 import logging
-import secrets
+import os
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 from clpipe.base.about import full_version
 from clpipe.base.errors import OutputError, RequestError
 from clpipe.base.files import discard
 from clpipe.base.processors import available_processors
-from clpipe.base.urls import upload, url_of
+from clpipe.base.urls import url_of
 from clpipe.batch.checks import (
     check_clip_chain,
     check_output,
@@ -24,18 +24,17 @@ from clpipe.batch.checks import (
     check_render_options,
 )
 from clpipe.batch.clip_sink import Clips
-from clpipe.batch.clips import ClipOptions
 from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.frames import check_frames
+from clpipe.batch.images import Images
 from clpipe.batch.metering import metering_ahead
-from clpipe.batch.outcome import Outcome
+from clpipe.batch.outcome import Outcome, host_name
 from clpipe.batch.processes import Processes, default_processes
 from clpipe.batch.remote_tars import RemoteTars
 from clpipe.batch.run_log import RunLog, Summary, log_name
 from clpipe.batch.sinks import Executor, Folder
 from clpipe.batch.spec import RunSpec
 from clpipe.batch.tar_sink import Tars
-from clpipe.batch.tars import Tar, split_into_tars
 from clpipe.batch.threads import Batch
 from clpipe.batch.trace import Trace, check_trace
 from clpipe.batch.work import ImageWorker
@@ -45,78 +44,16 @@ from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.state import has_state
 from clpipe.inputs.carry_rows import rows_note
-from clpipe.inputs.find import Job, Shard, find_jobs
+from clpipe.inputs.find import Job
 from clpipe.inputs.flow import check_flow
 from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.metering import write_exposures
-from clpipe.inputs.poses import assign_views
-from clpipe.inputs.sequences import in_sequences, sequence_of
-from clpipe.inputs.series import Series
-from clpipe.outputs.existing import pictures_without_input
+from clpipe.outputs.existing import Redo, pictures_without_input
 from clpipe.outputs.folder import output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Images:
-    """The images of a run.
-
-    Args:
-        inputs: files, directories, globs, URLs and manifests.
-        exclude: patterns of files that are skipped in directories and globs.
-        poses: the file with the renders' cameras and poses, if any.
-        series: several cameras and ISOs, whose pictures go to directories of their own.
-        shard: the part of the images to make.
-        per_tar: the number of images per tar. None writes no tars.
-        sequence: whether the images are frames of sequences.
-        clips: the clips that the frames of sequences go into. None writes no clips.
-        known_jobs: jobs that are known already, instead of inputs.
-    """
-
-    inputs: Sequence[str] = ()
-    exclude: Sequence[str] = ()
-    poses: Path | None = None
-    series: Series = field(default_factory=Series)
-    shard: Shard = field(default_factory=Shard)
-    per_tar: int | None = None
-    sequence: bool = False
-    clips: ClipOptions | None = None
-    known_jobs: Sequence[Job] = ()
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether the output directory will hold all pictures, as files, when the run ends."""
-        return bool(self.inputs) and not self.per_tar and not self.clips and self.shard.of == 1
-
-    def jobs(self, loader: ImageLoader, output: Path) -> tuple[list[Job], list[Tar]]:
-        """Return the jobs of this part of the run, and the tars that they go into.
-
-        Raises:
-            RequestError: an input, a camera or an ISO does not exist, or two outputs have one name.
-        """
-        jobs = self.known_jobs
-        if not jobs:
-            known_jobs = find_jobs(self.inputs, output, loader.endings(), self.exclude)
-            jobs = loader.exposures(known_jobs, self.sequence)
-        jobs = assign_views(jobs, self.poses, loader.settings.render, loader.request.truth_at)
-        jobs = self.series.jobs(jobs, loader.settings)
-        if self.sequence:
-            if self.per_tar and self.shard.of > 1:
-                raise RequestError(
-                    "--shard: a tar may hold frames of two sequences, so --sequence with "
-                    "--webdataset has no shards; remove one of the three options"
-                )
-            jobs = in_sequences(jobs)
-            names = self.shard.select(list(dict.fromkeys(map(sequence_of, jobs))))
-            if not self.per_tar:
-                return [job for job in jobs if sequence_of(job) in names], []
-        if self.per_tar:
-            tars = self.shard.select(split_into_tars(jobs, self.per_tar, output))
-            return [job for tar in tars for job in tar.jobs], tars
-        return self.shard.select(jobs), []
 
 
 class Run:
@@ -240,7 +177,14 @@ class Run:
             return
         images, execution = self.images, self.execution
         frames: list[Job] = []
-        start = {"arguments": list(self._arguments), "images": len(self.jobs)}
+        start = {
+            "arguments": list(self._arguments),
+            "images": len(self.jobs),
+            "tars": len(self._tars),
+            "shard": str(images.shard),
+            "host": host_name(),
+            "pid": os.getpid(),
+        }
         with ExitStack() as stack:
             sink = self.sink()
             sink.waiting = self._wait
@@ -263,11 +207,16 @@ class Run:
             trace = stack.enter_context(Trace(execution.trace)) if execution.trace else None
             if not images.clips:
                 remove_unfinished(execution.output, self.jobs, self._request.patch is not None)
-            if url := url_of(execution.output):
+            path = execution.output / log_name(images.shard)
+            url = url_of(execution.output)
+            if url:
                 stack.callback(discard, execution.output)
-                stack.callback(self._send_log, url)
-            run_log = RunLog(execution.output / log_name(images.shard), start, self._echo)
+                names = sink.names if isinstance(sink, RemoteTars) else ()
+                start["attempt"] = 1 + sum(name.startswith(f"{path.stem}.2") for name in names)
+            run_log = RunLog(path, start, self._echo, url)
             stack.enter_context(closing(run_log))
+            if url:
+                run_log.begin()  # shows whether the run may write there
             running = stack.enter_context(closing(sink.receive(executor, jobs)))
             self.summary.began = time.perf_counter()
             yield from self._log_outcomes(running, run_log, trace)
@@ -297,16 +246,6 @@ class Run:
         """Return what does the work of each image."""
         return ImageWorker(self._loader, sink, self._chain, self.execution.trace is not None)
 
-    def _send_log(self, url: str) -> None:
-        """Upload the log next to the tars, under a unique name."""
-        path = self.execution.output / log_name(self.images.shard)
-        if path.exists():
-            began = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
-            try:
-                upload(path, f"{url}/{path.stem}.{began}-{secrets.token_hex(2)}.jsonl")
-            except OutputError as error:  # this error must not hide an error of the run
-                log.warning("%s; the log of this run is lost", error)
-
     def _log_outcomes(
         self, running: Iterable[Outcome], log: RunLog, trace: Trace | None
     ) -> Iterator[Outcome]:
@@ -325,6 +264,9 @@ class Run:
                     except OutputError as error:
                         unlogged = error
                         self.stop()
+                limit = self.execution.max_failures
+                if limit and self.summary.exceeds(limit.count(self.summary.total)):
+                    self.stop()
                 if trace:
                     trace.add(outcome)
                 yield outcome
@@ -352,6 +294,24 @@ class Run:
                 f"{count} {pictures} in {self.execution.output} {are} of inputs that no longer "
                 "exist"
             )
+
+    def missing(self) -> list[Job]:
+        """Return the jobs of which pictures are missing, without writing anything.
+
+        Raises:
+            RequestError, OutputError: the output directory cannot be used or read.
+        """
+        sink = self.sink()
+        if isinstance(sink, RemoteTars):
+            return [job for tar in sink.tars if not sink.has(tar) for job in tar.jobs]
+        worker = self._worker(sink)
+        return [job for job in self.jobs if not worker.is_done(job)]
+
+    def trial(self, jobs: Sequence[Job], folder: Path) -> "Run":
+        """Return a run of some of the jobs on this machine, which writes files to a directory."""
+        options = {"output": folder, "redo": Redo.ALL, "trace": None, "max_failures": None}
+        execution = replace(self.execution, **options)  # type: ignore[arg-type]
+        return Run(self._loader.request, Images(known_jobs=jobs), execution)
 
     def sink(self) -> Folder:
         """Return the sink of the pictures: the output directory, clips or tars in it, or a URL.

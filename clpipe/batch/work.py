@@ -63,7 +63,7 @@ class ImageWorker:
         self.chain = chain
         self._trace = trace
         self._spare = SpareArrays(0)
-        self.frames = Frames(chain, self._is_done)
+        self.frames = Frames(chain, self.is_done)
 
     def reserve(self, count: int) -> None:
         """Set how many arrays of results are kept for later images."""
@@ -171,7 +171,7 @@ class ImageWorker:
     def _general_request(self) -> Mapping[str, Any]:
         return self.writer.request.record()
 
-    def _is_done(self, job: Job) -> bool:
+    def is_done(self, job: Job) -> bool:
         """Return whether nothing of a job is made: its pictures are kept, or it will fail."""
         try:
             return not self._missing(JobState(job, self.loader, job, request=self._request_of(job)))
@@ -347,6 +347,7 @@ class ImageWorker:
             OutputError: nothing more can be written.
         """
         written = None
+        state.device = device.info.name if device else "numpy"
         with state.timed("encode"):
             try:
                 with deferred_files() as group:

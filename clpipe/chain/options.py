@@ -251,6 +251,14 @@ _ALL = (
         above=0,
         most=10**6,
     ),
+    Key(
+        "max_failures",
+        str,
+        "The most images of this run that may fail, as a number or a percentage. If more fail, the "
+        "run stops and has exit status 1.",
+        "N|N%",
+        "no limit",
+    ),
     Key("shard", str, "The part of the images to make, such as 2/8, for job arrays.", "I/N"),
     DEVICE._replace(type_=list, default_text="the first GPU and all GPUs like it, else the CPU"),
     Key(

@@ -13,8 +13,9 @@ from rich.console import Console
 from clpipe.base.errors import RequestError
 from clpipe.base.files import check_folder
 from clpipe.batch.execution import ExecutionOptions
+from clpipe.batch.images import Images
 from clpipe.batch.run_log import Summary
-from clpipe.batch.session import Images, Run
+from clpipe.batch.session import Run
 from clpipe.chain.keys import CODE
 from clpipe.chain.options import FORMAT, TRUTH
 from clpipe.chain.panorama import projection_of

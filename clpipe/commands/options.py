@@ -32,8 +32,8 @@ GROUPS = {
     "Clips": "codec crf bit_rate bit_depth fps decoded",
     "Truth": "+truth +carry truth_at",
     "Inputs": "+sequence +poses +annotations +exclude layer transfer dump max_pixels",
-    "Batches": "+device +redo jobs processes memory shard dask quiet json_lines trace +help "
-    "+help_all",
+    "Batches": "+device +redo jobs processes memory shard dask max_failures dry_run quiet "
+    "json_lines metrics trace +help +help_all",
 }
 
 

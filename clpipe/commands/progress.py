@@ -1,6 +1,6 @@
 """Prints the progress of a run on stderr: a bar on a terminal, otherwise lines.
 
-Each image has a line. If there are many images, a line is printed every 10 s instead.
+Each image has a line if there are not many. Another line is printed every 10 s.
 """
 
 import contextlib
@@ -8,17 +8,21 @@ import shlex
 import time
 from collections import Counter
 from collections.abc import Callable, Generator
+from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import click
 from rich.console import Console
 from rich.text import Text
 
+from clpipe.base.errors import ImageError
 from clpipe.base.text import format_duration, one_line
+from clpipe.base.ticker import ticking
 from clpipe.base.urls import url_of
 from clpipe.batch.interrupt import interruptible
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
 from clpipe.batch.session import Run
+from clpipe.commands.metrics import write_metrics
 from clpipe.commands.notices import NOTICES
 from clpipe.engine.clipping import clipping_text
 from clpipe.engine.programs import watching_compilation
@@ -29,7 +33,7 @@ if TYPE_CHECKING:
 
 MAX_LINES = 50  # without a terminal, each image has a line if there are at most this many images
 COMPILE_DELAY = 0.5  # s; compiling is shown if it takes longer
-LINE_INTERVAL = 10.0  # s; the interval between lines if there are more than MAX_LINES images
+LINE_INTERVAL = 10.0  # s; the interval between lines of progress
 
 
 def bar_on(console: Console) -> "Progress":
@@ -78,17 +82,21 @@ class Reporter:
         run: the run.
         console: the console to print on; a terminal shows a bar if there are several images.
         quiet: print failures only.
+        metrics: the file for the counts of the run, if any.
     """
 
-    def __init__(self, run: Run, console: Console, quiet: bool = False) -> None:
+    def __init__(
+        self, run: Run, console: Console, quiet: bool = False, metrics: Path | None = None
+    ) -> None:
         self._summary = summary = run.summary
         self._writer = run.writer
         self._console = console
         self._quiet = quiet
+        self._metrics = metrics
         self._keeps_old = run.execution.redo is Redo.MISSING
         self._several = summary.total > 1
         run.watch = self._show_progress
-        self._last_line = self._start = time.perf_counter()
+        self._start = time.perf_counter()
         self._bar: Progress | None = None
         self._is_live = console.is_terminal and not quiet
         self._live = contextlib.ExitStack()
@@ -99,11 +107,14 @@ class Reporter:
         self._live.enter_context(watching_compilation(self._compiling))
         if self._is_live and self._several:
             self._show("")
+        self._write_metrics()
+        self._live.enter_context(ticking(LINE_INTERVAL, self._tick))
         return self
 
     def __exit__(self, *error: object) -> None:
         self._live.close()
         self.end()
+        self._write_metrics()
 
     def _show(self, description: str) -> None:
         """Show the bar with a description."""
@@ -140,14 +151,23 @@ class Reporter:
             self.print(f"{outcome.job.display_name} -> {self._files(outcome)}")
 
     def _show_progress(self) -> None:
-        """Update the bar, or print a line if the last one is old and images have no own lines."""
+        """Update the bar."""
         if self._bar and self._several:
             self._show(self._progress_text())
-            return
-        is_due = time.perf_counter() - self._last_line >= LINE_INTERVAL
-        if is_due and not self._quiet and self._summary.total > MAX_LINES:
-            self._last_line = time.perf_counter()
+
+    def _tick(self) -> None:
+        """Print a line if there is no bar, and write the metrics."""
+        if not self._is_live and not self._quiet:
             self.print(self._progress_text(with_count=True))
+        self._write_metrics()
+
+    def _write_metrics(self) -> None:
+        if self._metrics:
+            try:
+                write_metrics(self._metrics, self._summary)
+            except ImageError as error:  # a run goes on without metrics
+                self.print(f"clpipe: --metrics: {error}")
+                self._metrics = None
 
     def _files(self, outcome: Outcome) -> str:
         first, *others = self._writer.renditions_of(outcome.job)
@@ -234,6 +254,7 @@ class Reporter:
             text += f", {summary.waiting} kept for the next run"
         if left := summary.total - summary.made:
             text += f", {left} not begun"
+        text += f"; {summary.gave_up}" * bool(summary.gave_up)
         if counts[DONE]:
             speed = summary.megapixels / summary.elapsed
             text += f"; {summary.elapsed:.1f} s, {speed:.3g} MP/s; {summary.shares()}"
@@ -248,6 +269,7 @@ def follow(
     quiet: bool = False,
     reporter: Reporter | None = None,
     stop: Callable[[], None] | None = None,
+    metrics: Path | None = None,
 ) -> None:
     """Print the outcomes of a run's images, and its notes at the end.
 
@@ -257,11 +279,12 @@ def follow(
         quiet: print failures only.
         reporter: the reporter to use. None creates one that prints on stderr.
         stop: the function to call on Ctrl-C. None stops the run.
+        metrics: as for :class:`Reporter`.
 
     Raises:
         ClpipeError: the run cannot continue.
     """
-    output = reporter or Reporter(run, Console(stderr=True), quiet)
+    output = reporter or Reporter(run, Console(stderr=True), quiet, metrics)
     with contextlib.closing(outcomes), interruptible(stop or run.stop), output:
         for outcome in outcomes:
             output.report(outcome)

@@ -7,8 +7,9 @@ import click
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.batch.execution import ExecutionOptions
+from clpipe.batch.images import Images
 from clpipe.batch.replay import replay_of
-from clpipe.batch.session import Images, Run
+from clpipe.batch.session import Run
 from clpipe.chain.keys import CODE
 from clpipe.commands.chain_options import device_option, options, out_option
 from clpipe.commands.options import EXISTING, Command, json_option, quiet_option

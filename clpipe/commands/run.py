@@ -8,8 +8,12 @@ import click
 
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
+from clpipe.base.memory import format_bytes
+from clpipe.base.text import format_duration
 from clpipe.batch.api import run_of
-from clpipe.batch.session import Images
+from clpipe.batch.dry_run import plan_of
+from clpipe.batch.images import Images
+from clpipe.batch.session import Run
 from clpipe.chain.keys import KEYS
 from clpipe.chain.options import OPTIONS
 from clpipe.commands.chain_options import SETTINGS, options, out_option, set_option, settings_in
@@ -37,9 +41,29 @@ RUN_OPTIONS = [name for name in OPTIONS if name not in ("inputs", "output")]
     "scene_gt.json, or a directory of labels. They are warped like the pixels, by distortion, "
     "resizing and patches, and written to OUT.",
 )
+@click.option(
+    "--dry-run",
+    is_flag=True,
+    help="Write nothing. Show how many images exist, and how long the others would take on this "
+    "machine. A few are developed in a temporary directory.",
+)
+@click.option(
+    "--metrics",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.prom",
+    help="A file for the counts of the run, in the text format of Prometheus. It is replaced every "
+    "10 s.",
+)
 @quiet_option
 @json_lines_option
-def run(annotations: Path | None, quiet: bool, json_lines: bool, **options: Any) -> None:
+def run(
+    annotations: Path | None,
+    dry_run: bool,
+    metrics: Path | None,
+    quiet: bool,
+    json_lines: bool,
+    **options: Any,
+) -> None:
     """Run images through the chain: files, folders, globs or manifests (.csv, .jsonl).
 
     Renders are linear float images (EXR). Camera raws skip the stages that add noise.
@@ -58,13 +82,30 @@ def run(annotations: Path | None, quiet: bool, json_lines: bool, **options: Any)
         shard = batch.images.shard
         click.echo(f"shard {shard.number} of {shard.of} has no images", err=True)
         return
+    if dry_run:
+        show_plan(batch)
+        return
     render_annotations = read_annotations(annotations, batch.images) if annotations else None
-    follow(batch, batch.outcomes(batch.jobs), quiet or json_lines)
+    follow(batch, batch.outcomes(batch.jobs), quiet or json_lines, metrics=metrics)
     if render_annotations and not batch.summary.interrupted:
         for folder in batch.images.series.folders_in(batch.execution.output):
             for line in write_annotations(folder, render_annotations):
                 click.echo(line, err=True)
     sys.exit(batch.summary.exit_status)
+
+
+def show_plan(batch: Run) -> None:
+    """Print what a run would do."""
+    plan = plan_of(batch)
+    missing = plan.images - plan.existing
+    click.echo(f"{plan.images} images: {plan.existing} exist, {missing} would be made")
+    if missing:
+        size, output = format_bytes(plan.input_bytes), format_bytes(plan.output_bytes)
+        click.echo(f"input: {size}, about {plan.megapixels:.3g} megapixels")
+        click.echo(f"output: about {output}, not counting tars")
+        click.echo(f"time: about {format_duration(plan.seconds)} on this machine")
+    for error in plan.errors:
+        click.echo(f"clpipe: {error}", err=True)
 
 
 def read_annotations(path: Path, images: Images) -> Annotations:

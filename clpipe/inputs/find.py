@@ -364,6 +364,9 @@ class Shard:
     number: int = 1
     of: int = 1
 
+    def __str__(self) -> str:
+        return f"{self.number}/{self.of}"
+
     def select(self, jobs: Sequence[T]) -> list[T]:
         """Return the items of this part.
 

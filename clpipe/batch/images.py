@@ -1,0 +1,73 @@
+"""The images of a run: which files, which part of them, and the tars or clips that they go into."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from clpipe.base.errors import RequestError
+from clpipe.batch.clips import ClipOptions
+from clpipe.batch.tars import Tar, split_into_tars
+from clpipe.inputs.find import Job, Shard, find_jobs
+from clpipe.inputs.loader import ImageLoader
+from clpipe.inputs.poses import assign_views
+from clpipe.inputs.sequences import in_sequences, sequence_of
+from clpipe.inputs.series import Series
+
+
+@dataclass(frozen=True)
+class Images:
+    """The images of a run.
+
+    Args:
+        inputs: files, directories, globs, URLs and manifests.
+        exclude: patterns of files that are skipped in directories and globs.
+        poses: the file with the renders' cameras and poses, if any.
+        series: several cameras and ISOs, whose pictures go to directories of their own.
+        shard: the part of the images to make.
+        per_tar: the number of images per tar. None writes no tars.
+        sequence: whether the images are frames of sequences.
+        clips: the clips that the frames of sequences go into. None writes no clips.
+        known_jobs: jobs that are known already, instead of inputs.
+    """
+
+    inputs: Sequence[str] = ()
+    exclude: Sequence[str] = ()
+    poses: Path | None = None
+    series: Series = field(default_factory=Series)
+    shard: Shard = field(default_factory=Shard)
+    per_tar: int | None = None
+    sequence: bool = False
+    clips: ClipOptions | None = None
+    known_jobs: Sequence[Job] = ()
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the output directory will hold all pictures, as files, when the run ends."""
+        return bool(self.inputs) and not self.per_tar and not self.clips and self.shard.of == 1
+
+    def jobs(self, loader: ImageLoader, output: Path) -> tuple[list[Job], list[Tar]]:
+        """Return the jobs of this part of the run, and the tars that they go into.
+
+        Raises:
+            RequestError: an input, a camera or an ISO does not exist, or two outputs have one name.
+        """
+        jobs = self.known_jobs
+        if not jobs:
+            known_jobs = find_jobs(self.inputs, output, loader.endings(), self.exclude)
+            jobs = loader.exposures(known_jobs, self.sequence)
+        jobs = assign_views(jobs, self.poses, loader.settings.render, loader.request.truth_at)
+        jobs = self.series.jobs(jobs, loader.settings)
+        if self.sequence:
+            if self.per_tar and self.shard.of > 1:
+                raise RequestError(
+                    "--shard: a tar may hold frames of two sequences, so --sequence with "
+                    "--webdataset has no shards; remove one of the three options"
+                )
+            jobs = in_sequences(jobs)
+            names = self.shard.select(list(dict.fromkeys(map(sequence_of, jobs))))
+            if not self.per_tar:
+                return [job for job in jobs if sequence_of(job) in names], []
+        if self.per_tar:
+            tars = self.shard.select(split_into_tars(jobs, self.per_tar, output))
+            return [job for tar in tars for job in tar.jobs], tars
+        return self.shard.select(jobs), []
