@@ -57,7 +57,7 @@ def workers():
 
 @pytest.fixture
 def address(workers, monkeypatch):
-    for limit in ("CONNECT_TIMEOUT", "WORKER_TIMEOUT", "LONG_CHUNK"):
+    for limit in ("CONNECT_TIMEOUT", "FIRST_TIMEOUT", "WORKER_TIMEOUT", "LONG_CHUNK"):
         monkeypatch.setattr(cluster, limit, GUARD)  # a busy machine takes its time
     workers.wait_for_workers(2, timeout=GUARD)
     return workers.scheduler.address
@@ -277,6 +277,19 @@ def test_a_log_that_cannot_be_written_ends_the_run(
         go.touch()
 
 
+def test_a_worker_that_comes_later_must_see_the_output(clpipe, renders, workers, address):
+    def look_for(name):
+        dask_worker.LOCK = name
+
+    workers.run(look_for, ".none")  # the probe of all workers does not look for it
+    try:
+        stderr = clpipe("run", "in", "-o", "out", "--dask", address, status=2).stderr
+        assert "does not see the output directory" in stderr
+        assert not contents("out")
+    finally:
+        workers.run(look_for, ".clpipe.lock")
+
+
 def test_a_worker_of_another_make_that_comes_later(clpipe, renders, address, monkeypatch):
     probe = cluster.Cluster._probe
 
@@ -398,13 +411,26 @@ def test_a_scheduler_that_cannot_be_reached(clpipe, renders, monkeypatch):
 
 @pytest.mark.slow
 def test_a_scheduler_without_workers(clpipe, renders, monkeypatch):
-    def too_late(self, count, timeout):
-        raise TimeoutError
-
     monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", GUARD)
-    monkeypatch.setattr(Client, "wait_for_workers", too_late)
+    monkeypatch.setattr(cluster, "FIRST_TIMEOUT", 0.5)
+    monkeypatch.setattr(cluster, "NOTE_SECONDS", 0.1)
     with LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0", processes=False) as empty:
         address = empty.scheduler_address
         stderr = clpipe("run", "in", "-o", "out", "--dask", address, status=2).stderr
         assert f"the scheduler at {address} has no workers" in stderr
-    assert not Path("out").exists()
+        assert f"waiting for a worker; to start one: dask worker {address}" in stderr
+    assert not contents("out")
+
+
+@pytest.mark.slow
+def test_an_adaptive_cluster_without_workers_starts_some(clpipe, renders, monkeypatch):
+    for limit in ("CONNECT_TIMEOUT", "FIRST_TIMEOUT", "WORKER_TIMEOUT"):
+        monkeypatch.setattr(cluster, limit, GUARD)
+    clpipe("run", "in", "-o", "whole", "--iso", 3200)
+    with LocalCluster(n_workers=0, threads_per_worker=1, dashboard_address="127.0.0.1:0") as local:
+        local.adapt(minimum=0, maximum=2, interval="100ms", wait_count=1)
+        clpipe("run", "in", "-o", "out", "--iso", 3200, "--dask", local.scheduler_address)
+    found, expected = contents("out"), contents("whole")
+    pictures = {name for name in expected if name.suffix == ".jpg"}
+    assert len(pictures) == IMAGES
+    assert all(found[name] == expected[name] for name in pictures)

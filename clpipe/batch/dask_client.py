@@ -8,6 +8,7 @@ reports it as skipped.
 
 import asyncio
 import contextlib
+import logging
 import queue
 import time
 from collections import deque
@@ -36,9 +37,14 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.folder import remove_unfinished
 
-CONNECT_TIMEOUT = 10.0  # s; the wait for the scheduler's answer, and for the first worker
+log = logging.getLogger(__name__)
 
-WORKER_TIMEOUT = 60.0  # s; the time without any worker. Nannies and job queues start new workers.
+CONNECT_TIMEOUT = 10.0  # s; the wait for the scheduler's answer
+
+# s; the waits for the first worker, which a job queue may start late, and for one after all have
+# gone.
+FIRST_TIMEOUT, WORKER_TIMEOUT = 3600.0, 600.0
+NOTE_SECONDS = 5.0  # s; a longer wait for a worker is announced
 
 RETRIES = 2  # retries of a chunk that ended with an unexpected error
 
@@ -56,8 +62,7 @@ def connected(address: str, spec: DaskSpec) -> Iterator["Cluster"]:
     """Connect to the cluster of a scheduler.
 
     Raises:
-        RequestError: distributed is not installed, the scheduler does not answer, it has no
-            workers, or they have different versions of clpipe.
+        RequestError: distributed is not installed, or the scheduler does not answer.
     """
     require("--dask", "dask")
     from distributed import Client
@@ -71,18 +76,6 @@ def connected(address: str, spec: DaskSpec) -> Iterator["Cluster"]:
             f"{f' ({error})' * bool(str(error))}; expected tcp://HOST:PORT of a running scheduler"
         ) from None
     try:
-        with contextlib.suppress(TimeoutError):
-            client.wait_for_workers(1, timeout=CONNECT_TIMEOUT)
-        if not client.nthreads():
-            raise RequestError(
-                f"--dask: the scheduler at {address} has no workers; start some: "
-                f"dask worker {address}"
-            )
-        versions = client.run(lambda: __import__("clpipe").__version__, on_error="return")
-        for worker, version in versions.items():
-            if isinstance(version, BaseException):
-                raise RequestError(f"--dask: worker {worker} cannot load clpipe: {version}")
-        check_same("version of clpipe", {"this machine": __version__, **versions})
         yield Cluster(client, address, spec)
     finally:
         with contextlib.suppress(OSError, TimeoutError):
@@ -128,15 +121,51 @@ class Cluster:
         """Do every job, and yield outcomes as chunks finish, in any order.
 
         Raises:
-            RequestError: workers have different environments, lack the device, or do not see the
-                files.
+            RequestError: there are no workers. Or they have different environments or versions of
+                clpipe, lack the device, or do not see the files.
             DeviceError: a kernel does not compile.
             OutputError: nothing more can be written.
             ClusterError: the scheduler or all workers are gone.
         """
         with_absolute_paths = list(map(self._spec.absolute_job, jobs))
+        if not self._wait_for_worker():
+            return
         self._probe(with_absolute_paths)
-        return self._outcomes(with_absolute_paths)
+        yield from self._outcomes(with_absolute_paths)
+
+    def _wait_for_worker(self) -> bool:
+        """Wait until a worker has done a task. Adaptive clusters start workers only for tasks.
+
+        Returns:
+            False after a stop.
+
+        Raises:
+            RequestError: no worker has come, or a worker has another version of clpipe.
+        """
+        task = self._client.submit(lambda: __import__("clpipe").__version__, pure=False)
+        start, is_noted = time.monotonic(), False
+        while not self.is_stopping and task.status == "pending":
+            waited = time.monotonic() - start
+            if waited > FIRST_TIMEOUT:
+                raise RequestError(
+                    f"--dask: the scheduler at {self._address} has no workers; start some: "
+                    f"dask worker {self._address}"
+                )
+            if waited > NOTE_SECONDS and not is_noted:
+                is_noted = True
+                text = "--dask: waiting for a worker; to start one: dask worker %s"
+                log.info(text, self._address)
+            time.sleep(0.05)
+        if self.is_stopping:
+            return False
+        versions = self._client.run(lambda: __import__("clpipe").__version__, on_error="return")
+        if task.status == "error":
+            versions["of the first task"] = task.exception()
+        for worker, version in versions.items():
+            if isinstance(version, BaseException):
+                raise RequestError(f"--dask: worker {worker} cannot load clpipe: {version}")
+        check_same("version of clpipe", {"this machine": __version__, **versions})
+        return True
 
     def _probe(self, jobs: Sequence[Job]) -> None:
         """Check that all workers have one environment, and see the same files as this machine."""
@@ -149,12 +178,13 @@ class Cluster:
         probe = spec.execution.output / f".clpipe.{spec.run}"
         try:
             probe.touch()
-            environments = self._client.run(probe_worker, spec, probe.name, size, on_error="return")
+            check = spec, probe.name, size
+            task = self._client.submit(probe_worker, *check, pure=False)  # keeps a worker
+            environments = self._client.run(probe_worker, *check, on_error="return")
+            environments = environments or {"of the first task": task.result()}
         finally:
             with contextlib.suppress(OSError):
                 probe.unlink()
-        if not environments:
-            raise self._lost_cluster()
         for worker, environment in environments.items():
             if not isinstance(environment, WorkerEnvironment):
                 raise RequestError(f"--dask: worker {worker}: {environment}")
@@ -166,7 +196,9 @@ class Cluster:
         failure: ClpipeError | None = None
         try:
             while self._running or (chunks and not self.is_stopping):
-                self._submit_chunks(chunks)
+                has_workers = self._submit_chunks(chunks)
+                if self.is_stopping and not has_workers:
+                    break  # the other chunks wait for workers
                 try:
                     future = self._finished.get(timeout=1)
                 except queue.Empty:
@@ -191,30 +223,35 @@ class Cluster:
         if failure:
             raise failure
 
-    def _submit_chunks(self, chunks: "_Chunks") -> None:
-        """Submit chunks until there are as many as workers.
+    def _submit_chunks(self, chunks: "_Chunks") -> bool:
+        """Submit one chunk more than workers have threads, so that adaptive clusters grow.
 
         Dask chooses the worker. A chunk that is bound to one would wait for ever if it dies.
+
+        Returns:
+            Whether there are workers.
 
         Raises:
             ClusterError: there has been no worker for long, or the scheduler is gone.
         """
         try:
-            addresses = tuple(sorted(self._client.nthreads()))
+            workers = self._client.nthreads()
         except (OSError, ValueError, RuntimeError):
             raise self._lost_cluster() from None
-        self._spec = replace(self._spec, workers=addresses)
-        if workers := len(addresses):
+        self._spec = replace(self._spec, workers=tuple(sorted(workers)))
+        threads = sum(workers.values())
+        if workers:
             self._last_worker_time = time.monotonic()
         elif time.monotonic() - self._last_worker_time > WORKER_TIMEOUT:
             raise ClusterError(
                 f"--dask: the scheduler at {self._address} has had no workers for "
                 f"{WORKER_TIMEOUT:g} s; finished pictures are kept, and the same command resumes"
             )
-        while chunks.jobs and len(self._running) < workers and not self.is_stopping:
-            self._submit(chunks.cut(workers))
+        while chunks.jobs and len(self._running) <= threads and not self.is_stopping:
+            self._submit(chunks.cut(threads + 1))
         if chunks.suspects and not self._running and not self.is_stopping:
             self._submit([chunks.suspects.popleft()], alone=True)
+        return bool(workers)
 
     def _submit(self, chunk: list[Job], alone: bool = False) -> None:
         future = self._client.submit(run_chunk, self._spec, chunk, pure=False, retries=RETRIES)
@@ -290,9 +327,9 @@ class _Chunks:
     def __bool__(self) -> bool:
         return bool(self.jobs or self.suspects)
 
-    def cut(self, workers: int) -> list[Job]:
-        """Return the next chunk."""
-        size = max(1, min(self.size, len(self.jobs) // (2 * workers)))
+    def cut(self, count: int) -> list[Job]:
+        """Return the next chunk, if a number of chunks run or wait at a time."""
+        size = max(1, min(self.size, len(self.jobs) // (2 * count)))
         return [self.jobs.popleft() for _ in range(size)]
 
     def took(self, seconds: float) -> None:

@@ -24,7 +24,7 @@ from clpipe.engine.device import Device, open_devices
 from clpipe.engine.discovery import DeviceInfo, choose_all, find_devices
 from clpipe.images.write import versions
 from clpipe.inputs.find import Job
-from clpipe.outputs.folder import write_problem
+from clpipe.outputs.folder import LOCK, write_problem
 from clpipe.outputs.program import program_digest
 
 
@@ -195,6 +195,11 @@ def run_chunk(spec: DaskSpec, jobs: Sequence[Job]) -> ChunkReport:
             if environment != spec.environment:
                 check_same_environment(
                     {"the others": spec.environment, worker.address: environment}
+                )
+            if not (spec.execution.output / LOCK).exists():
+                raise RequestError(
+                    f"--dask: worker {worker.address} does not see the output directory "
+                    f"{spec.execution.output}"
                 )
             share = share_on_machine(worker.address, spec.workers)
             devices = _devices(spec.execution.devices, spec.execution.memory, share)
