@@ -5,12 +5,15 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
+from clpipe.base.errors import DeviceError, RequestError
+from clpipe.base.transfers import STOP_SECONDS
 from clpipe.commands.run import run
 from tests.conftest import ROOT
 
@@ -80,3 +83,22 @@ def test_kubernetes_shares_out_all_tars():
     assert Path(words[1]).name == "clpipe"
     known = {option for each in run.params for option in each.opts}
     assert {word for word in words if word.startswith("-")} <= known
+    failures, disruptions = job["podFailurePolicy"]["rules"]
+    assert failures["action"] == "FailIndex"
+    assert failures["onExitCodes"]["values"] == [RequestError.exit_status, DeviceError.exit_status]
+    assert failures["onExitCodes"]["containerName"] == container["name"]
+    assert disruptions["action"] == "Ignore"
+    assert job["template"]["spec"]["terminationGracePeriodSeconds"] > 20 > STOP_SECONDS
+
+
+def test_the_image_installs_what_is_locked():
+    text = (ROOT / "Dockerfile").read_text()
+    copied = re.findall(r"locks/[\w.]+", text.partition("COPY . ")[0])
+    assert set(copied) == {"locks/pip.txt", "locks/cloud.txt"}
+    locked = (ROOT / "locks/cloud.txt").read_text()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needed = [*project["dependencies"], *project["optional-dependencies"]["cloud"], "hatchling"]
+    for requirement in needed:
+        name = re.match(r"[\w.-]+", requirement)[0].lower().replace("_", "-")
+        assert re.search(rf"^{name}==", locked, re.MULTILINE), name
+    assert 'ENTRYPOINT ["clpipe"]' in text and text.index("USER clpipe") < text.index("VOLUME")

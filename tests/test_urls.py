@@ -289,7 +289,7 @@ def test_what_is_wrong_with_a_url_is_said(bucket, clpipe, monkeypatch):
     assert "6 of 7 images done, 1 failed" in text
     Flaky.forbidden, Flaky.rate = "", 1.0
     assert "flaky://b/renders: cannot be listed: " in stderr_of(
-        "flaky://b/renders", "-o", "p", status=2
+        "flaky://b/renders", "-o", "p", status=1
     )
 
 

@@ -147,6 +147,12 @@ class OutputError(ClpipeError):
     error_class = "output"
 
 
+class TransferError(ClpipeError):
+    """A service does not answer, or asks for fewer requests. The same command may succeed later."""
+
+    exit_status = 1
+
+
 class ClusterError(ClpipeError):
     """The cluster was lost during a run. The images finished before are written."""
 

@@ -14,7 +14,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Any, TypeVar
 
-from clpipe.base.errors import ClpipeError, RequestError
+from clpipe.base.errors import ClpipeError, RequestError, TransferError
 from clpipe.base.extras import require
 from clpipe.base.text import one_line
 from clpipe.base.url_text import name_in
@@ -95,7 +95,8 @@ def with_retries(
 
     Raises:
         RequestError: as for :func:`check_scheme`.
-        ClpipeError: all tries failed. The error has the type ``error_type``.
+        ClpipeError: all tries failed. The error has the type ``error_type``, or is a TransferError
+            if that is RequestError and the request may succeed later.
     """
     check_scheme(url)
     began, wait = time.monotonic(), FIRST_WAIT
@@ -111,7 +112,8 @@ def with_retries(
             is_permanent = isinstance(error, IsADirectoryError | NotImplementedError)
             if is_last or is_permanent or error_class in FINAL:
                 text = f"{url}: cannot be {what}: {_reason(url, error, error_class, tries)}"
-                failure = error_type(text)
+                may_pass = error_type is RequestError and error_class not in MEANINGS
+                failure = (TransferError if may_pass else error_type)(text)
                 failure.error_class = error_class
                 raise failure from None
         _sleep(wait * random.uniform(0.5, 1.0))  # noqa: S311 - no secret

@@ -95,6 +95,7 @@ def list_urls(url: str) -> list[str]:
 
     Raises:
         RequestError: the URL cannot be listed.
+        TransferError: it cannot be listed now.
     """
     inner = name_in(url)
     scheme, _, rest = inner.partition("://")
@@ -187,6 +188,7 @@ def fetch(path: Path) -> Path:
 
     Raises:
         RequestError: it cannot be fetched.
+        TransferError: it cannot be fetched now.
     """
     if url := url_of(path):
         _fetch(url, path, RequestError)

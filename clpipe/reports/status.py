@@ -113,7 +113,10 @@ def read_status(place: str) -> Status:
             data = read_url(f"{url}/{name}") if url else Path(local(place), name).read_bytes()
             found += sessions(parse_log(data or b""))
     for session in sorted(found, key=lambda each: moment(each.start)):
-        status.parts[str(session.start.get("shard", "1/1"))] = session
+        part = str(session.start.get("shard", "1/1"))
+        of = part.rpartition("/")[2]  # an earlier run may have had another number of shards
+        status.parts = {p: s for p, s in status.parts.items() if p.rpartition("/")[2] == of}
+        status.parts[part] = session
         status.lines |= {str(line.get("stem")): line for line in session.images}
     return status
 
