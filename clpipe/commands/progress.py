@@ -187,10 +187,10 @@ class Reporter:
         parts = [f"{text} MP/s", summary.shares()] + [f"{failed} failed"] * bool(failed)
         if not with_count:
             return "  ".join(parts)
-        left = summary.total - summary.made
-        remaining = format_duration(summary.elapsed * left / max(summary.made, 1))
-        count = f"{summary.made} of {summary.total} images"
-        return "; ".join([count, *parts, f"about {remaining} left"])
+        if summary.made:
+            left = summary.elapsed * (summary.total - summary.made) / summary.made
+            parts.append(f"about {format_duration(left)} left")
+        return "; ".join([f"{summary.made} of {summary.total} images", *parts])
 
     def _clipping_warning(self) -> str:
         """Return a warning about images with much clipping."""
