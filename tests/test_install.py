@@ -11,7 +11,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from clpipe import __version__
-from clpipe.base import extras, urls
+from clpipe.base import extras, transfers
 from tests.conftest import ROOT, STILL_LIFE, run_python
 
 pytestmark = pytest.mark.slow
@@ -91,7 +91,7 @@ def test_extras_have_these_packages():
     for extra, modules in extras.EXTRAS.items():
         if extra != "cloud":
             assert sorted(packages(extra)) == sorted(modules)
-    assert {*urls.PACKAGES.values(), "fsspec"} == {*packages("cloud")}
+    assert {*transfers.PACKAGES.values(), "fsspec"} == {*packages("cloud")}
 
 
 def test_no_text_installs_another_project_of_that_name():
@@ -159,7 +159,7 @@ def test_a_lock_has_all_that_is_asked_for(extra):
 
 def test_a_lock_names_no_index_and_no_folder():
     locks = sorted((ROOT / "locks").iterdir())
-    assert {lock.stem for lock in locks} == {"clpipe", "dev", "docs", "pip"}
+    assert {lock.stem for lock in locks} == {"clpipe", "cloud", "dev", "docs", "pip"}
     for lock in locks:
         assert not re.search(r"://|--(extra-)?index|--find-links|@ |\s/", lock.read_text())
 

@@ -278,9 +278,12 @@ def test_large_files_are_not_all_fetched_at_once(bucket, largest, ahead):
     assert jobs.qsize() == 39 - ahead and set(begun) <= {f"{n}.exr" for n in range(1, ahead + 1)}
 
 
+FILE = {"type": "file", "size": 0}
+
+
 def test_skipped_keys_are_counted(bucket, clpipe, monkeypatch):
     names = ["r0.exr", "a//b.exr", "../up.exr", ".hidden.exr", ".tmp/c.exr", "notes.txt"]
-    monkeypatch.setattr(Faulty, "find", lambda *_, **__: [f"/b/in/{name}" for name in names])
+    monkeypatch.setattr(Faulty, "find", lambda *_, **__: {f"/b/in/{n}": FILE for n in names})
     stderr = clpipe("run", "faulty://b/in", "-o", "o", *RUN).stderr
     assert "1 of 1 image" in stderr or "r0.exr ->" in stderr
     text = "2 hidden, 2 with '..', '.' or empty parts in the key, 1 .txt"

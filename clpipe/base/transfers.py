@@ -171,11 +171,12 @@ def _system_of(url: str) -> tuple[Any, str]:
     """Return the file system of a URL, which does not retry if that can be set, and the path."""
     from fsspec.core import url_to_fs
 
-    if not re.match(r"s3a?://", url):
+    if PACKAGES.get(url.partition("://")[0], "aiohttp") == "aiohttp":
         return url_to_fs(url)
-    # An instance that other code of this process does not use; the option has its default value.
-    system, path = url_to_fs(url, use_listings_cache=True)
-    if getattr(system, "retries", 1) != 1:
+    # Listings of these services are remembered in clpipe.base.urls. The option also gives clpipe
+    # an instance that other code of this process does not use.
+    system, path = url_to_fs(url, use_listings_cache=False)
+    if PACKAGES[url.partition("://")[0]] == "s3fs" and system.retries != 1:
         system.retries = 1
         once = {"retries": {"total_max_attempts": 1}}  # botocore's
         system.config_kwargs = {**once, **system.config_kwargs}

@@ -34,6 +34,9 @@ CHANGE_KEYS = ["ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_m
 CHANGE_KEYS += ["updated", "modified", "created"]
 
 
+Stamp = tuple[int, int]
+
+_listed: dict[str, Stamp] = {}  # of files that were listed, by URL
 _in_use: set[Path] = set()  # copies of files
 _choosing = threading.Lock()  # guards the set
 
@@ -88,7 +91,8 @@ def join_url(folder: Path, text: str) -> Path:
 def list_urls(url: str) -> list[str]:
     """Return the URLs of all files below one, at any depth, or of those that a glob matches.
 
-    The URL of a file returns itself. fsspec remembers the listing, so that stamps cost nothing.
+    The URL of a file returns itself. The stamps of the files are remembered, see
+    :func:`stamp_of_url`.
 
     Returns:
         The URLs, sorted. There may be none.
@@ -102,42 +106,54 @@ def list_urls(url: str) -> list[str]:
     fixed = re.split(r"[*[]", rest)[0].rpartition("/")[0] if is_glob(url) else rest.rstrip("/")
     prefix = f"{scheme}://{fixed}{'/' * bool(fixed)}"
 
-    def work(system: Any, path: str) -> list[str]:
+    def work(system: Any, path: str) -> dict[str, Stamp]:
         root = path.rstrip("/").removesuffix(rest[len(fixed) :].rstrip("/")).rstrip("/")
-        _forget_listing(system, root)
-        found: Iterable[str] = ()
+        system.invalidate_cache()
+        found: Mapping[str, Any] = {}
         try:
-            if is_glob(url):
-                infos = system.glob(path, detail=True)
-                found = [name for name, info in infos.items() if info["type"] != "directory"]
-            else:
-                found = system.find(path)
+            find = system.glob if is_glob(url) else system.find
+            found = find(path, detail=True)
         except FileNotFoundError as error:
             if NO_BUCKET.search(service_code(error)):
                 raise
-        # The URL keeps its scheme, because a file system may have several.
-        names = (name[len(root) :].lstrip("/") for name in found)
-        # The file of a URL that is no directory has an empty name.
-        return sorted(f"{prefix}{name}".rstrip("/") + url[len(inner) :] for name in names)
+        # The URL keeps its scheme, because a file system may have several. The file of a URL that
+        # is no directory has an empty name.
+        return {
+            f"{prefix}{name[len(root) :].lstrip('/')}".rstrip("/") + url[len(inner) :]: _stamp(info)
+            for name, info in found.items()
+            if info["type"] != "directory"
+        }
 
-    return with_retries(url, work, RequestError, "listed")
+    for known in [each for each in _listed if each.startswith(prefix)]:
+        del _listed[known]
+    stamps = with_retries(url, work, RequestError, "listed")
+    _listed.update(stamps)
+    return sorted(stamps)
 
 
-def _forget_listing(system: Any, folder: str) -> None:
-    """Make a file system list a folder and all folders in it again. It keeps other listings.
+def listed_stamps(paths: Iterable[Path]) -> dict[str, Stamp]:
+    """Return the known stamps of paths that represent URLs, for :func:`remember_stamps`."""
+    urls = filter(None, map(url_of, paths))
+    return {url: _listed[url] for url in urls if url in _listed}
 
-    A run lists its inputs before its output, and the listing of inputs has all their stamps.
+
+def forget_stamps() -> None:
+    """Forget all stamps, so that a new run sees files that have changed."""
+    _listed.clear()
+
+
+def remember_stamps(stamps: Mapping[str, Stamp]) -> None:
+    """Remember stamps that another process has listed."""
+    _listed.update(stamps)
+
+
+def stamp_of_url(url: str) -> Stamp:
+    """Return a file's size in bytes, and a number that changes with it; zeros if it is missing.
+
+    A file that was listed needs no request.
     """
-    if not folder:
-        system.invalidate_cache()
-        return
-    system.invalidate_cache(folder)
-    for name in [each for each in system.dircache if each.startswith(f"{folder}/")]:
-        system.dircache.pop(name, None)
-
-
-def stamp_of_url(url: str) -> tuple[int, int]:
-    """Return a file's size in bytes, and a number that changes with it; zeros if it is missing."""
+    if url in _listed:
+        return _listed[url]
     with contextlib.suppress(ClpipeError):
         return with_retries(url, lambda system, path: _stamp(system.info(path)), ImageError, "read")
     return 0, 0
@@ -203,6 +219,7 @@ def upload(path: Path, url: str) -> None:
     """
 
     size = path.stat().st_size
+    _listed.pop(url, None)
 
     def work(system: Any, remote: str) -> None:
         system.put_file(str(path), remote)
@@ -262,34 +279,39 @@ def _fetch(url: str, path: Path, error_type: type[ClpipeError]) -> None:
         ClpipeError: it cannot be fetched. The error has the given type.
     """
 
-    info: Mapping[str, Any] = {}
+    stamp = listed = _listed.get(url)
 
     def work(system: Any, remote: str) -> Path:
-        nonlocal info
-        try:
-            info = system.info(remote)
-        except OSError as error:
-            if service_code(error) not in ("400", "403"):  # reading tells the service's reason
-                raise
+        nonlocal stamp
+        if stamp is None:
+            try:
+                stamp = _stamp(system.info(remote))
+            except OSError as error:
+                if service_code(error) not in ("400", "403"):  # reading tells the service's reason
+                    raise
+            if listed and stamp and stamp[0] == listed[0]:  # it was cut off, but has not changed
+                stamp = listed
+        size, _ = stamp or (0, 0)
         # Other threads may fetch the file, and an abandoned try may still write its part.
         part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
         try:
             system.get_file(remote, str(part))
-            if info.get("size") not in (None, received := part.stat().st_size):
-                raise OSError(f"{received} of {info['size']} bytes were received")
+            if size and (received := part.stat().st_size) != size:
+                stamp = None  # the file may have changed since it was listed
+                raise OSError(f"{received} of {size} bytes were received")
         except BaseException:
             part.unlink(missing_ok=True)
             raise
         return part
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = with_retries(url, work, error_type, "read", lambda: info.get("size") or 0)
-    _, modified = _stamp(info)
+    part = with_retries(url, work, error_type, "read", lambda: (stamp or (0, 0))[0])
+    _, modified = stamp or (0, 0)
     os.utime(part, ns=(modified, modified))
     part.replace(path)
 
 
-def _stamp(info: Mapping[str, Any]) -> tuple[int, int]:
+def _stamp(info: Mapping[str, Any]) -> Stamp:
     """Return a file's size in bytes, and a number that changes when the file does."""
     version = next((str(v) for name in CHANGE_KEYS if (v := info.get(name)) is not None), "")
     number = int.from_bytes(hashlib.sha256(version.encode()).digest()[:7]) if version else 0

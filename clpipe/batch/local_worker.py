@@ -21,6 +21,7 @@ from clpipe.base.files import discard, remove_temporary_files
 from clpipe.base.process_folder import process_folder
 from clpipe.base.system import bind_to_processors
 from clpipe.base.transfers import TRANSFERS
+from clpipe.base.urls import remember_stamps
 from clpipe.batch.downloads import Jobs
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.spec import RunSpec
@@ -138,8 +139,10 @@ def _listen(pipe: _PipeToRun, jobs: Jobs, batch: Batch) -> None:
     """Receive jobs until the end or a stop."""
     while True:
         kind, *values = pipe.receive()
-        for job in values[0] if kind == "jobs" else ():
-            jobs.put(job)
+        if kind == "jobs":
+            remember_stamps(values[1])
+            for job in values[0]:
+                jobs.put(job)
         if kind == "stop":
             TRANSFERS.stop()
             batch.stop()

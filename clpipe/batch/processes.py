@@ -25,6 +25,7 @@ from clpipe.base.errors import ClpipeError, DeviceError, RequestError
 from clpipe.base.memory import available_memory
 from clpipe.base.processors import available_processors
 from clpipe.base.system import blocked_signals, processor_numbers
+from clpipe.base.urls import listed_stamps
 from clpipe.batch.interrupt import SIGNALS
 from clpipe.batch.local_worker import ProcessConfig
 from clpipe.batch.outcome import FAILED, Outcome
@@ -303,7 +304,7 @@ class Processes:
 
     def _give(self, process: _Process, jobs: Sequence[Job]) -> None:
         process.jobs |= {job.stem: job for job in jobs}
-        self._send(process, "jobs", jobs)
+        self._send(process, "jobs", jobs, listed_stamps(path for job in jobs for path in job.paths))
 
     def _handle_death(self, process: _Process) -> Iterable[Outcome]:
         """Handle the end of a process: others get its jobs. Returns the outcomes of failed jobs.

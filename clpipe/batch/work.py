@@ -11,7 +11,7 @@ from clpipe.base.digests import stamp_of
 from clpipe.base.errors import DeviceError, ImageError, NoPictureError, OutputError, RequestError
 from clpipe.base.files import FileGroup, deferred_files
 from clpipe.base.types import Array
-from clpipe.base.urls import fetched_files
+from clpipe.base.urls import fetched_files, url_of
 from clpipe.batch.frames import Frames
 from clpipe.batch.job_state import DecodedFrame, JobState, Stamps, Written
 from clpipe.batch.memory_budget import host_bytes
@@ -125,10 +125,10 @@ class ImageWorker:
             job.check()
             state.request = self._request_of(job)
             if renditions := self._missing(state):
-                start = time.perf_counter()
                 paths = decoded.paths if decoded else job.paths
-                first, *others = state.files.enter_context(fetched_files(paths))
-                if first != job.path:
+                if any(map(url_of, paths)):
+                    start = time.perf_counter()
+                    first, *others = state.files.enter_context(fetched_files(paths))
                     state.here = replace(job, path=first, subframes=tuple(others))
                     state.note("fetch", start)
                 state.renditions = renditions

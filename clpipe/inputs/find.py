@@ -15,7 +15,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_input
 from clpipe.base.text import printable, whole_number
 from clpipe.base.url_text import is_glob, is_url, local, name_in
-from clpipe.base.urls import list_urls, path_of, url_of
+from clpipe.base.urls import forget_stamps, list_urls, path_of, url_of
 from clpipe.chain.python_words import python_words
 from clpipe.chain.rendition import Rendition
 from clpipe.images.raw import RAW_SUFFIXES
@@ -166,6 +166,7 @@ def find_jobs(
     if not inputs:
         raise RequestError("there is no input; give files, folders, globs or manifests")
     excluded = Exclusion(exclude)
+    forget_stamps()
     for text in map(local, inputs):
         if not text:
             raise RequestError("an input is empty; give files, folders, globs or manifests")
