@@ -1,9 +1,10 @@
 """``clpipe dataset``: make a dataset of a scene or of a directory of renders."""
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from clpipe.commands.chain_options import (
 )
 from clpipe.commands.options import (
     EXISTING,
+    ExistingPath,
     GroupedCommand,
     json_lines_option,
     options_on_command_line,
@@ -46,8 +48,17 @@ from clpipe.reference.wide import MODELS
 from clpipe.scenes.blender import Rendering
 from clpipe.scenes.card import CardContents, write_card
 from clpipe.scenes.record import store_credits
-from clpipe.scenes.source import NOTE, RENDERS, UNIT, Source, from_folder, from_scene
+from clpipe.scenes.source import (
+    NOTE,
+    RENDERS,
+    UNIT,
+    Source,
+    from_folder,
+    from_leaves,
+    from_scene,
+)
 from clpipe.scenes.view_request import (
+    DEFAULT_VIEWS,
     PATHS,
     parse_box,
     parse_frames,
@@ -60,15 +71,33 @@ from clpipe.stage import StageRole
 VIEW_OPTIONS = ("views", "path", "box", "frames")
 RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit", "blender")
 
+LEAVES = "leaves"  # the source that needs no renderer
+LEAVES_OPTIONS = ("views", "resolution", "palette")
+
+
+class SourcePath(ExistingPath):
+    """A scene or a directory that exists, or the word for dead leaves."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if value != LEAVES:
+            return super().convert(value, param, ctx)
+        if Path(LEAVES).exists():
+            raise RequestError(
+                f"{LEAVES}: this word makes dead leaves images, but a file or directory here has "
+                f"the same name. Name it ./{LEAVES}, or run the command in another directory"
+            )
+        return None
+
 
 @click.command("dataset", cls=GroupedCommand)
-@click.argument("source", type=EXISTING, metavar="SCENE.blend|FOLDER")
+@click.argument("source", type=SourcePath(path_type=Path), metavar="SCENE.blend|FOLDER|leaves")
 @output_option("DS", "The directory of the dataset. It is created if it does not exist.")
 @click.option(
     "--views",
     type=click.IntRange(1, 100_000),
     metavar="N",
-    help="Render N views around the point that the scene's camera looks at. [default: 24]",
+    help="Render N views around the point that the scene's camera looks at, or make N dead leaves "
+    "images. [default: 24]",
 )
 @click.option(
     "--path",
@@ -93,7 +122,13 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
     "--resolution",
     metavar="WxH",
     type=parse_resolution,
-    help="The resolution of the renders in px. [default: the scene's]",
+    help="The resolution of the renders in px. [default: the scene's; 512x512 for leaves]",
+)
+@click.option(
+    "--palette",
+    type=EXISTING,
+    metavar="IMAGE",
+    help="A render or photograph whose colours dead leaves have. [default: drawn colours]",
 )
 @click.option(
     "--samples",
@@ -140,9 +175,10 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
 @quiet_option
 @json_lines_option
 def dataset(
-    source: Path,
+    source: Path | None,
     output: Path,
     poses: Path | None,
+    palette: Path | None,
     selector: str | None,
     lens_model: str | None,
     quiet: bool,
@@ -157,14 +193,16 @@ def dataset(
     transforms.json, COLMAP's sparse/0), manifest.csv, train.txt and val.txt, a contact sheet and a
     README.
 
-    A directory of renders is used unchanged, with the cameras.json or transforms.json in it. To
-    resume an interrupted run, repeat the command. For other ISOs and cameras, views are not
-    rendered again.
+    A directory of renders is used unchanged, with the cameras.json or transforms.json in it. The
+    word leaves makes dead leaves images, which need no renderer: textured shapes of all sizes that
+    cover each other, with depth and labels. To resume an interrupted run, repeat the command. For
+    other ISOs and cameras, views are not rendered again.
 
     \b
     clpipe dataset scene.blend -o set --iso 100,800,3200 --views 24
     clpipe dataset scene.blend -o film --frames 1-48 --iso 1600
     clpipe dataset renders/ -o set --iso 100,800 --camera sony-a7r2 --camera canon-5d2
+    clpipe dataset leaves -o set --views 100 --resolution 512x512 --iso 800,3200
     """
     check_folder(output)
     attribution = {name: options.pop(name) for name in ("licence", "author")}
@@ -185,14 +223,21 @@ def dataset(
         series = replace(series, isos=(request.settings().iso,))
     series.jobs((), request.settings())  # raises errors before anything is rendered
     with ExitStack() as stack:
-        if source.suffix.lower() == ".blend":
+        if source is None:
+            reject_options(LEAVES_OPTIONS, "a .blend, not to dead leaves")
+            views, size = rendering["views"] or DEFAULT_VIEWS, rendering["resolution"]
+            seed = request.settings().seed
+            show = (lambda text: None) if quiet else partial(click.echo, err=True)
+            renders = from_leaves(output, views, size or (512, 512), seed, palette, show)
+        elif source.suffix.lower() == ".blend":
+            reject_options(RENDER_OPTIONS, "dead leaves, not to a .blend")
             check_chain(request)
             program = rendering.pop("blender")
             job = rendering_from(source, output, poses, request.settings().seed, rendering)
             job = replace(job, faces=cube_faces(request, job.resolution))
             renders = from_scene(stack, job, output, program)
         else:
-            reject_render_options()
+            reject_options((), "a .blend or dead leaves, not to existing renders")
             renders = from_folder(source, output, poses)
         request = replace(request, carry=request.carry or renders.layers)
         attribution = store_credits(output, attribution)
@@ -260,17 +305,19 @@ def check_chain(request: Request) -> None:
         raise
 
 
-def reject_render_options() -> None:
-    """Reject options that apply only to a scene.
+def reject_options(allowed: Sequence[str], reason: str) -> None:
+    """Reject options that apply only to other sources.
+
+    Args:
+        allowed: the options that apply to this one.
+        reason: the sources that they apply to, and this one.
 
     Raises:
         RequestError: such an option is set.
     """
     for name, flag in options_on_command_line().items():
-        if name in RENDER_OPTIONS:
-            raise RequestError(
-                f"{flag}: this option applies only to a .blend, not to existing renders; remove it"
-            )
+        if name in {*RENDER_OPTIONS, *LEAVES_OPTIONS} - {*allowed}:
+            raise RequestError(f"{flag}: this option applies only to {reason}; remove it")
 
 
 def develop(

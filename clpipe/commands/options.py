@@ -26,7 +26,7 @@ GROUPS = {
     "Camera": "+config +camera +iso +lens lens_model focal_length aperture focus_distance +seed "
     "noise_key",
     "Chain": "+set +skip stages start_at until stage_file",
-    "Renders": "+views +path box +frames +resolution +samples denoise time_limit blender",
+    "Renders": "+views +path box +frames +resolution +samples denoise time_limit blender palette",
     "Pictures": "+output +format +keep bracket +patch patches_per_image augment webdataset licence "
     "author",
     "Clips": "codec crf bit_rate bit_depth fps decoded",

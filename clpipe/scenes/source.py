@@ -15,6 +15,7 @@ from clpipe.base.reading import check_exists
 from clpipe.images.passes import find_layers, layer_kind
 from clpipe.inputs.find import Job
 from clpipe.scenes.blender import Renderer, RenderError, Rendering, Scene
+from clpipe.scenes.leaves import dead_leaves, read_palette, write_leaves
 from clpipe.scenes.record import read_record, write_record
 from clpipe.scenes.view_request import dependencies
 
@@ -108,6 +109,49 @@ def from_folder(folder: Path, output: Path, poses: Path | None) -> Source:
     return Source(
         [str(folder)], poses or next(iter(layers_of_file), None), layers_in(folder), about
     )
+
+
+def from_leaves(
+    output: Path,
+    count: int,
+    size: tuple[int, int],
+    seed: int,
+    palette: Path | None,
+    show: Callable[[str], None],
+) -> Source:
+    """Return dead leaves images, which are made unless they exist.
+
+    Args:
+        output: the folder of the dataset.
+        count: the number of images.
+        size: their width and height in px.
+        seed: the seed.
+        palette: a render or photograph with the colours; None draws colours.
+        show: prints a line.
+
+    Raises:
+        RequestError: the size is not possible, or the output directory has another dataset.
+        ImageError: the palette cannot be read, or an image cannot be written.
+    """
+    colours = read_palette(palette) if palette else None
+    sha256 = digests([str(palette)])[str(palette)] if palette else ""
+    origin = {"leaves": list(size), "seed": seed, "palette": sha256}
+    read_record(output, origin)
+    folder = output / RENDERS
+    for number in range(count):
+        path = folder / f"leaves_{number:05}.exr"
+        if not path.exists():
+            image = dead_leaves(*size, seed, number, colours)  # raises an error for a wrong size
+            write_record(output, origin, {})
+            folder.mkdir(parents=True, exist_ok=True)
+            write_leaves(path, image)
+            show(f"made {path.stem}  {number + 1} of {count}")
+    about = {
+        "Renders": f"`{RENDERS}/`, dead leaves (Lee, Mumford and Huang 2001) with textures, which "
+        f"clpipe made from the seed {seed}; linear Rec. 709, with depth and the numbers of leaves",
+        UNIT: "arbitrary: leaves are from 1 to 10 deep",
+    }
+    return Source([str(folder)], None, ("Depth:png", "IndexOB"), about)
 
 
 def layers_in(folder: Path) -> tuple[str, ...]:
