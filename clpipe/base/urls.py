@@ -55,13 +55,18 @@ def path_of(text: str) -> Path:
     return _spool_path(text)
 
 
+def may_be_url(path: Path) -> bool:
+    """Return whether a path may represent a URL; much faster than :func:`url_of`."""
+    return SPOOL in str(path)
+
+
 def url_of(path: Path) -> str | None:
     """Return the URL that a path represents; None for a file of this machine.
 
     >>> url_of(Path("/tmp/x/clpipe-spool/s3/bucket/a/b.exr")), url_of(Path("/tmp/b.exr"))
     ('s3://bucket/a/b.exr', None)
     """
-    if SPOOL not in str(path):
+    if not may_be_url(path):
         return None
     parts = path.parts
     first, *rest = parts[parts.index(SPOOL) + 1 :] if SPOOL in parts else ("",)

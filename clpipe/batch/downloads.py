@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 
 from clpipe.base.cpu_time import CpuTimer
-from clpipe.base.urls import url_of
+from clpipe.base.urls import may_be_url
 from clpipe.batch.job_state import JobState
 from clpipe.inputs.find import Job
 
@@ -43,12 +43,12 @@ class Downloads:
         """
         with self._taking:
             item = self._ahead.popleft() if self._ahead else jobs.get(is_waiting)
-            if isinstance(item, Job) and url_of(item.path):
+            if isinstance(item, Job) and may_be_url(item.path):
                 count = min(max(MAX_BYTES // self._largest, 1), MAX_AHEAD)
                 with suppress(queue.Empty):
                     while len(self._ahead) < count:
                         self._ahead.append(later := jobs.get_nowait())
-                        if isinstance(later, Job) and url_of(later.path):
+                        if isinstance(later, Job) and may_be_url(later.path):
                             self._pool = self._pool or ThreadPoolExecutor(THREADS, "fetch")
                             self._begun[later.stem] = self._pool.submit(self._fetch, later)
             return item

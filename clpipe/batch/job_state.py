@@ -84,7 +84,7 @@ class JobState:
     leases: Sequence[Lease] = ()  # the memory that its image takes; () if it is not loaded
     renditions: Sequence[Rendition] = ()  # the renditions to make
     decoded: DecodedFrame | None = None  # the image, if it was decoded to be metered
-    files: ExitStack = field(default_factory=ExitStack)  # removes files that were fetched
+    files: ExitStack | None = None  # removes files that were fetched, if any were
 
     def drop_pixels(self) -> None:
         """Free the memory of the image, but keep its size."""
@@ -94,7 +94,8 @@ class JobState:
 
     def close(self) -> None:
         """Free what was prepared for an image that is not decoded."""
-        self.files.close()
+        if self.files:
+            self.files.close()
         if self.decoded:
             self.decoded.free()
 
