@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
+import clpipe as package
 from clpipe.base import transfers, urls
 from clpipe.base.errors import ImageError, OutputError, RequestError
 from clpipe.base.transfers import TRANSFERS, class_of
@@ -242,6 +243,30 @@ def test_nothing_is_retried_after_a_stop(bucket, clpipe, monkeypatch, kind):
     monkeypatch.setattr(Faulty, "fault", staticmethod(lambda path: None))
     clpipe("run", "faulty://b/in/r3.exr", "-o", "o", *RUN)  # the stop is forgotten
     assert images()["r3.exr"]["status"] == "done"
+
+
+def test_a_stop_in_python_ends_transfers(bucket, monkeypatch):
+    monkeypatch.setattr(transfers, "STOP_SECONDS", 0.2)
+    go = threading.Event()
+
+    def fault(path):
+        if path.endswith("r5.exr"):
+            run.stop()
+            go.wait(60)
+
+    monkeypatch.setattr(Faulty, "fault", staticmethod(fault))
+    run = package.run("faulty://b/in", "o", device="numpy", jobs=1)
+    run.stop()  # before it begins: no transfer of another run is affected
+    assert [each.status for each in package.run("faulty://b/in/r0.exr", "p", device="numpy")] == [
+        "done"
+    ]
+    run = package.run("faulty://b/in", "o", device="numpy", jobs=1)
+    outcomes = list(run)
+    go.set()
+    assert "r5.exr" not in {outcome.job.key for outcome in outcomes}
+    assert run.summary.interrupted and not run.summary.failures
+    monkeypatch.setattr(Faulty, "fault", staticmethod(lambda path: None))
+    assert {each.status for each in package.run("faulty://b/in", "o")} <= {"done", "skipped"}
 
 
 def test_files_are_fetched_before_a_thread_takes_them(bucket, clpipe, monkeypatch):

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 from clpipe.base.files import remove_temporary_files
-from clpipe.base.transfers import TRANSFERS
 from clpipe.outputs.folder import release_folders
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -35,7 +34,6 @@ def interruptible(stop: Callable[[], None]) -> Iterator[None]:
             release_folders()
             os._exit(INTERRUPTED)
         is_stopping = True
-        TRANSFERS.stop()
         stop()
         # No print() here, because the signal may have interrupted another print().
         with contextlib.suppress(OSError):
@@ -47,4 +45,3 @@ def interruptible(stop: Callable[[], None]) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        TRANSFERS.allow()

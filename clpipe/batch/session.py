@@ -16,6 +16,7 @@ from clpipe.base.about import full_version
 from clpipe.base.errors import OutputError, RequestError
 from clpipe.base.files import discard
 from clpipe.base.processors import available_processors
+from clpipe.base.transfers import TRANSFERS
 from clpipe.base.urls import url_of
 from clpipe.batch.checks import (
     check_clip_chain,
@@ -118,6 +119,7 @@ class Run:
         self._echo = echo
         self._running: Executor | None = None
         self._is_stopped = False
+        self._is_active = False  # whether images are made
         self.watch: Callable[[], None] = lambda: None
         self._loader = ImageLoader(request)
         self.jobs, self._tars = images.jobs(self._loader, execution.output)
@@ -157,7 +159,17 @@ class Run:
                 )
 
     def stop(self) -> None:
-        """Begin no more images, and finish those in flight. A signal handler may call it."""
+        """Begin no more images, and finish those in flight. A signal handler may call it.
+
+        Transfers from and to URLs end within seconds. Images whose files did not arrive have no
+        outcome.
+        """
+        if self._is_active:
+            TRANSFERS.stop()
+        self._halt()
+
+    def _halt(self) -> None:
+        """Begin no more images, but finish transfers."""
         self._is_stopped = True
         if self._running:
             self._running.stop()
@@ -186,6 +198,8 @@ class Run:
             "pid": os.getpid(),
         }
         with ExitStack() as stack:
+            self._is_active = True
+            stack.callback(self._end)
             sink = self.sink()
             sink.waiting = self._wait
             executor = self._running = stack.enter_context(self._executor(sink, jobs))
@@ -225,6 +239,10 @@ class Run:
                 name = Path(log_name(images.shard)).with_suffix(".csv")
                 write_exposures(execution.output / name, frames)
 
+    def _end(self) -> None:
+        self._is_active = False
+        TRANSFERS.allow()
+
     def _metered(
         self, executor: Executor, sink: Folder, jobs: Iterable[Job], frames: list[Job]
     ) -> Iterator[Job]:
@@ -263,10 +281,10 @@ class Run:
                         log.add(outcome)
                     except OutputError as error:
                         unlogged = error
-                        self.stop()
+                        self._halt()
                 limit = self.execution.max_failures
                 if limit and self.summary.exceeds(limit.count(self.summary.total)):
-                    self.stop()
+                    self._halt()
                 if trace:
                     trace.add(outcome)
                 yield outcome
