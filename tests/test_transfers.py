@@ -325,3 +325,22 @@ def test_s3_has_one_layer_of_retries():
     assert system.config_kwargs["retries"] == {"total_max_attempts": 1}
     others = s3fs.S3FileSystem()
     assert others.retries == s3fs.S3FileSystem.retries > 1  # what the user's own code uses
+
+
+def test_a_listing_of_one_file_may_lack_its_stamp(bucket, monkeypatch):
+    """For a URL that is a file, fsspec's own listing gives no information."""
+    monkeypatch.setattr(Faulty, "find", lambda self, path, **more: {path: {}})
+    assert urls.list_urls("faulty://b/in/r0.exr") == ["faulty://b/in/r0.exr"]
+    size = Path("in/r0.exr").stat().st_size
+    assert urls.stamp_of_url("faulty://b/in/r0.exr")[0] == size
+
+
+def test_a_file_that_changes_after_its_listing_is_fetched(bucket, monkeypatch):
+    (url,) = urls.list_urls("faulty://b/in/r0.exr")
+    listed = urls.stamp_of_url(url)
+    bucket.pipe_file("/b/in/r0.exr", b"another one")
+    with urls.fetched_files([urls.path_of(url)]) as (path,):
+        assert path.read_bytes() == b"another one"
+    assert urls.stamp_of_url(url) == listed  # of this run
+    urls.forget_stamps()
+    assert urls.stamp_of_url(url)[0] == 11

@@ -111,7 +111,7 @@ def list_urls(url: str) -> list[str]:
     fixed = re.split(r"[*[]", rest)[0].rpartition("/")[0] if is_glob(url) else rest.rstrip("/")
     prefix = f"{scheme}://{fixed}{'/' * bool(fixed)}"
 
-    def work(system: Any, path: str) -> dict[str, Stamp]:
+    def work(system: Any, path: str) -> dict[str, Any]:
         root = path.rstrip("/").removesuffix(rest[len(fixed) :].rstrip("/")).rstrip("/")
         system.invalidate_cache()
         found: Mapping[str, Any] = {}
@@ -124,22 +124,23 @@ def list_urls(url: str) -> list[str]:
         # The URL keeps its scheme, because a file system may have several. The file of a URL that
         # is no directory has an empty name.
         return {
-            f"{prefix}{name[len(root) :].lstrip('/')}".rstrip("/") + url[len(inner) :]: _stamp(info)
+            f"{prefix}{name[len(root) :].lstrip('/')}".rstrip("/") + url[len(inner) :]: info
             for name, info in found.items()
-            if info["type"] != "directory"
+            if info.get("type") != "directory"
         }
 
-    for known in [each for each in _listed if each.startswith(prefix)]:
-        del _listed[known]
-    stamps = with_retries(url, work, RequestError, "listed")
-    _listed.update(stamps)
-    return sorted(stamps)
+    for known in list(_listed):  # other threads may change it
+        if known.startswith(prefix):
+            _listed.pop(known, None)
+    infos = with_retries(url, work, RequestError, "listed")
+    _listed.update({each: _stamp(info) for each, info in infos.items() if info})
+    return sorted(infos)
 
 
 def listed_stamps(paths: Iterable[Path]) -> dict[str, Stamp]:
     """Return the known stamps of paths that represent URLs, for :func:`remember_stamps`."""
     urls = filter(None, map(url_of, paths))
-    return {url: _listed[url] for url in urls if url in _listed}
+    return {url: stamp for url in urls if (stamp := _listed.get(url))}
 
 
 def forget_stamps() -> None:
@@ -157,8 +158,8 @@ def stamp_of_url(url: str) -> Stamp:
 
     A file that was listed needs no request.
     """
-    if url in _listed:
-        return _listed[url]
+    if stamp := _listed.get(url):
+        return stamp
     with contextlib.suppress(ClpipeError):
         return with_retries(url, lambda system, path: _stamp(system.info(path)), ImageError, "read")
     return 0, 0
