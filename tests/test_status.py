@@ -157,6 +157,7 @@ def test_a_bucket_that_may_not_be_written_ends_the_run_at_once(bucket, clpipe, m
     stderr = clpipe("run", "in", "-o", "bucket://b/set", *TARS, status=1).stderr
     assert "jsonl: cannot be written: no write access. Renew or correct the credentials" in stderr
     assert "6 not begun" in stderr and not Bucket.uploads
+    assert stderr.count("no write access") == 1
 
 
 @pytest.mark.parametrize(

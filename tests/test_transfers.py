@@ -344,3 +344,17 @@ def test_a_file_that_changes_after_its_listing_is_fetched(bucket, monkeypatch):
     assert urls.stamp_of_url(url) == listed  # of this run
     urls.forget_stamps()
     assert urls.stamp_of_url(url)[0] == 11
+
+
+def test_a_run_of_one_file_sends_no_request_before_it_begins(bucket, monkeypatch):
+    monkeypatch.setattr(transfers, "MAX_TRIES", 4)
+    requests = []
+
+    def failing(self, path, **more):
+        requests.append(path)
+        raise OSError("the server is away")
+
+    monkeypatch.setattr(Faulty, "info", failing)
+    run = package.run("faulty://b/in/r0.exr", "o", device="numpy")
+    (outcome,) = run
+    assert outcome.error_class == "network" and len(requests) == 4

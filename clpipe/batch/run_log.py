@@ -176,7 +176,11 @@ class RunLog:
             OutputError: it cannot be written.
         """
         self._write(b"")
-        self._send()
+        try:
+            self._send()
+        except OutputError:
+            self._url = None  # one message is enough
+            raise
 
     def _send(self) -> None:
         """Upload the log, if it has a URL.

@@ -190,7 +190,8 @@ class Reporter:
         if summary.made:
             left = summary.elapsed * (summary.total - summary.made) / summary.made
             parts.append(f"about {format_duration(left)} left")
-        return "; ".join([f"{summary.made} of {summary.total} images", *parts])
+        images = "images" if self._several else "image"
+        return "; ".join([f"{summary.made} of {summary.total} {images}", *parts])
 
     def _clipping_warning(self) -> str:
         """Return a warning about images with much clipping."""

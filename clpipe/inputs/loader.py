@@ -11,6 +11,7 @@ import numpy as np
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, KindError, NoPictureError, RequestError
 from clpipe.base.reading import check_unchanged
+from clpipe.base.urls import listed_stamps, may_be_url
 from clpipe.chain.chain import Chain
 from clpipe.chain.entering import prepare_image
 from clpipe.chain.exposures import exposures_of
@@ -198,7 +199,7 @@ class ImageLoader:
         """Return the size and memory that a job's headers claim, without reading pixels.
 
         The claim is 0 if the file has too many pixels to be read. For a file that cannot be opened,
-        it is one pixel per byte.
+        it is one pixel per byte, and 0 at a URL that was not listed, so that nothing is requested.
         """
         max_pixels = self.request.max_pixels or DEFAULT_MAX_PIXELS
         dump = self.settings.dump_format
@@ -207,7 +208,10 @@ class ImageLoader:
         else:
             mosaic = len(self.reads.channels) == 1
             found = claim_of(job.path, mosaic)
-            claim = found or mosaic_claim(min(stamp_of(job.path)[0], max_pixels), 1)
+            is_here = not may_be_url(job.path) or job.path.exists()
+            known = [stamp_of(job.path)] if is_here else [*listed_stamps([job.path]).values()]
+            size = known[0][0] if known else 0
+            claim = found or mosaic_claim(min(size, max_pixels), 1)
         if claim.width * claim.height > max_pixels:
             return mosaic_claim(0, 0)
         files = len(job.paths) if job.is_panorama else 1
