@@ -9,7 +9,6 @@ from pathlib import Path
 import fsspec
 import numpy as np
 import pytest
-from fsspec.implementations.memory import MemoryFileSystem
 
 import clpipe as package
 from clpipe.base.errors import RequestError
@@ -17,6 +16,7 @@ from clpipe.batch.execution import parse_failures
 from clpipe.batch.run_log import read_log
 from clpipe.commands import progress
 from clpipe.reports.status import read_status
+from tests.buckets import MemoryBucket
 from tests.conftest import contents, written
 
 RUN = ("--iso", 3200, "--device", "numpy", "--skip", "noise")
@@ -105,20 +105,13 @@ def test_a_run_that_was_killed_has_no_end(renders, clpipe):
     assert re.search(r"killed, or still running, attempt 1 on .*; last image .* ago", text)
 
 
-class Bucket(MemoryFileSystem):
+class Bucket(MemoryBucket):
     """A bucket in memory that keeps what was uploaded, in order."""
 
     protocol = "bucket"
     store: dict = {}  # noqa: RUF012
     uploads: list = []  # noqa: RUF012
     forbidden = ""
-
-    @classmethod
-    def _strip_protocol(cls, path):
-        return MemoryFileSystem._strip_protocol(path.replace("bucket://", "memory://"))
-
-    def unstrip_protocol(self, name):
-        return f"bucket:/{name}"
 
     def put_file(self, local, remote, **more):
         if self.forbidden and self.forbidden in remote:

@@ -19,6 +19,7 @@ from clpipe.base.transfers import TRANSFERS, class_of
 from clpipe.batch import downloads
 from clpipe.batch.job_state import JobState
 from clpipe.inputs.find import Job
+from tests.buckets import MemoryBucket
 from tests.conftest import written
 
 RUN = ("--iso", 3200, "--device", "numpy", "--skip", "noise")
@@ -32,7 +33,7 @@ class ServiceError(Exception):
         self.response = {"Error": {"Code": code, "Message": message}}
 
 
-class Faulty(MemoryFileSystem):
+class Faulty(MemoryBucket):
     """A bucket in memory that calls ``fault`` before each transfer."""
 
     protocol = "faulty"
@@ -40,13 +41,6 @@ class Faulty(MemoryFileSystem):
     store: ClassVar = {}
     pseudo_dirs: ClassVar = [""]
     requests: ClassVar = Counter()
-
-    @classmethod
-    def _strip_protocol(cls, path):
-        return MemoryFileSystem._strip_protocol(path.replace("faulty://", "memory://"))
-
-    def unstrip_protocol(self, name):
-        return f"faulty:/{name}"
 
     @staticmethod
     def fault(path):

@@ -12,7 +12,6 @@ from typing import ClassVar
 import fsspec
 import numpy as np
 import pytest
-from fsspec.implementations.memory import MemoryFileSystem
 
 import clpipe as package
 from clpipe.base import transfers, urls
@@ -20,12 +19,13 @@ from clpipe.base.errors import OutputError, RequestError
 from clpipe.base.process_folder import process_folder
 from clpipe.batch.run_log import read_log
 from clpipe.camera.profile import built_in_cameras
+from tests.buckets import MemoryBucket
 from tests.conftest import contents, written
 
 RUN = ("--iso", 3200, "--device", "numpy", "--skip", "noise")
 
 
-class Flaky(MemoryFileSystem):
+class Flaky(MemoryBucket):
     """A bucket in memory, where requests randomly fail or return half a file."""
 
     protocol = "flaky"
@@ -35,13 +35,6 @@ class Flaky(MemoryFileSystem):
     rng = random.Random(0)
     failures: ClassVar = Counter()
     forbidden = ""
-
-    @classmethod
-    def _strip_protocol(cls, path):
-        return MemoryFileSystem._strip_protocol(path.replace("flaky://", "memory://"))
-
-    def unstrip_protocol(self, name):
-        return f"flaky:/{name}"
 
     def _may_fail(self, what, path):
         if self.forbidden and self.forbidden in path:
@@ -101,13 +94,6 @@ class Listed(Flaky):
     protocol = "listed"
     async_impl = True  # one instance for all threads, like that of S3
     requests: ClassVar = Counter()
-
-    @classmethod
-    def _strip_protocol(cls, path):
-        return MemoryFileSystem._strip_protocol(path.replace("listed://", "memory://"))
-
-    def unstrip_protocol(self, name):
-        return f"listed:/{name}"
 
     def find(self, path, *arguments, **more):
         self.requests["list"] += 1
