@@ -1,5 +1,6 @@
 // Means weighted by Tukey's biweight of the difference, on the roots of luma and chroma.
 #include "lib/roots.h"
+#include "lib/smooth.h"
 
 // In units of the difference with weight 0.
 INLINE ycbcr roots_to_luma_chroma(rgb c, site at, float luma_range, float chroma_range) {
@@ -19,39 +20,53 @@ INLINE rgb luma_chroma_to_light(ycbcr c, site at, float offset, float luma_range
     return roots_to_light(v, at, offset);
 }
 
-// Luma from adjacent pixels, chroma from eight on a ring: `chroma_scale` away along both axes, or
-// one more along one axis. Demosaicing has made their noise independent of the centre's. `grain` is
-// the share of luma that does not change, and `guide` the weight of luma in the distance of colours.
-// Pixels at the same distance share one weight of luma, which is applied last.
-INLINE ycbcr biweight(site at, image planes, float grain, float guide, int chroma_scale) {
+INLINE ycbcr smooth_chroma(site at, image planes) {
+    ycbcr v = smooth(at, planes);
+    v.y = tap_ycbcr(planes, 0, 0).y;
+    return v;
+}
+
+// Tukey's biweight, from the squared difference.
+INLINE vf biweight_of(vf squared) {
+    const vf near = vmax((vf)(1.0f) - squared, (vf)(0.0f));
+    return near * near;
+}
+
+// Luma from the four adjacent pixels, chroma from four that are `chroma_scale` away along both axes:
+// demosaicing has made their noise independent of the centre's. Differences of luma are those of
+// binomial means of 3x3 pixels. `grain` is the share of luma that does not change. The difference of
+// colours includes that of luma, squared, times `luma_share`.
+INLINE ycbcr biweight(site at, image planes, float grain, float luma_share, int chroma_scale) {
 #pragma OPENCL FP_CONTRACT ON
-    const ycbcr centre = tap_ycbcr(planes, 0, 0);
-    vf sums[3] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};  // of weighted differences, by squared distance
-    vf weights[3] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
+    const ycbcr centre = smooth_chroma(at, planes);
+    vf columns[3][5];  // sums along rows, in the columns around the pixel
+#pragma unroll
+    for (int x = 0; x < 3; ++x)
+#pragma unroll
+        for (int y = x == 1 ? 0 : 1; y < (x == 1 ? 5 : 4); ++y)
+            columns[x][y] = binomial(tap_ycbcr(planes, x - 2, y - 2).y, tap_ycbcr(planes, x - 1, y - 2).y,
+                                     tap_ycbcr(planes, x, y - 2).y);
+    const vf here = binomial(columns[1][1], columns[1][2], columns[1][3]) * 0.0625f;
+    vf luma = (vf)(0.0f), luma_weight = (vf)(1.0f);  // the sum is that of weighted differences
     vf blue = (vf)(0.0f), red = (vf)(0.0f), chroma_weight = (vf)(1.0f);
 #pragma unroll
-    for (int dy = -1; dy <= 1; ++dy) {
-#pragma unroll
-        for (int dx = -1; dx <= 1; ++dx) {
-            const int distance = dx * dx + dy * dy;
-            if (distance == 0) continue;
-            const vf d = centre.y - tap_ycbcr(planes, dx, dy).y;
-            const vf near = vmax((vf)(1.0f) - d * d, (vf)(0.0f)), weight = near * near;
-            sums[distance] += weight * d;
-            weights[distance] += weight;
-            const int reach = distance == 2 ? chroma_scale : chroma_scale + 1;
-            const ycbcr c = tap_ycbcr(planes, dx * reach, dy * reach);
-            const vf dl = centre.y - c.y, db = centre.cb - c.cb, dr = centre.cr - c.cr;
-            const vf alike = vmax((vf)(1.0f) - guide * (dl * dl) - db * db - dr * dr, (vf)(0.0f));
-            const vf share = alike * alike;
-            blue += share * db;
-            red += share * dr;
-            chroma_weight += share;
-        }
+    for (int k = 0; k < 4; ++k) {
+        const int dx = k == 0 ? -1 : k == 1, dy = k == 2 ? -1 : k == 3;
+        const vf d = here - binomial(columns[dx + 1][dy + 1], columns[dx + 1][dy + 2],
+                                     columns[dx + 1][dy + 3]) * 0.0625f;
+        const vf weight = biweight_of(d * d);
+        luma += weight * (centre.y - tap_ycbcr(planes, dx, dy).y);
+        luma_weight += weight;
+        const int right = k % 2 ? chroma_scale : -chroma_scale, down = k / 2 ? chroma_scale : -chroma_scale;
+        const ycbcr c = tap_ycbcr(planes, right, down);
+        const vf dl = here - c.y, db = centre.cb - c.cb, dr = centre.cr - c.cr;
+        const vf share = biweight_of(luma_share * (dl * dl) + db * db + dr * dr);
+        blue += share * db;
+        red += share * dr;
+        chroma_weight += share;
     }
-    const vf luma_weight = (vf)(1.0f) + 0.5f * weights[1] + 0.25f * weights[2];
-    const vf luma = (1.0f - grain) / luma_weight, chroma = 1.0f / chroma_weight;
-    const ycbcr v = {centre.y - (0.5f * sums[1] + 0.25f * sums[2]) * luma, centre.cb - blue * chroma,
-                     centre.cr - red * chroma};
+    const vf of_luma = (1.0f - grain) / luma_weight, of_chroma = 1.0f / chroma_weight;
+    const ycbcr v = {centre.y - luma * of_luma, centre.cb - blue * of_chroma,
+                     centre.cr - red * of_chroma};
     return v;
 }

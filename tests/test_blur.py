@@ -56,7 +56,7 @@ def test_a_slanted_edge_is_as_sharp_as_the_lens_says(lens):
     edge = beyond.reshape(200, 16, 96, 16).mean((1, 3))[..., None].repeat(3, 2)
     frequency, sharp = edge_mtf(edge[..., 1], slope)
     _, found = edge_mtf(blurred(edge, None, optical_blur=lens)[..., 1], slope)
-    light = line_spread(lens.get("sigma", 0.4), lens.get("low_pass", 0), lens.get("pixel_area", 0))
+    light = line_spread(lens.get("sigma", 0.65), lens.get("low_pass", 0), lens.get("pixel_area", 0))
     places = np.arange(len(light)) - len(light) // 2
     expected = np.cos(2 * np.pi * frequency[:, None] * places) @ light
     assert found / sharp == pytest.approx(expected, abs=0.02)
@@ -153,7 +153,7 @@ def test_a_streak_along_a_line_stays_on_it(direction):
 
 def test_the_default_has_a_good_lens_and_the_paper_none():
     image = dot()
-    assert make_chain(settings_from({})).step_named("optical_blur").method.sigma == 0.4
+    assert make_chain(settings_from({})).step_named("optical_blur").method.sigma == 0.65
     paper = make_chain(load_settings("paper"))
     kept = Runner(paper, None, ["exposure"], encode=False).run(image, "k").kept["exposure"]
     assert np.array_equal(kept, image)

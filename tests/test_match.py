@@ -456,7 +456,7 @@ def test_every_number_of_the_development_is_searched():
         again = {d.name for d in dimensions_of(chain) if d.name.startswith("denoise_2.")}
         assert again == {f"denoise_2.{name}" for name in numbers}
     scales = {choice.text for choice in variants_of(Settings(), "denoise")}
-    assert {"denoise.chroma_scale 2", "denoise.chroma_scale 4"} <= scales
+    assert {"denoise.chroma_scale 1", "denoise.chroma_scale 4"} <= scales
     radii = {choice.text for choice in variants_of(Settings(), "sharpen")}
     assert {"sharpen.radius 0.84", "sharpen.radius 1.68"} <= radii
 

@@ -202,8 +202,8 @@ def test_the_law_is_explained_with_the_numbers_it_gives():
     formula = "luma_noise = sqrt(sum of (0.299, 0.587, 0.114)^2 * sigma^2)"
     assert f"{formula} = {step.method.luma_noise:.3g}" in text
     assert f"{step.method.chroma_noise:.3g}" in text
-    luma, chroma = 3 * step.method.luma_noise, 6 * step.method.chroma_noise
-    assert f"range sigma = 3 * strength * noise: luma {luma:.3g}, chroma {chroma:.3g}" in text
+    luma, chroma = 1.2 * step.method.luma_noise, 2.4 * step.method.chroma_noise
+    assert f"range sigma = 1.2 * strength * noise: luma {luma:.3g}, chroma {chroma:.3g}" in text
     assert max(map(len, text.splitlines())) <= 100
 
 

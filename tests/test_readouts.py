@@ -198,7 +198,7 @@ def test_what_is_refused(clpipe, options, message):
 
 def test_a_dng_of_two_readouts_that_fit(clpipe, part):
     options = ("--set", "sensor_noise.method=dual_gain", "--set", "sensor_noise.ratio=4")
-    options += ("--set", "exposure.ev=1", "--device", "numpy")
+    options += ("--set", "exposure.ev=1.5", "--device", "numpy")
     clpipe("run", part, "-o", "out", "--format", "dng", "--keep", "quantize", *options)
     kept = read_image(Path("out/part.quantize.exr"), mosaic=True).pixels
     assert kept.max() > 16383

@@ -328,7 +328,7 @@ def test_two_runs_are_compared(out, renders, tmp_path):
     more = ("--iso", 400, "--set", "denoise.luma_strength=2", "--truth", "development")
     clpipe("run", renders / "a.exr", "-o", other, *NUMPY, *more)
     page = report(out, other)
-    assert "denoise.luma_strength 0.5 2" in page.shown_text
+    assert "denoise.luma_strength 0.12 2" in page.shown_text
     large = {each["name"]: each for each in page.data["look-data"]}
     labels = [view["label"] for view in large["a"]["views"]]
     assert labels[:2] == ["out image", "other image"]

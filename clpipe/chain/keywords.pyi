@@ -310,6 +310,7 @@ class Denoise(TypedDict, total=False):
     luma_size: Whole
     chroma_size: Whole
     spatial_sigma: Number
+    guide: Draw | Literal["smooth", "image"]
 
 class ColorMatrix(TypedDict, total=False):
     method: Draw | Literal["as_shot", "camera", "given", "none"]

@@ -32,7 +32,7 @@ MAX_PSF_SIZE = 65  # px; the side of a measured point spread function
 OVERSAMPLING = 8  # samples per pixel for the calculation of diffraction
 # Share of the light of a diffraction pattern that is kept, because its rings are infinite.
 ENCLOSED_ENERGY = 0.995
-DEFAULT_SIGMA = 0.4  # px
+DEFAULT_SIGMA = 0.65  # px
 MAX_UNROLLED_RADIUS = 3  # px; a wider blur takes two launches, one along rows and one along columns
 
 

@@ -2,28 +2,30 @@
 
 from collections.abc import Mapping
 from math import e, log2
-from typing import ClassVar
+from dataclasses import replace
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
-from clpipe.reference.image import tap
-from clpipe.stage import Context, ReferenceContext, parameter
+from clpipe.reference.image import smooth, tap
+from clpipe.stage import Context, Kind, Pass, ReferenceContext, Stencil, parameter
 from clpipe.stages.denoise.strength import WindowDenoiser
 
-# Sigma of the range weight, in multiples of strength * noise. We chose this value.
-# tools/pages/quality.py measures its PSNR, and no test asserts that it is optimal.
-RANGE = 3.0
+# Sigma of the range weight, in multiples of strength * noise, by the guide. The paper's images have
+# the second one. With the first, noise is as weak, and edges are no sharper than without noise.
+RANGES = {"smooth": 1.2, "image": 3.0}
 
 
 class Bilateral(WindowDenoiser):
     """Bilateral filter (Tomasi and Manduchi, ICCV 1998) in YCbCr.
 
     The weight of luma depends on the distance in luma, and that of both chroma planes on their
-    common distance. It is a Gaussian with sigma 3 * strength * noise, so a difference of one sigma
-    has the weight 0.61.
+    common distance. It is a Gaussian of sigma 1.2 * strength * noise. By default, distances are
+    those of a binomial mean of 3x3 pixels. Distances of the image contain the noise of the filtered
+    pixel, so edges become sharper with more noise.
     """
 
     method: ClassVar = "bilateral"
@@ -36,18 +38,40 @@ class Bilateral(WindowDenoiser):
     spatial_sigma: float = parameter(
         1.5, "Sigma of the Gaussian weight of spatial distance.", "px", gt=0, le=100
     )
+    guide: Literal["smooth", "image"] = parameter(
+        "smooth",
+        "Source of the distances: a mean of 3x3 pixels, or like in the paper the image itself.",
+        structural=True,
+    )
+
+    @property
+    def reaches(self) -> tuple[int, int]:
+        luma, chroma = super().reaches
+        return luma if self.luma_strength else 0, chroma if self.chroma_strength else 0
+
+    @property
+    def range(self) -> float:
+        """Sigma of the range weight, in multiples of strength * noise."""
+        return RANGES[self.guide]
+
+    def passes(self) -> tuple[Pass, ...]:
+        first, stencil, last = super().passes()
+        if self.guide == "image":
+            return first, replace(stencil, function="bilateral_by_itself"), last
+        smoothing = Pass("smooth", Stencil(1), (), ("planes",), "guide", Kind.YCBCR)
+        return first, smoothing, replace(stencil, reads=("planes", "guide")), last
 
     @property
     def effect(self) -> str:
-        luma, chroma = (f"{RANGE * amount:.3g}" for amount in self.amounts)
-        return f"range sigma = {RANGE:g} * strength * noise: luma {luma}, chroma {chroma}"
+        luma, chroma = (f"{self.range * amount:.3g}" for amount in self.amounts)
+        return f"range sigma = {self.range:g} * strength * noise: luma {luma}, chroma {chroma}"
 
     def numbers(self, context: Context) -> Mapping[str, np.float32]:
         luma, chroma = self.amounts
         return {
             "spatial_scale": gaussian_scale(self.spatial_sigma),
-            "luma_scale": gaussian_scale(RANGE * luma),
-            "chroma_scale": gaussian_scale(RANGE * chroma),
+            "luma_scale": gaussian_scale(self.range * luma),
+            "chroma_scale": gaussian_scale(self.range * chroma),
         }
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
@@ -55,26 +79,31 @@ class Bilateral(WindowDenoiser):
         numbers = self.numbers(inputs.context)
         luma, chroma = planes[..., :1], planes[..., 1:]
         near = numbers["spatial_scale"]
-        luma = bilateral(luma, self.reaches[0], near, numbers["luma_scale"])
-        chroma = bilateral(chroma, self.reaches[1], near, numbers["chroma_scale"])
+        guide = smooth(planes) if self.guide == "smooth" else planes
+        y, c = guide[..., :1], guide[..., 1:]
+        luma = bilateral(luma, y, self.reaches[0], near, numbers["luma_scale"])
+        chroma = bilateral(chroma, c, self.reaches[1], near, numbers["chroma_scale"])
         return ycbcr_to_rgb(np.concatenate([luma, chroma], axis=-1))
 
 
-def bilateral(planes: Floats, reach: int, spatial_scale: np.float32, scale: np.float32) -> Floats:
-    """Filter (height, width, plane) bilaterally by the planes' common distance (eq. 5 and 6).
+def bilateral(
+    planes: Floats, guide: Floats, reach: int, spatial_scale: np.float32, scale: np.float32
+) -> Floats:
+    """Filter (height, width, plane) bilaterally by the guide's common distance (eq. 5 and 6).
 
     A weight is 2^(spatial_scale * distance^2 + scale * difference^2). The distance is in px and the
     difference in signal units; see :func:`gaussian_scale`.
 
     >>> step = np.float32([[[0], [0], [1], [1]]])
-    >>> bilateral(step, 1, gaussian_scale(1.0), gaussian_scale(0.1))[0, :, 0].round(3).tolist()
+    >>> result = bilateral(step, step, 1, gaussian_scale(1.0), gaussian_scale(0.1))
+    >>> result[0, :, 0].round(3).tolist()
     [0.0, 0.0, 1.0, 1.0]
     """
     total, weights = planes.copy(), np.ones_like(planes[..., :1])
     offsets = range(-reach, reach + 1)
     for dx, dy in ((dx, dy) for dy in offsets for dx in offsets if (dx, dy) != (0, 0)):
         other = tap(planes, dx, dy)
-        squared = ((other - planes) ** 2).sum(-1, keepdims=True)
+        squared = ((tap(guide, dx, dy) - guide) ** 2).sum(-1, keepdims=True)
         near = np.float32(dx * dx + dy * dy) * spatial_scale
         weight = np.exp2(np.maximum(near + squared * scale, np.float32(-30)))
         total += weight * other
