@@ -1,4 +1,5 @@
 #include "site_gains.cl"
+#include "lib/lights.h"
 // White patch: gains that make the brightest samples of the three colours equal. Each colour has a
 // histogram, 12 octaves below 1 with 512 bins each, indexed by the upper bits of the float.
 #define WHITE_PATCH_BINS 6144
@@ -35,11 +36,13 @@ INLINE float white_patch_level(__global const uint *histogram, uint colour, uint
     return as_float(0x39800000 + (int)(bin << 14) + (1 << 13));
 }
 
-INLINE void white_patch(__global const uint *histogram, uint millionths, extent e,
-                        __global float *estimates) {
+INLINE void white_patch(__global const uint *histogram, uint millionths,
+                        __global const float *lights, int light_count, float light_tolerance,
+                        extent e, __global float *estimates) {
     const float red = white_patch_level(histogram, 0, millionths);
     const float green = white_patch_level(histogram, 1, millionths);
     const float blue = white_patch_level(histogram, 2, millionths);
     estimates[0] = red > 0.0f && green > 0.0f ? green / red : 1.0f;
     estimates[1] = blue > 0.0f && green > 0.0f ? green / blue : 1.0f;
+    limit_to_lights(estimates, lights, light_count, light_tolerance);
 }

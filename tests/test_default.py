@@ -83,7 +83,10 @@ def test_saturated_colours_have_no_dots():
     assert 2.5 < kurtosis <= 4.5
     assert 2 < rms < 8  # levels; there is noise
     assert spots < 0.5  # in 10,000
-    old = {"demosaic": {"method": "edge_directed_median"}, "denoise": {"method": "bilateral", "guide": "image"}}
+    old = {
+        "demosaic": {"method": "edge_directed_median"},
+        "denoise": {"method": "bilateral", "guide": "image"},
+    }
     assert noise(**old)[0] > 6
 
 
@@ -199,7 +202,9 @@ def test_the_configuration_paper_is_the_papers_pipeline():
 
     full = reference(EdgeDirectedMedian(), "demosaic", "white_balance")
     assert np.array_equal(kept["demosaic"], full)
-    assert np.array_equal(kept["denoise"], reference(Bilateral(guide="image"), "denoise", "demosaic"))
+    assert np.array_equal(
+        kept["denoise"], reference(Bilateral(guide="image"), "denoise", "demosaic")
+    )
     curved = CameraRaw().table()[curve_index(kept["denoise"])]
     assert np.array_equal(kept["tone_curve"], curved)
     assert np.abs(kept["gamma"] - np.clip(curved, 0, 1) ** (1 / 2.2)).max() < 2e-3

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import clpipe as package
+from clpipe.camera.lights import TOLERANCE, light_in_srgb, plausible_gains
+from clpipe.camera.profile import load_camera
 from clpipe.chain.files import load_config
 from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
@@ -96,11 +98,14 @@ def test_burnt_out_highlights_are_white(develop):
     assert encoded.min() == 255
 
 
+GRAY = {"method": "gray_world", "limit": False}
+
+
 def test_gray_world_makes_means_equal(develop):
     random = np.random.default_rng(0)
     image = (random.random((64, 64, 3)) * [0.5, 0.3, 0.1]).astype(np.float32)
     chain = ["mosaic", "white_balance"]
-    result = develop(image, numpy=True, stages=chain, white_balance={"method": "gray_world"})
+    result = develop(image, numpy=True, stages=chain, white_balance=GRAY)
     sites = [result.final[y::2, x::2].mean() for y in (0, 1) for x in (0, 1)]
     green = (sites[1] + sites[2]) / 2
     assert sites[0] == pytest.approx(green, rel=1e-5)
@@ -108,6 +113,31 @@ def test_gray_world_makes_means_equal(develop):
     gains = result.estimates["white_balance"]
     assert gains["red_gain"] == pytest.approx(0.6, rel=0.05)
     assert gains["blue_gain"] == pytest.approx(3.0, rel=0.05)
+
+
+@pytest.mark.parametrize("numpy", [False, True])
+@pytest.mark.parametrize("method", ["gray_world", "white_patch"])
+def test_gains_stay_near_those_of_lights(develop, numpy, method):
+    leaves = np.random.default_rng(2).uniform(0.5, 1.0, (64, 64, 1)) * [0.12, 0.3, 0.06]
+    camera = load_camera("canon-5d3")
+
+    def gains(light, **settings):
+        values = {"method": method, **settings}
+        image = (leaves * light).astype(np.float32)
+        result = develop(image, numpy=numpy, camera="canon-5d3", white_balance=values)
+        return np.array(list(result.estimates["white_balance"].values()))
+
+    daylight, tungsten = np.ones(3), light_in_srgb(2856)
+    assert gains(daylight, limit=False).min() / max(camera.white_balance_gains) > 1  # magenta
+    near = gains(daylight)
+    lights = plausible_gains(camera, camera.white_balance_gains)
+    assert abs(near / lights - 1).max(1).min() <= TOLERANCE + 1e-5
+    assert (
+        0.8 < min(near / camera.white_balance_gains) < max(near / camera.white_balance_gains) < 1.5
+    )
+    # Under a lamp, gains are those of lamps, and grey stays grey.
+    warm = plausible_gains(camera, camera.white_balance_gains)[:12]
+    assert abs(gains(tungsten) / warm - 1).max(1).min() <= TOLERANCE + 1e-5
 
 
 WHITE = {"stages": ["mosaic", "white_balance"]}
@@ -119,7 +149,7 @@ def test_white_patch_makes_the_brightest_samples_equal(develop, numpy, pattern):
     image = (random.random((61, 90, 3)) * [0.2, 0.4, 0.1]).astype(np.float32)
     image[10:20, 10:20] = [0.3, 0.6, 0.15]  # a white wall in warm light: 1.6 % of the picture
     image[30:34, 30:60] = [0.9, 1.0, 0.2]  # a lamp that clips in green
-    settings = {"method": "white_patch", "percentile": 99.5}
+    settings = {"method": "white_patch", "percentile": 99.5, "limit": False}
     mosaic = {"pattern": pattern}
     result = develop(image, numpy=numpy, white_balance=settings, mosaic=mosaic, **WHITE)
     gains = result.estimates["white_balance"]

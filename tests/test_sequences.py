@@ -395,7 +395,7 @@ def test_loops_start_at_the_first_frame_with_light(rule):
 
 def test_without_light_white_balance_waits():
     control = {"delay": 0, "smoothing": 0.0, "speed": 0.0, "hysteresis": 0.0}
-    balance = {"method": "gray_world"}
+    balance = {"method": "gray_world", "limit": False}
     red = np.full((24, 32, 3), (0.4, 0.1, 0.1), np.float32)
     with clpipe.Stream(device="numpy", white_balance=balance, control=control) as stream:
         gains = [stream(red * light).settings["white_balance"] for light in (0, 1, 0, 0.5)]

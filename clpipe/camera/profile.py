@@ -35,6 +35,17 @@ SRGB_TO_XYZ = np.array(
     ]
 )
 
+
+def srgb_to_camera(xyz_to_camera: Matrix) -> Doubles:
+    """Return the matrix of :meth:`Camera.srgb_to_camera`, (3, 3).
+
+    >>> srgb_to_camera(IDENTITY).sum(1).round(6).tolist()
+    [1.0, 1.0, 1.0]
+    """
+    matrix = np.array(xyz_to_camera) @ SRGB_TO_XYZ
+    return np.asarray(matrix / matrix.sum(1, keepdims=True))
+
+
 Share = Annotated[float, Field(ge=0, le=0.1)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Temperature = Annotated[float, Field(ge=-100, le=150)]  # deg C
@@ -156,8 +167,7 @@ class Camera(BaseModel):
         """
         if self.xyz_to_camera is None:
             raise RequestError(f"camera {self.name}: its profile contains no xyz_to_camera matrix")
-        matrix = np.array(self.xyz_to_camera) @ SRGB_TO_XYZ
-        return matrix / matrix.sum(1, keepdims=True)
+        return srgb_to_camera(self.xyz_to_camera)
 
     def noise(self, iso: float) -> NoiseModel:
         """Return shot and read noise at an ISO: a = K / range, b = (read noise / range)^2.

@@ -274,6 +274,7 @@ class WhiteBalance(TypedDict, total=False):
     method: Draw | Literal["as_shot", "gray_world", "white_patch", "gains", "none"]
     red_gain: Number
     blue_gain: Number
+    limit: Flag
     percentile: Number
     clip: Number
 

@@ -1,7 +1,7 @@
 """The result of a search: columns inside and outside the searched areas, and a configuration."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from clpipe.analysis.matching.ambiguity import Ambiguity, ambiguities
 from clpipe.analysis.matching.columns import COLUMNS, SKEWS, TAILS, Noise
+from clpipe.analysis.matching.edges import Sharpness, as_sharp
 from clpipe.analysis.matching.scenes import Scenes
 from clpipe.analysis.matching.search import Candidate, Search, Target, target_at, target_of
 from clpipe.analysis.matching.space import DEVELOPMENT, TONE
@@ -19,6 +20,10 @@ from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import value_text
 
 AT_END = 0.01  # share of the range; an ISO this close to an end counts as at the end
+NO_EDGES = (
+    "the pictures have too few straight, isolated edges to measure their sharpness, so optical_blur "
+    "and sharpen.limit are the defaults; add pictures of objects with straight edges"
+)
 CHECKED = 4  # frames of each pair that are developed to measure the result
 
 
@@ -65,17 +70,20 @@ class Match:
     evaluations: int
     noises: tuple[Compared, ...]
     ambiguities: tuple[Ambiguity, ...]
+    sharpness: Sharpness | None
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """Sentences for a reader of the configuration: the verdict and the warnings."""
-        return (self.verdict, *self.warnings)
+        sharpness = [str(self.sharpness)] if self.sharpness else []
+        return (self.verdict, *sharpness, *self.warnings)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences about poorly constrained numbers, and about an ISO at the end of the range."""
+        """Sentences about poorly constrained numbers, an ISO at the end of the range, and edges."""
         ended = ended_by(self.settings, self.numbers)
-        return (*map(str, self.ambiguities), *([ended] if ended else []))
+        blunt = [] if self.sharpness else [NO_EDGES]
+        return (*map(str, self.ambiguities), *([ended] if ended else []), *blunt)
 
     @property
     def verdict(self) -> str:
@@ -102,6 +110,7 @@ class Match:
             "scenes": [scene.name for scene in self.scenes.each],
             "notes": list(self.scenes.notes),
             "ambiguities": [each.record() for each in self.ambiguities],
+            "sharpness": asdict(self.sharpness) if self.sharpness else None,
             "ended_by_range": ended_by(self.settings, self.numbers) or None,
             "columns": {
                 seen.name: {
@@ -142,7 +151,8 @@ def measured(search: Search, found: Candidate) -> Match:
         StoppedError: the search's watch stopped it.
     """
     scenes = search.scenes
-    settings = with_output(found.settings, scenes)
+    sharp, sharpness = as_sharp(found.settings, scenes.each, search.simulator.device)
+    settings = with_output(sharp, scenes)
     pairs: dict[bool, list[tuple[Target, Target]]] = {True: [], False: []}
     noises = []
     for scene in scenes.each:
@@ -162,6 +172,7 @@ def measured(search: Search, found: Candidate) -> Match:
         search.evaluations,
         tuple(noises),
         ambiguities(search, found),
+        sharpness,
     )
 
 

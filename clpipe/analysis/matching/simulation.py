@@ -34,7 +34,7 @@ class Simulator:
     """
 
     def __init__(self, device: Device | None) -> None:
-        self._device = device
+        self.device = device
         self._lock = threading.Lock()  # lets one thread use the device and its runners
         self._noisy: Runner | None = None  # shares plans with all runners of noisy chains
         self._quiet: Runner | None = None
@@ -57,11 +57,11 @@ class Simulator:
         keys = [f"{key}:{scene.name}:{number}" for number in range(count or len(scene.frames))]
         with self._lock:
             linear = self._linear_light(chain, scene)
-            self._noisy = (self._noisy or Runner(chain, self._device)).for_chain(chain)
+            self._noisy = (self._noisy or Runner(chain, self.device)).for_chain(chain)
             pictures = [self._noisy.run(linear, name).encoded for name in keys]
             if not scene.own_mean:
                 clean = chain.without_noise()
-                self._quiet = (self._quiet or Runner(clean, self._device)).for_chain(clean)
+                self._quiet = (self._quiet or Runner(clean, self.device)).for_chain(clean)
                 pictures.append(self._quiet.run(linear, "").encoded)
         frames = [finished(picture, scene) for picture in pictures]
         mean = None if scene.own_mean else frames.pop()

@@ -30,7 +30,9 @@ SMOOTHER = {"method": "bilateral", "luma_size": 1, "luma_strength": 0.0, "chroma
 COARSER = {"method": "biweight", "luma_strength": 0.0, "chroma_scale": 4}
 # Units of searched numbers; numbers in signal units follow from the noise.
 SEARCHED_UNITS = ("", "px")
-ALSO = ("sharpen.limit",)  # also searched, because it sets the noise at edges
+# Noise does not tell these: a picture's colours are those of its scene, and edges come later.
+NOT_SEARCHED = ("tone_curve.saturation", "sharpen.limit")
+MOST = {"sharpen.amount": 2.0}  # more makes noise finer, and edges sharper than in any camera
 SPAN = 8.0  # a number is searched within this factor of its initial value
 
 
@@ -117,8 +119,8 @@ def dimensions_of(chain: Chain) -> list[Dimension]:
 
     A share is searched from 0 to 1. Other numbers are searched within a factor of 8 of their value
     in the chain, as far as their limits allow. A number that is 0 is turned off, and stays 0.
-    Numbers without an upper limit are not searched. Nor are numbers in units of the signal, except
-    for the limit of sharpening, because they follow from the noise.
+    Numbers without an upper limit are not searched. Nor are numbers in units of the signal, because
+    they follow from the noise.
     """
     found = []
     for step in chain.steps:
@@ -129,13 +131,15 @@ def dimensions_of(chain: Chain) -> list[Dimension]:
             dotted = f"{step.name}.{name}"
             if (
                 extra["structural"]
-                or (extra["unit"] not in SEARCHED_UNITS and dotted not in ALSO)
+                or extra["unit"] not in SEARCHED_UNITS
+                or dotted in NOT_SEARCHED
                 or not is_number(declared.annotation)
             ):
                 continue
             low, high = limits_of(declared.metadata)
             start = float(getattr(step.method, name))
-            if start > 0 and 0 <= low < high <= 1 and dotted not in ALSO:
+            high = min(high, MOST.get(dotted, high))
+            if start > 0 and 0 <= low < high <= 1:
                 found.append(Dimension(dotted, low, high, start))
             elif start > 0 and math.isfinite(low + high):
                 ends = max(start / SPAN, low), min(start * SPAN, high)

@@ -6,8 +6,9 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from pydantic import PrivateAttr
 
-from clpipe.base.tracing import float32
+from clpipe.base.tracing import float32, int32
 from clpipe.base.types import Floats
+from clpipe.camera.lights import TOLERANCE, limited_to_lights, plausible_gains
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.filter_array import FilterArray, parse_array, tiled
 from clpipe.stage import (
@@ -33,13 +34,23 @@ def apply_gains(image: Floats, context: Context, red: np.float32, blue: np.float
     return np.minimum(image * gains, np.float32(1))
 
 
+LIGHTS = ("lights", "light_count", "light_tolerance")  # arguments that limit estimated gains
 APPLY = Pass("white_balance", Pointwise(inline_at_taps=True), ("pattern", "red_gain", "blue_gain"))
 
 
 class EstimatedGains(Method):
-    """Gains that are estimated from the image; subclasses define how."""
+    """Gains that are estimated from the image; subclasses define how.
+
+    The colours of a scene can mislead an estimate: among leaves, a grey card becomes magenta. The
+    gains are therefore moved to within 8 % of those for the nearest daylight or incandescent light,
+    like in cameras; see :mod:`clpipe.camera.lights`.
+    """
 
     tolerance: ClassVar = 1e-6  # division is not exact on every device
+
+    limit: bool = parameter(
+        True, "Whether gains stay near those for daylight and incandescent light."
+    )
 
     def next_context(self, context: Context) -> Context:
         # The estimates are known only when the image is processed; the as-shot gains replace them
@@ -50,6 +61,14 @@ class EstimatedGains(Method):
         """The pass that estimates "red_gain" and "blue_gain"."""
         raise NotImplementedError(type(self).__name__)
 
+    def arguments(self, context: Context) -> Arguments:
+        lights = plausible_gains(context.camera, context.gains)
+        return {
+            "lights": lights,
+            "light_count": int32(len(lights) if self.limit else 0),
+            "light_tolerance": float32(TOLERANCE),
+        }
+
     def gains(self, image: Floats, pattern: Pattern) -> tuple[np.float32, np.float32]:
         """Return the gains of red and blue (green = 1) for a (height, width) mosaic."""
         raise NotImplementedError(type(self).__name__)
@@ -59,7 +78,10 @@ class EstimatedGains(Method):
         return estimation_pass, APPLY
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        red, blue = self.gains(image, inputs.context.pattern)
+        estimated = np.float32(self.gains(image, inputs.context.pattern))
+        context = inputs.context
+        lights = plausible_gains(context.camera, context.gains)[: None if self.limit else 0]
+        red, blue = limited_to_lights(estimated, lights, np.float32(TOLERANCE))
         inputs.estimates["red_gain"], inputs.estimates["blue_gain"] = float(red), float(blue)
         return apply_gains(image, inputs.context, red, blue)
 

@@ -7,7 +7,7 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.stage import Arguments, Context, Pass, Reduction
-from clpipe.stages.white_balance.gains import EstimatedGains
+from clpipe.stages.white_balance.gains import LIGHTS, EstimatedGains
 
 
 class GrayWorld(EstimatedGains):
@@ -22,11 +22,11 @@ class GrayWorld(EstimatedGains):
     summary: ClassVar = "make the means of the three colours equal"
 
     def estimation_pass(self) -> Pass:
-        find = Reduction("gray_world", ("red_gain", "blue_gain"), ("pattern",))
+        find = Reduction("gray_world", ("red_gain", "blue_gain"), ("pattern", *LIGHTS))
         return Pass("gray_world_sample", find)
 
     def arguments(self, context: Context) -> Arguments:
-        return {"pattern": context.cfa}
+        return {**super().arguments(context), "pattern": context.cfa}
 
     def gains(self, image: Floats, pattern: Pattern) -> tuple[np.float32, np.float32]:
         return gray_world_gains(image, pattern)

@@ -7,7 +7,7 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.stage import Arguments, Context, Pass, Reduction, parameter
-from clpipe.stages.white_balance.gains import EstimatedGains
+from clpipe.stages.white_balance.gains import LIGHTS, EstimatedGains
 
 STEPS = 6144  # bins of each colour: 12 octaves below 1, with 512 bins each
 _FIRST = int(np.float32(2.0**-12).view(np.int32))
@@ -71,12 +71,18 @@ class WhitePatch(EstimatedGains):
     def estimation_pass(self) -> Pass:
         return Pass(
             "white_patch_bin",
-            Reduction("white_patch", ("red_gain", "blue_gain"), ("millionths",), bins=3 * STEPS),
+            Reduction(
+                "white_patch",
+                ("red_gain", "blue_gain"),
+                ("millionths", *LIGHTS),
+                bins=3 * STEPS,
+            ),
             ("pattern", "clip"),
         )
 
     def arguments(self, context: Context) -> Arguments:
         return {
+            **super().arguments(context),
             "pattern": context.cfa,
             "clip": np.float32(self.clip),
             "millionths": np.uint32(self._millionths),

@@ -1,0 +1,85 @@
+"""Makes a development's edges as sharp as those of a camera's pictures.
+
+Noise does not depend on the blur of the lens, and hardly on the limit of sharpening. Both are
+therefore chosen after the search, for the MTF50 and the overshoot of the camera's edges.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from clpipe.analysis.matching.scenes import Scene
+from clpipe.analysis.sharpness import Edge, edges_in, median_edge, sharpest, slanted_edge
+from clpipe.base.types import Array
+from clpipe.chain.making import make_chain
+from clpipe.chain.settings import Settings, overlay
+from clpipe.engine.device import Device
+from clpipe.engine.runner import Runner
+
+CONTRAST, ANGLES = 4.0, (5.0, 20.0, 70.0, 85.0)  # of the edges that are developed
+SIGMAS, LIMITS = (0.1, 3.0), (0.0, 0.2)  # of optical_blur.sigma and sharpen.limit
+ROUNDS, STEPS = 3, 8  # of the search, and of each bisection
+
+
+@dataclass(frozen=True)
+class Sharpness:
+    """The sharpest edges of a camera's pictures, and those of the development."""
+
+    theirs: Edge
+    ours: Edge
+
+    def __str__(self) -> str:
+        figures = (
+            ("MTF50", f"{self.theirs.mtf50:.2f}", f"{self.ours.mtf50:.2f} cycles/px"),
+            ("overshoot", f"{self.theirs.overshoot:.0%}", f"{self.ours.overshoot:.0%}"),
+        )
+        parts = (f"{name} {theirs} in the pictures, {ours} here" for name, theirs, ours in figures)
+        return "edges: " + "; ".join(parts)
+
+
+def as_sharp(
+    settings: Settings, scenes: Sequence[Scene], device: Device | None
+) -> tuple[Settings, Sharpness | None]:
+    """Return settings with edges as sharp as in the scenes' means, and the figures of both.
+
+    The settings do not change, and there are no figures, if the means have fewer than 12 straight
+    edges, or the chain lacks ``optical_blur`` or ``sharpen``.
+
+    Args:
+        settings: of the development.
+        scenes: of a camera.
+        device: the device that develops edges; None is NumPy.
+    """
+    means = [scene.clean.round().astype("uint8") for scene in scenes]
+    theirs = sharpest([edge for mean in means for edge in edges_in(mean)])
+    if theirs is None or not {"optical_blur", "sharpen"} <= set(settings.step_names):
+        return settings, None
+    renders = [slanted_edge(CONTRAST, angle) for angle in ANGLES]
+
+    def over(sigma: float, limit: float) -> Settings:
+        return overlay(settings, {"optical_blur": {"sigma": sigma}, "sharpen": {"limit": limit}})
+
+    def ours(sigma: float, limit: float) -> Edge:
+        runner = Runner(make_chain(over(sigma, limit)).without_noise(), device)
+        return median_edge([e for render in renders for e in edges_in(picture(runner, render))])
+
+    sigma, limit = 0.65, 0.03
+    for _ in range(ROUNDS):
+        limit = _solved(lambda x: ours(sigma, x).overshoot - theirs.overshoot, *LIMITS)
+        sigma = _solved(lambda x: theirs.mtf50 - ours(x, limit).mtf50, *SIGMAS)
+    found = round(sigma, 3), round(limit, 4)
+    return over(*found), Sharpness(theirs, ours(*found))
+
+
+def picture(runner: Runner, render: Array) -> Array:
+    """Return a developed render, uint8."""
+    encoded = runner.run(render, "edge").encoded
+    assert encoded is not None
+    return encoded
+
+
+def _solved(excess: Callable[[float], float], low: float, high: float) -> float:
+    """Return where a rising function is 0, or the nearer end if it is 0 nowhere."""
+    for _ in range(STEPS):
+        middle = (low + high) / 2
+        low, high = (low, middle) if excess(middle) > 0 else (middle, high)
+    return (low + high) / 2
