@@ -110,53 +110,60 @@ def median_edge(edges: Sequence[Edge]) -> Edge:
 
 def _edge_of(light: Doubles, luma: Doubles, across: Doubles, down: Doubles) -> Iterator[Edge]:
     """Yield the edge through the middle of a window, if there is one."""
-    steep = np.hypot(across, down)
-    weights = np.where(steep > 0.3 * steep.max(), steep, 0) ** 2
-    xx, yy, xy = (
-        (weights * a * b).sum() for a, b in ((across, across), (down, down), (across, down))
-    )
-    angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the normal; the tensor's main axis
-    if np.hypot(xx - yy, 2 * xy) < 0.9 * (xx + yy):
-        return
-    at = np.arange(len(luma)) - (len(luma) - 1) / 2
-    along = across * np.cos(angle) + down * np.sin(angle)
-    if along[np.unravel_index(steep.argmax(), steep.shape)] < 0:
-        angle += np.pi  # from dark to bright
-    distance = at * np.cos(angle) + at[:, None] * np.sin(angle)
-    place = at[:, None] * np.cos(angle) - at * np.sin(angle)  # along the edge
-    line = _line(place, distance, weights)
-    if line is None:
-        return
-    offset, slope = line
-    distance = (distance - offset - slope * place) / np.hypot(1, slope)
-    if abs(offset) > STEP or abs(place[abs(distance) < 1]).max(initial=0) < len(at) / 4:
-        return
-    profile = _profile(distance, luma)
-    if profile is None:
+    distance = _distance(across, down)
+    profile = None if distance is None else _profile(distance, luma)
+    if distance is None or profile is None:
         return
     dark, bright = profile[: FLAT * BINS], profile[-FLAT * BINS :]
     contrast = bright.mean() - dark.mean()
-    if contrast < MIN_CONTRAST or max(dark.std(), bright.std()) > MAX_UNEVENNESS * contrast:
+    uneven = max(dark.std(), bright.std()) > MAX_UNEVENNESS * contrast
+    places = [_centre(_profile(distance, light[..., c])) for c in range(3)]
+    if contrast < MIN_CONTRAST or uneven or None in places:
         return
     profile = (profile - dark.mean()) / contrast
     frequency, mtf = _transfer(profile)
     below = int(np.argmax(mtf < 0.5))
     if below == 0:
         return
-    mtf50 = np.interp(0.5, mtf[[below, below - 1]], frequency[[below, below - 1]])
     near = profile[FLAT * BINS : -FLAT * BINS].reshape(-1, BINS // 2).mean(1)
-    places = [_centre(_profile(distance, light[..., c])) for c in range(3)]
-    if None in places:
-        return
     red, green, blue = (float(each or 0) for each in places)
     yield Edge(
-        float(mtf50),
+        float(np.interp(0.5, mtf[[below, below - 1]], frequency[[below, below - 1]])),
         float(np.interp(0.5, frequency, mtf)),
         max(float(near.max()) - 1, 0.0),
         max(float(-near.min()), 0.0),
         red - green,
         blue - green,
     )
+
+
+def _distance(across: Doubles, down: Doubles) -> Doubles | None:
+    """Return each pixel's distance from a window's edge, px, or None if there is no straight edge.
+
+    It is above 0 on the bright side.
+
+    Args:
+        across: the slope along rows, (SIDE, SIDE).
+        down: the slope along columns, of that shape.
+    """
+    steep = np.hypot(across, down)
+    weights = np.where(steep > 0.3 * steep.max(), steep, 0) ** 2
+    xx, yy, xy = ((weights * p).sum() for p in (across**2, down**2, across * down))
+    if np.hypot(xx - yy, 2 * xy) < 0.9 * (xx + yy):
+        return None
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the normal: the structure tensor's main axis
+    at = np.arange(SIDE) - (SIDE - 1) / 2
+    if (weights * (across * np.cos(angle) + down * np.sin(angle))).sum() < 0:
+        angle += np.pi
+    distance = at * np.cos(angle) + at[:, None] * np.sin(angle)
+    place = at[:, None] * np.cos(angle) - at * np.sin(angle)
+    line = _line(place, distance, weights)
+    if line is None:
+        return None
+    offset, slope = line
+    distance = (distance - offset - slope * place) / np.hypot(1, slope)
+    length = abs(place[abs(distance) < 1]).max(initial=0)
+    return distance if abs(offset) <= STEP and length >= SIDE / 4 else None
 
 
 def _line(place: Doubles, distance: Doubles, weights: Doubles) -> tuple[float, float] | None:

@@ -1,6 +1,7 @@
 """Lights under which pictures are taken, and the white balance gains that a camera needs for them.
 
-Their colours are those of incandescent lamps, 2500 to 4000 K, and of daylight, 4000 to 12000 K. An estimate of gains far away from all of them was misled by the colours of the scene.
+Their colours are those of incandescent lamps, 2500 to 4000 K, and of daylight, 4000 to 12000 K. An
+estimate of gains far away from all of them was misled by the colours of the scene.
 """
 
 from functools import lru_cache

@@ -62,10 +62,16 @@ def as_sharp(
         runner = Runner(make_chain(over(sigma, limit)).without_noise(), device)
         return median_edge([e for render in renders for e in edges_in(picture(runner, render))])
 
-    sigma, limit = 0.65, 0.03
+    def too_much(limit: float, sigma: float) -> bool:
+        return ours(sigma, limit).overshoot > theirs.overshoot
+
+    def too_blunt(sigma: float, limit: float) -> bool:
+        return ours(sigma, limit).mtf50 < theirs.mtf50
+
+    sigma = 0.65
     for _ in range(ROUNDS):
-        limit = _solved(lambda x: ours(sigma, x).overshoot - theirs.overshoot, *LIMITS)
-        sigma = _solved(lambda x: theirs.mtf50 - ours(x, limit).mtf50, *SIGMAS)
+        limit = _solved(too_much, *LIMITS, sigma)
+        sigma = _solved(too_blunt, *SIGMAS, limit)
     found = round(sigma, 3), round(limit, 4)
     return over(*found), Sharpness(theirs, ours(*found))
 
@@ -77,9 +83,11 @@ def picture(runner: Runner, render: Array) -> Array:
     return encoded
 
 
-def _solved(excess: Callable[[float], float], low: float, high: float) -> float:
-    """Return where a rising function is 0, or the nearer end if it is 0 nowhere."""
+def _solved(
+    exceeds: Callable[[float, float], bool], low: float, high: float, other: float
+) -> float:
+    """Return the number above which ``exceeds(number, other)`` holds, or the nearer end."""
     for _ in range(STEPS):
         middle = (low + high) / 2
-        low, high = (low, middle) if excess(middle) > 0 else (middle, high)
+        low, high = (low, middle) if exceeds(middle, other) else (middle, high)
     return (low + high) / 2

@@ -1,8 +1,8 @@
 """The bilateral filter."""
 
 from collections.abc import Mapping
-from math import e, log2
 from dataclasses import replace
+from math import e, log2
 from typing import ClassVar, Literal
 
 import numpy as np
