@@ -224,13 +224,15 @@ def test_noise_of_static_fields_follows_the_formulas(device, method, frames, lev
     assert correlation == pytest.approx((frames - 1) / (frames + 1), abs=0.02)
 
 
-def ghost_of_edge(device, step, **parameters):
-    """Return the share of an edge's contrast, six times the noise, that remains where it was.
+def ghost_of_edge(device, step, noises=6, **parameters):
+    """Return the share of an edge's contrast that remains where it was.
+
+    The contrast is a multiple of the noise.
 
     The bright side moves by ``step`` pixels to the right in each frame.
     """
     chain, rng = chain_of(**parameters), np.random.default_rng(2)
-    contrast = 6 * np.sqrt(variance_at(chain, 0.3))
+    contrast = noises * np.sqrt(variance_at(chain, 0.3))
     edges = [20 + step * n for n in range(30)]
     cleans = [np.full((160, 120, 3), 0.2) for _ in edges]
     for edge, clean in zip(edges, cleans, strict=True):
@@ -248,6 +250,24 @@ def ghost_of_edge(device, step, **parameters):
 @pytest.mark.parametrize("step", [1, 3])
 def test_a_moving_edge_leaves_no_ghost(device, method, step):
     assert ghost_of_edge(device, step, method=method) < 0.02
+
+
+def test_faint_edges_leave_a_faint_ghost(device):
+    assert ghost_of_edge(device, 3, noises=1.5) < 0.25
+    assert ghost_of_edge(device, 3, noises=1.5, threshold=2.5) > 0.4
+    assert ghost_of_edge(device, 3, noises=1.5, method="block_matching") < 0.25
+
+
+@pytest.mark.parametrize("period", [3, 4, 8])
+@pytest.mark.parametrize("noises", [1, 2, 6])
+def test_a_moving_grating_is_not_smeared(device, period, noises):
+    chain, rng = chain_of(), np.random.default_rng(4)
+    wave = noises * np.sqrt(variance_at(chain, 0.3))
+    x = np.arange(120)[None, :, None] * np.ones((80, 1, 1))
+    cleans = [0.3 + wave * np.sin(2 * np.pi * (x - 2 * n) / period) for n in range(12)]
+    frames = [noisy(clean, chain, rng) for clean in cleans]
+    last = results(Runner(chain, device, encode=False, final=True), frames)[-1].final
+    assert (last - cleans[-1]).var() < 1.1 * (frames[-1] - cleans[-1]).var()
 
 
 def test_without_the_threshold_a_ghost_remains(device):
