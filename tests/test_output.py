@@ -120,6 +120,7 @@ def test_light_beyond_half_is_clipped_in_half(write_exr, tmp_path):
         (("--set", "output.jpeg_quality=101"), "output.jpeg_quality: found 101: .* less than or"),
         (("--set", "output.jpeg_qualty=9"), "unknown key of output 'jpeg_qualty'.*jpeg_quality"),
         (("--set", "output.jpeg_subsampling=4:1:1"), "found '4:1:1': .*'4:4:4', '4:2:2' or"),
+        (("--set", "output.date=today"), "output.date: found 'today': write the date like 2026"),
         (("--set", "render.focal_length=0"), "render.focal_length: found 0: .* greater than 0"),
         (("--set", "render.exposure_time=fast"), "render.exposure_time: found 'fast': .* number"),
     ],
@@ -133,6 +134,7 @@ def test_refusals(scene, tmp_path, options, message):
 def test_a_configuration_says_how_files_are_written(scene, tmp_path):
     config = tmp_path / "c.toml"
     lines = ("jpeg_quality = 60", 'jpeg_subsampling = "4:2:0"', "jpeg_progressive = true")
+    lines += ('date = "2026:05:04 10:30:00"',)
     config.write_text("\n".join(["iso = 400", "[output]", *lines, "[render]", "focal_length = 35"]))
     clpipe("run", scene, "-o", tmp_path / "o", "-c", config, "--set", "output.jpeg_quality=50")
     with Image.open(tmp_path / "o" / "scene.jpg") as image:
@@ -140,6 +142,7 @@ def test_a_configuration_says_how_files_are_written(scene, tmp_path):
         assert image.layer[0][1:3] == (2, 2)
         assert image.info["progressive"]
         assert image.getexif().get_ifd(0x8769)[0x920A] == 35
+        assert image.getexif().get_ifd(0x8769)[0x9003] == "2026:05:04 10:30:00"
     record = json.loads((tmp_path / "o" / "scene.json").read_text())
     assert record["output"]["jpeg_quality"] == 50
     assert record["output"]["focal_length"] == 35
@@ -147,6 +150,15 @@ def test_a_configuration_says_how_files_are_written(scene, tmp_path):
     (tmp_path / "again.toml").write_text(text)
     again, first = load_settings(str(tmp_path / "again.toml")), load_settings(str(config))
     assert (again.output, again.render) == (first.output, first.render)
+
+
+def test_a_render_without_a_date_gets_one_from_the_seed(scene, tmp_path):
+    dates = []
+    for run, seed in (("a", 5), ("b", 5), ("c", 6)):
+        clpipe("run", scene, "-o", tmp_path / run, "--seed", seed)
+        with Image.open(tmp_path / run / "scene.jpg") as image:
+            dates.append(image.getexif().get_ifd(0x8769)[0x9003])
+    assert dates == ["2020:01:06 12:00:00"] * 2 + ["2020:01:07 12:00:00"]
 
 
 @pytest.mark.slow

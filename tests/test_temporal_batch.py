@@ -71,7 +71,7 @@ def test_noise_falls_from_frame_to_frame_in_each_sequence(frames):
             for n in range(5)
         ]
         assert noise[4] < 0.7 * noise[0]
-        assert all(later < 1.03 * earlier for earlier, later in zip(noise, noise[1:], strict=False))
+        assert all(later < 1.03 * earlier for earlier, later in pairwise(noise))
 
 
 def test_numpy_and_the_device_agree(frames):

@@ -388,6 +388,7 @@ class Encoding(TypedDict, total=False):
     jpeg_quality: Whole
     jpeg_subsampling: Draw | Literal["4:4:4", "4:2:2", "4:2:0"]
     jpeg_progressive: Flag
+    date: Text
     png_compression: Whole
 
 class RenderCamera(TypedDict, total=False):

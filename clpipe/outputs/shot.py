@@ -2,21 +2,26 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from datetime import datetime, timedelta
 
 import numpy as np
 
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.photometry import Estimates, exposure_of
+from clpipe.images.encoding import DATE
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import TAG_ATTRIBUTES, Tags, exposed_attributes
 from clpipe.reference.geometry import Scaling
 from clpipe.stage import StageRole
 
+FIRST_DATE, DATES = datetime(2020, 1, 1, 12), 3650  # of renders without a date; number of days
+
 
 def tags_of(chain: Chain, source: SourceImage, tags: Tags, estimates: Estimates) -> Tags:
     """Return the tags of a picture. Values of the request take precedence over the image's.
 
-    A positive EV is recorded as a longer exposure time.
+    A positive EV is recorded as a longer exposure time. A render without a date gets one that
+    follows from the seed, because programs sort and group photographs by their dates.
     """
     optics, stated_values = chain.optics, {**source.shot, **tags.shot}
     time, bias = optics.exposure_time or stated_values.get("exposure_time"), tags.bias
@@ -35,8 +40,18 @@ def tags_of(chain: Chain, source: SourceImage, tags: Tags, estimates: Estimates)
         aperture=optics.f_number or tags.aperture,
         focal_length=optics.focal_length or stated_values.get("focal_length"),
         sensor_width=sensor_width_of(chain, source, stated_values),
+        taken=chain.settings.output.date or tags.taken or date_of(chain.seed),
         encoding=chain.settings.output,
     )
+
+
+def date_of(seed: int) -> str:
+    """Return a date in EXIF's format for a seed, one day later for each.
+
+    >>> date_of(0), date_of(31)
+    ('2020:01:01 12:00:00', '2020:02:01 12:00:00')
+    """
+    return f"{FIRST_DATE + timedelta(days=seed % DATES):{DATE}}"
 
 
 def sensor_width_of(
