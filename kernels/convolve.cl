@@ -1,3 +1,5 @@
+#include "lib/radius.h"
+
 // A weighted mean of surrounding pixels. Tap k is five numbers: its offset to the right and down,
 // and its weights for red, green and blue.
 INLINE rgb convolve(site at, src_image src, __global const float *taps, int count) {
@@ -33,4 +35,14 @@ INLINE rgb blur(site at, src_image src, int reach, __global const float *weights
         sum.b += weight * row.b;
     }
     return sum;
+}
+
+// A blur that grows from the centre to the corners: its share is the squared distance.
+INLINE rgb field_blur(site at, src_image src, extent e, int corner_reach,
+                      __global const float *corner_weights) {
+    const rgb c = src_tap(src, 0, 0), blurred = blur(at, src, corner_reach, corner_weights);
+    const vf share = vmin(relative_radius(at, e), (vf)(1.0f));
+    const rgb v = {c.r + share * (blurred.r - c.r), c.g + share * (blurred.g - c.g),
+                   c.b + share * (blurred.b - c.b)};
+    return v;
 }

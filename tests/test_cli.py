@@ -55,7 +55,7 @@ def test_the_main_job(clpipe, tmp_path):
     for name, given in (
         ("sensor_noise", {"a", "b"}),
         ("motion_blur", {"length", "angle"}),
-        ("optical_blur", {"sigma", "pixel_pitch", "low_pass", "pixel_area"}),
+        ("optical_blur", {"sigma", "pixel_pitch", "low_pass", "pixel_area", "corner"}),
     ):
         with_unused = stages.pop(name)["parameters"]
         assert {k for k, v in with_unused.items() if v is not None} == given

@@ -63,8 +63,9 @@ def test_a_sample_is_what_a_run_makes(clpipe, renders):
 
 
 def test_truths_with_and_without_denoising(renders):
+    values = {"device": "numpy", "sharpen": {"amount": 0.5}}
     truths = [
-        next(iter(api.Dataset(renders, device="numpy", iso=iso, truth=truth)))["truth"]
+        next(iter(api.Dataset(renders, iso=iso, truth=truth, **values)))["truth"]
         for iso, truth in ((100, "clean"), (ISO, "clean"), (ISO, "development"), (ISO, True))
     ]
     assert np.array_equal(truths[0], truths[1])

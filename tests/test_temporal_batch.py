@@ -1,6 +1,7 @@
 """Runs of sequences with temporal denoising: their order, resuming and failures."""
 
 import threading
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np

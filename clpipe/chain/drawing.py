@@ -12,6 +12,7 @@ from clpipe.base.errors import KeyedError
 from clpipe.base.text import unknown_name
 from clpipe.chain.draws import Choice, Draw, Drift, parse_draw
 from clpipe.chain.keys import KEYS
+from clpipe.chain.lens_presets import PRESETS
 from clpipe.chain.limits import Limits
 from clpipe.reference.random import philox_rounds, stream_of
 
@@ -31,6 +32,12 @@ def parse_drawn(key: str, table: Mapping[str, Any]) -> Draw:
             key, f"{key}: found {dict(table)!r}, but {key} cannot be drawn; only {allowed}"
         )
     draw = parse_draw(key, table)
+    if key == "lens" and isinstance(draw, Choice) and (presets := PRESETS.keys() & draw.choice):
+        raise KeyedError(
+            key,
+            f"lens: found {dict(table)!r}, but {sorted(presets)[0]!r} is no lens of lensfun's "
+            "database, and cannot be drawn; remove it",
+        )
     if (key == "camera" or key.endswith(".method")) and not isinstance(draw, Choice):
         raise KeyedError(
             key,

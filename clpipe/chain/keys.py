@@ -102,9 +102,10 @@ _ALL = (
     Key(
         "lens",
         str,
-        "A lens in lensfun's database. It has distortion, lateral colour and vignetting.",
+        "A lens in lensfun's database, with its distortion, lateral colour and vignetting; or "
+        "'typical', whose faults are drawn for each image; or 'none', without any blur.",
         "NAME",
-        "none",
+        "a good lens without distortion",
         is_drawn=True,
     ),
     _lens_key("focal_length", "The focal length of the lens.", "mm"),

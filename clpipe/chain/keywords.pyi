@@ -120,6 +120,10 @@ class InverseColorMatrix(TypedDict, total=False):
     method: Draw | Literal["camera", "given", "none"]
     matrix: Several
 
+class Glare(TypedDict, total=False):
+    method: Draw | Literal["none", "veil"]
+    share: Number
+
 class OpticalBlur(TypedDict, total=False):
     method: Draw | Literal["lens", "none"]
     sigma: Number
@@ -127,6 +131,7 @@ class OpticalBlur(TypedDict, total=False):
     pixel_pitch: Number
     low_pass: Number
     pixel_area: Number
+    corner: Number
     psf: Text
 
 class Exposure(TypedDict, total=False):
@@ -431,6 +436,7 @@ class Keywords(TypedDict, total=False):
     distortion: Distortion
     vignetting: Vignetting
     inverse_color_matrix: InverseColorMatrix
+    glare: Glare
     optical_blur: OpticalBlur
     exposure: Exposure
     mosaic: Mosaic

@@ -135,7 +135,7 @@ def resolve_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list
     light = illuminant_gains(methods, camera)
     context = Context(camera, settings.iso, light=light, optics=optics, exposure_time=time)
     steps: list[Step] = []
-    previous, takes_lens = "the input", not settings.lens
+    previous, takes_lens = "the input", not settings.named_lens
     wide_step = ""  # the step after which the picture is no longer in perspective
     for name, configured in methods.items():
         stage = all_stages()[base_name(name)].for_kind(kind)
@@ -202,7 +202,7 @@ def optics_of(settings: Settings, camera: Camera, methods: Mapping[str, Method])
     for step, method in methods.items():
         stated += [(f"{step}.{name}", name, value) for name, value in method.optics().items()]
     optics = Optics.of(stated)
-    if not settings.lens:
+    if not settings.named_lens:
         return optics
     set_to = optics.focal_length, optics.f_number, optics.focus_distance
     try:

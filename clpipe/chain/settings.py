@@ -30,6 +30,7 @@ from clpipe.chain.keys import (
     set_dotted,
     string_list,
 )
+from clpipe.chain.lens_presets import PRESETS, with_preset, without_preset
 from clpipe.chain.limits import SMALLEST_FLOAT, Limits, field_limits
 from clpipe.chain.methods import (
     TABLE_MODELS,
@@ -60,7 +61,7 @@ class Settings:
 
     camera: str = DEFAULT_CAMERA
     iso: float = DEFAULT_ISO
-    lens: str = ""  # a name in lensfun's database
+    lens: str = ""  # a name in lensfun's database, or of a preset
     focal_length: float | None = None  # mm
     aperture: float | None = None  # f-number
     focus_distance: float | None = None  # m
@@ -183,6 +184,11 @@ class Settings:
         return step_names(self.stages, self.skip)
 
     @property
+    def named_lens(self) -> str:
+        """The name of a lens in lensfun's database; "" without one."""
+        return "" if self.lens in PRESETS else self.lens
+
+    @property
     def dump_format(self) -> Dump | None:
         """The format of headerless dumps; None if it is not set."""
         return parse_dump(self.dump) if self.dump else None
@@ -275,6 +281,9 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
     """
     if folder is not None:
         values = resolve_paths(folder, values)
+    if "lens" in values and settings.lens in PRESETS:
+        settings = _without_lens(settings)
+    values = with_preset(values, settings.stages)
     tables = {key: value for key, value in values.items() if isinstance(value, Mapping)}
     plain = {k: v for k, v in values.items() if k not in tables}
     plain = _check_plain_values(settings, plain)
@@ -347,6 +356,18 @@ def _check_plain_values(settings: Settings, plain: Mapping[str, Any]) -> dict[st
         except RequestError as error:
             raise KeyedError("dump", str(error)) from None
     return checked
+
+
+def _without_lens(settings: Settings) -> Settings:
+    """Return settings without the values of a lens that has no name."""
+    draws, parameters = dict(settings.draws), dict(settings.parameters)
+    for step in PRESETS[settings.lens]:
+        own = without_preset(settings.lens, settings.table(step), step)
+        parameters[step] = {k: v for k, v in own.items() if not isinstance(v, Draw)}
+        for key in [k for k in draws if k.startswith(f"{step}.")]:
+            if key.removeprefix(f"{step}.") not in own:
+                del draws[key]
+    return with_changes(settings, {"lens": "", "parameters": parameters, "draws": draws})
 
 
 def _merge_table(settings: Settings, step: str, table: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from clpipe.camera.lens import name_note
+from clpipe.chain.lens_presets import PRESETS
 from clpipe.chain.settings import Settings
 from clpipe.inputs.find import Job
 
@@ -14,5 +15,7 @@ def lens_notes(settings: Settings, jobs: Sequence[Job]) -> list[str]:
         KeyedError: as for :func:`clpipe.camera.lens.name_note`.
     """
     named = [*settings.names_of("lens"), *(job.values.get("lens") for job in jobs if job.values)]
-    names = dict.fromkeys(name for name in named if isinstance(name, str) and name)
+    names = dict.fromkeys(
+        name for name in named if isinstance(name, str) and name and name not in PRESETS
+    )
     return list(filter(None, map(name_note, names)))

@@ -20,6 +20,7 @@ DEFAULT_CHAIN = (
     "distortion",
     "vignetting",
     "inverse_color_matrix",
+    "glare",
     "optical_blur",
     "exposure",
     "mosaic",

@@ -1,5 +1,6 @@
 """Blur by the optics before the photosites: lens, low-pass filter, and photosite area."""
 
+from dataclasses import replace
 from functools import lru_cache
 from math import erf, sqrt
 from pathlib import Path
@@ -26,6 +27,7 @@ from clpipe.stage import (
     Unchanged,
     parameter,
 )
+from clpipe.stages.vignetting import relative_radius
 
 WAVELENGTHS = (0.600, 0.540, 0.460)  # um, about the middle of the passbands of red, green and blue
 MAX_PSF_SIZE = 65  # px; the side of a measured point spread function
@@ -205,6 +207,7 @@ class Lens(Method):
     other_examples: ClassVar = (
         {"sigma": 1.6},
         {"sigma": 0.3, "f_number": 11.0, "low_pass": 0.6},
+        {"corner": 0.8},
     )
 
     sigma: float | None = parameter(
@@ -236,6 +239,13 @@ class Lens(Method):
     )
     pixel_area: float = parameter(
         0.0, "Side of a photosite's light-sensitive square; 0 is a point.", "px", ge=0, le=1
+    )
+    corner: float = parameter(
+        0.0,
+        "Sigma of a blur that is added at the corners, and decreases to none at the centre.",
+        "px",
+        ge=0,
+        le=4,
     )
     psf: str | None = parameter(
         None,
@@ -277,6 +287,16 @@ class Lens(Method):
         )
 
     def passes(self) -> tuple[Pass, ...]:
+        if not self.corner:
+            return self._even_passes()
+        reach = len(half_line_spread(self.corner, 0, 0)) - 1
+        names = ("extent", "corner_reach", "corner_weights")
+        *others, last = self._even_passes() or (None,)
+        field = Pass("field_blur", Stencil(reach), names, ("even",) if last else ("src",))
+        return (*others, *([replace(last, writes="even", kind=Kind.RGB)] if last else []), field)
+
+    def _even_passes(self) -> tuple[Pass, ...]:
+        """The passes of the blur that is the same in the whole image."""
         lines = self._separable_arguments
         if lines is None:
             radius = tap_radius(self._taps)
@@ -293,6 +313,14 @@ class Lens(Method):
         )
 
     def arguments(self, context: Context) -> Arguments:
+        return {**self._even_arguments(), **(self._corner_arguments() if self.corner else {})}
+
+    def _corner_arguments(self) -> Arguments:
+        weights = half_line_spread(self.corner, 0, 0)
+        reach = CompileTime(str(len(weights) - 1))
+        return {"extent": CompileTime("e"), "corner_reach": reach, "corner_weights": weights}
+
+    def _even_arguments(self) -> Arguments:
         lines = self._separable_arguments
         if lines is None:
             return {"taps": self._taps, "count": int32(len(self._taps))}
@@ -304,9 +332,17 @@ class Lens(Method):
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         resolved = self.resolve(inputs.context)
-        lines = resolved._separable_arguments
+        even = resolved._even_reference(image)
+        if not self.corner:
+            return even
+        blurred = blur(even, half_line_spread(self.corner, 0, 0))
+        share = np.minimum(relative_radius(image), np.float32(1))[..., None]
+        return np.asarray(even + share * (blurred - even))
+
+    def _even_reference(self, image: Floats) -> Floats:
+        lines = self._separable_arguments
         if lines is None:
-            return convolve(image, resolved._taps)
+            return convolve(image, self._taps)
         weights = half_line_spread(*lines)
         if len(weights) - 1 <= MAX_UNROLLED_RADIUS:
             return blur(image, weights)

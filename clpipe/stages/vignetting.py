@@ -82,9 +82,7 @@ class Pa(Method):
         return {"extent": CompileTime("e"), **coefficients}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        sides: Floats = np.maximum(np.array(image.shape[:2], np.float32) - 1, 1)
-        corner = (sides * sides).sum(keepdims=True) * np.float32(0.25)
-        r2 = _squared_radius(image) * _reciprocal(corner)
+        r2 = relative_radius(image)
         k1, k2, k3 = map(np.float32, (self.k1, self.k2, self.k3))
         gain = ((r2 * k3 + k2) * r2 + k1) * r2 + np.float32(1)
         return image * np.maximum(gain, np.float32(0))[..., None]
@@ -144,6 +142,17 @@ class CosineFourth(FocalLengthMethod, PrincipalPointMethod):
         unit = per_px or per_side * _reciprocal(side * side)
         cosine = _reciprocal(_squared_radius(image, self.cx, self.cy) * unit + np.float32(1))
         return image * (cosine * cosine)[..., None]
+
+
+def relative_radius(image: Floats) -> Floats:
+    """Return the squared distance of each pixel from the centre, 1 at the corner pixel.
+
+    >>> relative_radius(np.zeros((1, 3, 3), np.float32)).tolist()
+    [[1.0, 0.0, 1.0]]
+    """
+    sides: Floats = np.maximum(np.array(image.shape[:2], np.float32) - 1, 1)
+    corner = (sides * sides).sum(keepdims=True) * np.float32(0.25)
+    return _squared_radius(image) * _reciprocal(corner)
 
 
 def _squared_radius(image: Floats, cx: float | None = None, cy: float | None = None) -> Floats:
