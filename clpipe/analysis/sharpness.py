@@ -65,7 +65,8 @@ def slanted_edge(contrast: float, angle: float, size: int = 120, middle: float =
     distance = at * np.cos(normal) + at[:, None] * np.sin(normal)
     share = (distance > 0).reshape(size, samples, size, samples).mean((1, 3))
     dark, bright = middle / np.sqrt(contrast), middle * np.sqrt(contrast)
-    return np.float32(dark + (bright - dark) * share)[..., None].repeat(3, 2)
+    light = np.asarray(dark + (bright - dark) * share, np.float32)
+    return light[..., None].repeat(3, 2)
 
 
 def edges_in(picture: Array) -> list[Edge]:
@@ -203,7 +204,8 @@ def _transfer(profile: Doubles) -> tuple[Doubles, Doubles]:
     used = frequency < 1
     # Bins and differences have a width of their own.
     width = np.sinc(frequency[used] / BINS) ** 2
-    return frequency[used], mtf[used] / mtf[0] / width
+    found = np.asarray(mtf[used] / mtf[0] / width, np.float64)
+    return np.asarray(frequency[used], np.float64), found
 
 
 def _centre(profile: Doubles | None) -> float | None:

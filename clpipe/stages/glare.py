@@ -86,7 +86,7 @@ def mean_light(image: Floats) -> Floats:
     means: list[np.float32] = []
     for total, count in zip(sums, counts, strict=True):
         means.append(np.float32(total) / np.float32(count) if count else means[-1])
-    return np.float32(means)
+    return np.array(means, np.float32)
 
 
 STAGE = Stage(

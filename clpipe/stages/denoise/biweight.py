@@ -1,7 +1,7 @@
 """Means weighted by Tukey's biweight, which leave grain like a camera's."""
 
 from collections.abc import Iterable
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from clpipe.stage import (
     ReferenceContext,
     Stencil,
     parameter,
+    typed_arguments,
 )
 from clpipe.stages.denoise.strength import MID_GREY, Denoiser, offset_of_roots, offset_parameter
 
@@ -190,23 +191,22 @@ class Biweight(Denoiser):
         }
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        ranges = np.float32([self.ranges[0], *[self.ranges[1]] * 2])
+        ranges = np.array([self.ranges[0], *[self.ranges[1]] * 2], np.float32)
         offset = np.float32(self.offset)
         planes = rgb_to_ycbcr(in_steps(root_of(image, offset))) * (np.float32(1) / ranges)
         luma, guide = planes[..., :1], smooth(planes)
         chroma = guide[..., 1:]
         if not self.is_low_pass:
-            numbers = self.arguments(inputs.context)
-            share, grain = (np.float32(numbers[name]) for name in ("luma_share", "grain"))
+            numbers: dict[str, Any] = typed_arguments(self.arguments(inputs.context))
             adjacent = [
                 (tap(luma, dx, dy), np.square(tap(guide[..., :1], dx, dy) - guide[..., :1]))
                 for dx, dy in ADJACENT
             ]
             filtered = biweight(luma, adjacent)
-            luma = filtered + grain * (luma - filtered)
+            luma = filtered + numbers["grain"] * (luma - filtered)
             step = self.chroma_scale
             diagonal = [tap(planes, dx * step, dy * step) for dx, dy in DIAGONAL]
-            weigh = np.float32([share, 1, 1])
+            weigh = np.array([numbers["luma_share"], 1, 1], np.float32)
             apart = [(np.square(p - guide) * weigh).sum(-1, keepdims=True) for p in diagonal]
             chroma = biweight(chroma, zip((p[..., 1:] for p in diagonal), apart, strict=True))
         return from_root(ycbcr_to_rgb(np.concatenate([luma, chroma], axis=-1) * ranges), offset)

@@ -78,7 +78,7 @@ class EstimatedGains(Method):
         return estimation_pass, APPLY
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        estimated = np.float32(self.gains(image, inputs.context.pattern))
+        estimated = np.array(self.gains(image, inputs.context.pattern), np.float32)
         context = inputs.context
         lights = plausible_gains(context.camera, context.gains)[: None if self.limit else 0]
         red, blue = limited_to_lights(estimated, lights, np.float32(TOLERANCE))
