@@ -53,8 +53,8 @@ def test_the_faults_of_a_typical_lens_are_drawn_for_each_image():
     one, two, again = (settings.drawn(name).parameters for name in ("a", "b", "a"))
     assert one == again != two
     assert 0.003 <= one["glare"]["share"] <= 0.03
-    assert 0.3 <= one["optical_blur"]["corner"] <= 1 and one["optical_blur"]["sigma"] == 0.8
-    assert abs(one["distortion"]["kr"] - 1) < 0.004 and one["vignetting"]["k1"] < 0
+    assert 0 <= one["optical_blur"]["corner"] <= 0.7 and one["optical_blur"]["sigma"] == 0.8
+    assert abs(one["distortion"]["kr"] - 1) < 0.01 and one["vignetting"]["k1"] < 0
 
 
 def test_no_lens_leaves_the_render_as_it_is():

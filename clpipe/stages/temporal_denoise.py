@@ -53,9 +53,9 @@ class Recursive(Method):
     is 1 for differences up to half of ``threshold`` squared. From there to ``threshold`` squared,
     it falls to 0 like Tukey's biweight.
 
-    The difference of the sums of 3x3 pixels limits g as well, because noise hardly changes it. An
-    edge with a contrast of 1.5 times the noise leaves about a tenth of it at its former place, and
-    one with six times the noise less than 2 %.
+    The difference of the sums of 3x3 pixels limits g as well, because noise hardly changes it. At
+    its former place, an edge with a contrast of 1.5 times the noise leaves about a tenth of it. An
+    edge with six times the noise leaves less than 2 %.
 
     The stage needs a sequence. It returns a single image and a first frame unchanged.
     """

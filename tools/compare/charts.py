@@ -130,22 +130,3 @@ def patch_means(picture: NDArray[np.number], patches: int = 24) -> Doubles:
     blocks = picture[: rows * SIDE].reshape(rows, SIDE, ROW, SIDE, -1)
     inner = blocks[:, INNER:-INNER, :, INNER:-INNER].mean((1, 3), dtype=np.float64)
     return np.asarray(inner.reshape(rows * ROW, -1)[:patches])
-
-
-def slanted_edge(size: int = 128, dark: float = 0.05, bright: float = 0.5) -> Floats:
-    """Return a grey edge, five degrees from vertical, to measure sharpness (ISO 12233).
-
-    Each pixel is the mean light over its area.
-
-    Returns:
-        (size, size, 3), linear, ``dark`` on the left and ``bright`` on the right.
-
-    >>> edge = slanted_edge(64)
-    >>> edge.shape, edge[0, 0].tolist() < [0.06] * 3, edge[0, -1].tolist()
-    ((64, 64, 3), True, [0.5, 0.5, 0.5])
-    """
-    fine = (np.arange(size * 8) + 0.5) / 8 - size / 2
-    share = fine[None, :] > np.tan(np.radians(5)) * fine[:, None]
-    covered = share.reshape(size, 8, size, 8).mean((1, 3))
-    grey = dark + (bright - dark) * covered
-    return np.repeat(grey[..., None], 3, axis=-1).astype(np.float32)

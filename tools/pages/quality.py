@@ -1,4 +1,4 @@
-"""Measure the quality of demosaicing, denoising and sharpening, for docs/quality.md.
+"""Measure the quality of demosaicing and denoising, for docs/quality.md.
 
 Demosaicing: CPSNR of eight Kodak pictures and of the project's own render after mosaic and
 demosaic: RGGB, rounded to 8 bits, without a border of 10 pixels. The Kodak pictures are kodim01.png
@@ -7,8 +7,6 @@ exit status is 1 if a figure is missed by more than 0.05 dB.
 
 Denoising: CPSNR of the project's own render at several ISOs, developed to 8 bits with each method,
 against the same development without noise and without denoising.
-
-Sharpness: a slanted edge (ISO 12233) without noise, through whole chains, in linear light.
 """
 
 import argparse
@@ -31,8 +29,7 @@ from clpipe.reference.curve import to_8_bit
 from clpipe.reference.filter_array import NAMED
 from clpipe.stages import DEFAULT_CHAIN
 from tools import RENDER, ROOT
-from tools.compare.charts import slanted_edge
-from tools.compare.fidelity import psnr, sharpness
+from tools.compare.fidelity import psnr
 
 KODAK = ROOT.parent / "shared" / "data" / "kodak"
 BORDER = 10
@@ -78,22 +75,6 @@ DENOISE: dict[str, dict[str, Any]] = {
             *DEFAULT_CHAIN[BEFORE_DEMOSAIC:],
         ],
         "skip": ["denoise"],
-    },
-}
-# Chains whose sharpness is measured, on a grey slanted edge without noise.
-WITHOUT_NOISE = {"skip": ["sensor_noise", "row_noise", "column_noise"]}
-SHARPNESS: dict[str, dict[str, Any]] = {
-    "no mosaic": {"stages": ["exposure", "tone_curve", "gamma"]},
-    "default, ISO 100": WITHOUT_NOISE,
-    "default, ISO 1600": {**WITHOUT_NOISE, "iso": 1600},
-    "default, ISO 6400": {**WITHOUT_NOISE, "iso": 6400},
-    "default without sharpen, ISO 1600": {
-        "skip": [*WITHOUT_NOISE["skip"], "sharpen"],
-        "iso": 1600,
-    },
-    "bilinear, no denoise, no sharpen": {
-        "skip": [*WITHOUT_NOISE["skip"], "denoise", "sharpen"],
-        "demosaic": {"method": "bilinear"},
     },
 }
 NOISE = ("sensor_noise", "row_noise", "column_noise", "quantize", "normalize")
@@ -169,19 +150,6 @@ def measure_denoising(render: Array, console: Console) -> None:
     console.print("\nCPSNR of the finished picture in dB", table, sep="\n")
 
 
-def measure_sharpness(console: Console) -> None:
-    """Print the table of sharpness."""
-    table = Table("a slanted edge, linear light", box=None, pad_edge=False)
-    for heading in ("MTF50, cycles/px", "MTF at 0.25", "overshoot"):
-        table.add_column(heading, justify="right")
-    for name, part in SHARPNESS.items():
-        camera = clpipe.Pipeline(**part, tone_curve={"method": "linear"})
-        found = sharpness(camera.process(slanted_edge(), "quality").image)
-        row = f"{found.mtf50:.2f}", f"{found.mtf25:.2f}", f"{found.overshoot:.0%}"
-        table.add_row(name, *row)
-    console.print("", table, sep="\n")
-
-
 def main() -> int:
     """Measure and print the tables."""
     parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
@@ -191,7 +159,6 @@ def main() -> int:
     render = read_image(RENDER).pixels
     right = measure_demosaicing(folder, render, console)
     measure_denoising(render, console)
-    measure_sharpness(console)
     return 0 if right else 1
 
 
