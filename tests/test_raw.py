@@ -1,15 +1,18 @@
 """Camera raws and dumps: the correct picture, or the correct error."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
-from clpipe.images.raw import read_raw, read_raw_info
+from clpipe.camera.profile import SRGB_TO_XYZ
+from clpipe.images.raw import Exif, read_raw, read_raw_info
 from clpipe.images.read import read_image
 from clpipe.images.tags import upright
+from clpipe.images.two_lights import BRADFORD, camera_to_srgb
 from clpipe.images.write import write_exr
 from clpipe.reference.cfa import PATTERNS, by_site
 from tests.conftest import STILL_LIFE, written
@@ -50,6 +53,51 @@ def sidecar(path):
 
 def parameters(path):
     return {stage["name"]: stage["parameters"] for stage in sidecar(path)["stages"]}
+
+
+LAMP_WHITE, DAYLIGHT = np.array([1.0985, 1.0, 0.3558]), SRGB_TO_XYZ.sum(1)  # XYZ of A and D65
+LAMP = np.array([[0.62, -0.02, -0.07], [-0.68, 1.36, 0.36], [-0.16, 0.28, 0.72]])
+DAY = np.array([[0.60, -0.06, -0.04], [-0.86, 1.59, 0.28], [-0.24, 0.39, 0.74]])
+
+
+def numbers(*values):
+    return SimpleNamespace(values=list(values))
+
+
+def two_light_tags(**changes):
+    tags = {"0xC65A": numbers(17), "0xC65B": numbers(21), "0xC621": numbers(*LAMP.ravel())}
+    tags |= {"0xC622": numbers(*DAY.ravel()), **changes}
+    return Exif({f"Image Tag {name}": tag for name, tag in tags.items() if tag})
+
+
+@pytest.mark.parametrize(
+    ("matrix", "white", "kelvin"), [(LAMP, LAMP_WHITE, 2856), (DAY, DAYLIGHT, 6504)]
+)
+def test_a_dng_for_two_lights_has_the_colours_of_its_own(matrix, white, kelvin):
+    lights = two_light_tags().lights()
+    neutral = matrix @ white
+    to_srgb, temperature = camera_to_srgb(*lights, neutral)
+    assert temperature == pytest.approx(kelvin, rel=0.02)
+    assert to_srgb @ np.ones(3) == pytest.approx(np.ones(3), abs=1e-6)
+    # A surface of known reflectance in the light: its colour relative to the white is adapted.
+    seen = np.array([0.35, 0.2, 0.05]) * white
+    cones = BRADFORD @ seen * (BRADFORD @ DAYLIGHT) / (BRADFORD @ white)
+    expected = np.linalg.inv(SRGB_TO_XYZ) @ np.linalg.inv(BRADFORD) @ cones
+    assert to_srgb @ (matrix @ seen / neutral) == pytest.approx(expected, abs=0.01)
+
+
+def test_a_dng_without_two_lights_has_one_matrix():
+    assert two_light_tags().lights() is not None
+    for changes in (
+        {"0xC65A": numbers(255)},
+        {"0xC65A": numbers(21)},
+        {"0xC622": None},
+        {"0xC622": numbers(*[0.0] * 9)},
+        {"0xC622": numbers(1.0, 2.0)},
+    ):
+        assert two_light_tags(**changes).lights() is None
+    balanced = two_light_tags(**{"0xC627": numbers(2.0, 1.0, 1.0)}).lights()
+    assert balanced[1].matrix[0] == pytest.approx(2 * DAY[0])
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)

@@ -23,6 +23,7 @@ from clpipe.images.dng import ARRAY_SEPARATOR, D65
 from clpipe.images.encoding import SIMULATED
 from clpipe.images.pixels import DEFAULT_MAX_PIXELS, MAX_PIXELS, check_size
 from clpipe.images.tags import DATE
+from clpipe.images.two_lights import TEMPERATURES, Light, camera_to_srgb
 from clpipe.reference.cfa import PATTERNS
 from clpipe.reference.filter_array import MONO
 
@@ -46,6 +47,9 @@ TAG_PREFIXES = ("EXIF", "Image")  # exifread's prefixes of tags, in order of pre
 EXIF_BYTES = 1 << 20  # largest size of a tag, and of the part of a file searched for EXIF_MARKS
 MAX_READS = 200_000  # values; exifread reads each one separately, and 1,000 are usual
 DATE_TAGS = ("DateTimeOriginal", "DateTime")
+# Tags of a DNG: illuminant, color matrix and calibration of the camera, for two lights.
+LIGHT_TAGS = ("0xC65A", "0xC621", "0xC623"), ("0xC65B", "0xC622", "0xC624")
+ANALOG_BALANCE = "0xC627"
 # Tags of a DNG's color matrices, and of their illuminants.
 COLOR_MATRICES = {"0xC622": "0xC65B", "0xC621": "0xC65A"}
 DUMP_HINT = "if it is a headerless dump of samples, add --dump WxH:TYPE"
@@ -112,6 +116,8 @@ def read_raw_info(path: Path, max_pixels: int = DEFAULT_MAX_PIXELS) -> RawInfo:
         if to_srgb is None and matrix is not None:
             to_camera = np.array(matrix) @ SRGB_TO_XYZ
             to_srgb = _matrix(np.linalg.inv(to_camera / to_camera.sum(1, keepdims=True)))
+        if (lights := exif.lights()) and min(red, green, blue) > 0:
+            to_srgb = _matrix(camera_to_srgb(*lights, green / np.array([red, green, blue]))[0])
         return RawInfo(
             make=exif.text("Make") or "unknown",
             model=exif.text("Model").removeprefix(SIMULATED) or "unknown",
@@ -304,6 +310,31 @@ class Exif:
                 with suppress(TypeError, ValueError, ZeroDivisionError):
                     values = [float(value) for value in self.tags[f"Image Tag {name}"].values]
                     return _matrix(np.reshape(values, (3, 3)))
+        return None
+
+    def lights(self) -> tuple[Light, Light] | None:
+        """Return a DNG's matrices for two lights; None unless it states both."""
+        found = []
+        for illuminant, matrix, calibration in LIGHT_TAGS:
+            temperature = TEMPERATURES.get(int(self.number(f"Tag {illuminant}", 0) or 0))
+            colours = self._numbers(matrix, 9)
+            if temperature is None or colours is None:
+                return None
+            own, balance = self._numbers(calibration, 9), self._numbers(ANALOG_BALANCE, 3)
+            camera = np.reshape(colours, (3, 3))
+            camera = camera if own is None else np.reshape(own, (3, 3)) @ camera
+            camera = camera if balance is None else np.diag(balance) @ camera
+            if _matrix(camera) is None:
+                return None
+            found.append(Light(float(temperature), camera))
+        one, two = found
+        return (one, two) if one.temperature != two.temperature else None
+
+    def _numbers(self, name: str, count: int) -> list[float] | None:
+        """Return the numbers of a tag; None unless it has this many."""
+        with suppress(AttributeError, KeyError, TypeError, ValueError, ZeroDivisionError):
+            values = [float(value) for value in self.tags[f"Image Tag {name}"].values]
+            return values if len(values) == count else None
         return None
 
 
