@@ -118,7 +118,7 @@ def costs(device, tmp_path_factory):
     ("work", "calls", "launches"),
     [
         # Noisy and clean, raw and picture, of 16 patches, a camera and an ISO drawn for each.
-        ("drawn sample", 1_785, 35 / 16),
+        ("drawn sample", 1_800, 35 / 16),
         ("sample", 2_130, 12),
         ("process", 880, 7),
         ("process with settings", 1_040, 7),

@@ -52,7 +52,7 @@ def test_cpsnr():
 
 
 def test_the_tables(tmp_path, capsys, monkeypatch):
-    for table in (quality.DEMOSAIC, quality.DENOISE, quality.SHARPNESS):
+    for table in (quality.DEMOSAIC, quality.DENOISE):
         for name in [*table][1:-1]:  # the first and the last are enough
             monkeypatch.delitem(table, name)
     monkeypatch.setattr(quality, "ISOS", (1600,))
@@ -62,12 +62,12 @@ def test_the_tables(tmp_path, capsys, monkeypatch):
     assert quality.main() == 0
     out = capsys.readouterr().out
     assert "does not contain the Kodak pictures; skipped" in out
-    for name in (*quality.DEMOSAIC, *quality.DENOISE, *quality.SHARPNESS):
+    for name in (*quality.DEMOSAIC, *quality.DENOISE):
         assert name in out
 
 
 def test_every_chain_can_be_made():
     for choice, _ in quality.DEMOSAIC.values():
         assert quality.camera_of(choice).chain
-    for settings in (*quality.DENOISE.values(), *quality.SHARPNESS.values()):
+    for settings in quality.DENOISE.values():
         assert clpipe.Pipeline(**settings).chain

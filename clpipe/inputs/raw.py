@@ -28,6 +28,7 @@ from clpipe.reference.cfa import PATTERNS
 from clpipe.reference.filter_array import parse_array
 from clpipe.stage import Kind, StageRole
 
+GRAY_WORLD = {"method": "gray_world"}  # its limits are those of a known camera
 UNKNOWN_COLOURS = "its colour matrix is unknown, so colours stay in the sensor's own space"
 
 
@@ -224,7 +225,7 @@ def settings_of(facts: RawInfo | Dump) -> tuple[Settings, dict[str, str]]:
         stage_name(StageRole.COLOURS_OF_LIGHT): {"method": "none"}
     }
     if isinstance(facts, Dump):
-        gray_world = {balance: {"method": "gray_world"}}
+        gray_world = {balance: {**GRAY_WORLD, "limit": False}}
         return Settings(parameters=gray_world | light_parameters), {
             balance: "the file does not state its white balance; gray_world estimates it",
             colours: UNKNOWN_COLOURS,
@@ -258,7 +259,7 @@ def settings_of(facts: RawInfo | Dump) -> tuple[Settings, dict[str, str]]:
         light = stage_name(StageRole.BALANCE_OF_LIGHT)
         parameters |= {light: red_and_blue, balance: {**red_and_blue}}
     else:
-        parameters[balance] = {"method": "gray_world"}
+        parameters[balance] = {**GRAY_WORLD, "limit": profile is not None}
         multipliers = ", ".join(f"{x:.4g}" for x in facts.as_shot)
         warnings[balance] = (
             f"its as-shot white balance is impossible, with multipliers {multipliers}; "

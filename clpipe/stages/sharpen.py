@@ -104,9 +104,8 @@ class Unsharp(Method):
         return self.with_defaults(amount=amount, offset=offset, threshold=THRESHOLD * noise)
 
     def noise_free(self, context: Context) -> Method:
-        # As sharp as the picture with noise.
-        amount = self.resolve(context.replace(clean=False)).amount
-        return self.model_copy(update={"amount": amount}).resolve(context)
+        quiet = self.with_defaults(threshold=0.0, offset=offset_of_roots(context))
+        return quiet.resolve(context.replace(clean=False))  # as sharp as the picture with noise
 
     @property
     def reach(self) -> int:

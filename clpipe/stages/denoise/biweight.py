@@ -145,8 +145,9 @@ class Biweight(Denoiser):
         return (self.ranges[0] / reach) ** 2
 
     def noise_free(self, context: Context) -> Method:
-        off = {"luma_strength": 0.0, "chroma_strength": 0.0}
-        return self.resolve(context).model_copy(update=off)
+        off = dict.fromkeys(("luma_strength", "chroma_strength", "grain"), 0.0)
+        none = dict.fromkeys(("luma_noise", "chroma_noise"), 0.0)
+        return self.model_copy(update=off | none).with_defaults(offset=offset_of_roots(context))
 
     @property
     def is_low_pass(self) -> bool:
