@@ -10,6 +10,7 @@ from clpipe.base.errors import KeyedError
 from clpipe.camera.lens import INSTALL, lens_names
 from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.keys import KEYS, LENS
+from clpipe.chain.lens_presets import PRESETS
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
@@ -59,7 +60,7 @@ def parameters_of(model: type[BaseModel]) -> dict[str, Any]:
 def key_controls() -> dict[str, Any]:
     """Return the settings outside tables, each as a JSON schema with a text.
 
-    The schema of "lens" lists all names as "suggested", or states what to install for them.
+    The schema of "lens" lists names as "suggested", or states what to install for more of them.
     """
     names = {int: "integer", str: "string", float: "number"}
     controls: dict[str, dict[str, Any]] = {}
@@ -67,8 +68,9 @@ def key_controls() -> dict[str, Any]:
         about = {"type": names[known.type_], "text": known.text, "unit": known.unit}
         limit = {"exclusiveMinimum": known.above} if known.above == 0 else {}
         controls[known.name] = {**about, "plain": True, **limit}
+    controls["lens"]["suggested"] = [*PRESETS]
     try:
-        controls["lens"]["suggested"] = lens_names()
+        controls["lens"]["suggested"] += lens_names()
     except KeyedError:
         controls["lens"]["text"] += f" It needs {INSTALL}."
     return controls
