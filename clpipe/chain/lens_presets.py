@@ -7,7 +7,7 @@ from typing import Any
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     file.name.removesuffix(".toml"): tomllib.loads(file.read_text("utf-8"))
-    for file in files("clpipe.chain").joinpath("lenses").iterdir()
+    for file in sorted(files("clpipe.chain").joinpath("lenses").iterdir(), key=str)
 }
 
 
