@@ -9,10 +9,11 @@ import pytest
 from PIL import Image
 
 from clpipe.camera.profile import SRGB_TO_XYZ
+from clpipe.images.colour import BRADFORD
 from clpipe.images.raw import Exif, read_raw, read_raw_info
 from clpipe.images.read import read_image
 from clpipe.images.tags import upright
-from clpipe.images.two_lights import BRADFORD, camera_to_srgb
+from clpipe.images.two_lights import camera_to_srgb
 from clpipe.images.write import write_exr
 from clpipe.reference.cfa import PATTERNS, by_site
 from tests.conftest import STILL_LIFE, written

@@ -11,16 +11,13 @@ import numpy as np
 
 from clpipe.base.types import Doubles
 from clpipe.camera.profile import SRGB_TO_XYZ
+from clpipe.images.colour import adaptation
 
 # Temperatures in K of EXIF's light sources.
 TEMPERATURES = {1: 5500, 2: 4230, 3: 2856, 4: 5500, 9: 5500, 10: 6504, 11: 7504, 12: 6430, 13: 5000}
 TEMPERATURES |= {14: 4230, 15: 3450, 17: 2856, 18: 4874, 19: 6774, 20: 5503, 21: 6504, 22: 7504}
 TEMPERATURES |= {23: 5003, 24: 3200}
 ROUNDS = 12  # until the temperature no longer changes
-# Bradford's cone responses (Lam 1985), for the adaptation to another white.
-BRADFORD = np.array(
-    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
-)
 
 
 class Light(NamedTuple):
@@ -73,9 +70,6 @@ def camera_to_srgb(one: Light, two: Light, neutral: Doubles) -> tuple[Doubles, f
         to_xyz = np.linalg.inv(matrix_between(one, two, temperature))
         white = to_xyz @ neutral
         temperature = float(np.clip(temperature_of(white), 1000, 40000))
-    white = white / white[1]
-    cones, daylight = BRADFORD @ white, BRADFORD @ SRGB_TO_XYZ.sum(1)
-    adapted = np.linalg.inv(BRADFORD) @ np.diag(daylight / cones) @ BRADFORD
-    scale = (to_xyz @ neutral)[1]
-    matrix = np.linalg.inv(SRGB_TO_XYZ) @ adapted @ to_xyz @ np.diag(neutral) / scale
+    adapted = adaptation(white / white[1], SRGB_TO_XYZ.sum(1)) @ to_xyz
+    matrix = np.linalg.inv(SRGB_TO_XYZ) @ adapted @ np.diag(neutral) / white[1]
     return np.asarray(matrix), temperature
