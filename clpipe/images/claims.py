@@ -6,6 +6,7 @@ from typing import Any
 
 from clpipe.base.errors import ImageError
 from clpipe.images.colour import CIE_XYZ, SRGB, to_linear_srgb
+from clpipe.images.colour_names import space_of
 from clpipe.images.layers import picture_channels
 from clpipe.images.openexr import MAX_EXTRA
 from clpipe.images.openimageio import open_image
@@ -102,11 +103,15 @@ def _claim(spec: Any, is_exr: bool, mosaic: bool) -> MemoryClaim:
 
 
 def _is_converted(spec: Any, has_picture: bool) -> bool:
-    """Return whether the picture has other primaries than sRGB."""
+    """Return whether the picture has other primaries than sRGB, or is encoded."""
     stated, neutral = spec.getattribute("chromaticities"), spec.getattribute("adoptedNeutral")
-    if has_picture and stated is None and neutral is None:
-        return False
     try:
+        space, _ = space_of(spec)
+        if space and space.encoding:
+            return True
+        stated = stated or (space and space.chromaticities)
+        if has_picture and stated is None and neutral is None:
+            return False
         return to_linear_srgb(stated or (SRGB if has_picture else CIE_XYZ), neutral) is not None
     except ImageError:
         return False

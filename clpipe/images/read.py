@@ -12,6 +12,7 @@ from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.images.attributes import clpipe_attributes, photograph_attributes, shot_attributes
 from clpipe.images.colour import SRGB, to_linear_srgb
+from clpipe.images.colour_names import DECODERS
 from clpipe.images.layers import find_picture, picture_channels
 from clpipe.images.luminance_chroma import read_luminance_chroma
 from clpipe.images.openimageio import SubsampledError, open_image
@@ -129,6 +130,24 @@ def read_image(
 
 
 GREY = "the file has only luminance, so the picture is grey"
+
+
+def _decoded(path: Path, pixels: Array, stated: Statements) -> Array:
+    """Return linear light from samples that are encoded as their colour space states.
+
+    Raises:
+        ImageError: the samples are no colours.
+    """
+    space = stated.space
+    if space and space.is_data:
+        raise ImageError(
+            f"{path}: its colour space is {space.name}, so it is no picture. Give a picture; to "
+            "carry this file next to one, use --carry"
+        )
+    if not space or not space.encoding:
+        return pixels
+    decode = DECODERS[space.encoding]
+    return convert_by_rows(lambda rows: decode(rows.astype(np.float64)), pixels)
 
 
 def _to_srgb(path: Path, light: Array, stated: Statements) -> tuple[Array, list[str]]:
@@ -320,7 +339,7 @@ def _decode(
             path, lambda: read_part(path, file, location, mosaic, max_pixels, margins)
         )
         if not mosaic:
-            pixels = stated.light(pixels)
+            pixels = _decoded(path, stated.light(pixels), stated)
             if stated.alpha >= 0:
                 alpha = read_samples(path, file, location.part, [stated.alpha], oiio.FLOAT)
                 pixels = over_black(pixels, alpha[..., 0])

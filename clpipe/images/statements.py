@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 
+from clpipe.base.errors import ImageError
 from clpipe.base.reading import read_errors
 from clpipe.base.text import printable
 from clpipe.base.types import Array, Floats
 from clpipe.images import png, radiance
 from clpipe.images.colour import CIE_XYZ
+from clpipe.images.colour_names import ColourSpace, space_of
 from clpipe.images.openimageio import radiance_header
 from clpipe.images.pixels import convert_by_rows
 from clpipe.images.tags import FLIPS, upright
@@ -32,6 +34,7 @@ class Statements:
         is_inverted: whether 0 is white, which OpenImageIO applies only to 8-bit samples.
         header: the header of a Radiance picture.
         warnings: sentences about statements that are not applied.
+        space: the colour space that an OpenEXR file names.
     """
 
     chromaticities: Any = None
@@ -43,6 +46,7 @@ class Statements:
     is_inverted: bool = False
     header: radiance.RadianceHeader | None = None
     warnings: tuple[str, ...] = ()
+    space: ColourSpace | None = None
 
     def warnings_with(self, transfer: str) -> tuple[str, ...]:
         """Return the warnings if samples are decoded with a transfer curve."""
@@ -99,6 +103,9 @@ def read_statements(path: Path, file: Any, xyz: bool = False) -> Statements:
         file.seek_subimage(part, 0)
         file.geterror()  # clears the error: the next page need not exist
     chromaticities = CIE_XYZ if xyz else spec.getattribute("chromaticities")
+    space, notes = _named_space(path, spec) if format_ == "openexr" else (None, [])
+    warnings += notes
+    chromaticities = chromaticities or (space and space.chromaticities)
     curve = ""
     if format_ == "png":
         colours = png_colours(path)
@@ -124,7 +131,23 @@ def read_statements(path: Path, file: Any, xyz: bool = False) -> Statements:
         is_inverted and spec.format.basetype != oiio.UINT8,
         header,
         tuple(warnings),
+        space,
     )
+
+
+def _named_space(path: Path, spec: Any) -> tuple[ColourSpace | None, list[str]]:
+    """Return the colour space that an OpenEXR file names, or None, and warnings.
+
+    Raises:
+        ImageError: as for :func:`~clpipe.images.colour_names.space_of`.
+    """
+    try:
+        space, warnings = space_of(spec)
+    except ImageError as error:
+        raise ImageError(f"{path}: {error}") from None
+    if space and space.encoding:
+        warnings.append(f"its samples, encoded as {printable(space.name)}, were decoded")
+    return space, warnings
 
 
 def png_colours(path: Path) -> png.PngColours:
