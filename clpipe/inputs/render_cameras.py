@@ -3,7 +3,6 @@ folder with COLMAP's text model.
 """
 
 import math
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import parse_json, read_named, read_named_text
 from clpipe.base.types import Array
+from clpipe.inputs.camera_keys import check_keys
 from clpipe.inputs.manifest import MANIFEST_BYTES
 from clpipe.reference.pose import from_opengl, from_quaternion
 
@@ -28,7 +28,8 @@ FOCAL_LENGTHS = {
     "FULL_OPENCV": ("fx", "fy", "cx", "cy"),
 }
 
-COEFFICIENT = re.compile(r"[kp][1-6]")
+ANGLES = ("camera_angle_x", "camera_angle_y")  # keys of a transforms.json
+ANGLE_TOLERANCE = 0.01  # relative, of the focal length that an angle means
 
 
 @dataclass(frozen=True)
@@ -53,14 +54,25 @@ class View:
         return self.size is None and "camera_angle_x" in self.values and "fx" not in self.values
 
     def with_size(self, width: int, height: int) -> "View":
-        """Return a copy with an image size in px, and fx from the angle of view if fx is missing.
+        """Return a copy with an image size in px, and focal lengths from the angles of view.
+
+        If a focal length and an angle contradict each other, the copy has a problem.
 
         >>> View("a", {"camera_angle_x": math.pi / 2}).with_size(400, 300).values["fx"]
         200.00000000000003
         """
         values = dict(self.values)
-        if "fx" not in values and 0 < values.get("camera_angle_x", 0.0) < math.pi:
-            values["fx"] = width / 2 / math.tan(values.pop("camera_angle_x") / 2)
+        for angle, focal, side in zip(ANGLES, ("fx", "fy"), (width, height), strict=True):
+            if not 0 < values.get(angle, 0.0) < math.pi:
+                continue
+            from_angle = side / 2 / math.tan(values.pop(angle) / 2)
+            stated = values.setdefault(focal, from_angle)
+            if stated and abs(from_angle / stated - 1) > ANGLE_TOLERANCE:
+                problem = (
+                    f"{angle} means {focal} = {from_angle:.6g} px in a picture of {width}x{height} "
+                    f"px, but {focal} is {stated:.6g} px; correct or remove one of them"
+                )
+                return replace(self, problem=self.problem or problem)
         return replace(self, values=values, size=(width, height))
 
 
@@ -156,7 +168,7 @@ def _from_frame(frame: Mapping[str, Any], common: Mapping[str, Any]) -> View:
         ValueError: a value is not allowed; the message names it.
     """
     merged = {**common, **frame}
-    names = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "camera_angle_x": "camera_angle_x"}
+    names = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", **{a: a for a in ANGLES}}
     values: dict[str, Any] = {
         to: number_array(name, merged[name], ()).item()
         for name, to in names.items()
@@ -167,10 +179,8 @@ def _from_frame(frame: Mapping[str, Any], common: Mapping[str, Any]) -> View:
         matrix = number_array("transform_matrix", merged["transform_matrix"], shape)
         r, t = from_opengl(matrix)
         values |= {"rotation": r.tolist(), "translation": t.tolist()}
-    coefficients = {name: value for name, value in merged.items() if COEFFICIENT.fullmatch(name)}
-    listed = number_array("distortion_params", merged.get("distortion_params", []), None).tolist()
-    coefficients |= {f"distortion_params[{i}]": value for i, value in enumerate(listed)}
-    _check_pinhole(str(merged.get("camera_model") or "PINHOLE"), coefficients)
+    check_keys(merged)
+    _check_pinhole(str(merged.get("camera_model") or "PINHOLE"), {})
     view = View("", values)
     size = _size(merged, "w", "h")
     return view.with_size(*size) if size else view
@@ -307,7 +317,9 @@ def _check_pinhole(model: str, coefficients: Mapping[str, Any]) -> None:
     """
     distortion = ", ".join(f"{k} {v}" for k, v in coefficients.items() if v)
     if distortion or model not in FOCAL_LENGTHS:
-        what = f"has distortion ({distortion})" if distortion else f"has the model {model}"
+        known = model in FOCAL_LENGTHS
+        what = f"of the model {model} has distortion ({distortion})"
+        what = what if known else f"has the model {model}"
         raise ValueError(
             f"its camera {what}, but renders have no lens distortion; remove it from the file, and "
             "let clpipe warp the picture (see clpipe stages distortion)"
