@@ -220,8 +220,9 @@ def test_the_digest_of_a_large_file_is_the_same(tmp_path, monkeypatch):
 def test_every_block_is_looked_at(dtype):
     pixels = np.zeros((3, 2, BLOCK), dtype).transpose(1, 2, 0)  # planar in memory
     pixels[0, 0, 0], pixels[1, -1, 2], pixels[1, 7, 1] = -np.inf, np.nan, -65504
-    assert make_finite(pixels) == 2 and make_finite(pixels) == 0
-    assert pixels.sum(dtype=np.float64) == -65504
+    pixels[0, 3, 1] = np.inf
+    assert make_finite(pixels) == (1, 2) and make_finite(pixels) == (0, 0)
+    assert (pixels[0, 3, 1], pixels.sum(dtype=np.float64)) == (HALF_MAX, 0)
     if dtype == np.float32:
         pixels[1, -1, 2], pixels[0, 5, 1] = 65504.1, -1e30
         assert clip_to_half(pixels) == 2 and clip_to_half(pixels) == 0

@@ -50,14 +50,17 @@ def test_rgb_is_found_by_name(write_exr, channels, layer, order):
     assert picture_channels(names) == (layer, order)
 
 
-def test_nan_and_infinity_become_zero_and_are_counted(write_exr):
+def test_infinity_becomes_bright_and_nan_black_and_both_are_counted(write_exr):
     pixels = ramp()
     pixels[0, 0, 0], pixels[1, 2, 1], pixels[3, 3, 2] = np.nan, np.inf, -np.inf
     for half in (True, False):
         source = read_image(write_exr("nan.exr", pixels, half=half))
-        assert source.warnings == ("3 samples were NaN or infinite and were set to 0",)
+        assert source.warnings == (
+            "1 sample was infinite and was set to 65504, the largest half",
+            "2 samples were NaN or -infinite and were set to 0",
+        )
         assert np.isfinite(source.pixels).all()
-        assert source.pixels[1, 2, 1] == 0
+        assert source.pixels[1, 2, 1] == 65504 and source.pixels[0, 0, 0] == 0
         assert source.pixels[5, 5, 1] == pixels[5, 5, 1]
 
 

@@ -90,15 +90,21 @@ def convert_by_rows(convert: Callable[[Array], Array], pixels: Array) -> Floats:
 
 
 @CpuTimer("convert")
-def make_finite(pixels: Array) -> int:
-    """Set each NaN and infinity of an image to 0, in place, and return their number."""
+def make_finite(pixels: Array) -> tuple[int, int]:
+    """Replace each NaN and infinity of an image, in place, and return the numbers of both kinds.
+
+    Infinite light is a light that overflowed, such as the sun in half floats. It becomes the
+    largest half. NaN and negative infinity become 0.
+    """
     infinity = np.array(np.inf, pixels.dtype)
-    count = 0
+    bright = dark = 0
     for block in _blocks_outside(pixels, np.nextafter(infinity, pixels.dtype.type(0))):
-        bad = ~np.isfinite(block)
-        count += int(np.count_nonzero(bad))
+        bad, endless = ~np.isfinite(block), np.isposinf(block)
+        bright += int(np.count_nonzero(endless))
+        dark += int(np.count_nonzero(bad)) - int(np.count_nonzero(endless))
         block[bad] = 0
-    return count
+        block[endless] = HALF_MAX
+    return bright, dark
 
 
 @CpuTimer("convert")

@@ -87,8 +87,8 @@ def read_image(
     The picture is the channels R, G and B. Without them it is X, Y and Z, or luminance, which
     becomes grey. Primaries other than sRGB's are converted, and the orientation is applied.
     Straight alpha multiplies the light, which composites the picture over black. Half samples stay
-    half unless they are converted. NaN and infinity become 0, with a warning. Pixels outside the
-    data window are black. Warnings list what the file states but clpipe does not apply.
+    half unless they are converted. NaN becomes 0 and infinity 65504, with a warning. Pixels outside
+    the data window are black. Warnings list what the file states but clpipe does not apply.
 
     Args:
         path: the file.
@@ -111,9 +111,11 @@ def read_image(
         image, stated = _decode_luminance_chroma(path, max_pixels, overscan)
     pixels = image.pixels
     warnings = list(stated.warnings_with("linear"))
-    if count := make_finite(pixels):
-        were = "sample was" if count == 1 else "samples were"
-        warnings.append(f"{count} {were} NaN or infinite and {were.split()[1]} set to 0")
+    values = (("infinite", f"{HALF_MAX:g}, the largest half"), ("NaN or -infinite", "0"))
+    for count, (what, to) in zip(make_finite(pixels), values, strict=True):
+        if count:
+            were = "sample was" if count == 1 else "samples were"
+            warnings.append(f"{count} {were} {what} and {were.split()[1]} set to {to}")
     if pixels.ndim == 2 and not mosaic:
         pixels = np.stack([pixels] * 3, axis=-1)
         warnings.append(GREY)
