@@ -32,8 +32,8 @@ PICTURES = {
     "ScanLines_Cannon": (96, 128, 0.31781, 0.32564, 0.30412),
     "ScanLines_Carrots": (96, 128, 0.19549, 0.13658, 0.11362),
     "ScanLines_Desk": (96, 128, 8.0272, 7.4736, 3.6098),
-    "TestImages_AllHalfValues": (256, 256, 0, 0, 0),
-    "TestImages_BrightRingsNanInf": (800, 800, 27.585, 27.585, 27.585),
+    "TestImages_AllHalfValues": (256, 256, *[65504 / 256**2] * 3),  # one of them is infinite
+    "TestImages_BrightRingsNanInf": (800, 800, 27.790, 27.790, 27.790),
     "TestImages_GrayRampsHorizontal": (800, 800, 0.64293, 0.64293, 0.64293),
     "TestImages_WideColorGamut": (800, 800, 1.0991, 0.96227, 1.0819),
     "Tiles_GoldenGate": (100, 150, 0.17151, 0.13147, 0.30627),
