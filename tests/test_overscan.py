@@ -272,7 +272,8 @@ def test_black_corners_are_told(clpipe, write_exr, around):
 def test_datasets_and_pipelines(write_exr, tmp_path):
     path = write_render(write_exr, "a.exr")
     own = {"stages": ["distortion"], "distortion": BARREL}
-    sample = clpipe_api.Dataset(path, device="numpy", carry="Z:label", epochs=1, **own)[0]
+    with pytest.warns(UserWarning, match="values of its layer Z are not whole"):
+        sample = clpipe_api.Dataset(path, device="numpy", carry="Z:label", epochs=1, **own)[0]
     pipe = clpipe_api.Pipeline(device="numpy", **own)
     image = read_image(path, overscan=True).pixels
     made = pipe.process(image, "a", overscan=AROUND).image
@@ -293,9 +294,8 @@ def test_windows_that_do_not_meet_or_are_too_far_apart(clpipe, write_exr):
     pixels = np.ones((4, 5, 3))
     window = {"full_width": 6, "full_height": 4}
     write_exr("in/a.exr", pixels, x=6, **window)
-    clpipe(*BEND)
-    assert (read_image(Path("o/a.exr")).pixels == 0).all()
-    assert "overscan" not in json.loads(Path("o/a.json").read_text())
+    assert "no pixel of its data window, 5x4 at 6, 0, lies in" in clpipe(*BEND, status=1).stderr
+    assert not Path("o/a.exr").exists()
     write_exr("in/a.exr", np.ones((1, 300, 3)), x=-100, **{"full_width": 2, "full_height": 200})
     stderr = clpipe(*BEND, "--max-pixels", 1000, "--redo", "all", status=1).stderr
     assert "300x200 pixels; at most 1000 are read" in stderr

@@ -168,6 +168,8 @@ class JobLoader:
             )
             if patches and patches.augment:
                 state.carried_layers.check_no_vectors()
+            warnings = (*loaded.source.warnings, *state.carried_layers.warnings)
+            loaded = replace(loaded, source=replace(loaded.source, warnings=warnings))
         state.source = loaded.source
         state.recipes = recipes(renditions, loaded.chain, loaded.key)
         state.unwritten = len(state.recipes)

@@ -103,12 +103,14 @@ class SampleLoader:
         job = batch.job
         loader = self._loader
         carried: Sample = {}
+        warnings: list[str] = []
         try:
             loader = self._loader.for_job(job, batch.draw_key)
             loaded = loader.enter(job, self._source(job, loader))
             if loaded and loader.request.carry:
                 layers = loader.carried_layers(job, loaded)
                 named = {**layers.arrays(), VALID: layers.valid}
+                warnings += layers.warnings
                 carried = {f"carried.{name}": array for name, array in named.items()}
                 if self.patches and self.patches.augment:
                     layers.check_no_vectors()
@@ -119,7 +121,7 @@ class SampleLoader:
                 f"{job.path}: this image was not kept directly before "
                 f"{loader.request.start_at}. Select such images with a glob"
             )
-        for warning in self._warned.new(loaded.source.warnings):
+        for warning in self._warned.new([*loaded.source.warnings, *warnings]):
             warn(f"{job.path}: {python_words(warning)}")
         return loaded, carried
 

@@ -49,9 +49,18 @@ def overscan_margins(x: int, y: int, data: Sequence[int], display: Sequence[int]
     (0, 0, 0, 0)
     """
     (width, height), (right, bottom) = display, (x + data[0], y + data[1])
-    if min(right, bottom) <= 0 or x >= width or y >= height:
+    if not windows_overlap(x, y, data, display):
         return NO_MARGINS
     return Margins(*(max(each, 0) for each in (-x, -y, right - width, bottom - height)))
+
+
+def windows_overlap(x: int, y: int, data: Sequence[int], display: Sequence[int]) -> bool:
+    """Return whether a data window has pixels in the display window; for the arguments, see above.
+
+    >>> windows_overlap(7, 0, (3, 3), (7, 7)), windows_overlap(6, 0, (3, 3), (7, 7))
+    (False, True)
+    """
+    return min(x + data[0], y + data[1]) > 0 and x < display[0] and y < display[1]
 
 
 @CpuTimer("convert")

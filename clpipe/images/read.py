@@ -25,6 +25,7 @@ from clpipe.images.pixels import (
     display_window,
     make_finite,
     overscan_margins,
+    windows_overlap,
 )
 from clpipe.images.samples import digest_of, read_part, read_samples, with_digest
 from clpipe.images.statements import Statements, over_black, read_statements
@@ -335,6 +336,12 @@ def _decode(
         spec = file.spec()
         data, display = (spec.width, spec.height), (spec.full_width, spec.full_height)
         x, y = spec.x - spec.full_x, spec.y - spec.full_y
+        if not windows_overlap(x, y, data, display):
+            raise ImageError(
+                f"{path}: no pixel of its data window, {data[0]}x{data[1]} at {spec.x}, {spec.y}, "
+                f"lies in its display window, {display[0]}x{display[1]} at {spec.full_x}, "
+                f"{spec.full_y}, so the picture would be black; crop the render inside its frame"
+            )
         margins = overscan_margins(x, y, data, display) if overscan else NO_MARGINS
         stated = read_statements(path, file, location.xyz)
         pixels, digest = with_digest(

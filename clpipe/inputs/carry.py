@@ -19,6 +19,7 @@ from clpipe.images.read import SourceImage
 from clpipe.images.tags import FLIPS
 from clpipe.inputs.carry_rows import combine_rows, files_by_row, row_step
 from clpipe.inputs.companions import LayerSource, find_carried_layers
+from clpipe.inputs.layer_values import value_warnings
 from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, between_rows, warp
 from clpipe.reference.geometry import Composition, Geometry, Margins, Orientation
 
@@ -51,12 +52,14 @@ class CarriedLayers:
         valid: (height, width): 1 where all layers are known, otherwise 0.
         attributes: EXR attributes of the layers, such as the names of a Cryptomatte's objects.
         other_records: entries in a sidecar of further files that the layers are made of.
+        warnings: sentences about values that cannot mean what their kind says.
     """
 
     layers: tuple[CarriedLayer, ...]
     valid: Array
     attributes: Mapping[str, str]
     other_records: tuple[Mapping[str, Any], ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def records(self) -> list[Mapping[str, Any]]:
@@ -121,11 +124,13 @@ def carry(
     used = {number: paths[number] for number in np.unique(by_row).tolist()}
     sources_by_file = find_same_layers([*used.values()], layers)
     read: list[Layer] = []
+    warnings: list[str] = []
     for matching in zip(*sources_by_file, strict=True):
         parts = {
             number: read_source(each, used[number], source.margins, size, max_pixels)
             for number, each in zip(used, matching, strict=True)
         }
+        warnings += warnings_of(matching[0], parts[min(parts)])
         layer = combine_rows(parts, by_row)
         if layer.vectors and len(paths) > 1:
             layer = between_rows(layer, matching[0].directions, row_step(chain))
@@ -140,7 +145,20 @@ def carry(
         for each, pixels, record in zip(sources_by_file[0], warped, first, strict=True)
     )
     other_records = tuple(record for records in others for record in records)
-    return CarriedLayers(carried, valid, attributes_of(sources_by_file[0]), other_records)
+    attributes = attributes_of(sources_by_file[0])
+    return CarriedLayers(carried, valid, attributes, other_records, tuple(warnings))
+
+
+def warnings_of(source: LayerSource, layer: Layer) -> list[str]:
+    """Return warnings about the values of a layer.
+
+    Raises:
+        ImageError: it is a Cryptomatte whose hashes are rounded.
+    """
+    try:
+        return value_warnings(source.name, layer.kind, layer.pixels)
+    except ImageError as error:
+        raise ImageError(f"{source.file}: {error}") from None
 
 
 def find_same_layers(paths: Sequence[Path], layers: Sequence[AovSpec]) -> list[list[LayerSource]]:
@@ -235,7 +253,8 @@ def merge_moments(by_moment: Mapping[str, CarriedLayers], named: bool) -> Carrie
     valid = first.valid.copy()
     for other in others:
         valid *= other.valid
-    return replace(first, layers=tuple(layers), valid=valid)
+    warnings = dict.fromkeys(w for each in by_moment.values() for w in each.warnings)
+    return replace(first, layers=tuple(layers), valid=valid, warnings=tuple(warnings))
 
 
 def geometry_of(chain: Chain, orientation: int) -> Geometry | None:
