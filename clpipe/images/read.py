@@ -340,7 +340,7 @@ def _decode(
             raise ImageError(
                 f"{path}: no pixel of its data window, {data[0]}x{data[1]} at {spec.x}, {spec.y}, "
                 f"lies in its display window, {display[0]}x{display[1]} at {spec.full_x}, "
-                f"{spec.full_y}, so the picture would be black; crop the render inside its frame"
+                f"{spec.full_y}; crop the render inside its frame"
             )
         margins = overscan_margins(x, y, data, display) if overscan else NO_MARGINS
         stated = read_statements(path, file, location.xyz)
