@@ -7,8 +7,10 @@ import OpenEXR
 import pytest
 
 from clpipe.base.errors import ImageError, NoPictureError
+from clpipe.chain.carry import AovSpec
 from clpipe.images.kinds import is_aov
 from clpipe.images.read import ReadOptions, read_image, read_source
+from clpipe.inputs.companions import LayerFinder
 from clpipe.stage import Kind
 from tests.conftest import run_cli
 
@@ -124,3 +126,45 @@ def test_sidecar_and_log_record_layer_and_part(tmp_path):
     (line,) = [each for each in lines if each["event"] == "image"]
     for record in (sidecar, line):
         assert (record["layer"], record["part"]) == ("RGB_IMAGEPIPELINE", 0)
+
+
+STEREO = {"R": 0.1, "G": 0.2, "B": 0.3, "Z": 3.0}
+STEREO |= {"right.R": 0.4, "right.G": 0.5, "right.B": 0.6, "right.Z": 6.0}
+VIEW_LAYERS = {f"{name}.Combined.{c}": 0.3 for name in ("beauty", "volume") for c in "RGB"}
+VIEW_LAYERS |= {"beauty.Depth.Z": 3.0}
+
+
+def planes_written(name, values, **header):
+    planes = {c: np.full((6, 8), value, np.float32) for c, value in values.items()}
+    OpenEXR.File(header, planes).write(name)
+
+
+@pytest.mark.parametrize(
+    ("layer", "name", "channel", "value"),
+    [("right", "Z", "right.Z", 6), ("right", "Depth", "right.Z", 6), (None, "Z", "Z", 3)],
+)
+def test_layers_of_the_pictures_own_view_are_carried(clpipe, layer, name, channel, value):
+    planes_written("a.exr", STEREO, multiView=["left", "right"])
+    chosen = ("--layer", layer) if layer else ()
+    clpipe("run", "a.exr", "-o", "o", "--carry", name, *chosen, "--device", "numpy")
+    carried = OpenEXR.File("o/a.carried.exr", separate_channels=True).channels()
+    assert set(carried) == {channel, "valid"}
+    assert (carried[channel].pixels == value).all()
+
+
+def test_layers_of_another_view_layer_need_their_full_name(clpipe):
+    planes_written("a.exr", VIEW_LAYERS)
+    run = ("run", "a.exr", "-o", "o", "--device", "numpy", "--layer", "volume.Combined")
+    stderr = clpipe(*run, "--carry", "Depth", status=1).stderr
+    assert "the picture is volume.Combined, and its view layer and view have no such" in stderr
+    assert "The file has beauty.Depth; to carry one of these, give its full name" in stderr
+    clpipe(*run, "--carry", "beauty.Depth")
+    carried = OpenEXR.File("o/a.carried.exr", separate_channels=True).channels()
+    assert (carried["beauty.Depth.Z"].pixels == 3).all()
+
+
+@pytest.mark.parametrize(("picture", "found"), [("right", "right.Z"), ("", "Z")])
+def test_a_step_finds_the_depth_of_the_pictures_own_view(tmp_path, picture, found):
+    planes_written(str(tmp_path / "a.exr"), STEREO, multiView=["left", "right"])
+    [source] = LayerFinder(tmp_path / "a.exr", (), picture).find(AovSpec("Depth", "depth"))
+    assert source.location.name == found

@@ -109,8 +109,7 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
         channel_names += [name for name in names if name not in channel_names]
         is_kept = "kind" in clpipe_attributes(spec)
         part_name = str(spec.getattribute("oiio:subimagename") or "") if several_parts else ""
-        stated = spec.getattribute("view") or spec.getattribute("multiView") or ()
-        views += [stated] if isinstance(stated, str) else [str(each) for each in stated]
+        views += stated_views(spec)
         channel = mosaic_channel(names) if mosaic else None
         found = [] if mosaic else list(_layers(names, is_kept))
         if is_kept and not (found or channel):
@@ -120,7 +119,7 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
             full = full_name(part_name, layer_name)
             rejections += (problem := _integer_problem(spec, full, channels))
             if not problem:
-                view, name = _view_of(full, views)
+                view, name = view_of(full, views)
                 pictures.append(PictureLocation(part - 1, full, channels, xyz, view, name))
     if not pictures and rejections:
         raise ImageError(f"{path}: {rejections[0]}")
@@ -135,15 +134,25 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
     return best
 
 
-def _view_of(name: str, views: Sequence[str]) -> tuple[int, str]:
+def stated_views(spec: Any) -> list[str]:
+    """Return the names of the views that a part states, an ``oiio.ImageSpec``."""
+    stated = spec.getattribute("view") or spec.getattribute("multiView") or ()
+    return [stated] if isinstance(stated, str) else [str(each) for each in stated]
+
+
+def view_of(name: str, views: Sequence[str]) -> tuple[int, str]:
     """Return the number of a layer's view, 0 if it has none, and the layer's name without it.
 
-    >>> _view_of("rgba_right", ["left", "right"]), _view_of("beauty.left", ["left"])
+    >>> view_of("rgba_right", ["left", "right"]), view_of("beauty.left", ["left"])
     ((1, 'rgba'), (0, 'beauty'))
+    >>> view_of("right.Z", ["left", "right"])
+    (1, 'Z')
     """
     for number, view in enumerate(dict.fromkeys(views)):
         if name == view or (view and name.endswith((f".{view}", f"_{view}"))):
             return number, name[: -len(view)].rstrip("._")
+        if view and name.startswith(f"{view}."):
+            return number, name.removeprefix(f"{view}.")
     return 0, name
 
 

@@ -1,7 +1,7 @@
 """Finds and reads the layers of a render other than its picture: depth, normals, IDs, motion."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import OpenImageIO as oiio
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.types import Array
 from clpipe.images.kinds import kind_from_name
-from clpipe.images.layers import MAX_PARTS, full_name
+from clpipe.images.layers import MAX_PARTS, full_name, stated_views, view_of
 from clpipe.images.openimageio import open_image
 from clpipe.images.pixels import check_size
 from clpipe.images.samples import read_samples
@@ -35,6 +35,8 @@ class LayerLocation:
         channels: the names of its channels, without the layer's.
         indices: their numbers in the part.
         type: the ``oiio.BASETYPE`` of its samples.
+        view: the number of its view, in the order of the file's views.
+        base: its name without the view.
     """
 
     name: str
@@ -42,6 +44,13 @@ class LayerLocation:
     channels: tuple[str, ...]
     indices: tuple[int, ...]
     type: Any
+    view: int = 0
+    base: str = ""
+
+    @property
+    def view_layer(self) -> str:
+        """The name of the view layer that it belongs to: its name before the last part, or ""."""
+        return self.base.rpartition(".")[0]
 
     @property
     def is_bare_channel(self) -> bool:
@@ -58,7 +67,8 @@ class LayerLocation:
 
         All ranks of a Cryptomatte match its name without a number. A single Z matches depth.
         """
-        names = [self.name, self.without_rank, *(["depth"] if self.name in ("Z", "z") else [])]
+        is_z = self.name.rpartition(".")[2] in ("Z", "z")
+        names = [self.name, self.without_rank, *(["depth"] if is_z else [])]
         return any(f".{each}".lower().endswith(f".{name}".lower()) for each in names)
 
     @property
@@ -70,7 +80,7 @@ class LayerLocation:
 
 def layer_kind(name: str, location: LayerLocation) -> LayerKind | None:
     """Return the kind of a layer, from its names and channels; None if it is not known."""
-    if kind := kind_from_name(name) or kind_from_name(location.name):
+    if kind := kind_from_name(name) or kind_from_name(location.base):
         return kind
     if location.type not in FLOAT_TYPES:
         return "label"
@@ -84,6 +94,7 @@ def find_layers(path: Path) -> list[LayerLocation]:
         ImageError: the file is missing, damaged or not an image.
     """
     found: list[LayerLocation] = []
+    views: list[str] = []
     with open_image(path) as file:
         several = file.seek_subimage(1, 0)
         part = 0
@@ -91,16 +102,19 @@ def find_layers(path: Path) -> list[LayerLocation]:
             spec = file.spec()
             if not spec.deep:
                 part_name = str(spec.getattribute("oiio:subimagename") or "") if several else ""
+                views += stated_views(spec)
                 found += _layers_in(part, part_name, spec)
             part += 1
         file.geterror()  # clears the error: the loop asked for a part that does not exist
-    return found
+    named = ((each, view_of(each.name, views)) for each in found)
+    return [replace(each, view=view, base=base) for each, (view, base) in named]
 
 
 def _layers_in(part: int, part_name: str, spec: Any) -> Iterator[LayerLocation]:
     """Yield the layers of one part."""
     types = spec.channelformats or [spec.format] * spec.nchannels
-    for name, indices in _group_channels(spec.channelnames, bool(part_name)).items():
+    views = stated_views(spec)
+    for name, indices in _group_channels(spec.channelnames, bool(part_name), views).items():
         names = {i: spec.channelnames[i].rpartition(".")[2] for i in indices}
         order = sorted(indices, key=lambda i: (CHANNEL_ORDER.find(names[i].upper()), names[i]))
         basetypes = {types[i].basetype for i in indices}
@@ -109,17 +123,21 @@ def _layers_in(part: int, part_name: str, spec: Any) -> Iterator[LayerLocation]:
         yield LayerLocation(full_name(part_name, name), part, channels, tuple(order), type_)
 
 
-def _group_channels(names: Sequence[str], in_part: bool = False) -> Mapping[str, list[int]]:
+def _group_channels(
+    names: Sequence[str], in_part: bool = False, views: Sequence[str] = ()
+) -> Mapping[str, list[int]]:
     """Return the numbers of channels by layer.
 
     Colour channels and vector components without a layer form the layer "". Any other channel
     without a layer is a layer of its own. In a file of several parts, this requires that the part
-    has R, G and B as well.
+    has R, G and B as well. The same applies to the channels of a view.
 
     >>> _group_channels(["R", "G", "B", "A", "Z", "id", "Normal.X"])
     {'': [0, 1, 2, 3], 'Z': [4], 'id': [5], 'Normal': [6]}
     >>> _group_channels(["X", "Y", "Z"]), _group_channels(["Z"])
     ({'': [0, 1, 2]}, {'Z': [0]})
+    >>> _group_channels(["right.R", "right.G", "right.B", "right.Z"], views=["left", "right"])
+    {'right': [0, 1, 2], 'right.Z': [3]}
     >>> _group_channels(["Z"], in_part=True)
     {'': [0]}
     """
@@ -130,6 +148,8 @@ def _group_channels(names: Sequence[str], in_part: bool = False) -> Mapping[str,
     for i, name in enumerate(names):
         layer, dot, channel = name.rpartition(".")
         group = layer if dot or channel.upper() in vector else channel
+        if layer in views and channel.upper() not in "RGBA":
+            group = name
         groups.setdefault(group, []).append(i)
     return groups
 

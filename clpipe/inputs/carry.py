@@ -122,7 +122,7 @@ def carry(
     size = source.pixels.shape[1::-1]
     by_row = files_by_row(chain, len(paths), size[1], source.margins)
     used = {number: paths[number] for number in np.unique(by_row).tolist()}
-    sources_by_file = find_same_layers([*used.values()], layers)
+    sources_by_file = find_same_layers([*used.values()], layers, source.layer)
     read: list[Layer] = []
     warnings: list[str] = []
     for matching in zip(*sources_by_file, strict=True):
@@ -161,13 +161,20 @@ def warnings_of(source: LayerSource, layer: Layer) -> list[str]:
         raise ImageError(f"{source.file}: {error}") from None
 
 
-def find_same_layers(paths: Sequence[Path], layers: Sequence[AovSpec]) -> list[list[LayerSource]]:
+def find_same_layers(
+    paths: Sequence[Path], layers: Sequence[AovSpec], picture: str = ""
+) -> list[list[LayerSource]]:
     """Return the carried layers of each file. All files have the same layers.
+
+    Args:
+        paths: the files.
+        layers: the requested layers.
+        picture: the name of the layer that contains the picture.
 
     Raises:
         ImageError: a layer is missing, or files have different layers.
     """
-    sources_by_file = [find_carried_layers(path, layers) for path in paths]
+    sources_by_file = [find_carried_layers(path, layers, picture) for path in paths]
     names = [[(each.name, each.kind, each.channels) for each in found] for found in sources_by_file]
     for path, layer_names in zip(paths, names, strict=True):
         if layer_names != names[0]:

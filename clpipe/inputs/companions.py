@@ -52,15 +52,23 @@ class LayerSource:
         return flow_directions(f"{self.name} {self.location.name}", self.location.channels)
 
 
-def find_carried_layers(path: Path, layers: Sequence[AovSpec]) -> list[LayerSource]:
+def find_carried_layers(
+    path: Path, layers: Sequence[AovSpec], picture: str = ""
+) -> list[LayerSource]:
     """Return all requested layers of an image; see :meth:`LayerFinder.find`.
+
+    Args:
+        path: the image file.
+        layers: the requested layers.
+        picture: the name of the layer that contains the picture.
 
     Raises:
         ImageError: a layer is missing, or a channel is carried twice.
     """
     found: list[LayerSource] = []
     for layer in layers:
-        found += LayerFinder(path, [layer.pattern] if layer.pattern else []).find(layer)
+        patterns = [layer.pattern] if layer.pattern else []
+        found += LayerFinder(path, patterns, picture).find(layer)
     _check_names(path, found)
     return found
 
@@ -89,11 +97,13 @@ class LayerFinder:
     Args:
         path: the image file.
         patterns: patterns of companion names; without any, :func:`companions_of` finds companions.
+        picture: the name of the layer that contains the picture.
         layers: the layers of each file that has been read so far.
     """
 
     path: Path
     patterns: Sequence[str] = ()
+    picture: str = ""
     layers: dict[Path, list[LayerLocation]] = field(default_factory=dict)
 
     def find(self, spec: AovSpec) -> list[LayerSource]:
@@ -104,7 +114,10 @@ class LayerFinder:
         """
         for file in self._files(spec.name):
             locations = self._layers_in(file)
-            named = _named(file, spec.name, locations)
+            if file == self.path:
+                named = _named(file, spec.name, self._of_picture(spec.name, locations))
+            else:
+                named = _named(file, spec.name, locations)
             if not named and self._is_named_after(file, spec.name):
                 if len(locations) != 1:
                     listed = ", ".join(each.name or "one without a name" for each in locations)
@@ -127,6 +140,29 @@ class LayerFinder:
             f"{self.path}: --carry: there is no layer '{one_line(spec.name)}'{hint}; {where} "
             f"{', '.join(map(one_line, names)) or 'no layers besides the picture'}, and there "
             f"is no {expected} next to it; render the layer into one of these files"
+        )
+
+    def _of_picture(self, name: str, locations: Sequence[LayerLocation]) -> Sequence[LayerLocation]:
+        """Return the layers of the picture's own view and view layer; a full name is one of them.
+
+        Raises:
+            ImageError: a layer has this name, but in another view or view layer.
+        """
+        picture = next((each for each in locations if each.name == self.picture), None)
+        matching = [each for each in locations if each.matches(name)]
+        if picture is None or not matching:
+            return locations
+        full = [each for each in matching if "." in name and each.name.lower() == name.lower()]
+        layer = picture.view_layer
+        own = [each for each in matching if each.view == picture.view]
+        own = [each for each in own if not layer or each.view_layer in ("", layer)]
+        if full or own:
+            return full or own
+        others = ", ".join(one_line(each.name) for each in matching)
+        raise ImageError(
+            f"{self.path}: --carry {name}: the picture is {one_line(self.picture) or 'the first'}, "
+            f"and its view layer and view have no such layer. The file has {others}; to carry one "
+            "of these, give its full name"
         )
 
     def _check_unique(self, name: str, file: Path) -> None:
@@ -194,8 +230,11 @@ class LayerFinder:
             )
         is_named = location.name and not (location.is_bare_channel and file != self.path)
         layer = location.name if is_named else spec.name
-        alone = location.is_bare_channel and file == self.path
-        channels = [name if alone else f"{layer}.{name}" for name in location.channels]
+        # A channel of a view, such as right.Z, is named like its layer.
+        is_last = location.channels == (location.name.rpartition(".")[2],)
+        if is_last and file == self.path:
+            return LayerSource(spec.name, kind, file, location, (location.name,))
+        channels = [f"{layer}.{name}" for name in location.channels]
         return LayerSource(spec.name, kind, file, location, tuple(channels))
 
 

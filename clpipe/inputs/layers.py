@@ -18,6 +18,7 @@ from clpipe.stage import ImageLayer
 
 def read_step_layer(
     path: Path,
+    picture: str,
     chain: Chain,
     step: str,
     width: int,
@@ -30,6 +31,7 @@ def read_step_layer(
 
     Args:
         path: the image file.
+        picture: the name of the layer that contains the picture.
         chain: the chain of the image.
         step: the name of the step.
         width: the width of the image with its overscan, in px.
@@ -43,7 +45,8 @@ def read_step_layer(
             cannot use.
         RequestError: as for :func:`~clpipe.chain.layers.layer_of`.
     """
-    found = _find(path, chain, step, [each.pattern for each in carried if each.pattern])
+    patterns = [each.pattern for each in carried if each.pattern]
+    found = _find(path, picture, chain, step, patterns)
     layer = read_source(found, path, margins, (width, height), max_pixels)
     # The first vector is that to the frame before.
     channels, signs = layer.vectors[0] if layer.vectors else ((0,), (1,))
@@ -57,14 +60,16 @@ def read_step_layer(
         raise ImageError(f"{found.file}: layer {found.name}: {error}") from None
 
 
-def _find(path: Path, chain: Chain, step: str, patterns: Sequence[str]) -> LayerSource:
+def _find(
+    path: Path, picture: str, chain: Chain, step: str, patterns: Sequence[str]
+) -> LayerSource:
     """Return the layer that a step names, or the first of its usual layers that exists."""
     method = layer_steps(chain)[step]
     name, _, pattern = method.layer.partition("=")
     errors = []
     for layer_name in (name,) if name else method.usual_layers:
         try:
-            finder = LayerFinder(path, [pattern] if pattern else patterns)
+            finder = LayerFinder(path, [pattern] if pattern else patterns, picture)
             return finder.find(AovSpec(layer_name, method.layer_kind))[0]
         except ImageError as error:
             errors.append(str(error))

@@ -302,7 +302,8 @@ class ImageLoader:
 
         def layer(chain: Chain, step: str, width: int, height: int, margins: Margins) -> ImageLayer:
             return source.layers.get(step) or read_step_layer(
-                job.at("middle"), chain, step, width, height, margins, carried, max_pixels
+                *(job.at("middle"), source.layer, chain, step, width, height, margins, carried),
+                max_pixels,
             )
 
         around = source.panorama
