@@ -1,5 +1,6 @@
 """The images of a run: which files, which part of them, and the tars or clips that they go into."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,8 +11,10 @@ from clpipe.batch.tars import Tar, split_into_tars
 from clpipe.inputs.find import Job, Shard, find_jobs
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.poses import assign_views
-from clpipe.inputs.sequences import in_sequences, sequence_of
+from clpipe.inputs.sequences import in_sequences, sequence_of, summary
 from clpipe.inputs.series import Series
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,8 @@ class Images:
                     "--webdataset has no shards; remove one of the three options"
                 )
             jobs = in_sequences(jobs)
+            if jobs and not self.known_jobs:
+                log.info(summary(jobs))
             names = self.shard.select(list(dict.fromkeys(map(sequence_of, jobs))))
             if not self.per_tar:
                 return [job for job in jobs if sequence_of(job) in names], []

@@ -3,8 +3,10 @@
 import logging
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
@@ -14,9 +16,19 @@ from clpipe.inputs.find import Job, Place
 
 log = logging.getLogger(__name__)
 
-# A number of a name. A minus after a letter or a digit is a separator, not a sign.
-NUMBER = re.compile(r"(?:(?<=[._])-|^-)?\d+")
+# A number of a name. A minus after a letter or a digit is a separator, not a sign. Seconds since
+# 1970 may have decimals.
+NUMBER = re.compile(r"(?:(?<=[._])-|^-)?(?:\d{9,10}\.\d{3,}|\d+)")
+WORD = re.compile(r"([A-Za-z]*)[._ -]*\{\}")  # the word before a number of a pattern
+FRAME_WORDS = ("f", "fr", "frame", "frm", "img", "image", "t", "time")
+# Words before numbers that count something other than frames.
+OTHER_WORDS: tuple[str, ...] = ("cam", "camera", "view", "v", "ver", "version", "take", "shot")
+OTHER_WORDS += ("sc", "scene", "seq")
+OTHER_WORDS += ("sequence", "id", "part", "eye", "rig", "sensor", "run", "obj", "object", "seed")
 MAX_GAPS = 5  # the most gaps that a message lists
+STAMP = 10**8  # the smallest time stamp: seconds, milliseconds or nanoseconds since 1970
+MAX_PLACES = 10**7  # in a sequence; with more, numbers only order the frames
+MAX_NAMES = 3  # sequences that a summary names
 
 
 def split_numbers(key: str) -> tuple[str, list[str]]:
@@ -46,17 +58,36 @@ def by_pattern(jobs: Sequence[Job]) -> dict[str, list[Job]]:
     return {pattern: sorted(each, key=numbers_of) for pattern, each in grouped.items()}
 
 
-def numbers_of(job: Job) -> list[int]:
+def numbers_of(job: Job) -> list[Fraction]:
     """Return the numbers in the name of a job's file."""
-    return [int(number) for number in split_numbers(job.key)[1]]
+    return [Fraction(number) for number in split_numbers(job.key)[1]]
+
+
+def summary(jobs: Sequence[Job]) -> str:
+    """Return a sentence about the sequences of jobs.
+
+    >>> names = [f"cam{camera}_f{number}.exr" for camera in "01" for number in "123"]
+    >>> summary(in_sequences([Job(Path(name), name) for name in names]))
+    '2 sequences of 3 frames: cam0_f, cam1_f'
+    """
+    counts = Counter(map(sequence_of, jobs))
+    low, high = min(counts.values()), max(counts.values())
+    frames = f"{low}" if low == high else f"{low} to {high}"
+    names = ", ".join(list(counts)[:MAX_NAMES])
+    more = f" and {len(counts) - MAX_NAMES} more" if len(counts) > MAX_NAMES else ""
+    of = f"{len(counts)} sequence{'s' * (len(counts) > 1)} of {frames} frame{'s' * (high > 1)}"
+    return f"{of}: {names}{more}"
 
 
 def in_sequences(jobs: Sequence[Job]) -> list[Job]:
     """Return jobs with their places in sequences, one sequence after the other, in temporal order.
 
     Files of one directory are a sequence if their names differ in one number. If they differ in
-    several, the number with the most values counts the frames. Each value of the others is then a
+    several, one of these counts the frames: after a word such as frame, else with leading zeros,
+    else the last one, but none after a word such as cam. Each value of the others is then a
     sequence, such as a camera of a rig. Names without numbers keep the order of the jobs.
+
+    Time stamps only order the frames. Their times are not used.
 
     A sequence has the name of its directory, or of its files if the directory has several. Gaps are
     logged. Missing frames keep their places, so that the time between the other frames is right.
@@ -68,13 +99,13 @@ def in_sequences(jobs: Sequence[Job]) -> list[Job]:
     Raises:
         RequestError: two frames of a sequence have the same number.
     """
-    sequences: dict[str, list[tuple[int, Job]]] = {}
-    for pattern, members in by_pattern(jobs).items():
-        names = [split_numbers(job.key)[1] for job in members]
-        frame = _frame_column(names)
+    sequences: dict[str, list[tuple[Fraction, Job]]] = {}
+    for written, members in by_pattern(jobs).items():
+        pattern, names = with_decimals(written, [split_numbers(job.key)[1] for job in members])
+        frame = _frame_column(names, words_of(pattern))
         for place, (numbers, job) in enumerate(zip(names, members, strict=True)):
             name = _name(pattern, numbers, frame)
-            number = int(numbers[frame]) if numbers else place
+            number = Fraction(numbers[frame]) if numbers else Fraction(place)
             sequences.setdefault(name, []).append((number, job))
     folders = [PurePosixPath(name).parent for name in sequences]
     placed: list[Job] = []
@@ -93,17 +124,49 @@ def sequence_of(job: Job) -> str:
     return job.place.sequence
 
 
-def _frame_column(names: Sequence[Sequence[str]]) -> int:
-    """Return which of the numbers of names counts frames.
+def with_decimals(
+    pattern: str, names: Sequence[Sequence[str]]
+) -> tuple[str, Sequence[Sequence[str]]]:
+    """Return the pattern and the numbers of names whose last two numbers may be one with decimals.
 
-    It has the most values. If several have, it has the most digits, or is the last one.
+    They are if the last one has different lengths: 1.25, 1.5.
 
-    >>> _frame_column([["0001", "0"], ["0001", "1"], ["0002", "0"], ["0002", "1"]])
-    0
+    >>> with_decimals("f.{}.{}", [["1", "25"], ["1", "5"], ["2", "0"]])
+    ('f.{}', [['1.25'], ['1.5'], ['2.0']])
+    >>> with_decimals("f.{}.{}", [["1", "0025"], ["2", "0001"]])[0]
+    'f.{}.{}'
     """
-    columns = list(zip(*names, strict=True))
-    ranks = [(len(set(texts)), max(map(len, texts)), n) for n, texts in enumerate(columns)]
-    return max(ranks)[2] if ranks else 0
+    lengths = {len(numbers[-1]) for numbers in names if numbers}
+    if not pattern.endswith("{}.{}") or len(lengths) < 2:
+        return pattern, names
+    merged = [[*numbers[:-2], f"{numbers[-2]}.{numbers[-1]}"] for numbers in names]
+    if words_of(pattern)[-2] in OTHER_WORDS:
+        return pattern, names
+    return pattern.removesuffix(".{}"), merged
+
+
+def words_of(pattern: str) -> list[str]:
+    """Return the word before each number of a pattern, in lower case.
+
+    >>> words_of("rig/cam{}_frame-{}.{}")
+    ['cam', 'frame', '']
+    """
+    return [word.lower() for word in WORD.findall(PurePosixPath(pattern).name)]
+
+
+def _frame_column(names: Sequence[Sequence[str]], words: Sequence[str]) -> int:
+    """Return which of the numbers of names counts frames; see :func:`in_sequences`.
+
+    >>> names = [["0001", "0"], ["0001", "1"], ["0002", "0"], ["0002", "1"]]
+    >>> _frame_column(names, ["", ""]), _frame_column(names, ["shot", "frame"])
+    (0, 1)
+    """
+    ranks = []
+    for n, texts in enumerate(zip(*names, strict=True)):
+        word = (words[n] in FRAME_WORDS) - (words[n] in OTHER_WORDS)
+        is_padded = len(set(map(len, texts))) == 1 and texts[0].startswith("0") and texts[0] != "0"
+        ranks.append((len(set(texts)) > 1, word, is_padded, n))
+    return max(ranks)[-1] if ranks else 0
 
 
 def _name(pattern: str, numbers: Sequence[str], frame: int) -> str:
@@ -117,14 +180,25 @@ def _name(pattern: str, numbers: Sequence[str], frame: int) -> str:
     return str(path.with_name(re.sub(r"([._-])[._-]+", r"\1", filled).strip("._-") or "frames"))
 
 
-def _placed(key: str, frames: Sequence[tuple[int, Job]]) -> Iterator[Job]:
+def _placed(key: str, frames: Sequence[tuple[Fraction, Job]]) -> Iterator[Job]:
     """Yield the jobs of a sequence with their places, in temporal order."""
     numbers = sorted({number for number, _ in frames})
-    step = math.gcd(*(number - numbers[0] for number in numbers)) or 1
-    count = (numbers[-1] - numbers[0]) // step + 1
+    unit = math.lcm(*(number.denominator for number in numbers))
+    step = Fraction(math.gcd(*(int((n - numbers[0]) * unit) for n in numbers)) or unit, unit)
+    count = int((numbers[-1] - numbers[0]) / step) + 1
+    if count > MAX_PLACES or (numbers[0] >= STAMP and count > len(numbers)):
+        text = "its numbers are time stamps: frames have their order, but equal intervals"
+        log.warning("%s: %s", printable(key), text)
+        places = {number: place for place, number in enumerate(numbers)}
+        frames = [(Fraction(places[number]), job) for number, job in frames]
+        numbers = sorted(map(Fraction, places.values()))
+        step, count = Fraction(1), len(numbers)
     gaps = [(a + step, b - step) for a, b in pairwise(numbers) if b > a + step]
     if gaps:
-        texts = [f"{a}" if a == b else f"{a} to {b}" for a, b in gaps[:MAX_GAPS]]
+        texts = [
+            f"{float(a):g}" if a == b else f"{float(a):g} to {float(b):g}"
+            for a, b in gaps[:MAX_GAPS]
+        ]
         more = f", and {len(gaps) - MAX_GAPS} more gaps" if len(gaps) > MAX_GAPS else ""
         missing = f"{count - len(numbers)} of {count} frames are missing: {', '.join(texts)}{more}"
         log.warning("%s: %s", printable(key), missing)
@@ -134,12 +208,12 @@ def _placed(key: str, frames: Sequence[tuple[int, Job]]) -> Iterator[Job]:
         folder = PurePosixPath(job.stem).parent
         is_folder = folder.name == PurePosixPath(key).name
         sequence = str(folder if is_folder else folder / PurePosixPath(key).name)
-        place = Place(key, sequence, (number - numbers[0]) // step, count)
+        place = Place(key, sequence, int((number - numbers[0]) / step), count)
         # The run itself rejects two jobs with the same outputs.
         if place in by_place and by_place[place].stem != job.stem:
             raise RequestError(
-                f"{by_place[place].label} and {job.label} are both frame {number} of the sequence "
-                f"{sequence}; remove or rename one of them"
+                f"{by_place[place].label} and {job.label} are both frame {float(number):g} of the "
+                f"sequence {sequence}; remove or rename one of them"
             )
         by_place[place] = job
         yield replace(job, place=place)
