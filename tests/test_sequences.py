@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 
 import clpipe
@@ -493,3 +494,30 @@ def test_a_run_names_its_sequences(clpipe, write_exr):
         write_exr(f"{name}.exr", np.full((8, 8, 3), 0.2))
     stderr = clpipe("run", "rig", "-o", "out", "--sequence", "--device", "numpy").stderr
     assert "clpipe: 2 sequences of 2 frames: cam0_f, cam1_f" in stderr
+
+
+def test_all_frames_of_a_sequence_have_one_layer(clpipe, tmp_path):
+    for number in range(1, 5):
+        combined = {f"Combined.{c}": np.full((8, 8), 0.6, np.float32) for c in "RGB"}
+        noisy = {f"beauty.{c}": np.full((8, 8), 0.1, np.float32) for c in "RGB"}
+        Path("in").mkdir(exist_ok=True)
+        OpenEXR.File({}, noisy | (combined if number < 3 else {})).write(f"in/f.{number}.exr")
+    run = ("run", "in", "-o", "out", "--sequence", "--device", "numpy")
+    stderr = clpipe(*run, status=1).stderr
+    message = "f.4.exr: its picture is the layer 'beauty', but that of the first frame of its"
+    assert message in stderr and "choose one for all frames with --layer" in stderr
+    assert sorted(path.stem for path in Path("out").glob("*.jpg")) == ["f.1", "f.2"]
+    clpipe(*run, "--layer", "beauty", "--redo", "all")
+    assert len(list(Path("out").glob("*.jpg"))) == 4
+
+
+def test_a_frame_without_a_picture_fails_if_the_first_has_one(clpipe):
+    Path("in").mkdir()
+    for number in range(1, 4):
+        name = "Combined" if number < 3 else "Depth"
+        planes = {f"{name}.{c}": np.full((8, 8), 0.6, np.float32) for c in "RGB"}
+        OpenEXR.File({}, planes).write(f"in/f.{number}.exr")
+        OpenEXR.File({}, {"Depth.Z": planes[f"{name}.R"]}).write(f"in/f.{number}_depth.exr")
+    result = clpipe("run", "in", "-o", "out", "--sequence", "--device", "numpy", status=1)
+    assert "f.3.exr: has no layer with the finished picture" in result.stderr
+    assert "2 of 3 images done, 1 failed" in result.stderr

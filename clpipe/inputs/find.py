@@ -78,6 +78,7 @@ class Job:
         problem: why it cannot be processed, if that is known before it is read.
         is_panorama: whether its files are views of a panorama and not sub-frames.
         place: its place in a sequence; None if it is a single image.
+        first: the file of the first frame of its sequence.
     """
 
     path: Path
@@ -94,6 +95,7 @@ class Job:
     problem: str = ""
     is_panorama: bool = False
     place: Place | None = None
+    first: Path | None = None
 
     def check(self) -> None:
         """Raise the known problem of this job, if there is one.

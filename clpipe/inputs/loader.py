@@ -48,6 +48,7 @@ from clpipe.inputs.panoramas import (
     wide_lens_of,
 )
 from clpipe.inputs.raw import RawImage, RawLoader, may_be_dump
+from clpipe.inputs.sequences import check_same_layer, picture_layer
 from clpipe.inputs.subframes import average, exposures, shutter_of
 from clpipe.reference.geometry import Margins
 from clpipe.stage import ImageLayer, Kind, Span, StageRole
@@ -258,6 +259,8 @@ class ImageLoader:
                 f"has {job.size[0]}x{job.size[1]}. Correct the camera's size, or render at that "
                 "size"
             )
+        if is_render and job.first and not self.request.layer:
+            check_same_layer(job.path, source.layer, job.first)
         return source
 
     def shutter(self, job: Job) -> Rows | None:
@@ -372,8 +375,11 @@ class ImageLoader:
 
     def is_skipped(self, job: Job, error: Exception) -> bool:
         """Return whether an image that cannot be used is skipped, because it is from a folder."""
-        is_of_other_step = isinstance(error, KindError) and self.kept is not None
-        return not job.named_by_user and (is_of_other_step or isinstance(error, NoPictureError))
+        if job.named_by_user:
+            return False
+        if isinstance(error, NoPictureError):  # a frame has a picture if the first one has
+            return job.first in (None, job.path) or picture_layer(job.first) is None
+        return isinstance(error, KindError) and self.kept is not None
 
     def error_text(self, job: Job, error: Exception) -> str:
         """Return the message of an error, with the name of the file and a way to correct it."""

@@ -7,11 +7,16 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
-from clpipe.base.errors import RequestError
-from clpipe.base.text import printable
+from clpipe.base.digests import stamp_of
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.text import one_line, printable
+from clpipe.base.urls import may_be_url
+from clpipe.images.layers import find_picture
+from clpipe.images.openimageio import open_image
 from clpipe.inputs.find import Job, Place
 
 log = logging.getLogger(__name__)
@@ -203,6 +208,7 @@ def _placed(key: str, frames: Sequence[tuple[Fraction, Job]]) -> Iterator[Job]:
         missing = f"{count - len(numbers)} of {count} frames are missing: {', '.join(texts)}{more}"
         log.warning("%s: %s", printable(key), missing)
     by_place: dict[Place, Job] = {}
+    first = min(frames, key=lambda frame: frame[0])[1].path
     for number, job in sorted(frames, key=lambda frame: frame[0]):
         # A directory for an ISO or a camera may precede the key.
         folder = PurePosixPath(job.stem).parent
@@ -216,4 +222,40 @@ def _placed(key: str, frames: Sequence[tuple[Fraction, Job]]) -> Iterator[Job]:
                 f"sequence {sequence}; remove or rename one of them"
             )
         by_place[place] = job
-        yield replace(job, place=place)
+        yield replace(job, place=place, first=first)
+
+
+def check_same_layer(path: Path, layer: str, first: Path) -> None:
+    """Check that the picture of a frame is the same layer as that of its sequence's first frame.
+
+    Raises:
+        ImageError: it is another layer.
+    """
+    expected = None if path == first else picture_layer(first)
+    if expected not in (None, layer):
+        own, other = (
+            f"the layer {one_line(each)!r}" if each else "no layer" for each in (layer, expected)
+        )
+        raise ImageError(
+            f"{path}: its picture is {own}, but that of the first frame of its sequence, {first}, "
+            f"is {other}; choose one for all frames with --layer"
+        )
+
+
+def picture_layer(path: Path) -> str | None:
+    """Return the name of the layer that contains the picture of an OpenEXR file.
+
+    It is None if the file has no picture, is at a URL, or has another format.
+    """
+    if path.suffix.lower() != ".exr" or may_be_url(path):
+        return None
+    try:
+        return _picture_layer(path, stamp_of(path))
+    except (ImageError, OSError):
+        return None
+
+
+@lru_cache(maxsize=64)
+def _picture_layer(path: Path, _stamp: object) -> str:
+    with open_image(path) as file:
+        return find_picture(path, file, False, None).layer
