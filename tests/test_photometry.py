@@ -2,14 +2,16 @@
 
 import json
 import math
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 
+import exifread
 import numpy as np
 import pytest
 from PIL import Image
 
-from clpipe.images.lens_tag import with_lens_model
+from clpipe.images.exif_block import with_lens_model
 from clpipe.images.tags import Tags
 from clpipe.images.write import write_display
 
@@ -191,3 +193,32 @@ def test_the_lens_is_put_into_a_file_that_stays_as_it_was(tmp_path, ending):
         assert dict(one.getexif()) | {0x8769: 0} == dict(other.getexif()) | {0x8769: 0}
         own, found = (dict(each.getexif().get_ifd(0x8769)) for each in (one, other))
         assert found == own | {0xA434: "Lens 35mm"}
+
+
+@pytest.mark.parametrize(("shape", "lens"), [((700, 1100, 3), ""), ((1024, 40, 1), "Lens 35mm")])
+def test_a_large_jpeg_has_a_thumbnail(tmp_path, monkeypatch, shape, lens):
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    pixels = (127 + 100 * np.sin(columns / 90) * np.cos(rows / 70))[..., None]
+    pixels = np.repeat(pixels, shape[2], axis=2).astype(np.uint8)
+    pixels[..., 0] //= 2
+    tags = Tags("Maker", "Model", 400, lens=lens)
+    write_display(tmp_path / "a.jpg", pixels, tags)
+    monkeypatch.setattr("clpipe.images.write.THUMBNAIL_FROM", 5000)
+    write_display(tmp_path / "b.jpg", pixels, tags)
+    with Image.open(tmp_path / "a.jpg") as one, Image.open(tmp_path / "b.jpg") as other:
+        assert np.array_equal(np.asarray(one), np.asarray(other))
+        assert dict(one.getexif()) == dict(other.getexif())
+        assert not other.getexif().get_ifd(1)
+    with (tmp_path / "a.jpg").open("rb") as file:
+        small = exifread.process_file(file)["JPEGThumbnail"]
+    with Image.open(BytesIO(small)) as found, Image.fromarray(pixels.squeeze()) as whole:
+        assert found.width <= 160 and found.height <= 120 and max(found.size) >= 120
+        difference = np.float32(found) - np.float32(whole.resize(found.size, Image.Resampling.BOX))
+    assert abs(difference).mean() < 3
+
+
+def test_small_jpegs_and_other_formats_have_no_thumbnail(tmp_path):
+    for name, side in (("a.jpg", 512), ("b.png", 1200), ("c.tif", 1200)):
+        write_display(tmp_path / name, np.zeros((side, 9, 3), np.uint8), Tags("M", "N", 100))
+        with Image.open(tmp_path / name) as picture:
+            assert not picture.getexif().get_ifd(1)

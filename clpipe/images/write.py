@@ -21,7 +21,7 @@ from clpipe.base.system import max_file_size, temporary_file
 from clpipe.base.types import Array, Floats
 from clpipe.images.attributes import PREFIX
 from clpipe.images.encoding import Encoding
-from clpipe.images.lens_tag import with_lens_model
+from clpipe.images.exif_block import with_lens_model, with_thumbnail
 from clpipe.images.openexr import write_channels
 from clpipe.images.openimageio import error_text
 from clpipe.images.pixels import HALF_MAX
@@ -30,6 +30,7 @@ from clpipe.reference.geometry import NO_MARGINS, Margins
 
 JPEG_MAX_SIDE = 65500
 LENS, NO_LENS = "Exif:LensModel", ("jpg", "png")  # OpenImageIO omits the tag in these formats
+THUMBNAIL_FROM = 1024  # px, width or height; smaller JPEGs, such as crops for training, have none
 # Without a time, OpenImageIO adds the current one, and the bytes would differ in each run.
 NO_TIME = "1970:01:01 00:00:00"
 
@@ -230,8 +231,12 @@ def _encode(format_: str, to: str, spec: Any, pixels: Array) -> None:
         raise OSError(0, error_text(file.geterror() if file else oiio.geterror()))
     if not file.close():
         raise OSError(0, error_text(file.geterror()))
-    if format_ in NO_LENS and (lens := spec.getattribute(LENS)):
-        Path(to).write_bytes(with_lens_model(Path(to).read_bytes(), lens))
+    lens = format_ in NO_LENS and spec.getattribute(LENS)
+    has_thumbnail = format_ == "jpg" and max(data.shape) >= THUMBNAIL_FROM
+    if lens or has_thumbnail:
+        encoded = Path(to).read_bytes()
+        encoded = with_lens_model(encoded, lens) if lens else encoded
+        Path(to).write_bytes(with_thumbnail(encoded, data) if has_thumbnail else encoded)
 
 
 @cache
