@@ -7,7 +7,7 @@ import re
 import pytest
 
 from clpipe.base.errors import RequestError
-from clpipe.inputs.camera_keys import KEYS, check_keys
+from clpipe.inputs.camera_keys import COLMAP, TRANSFORMS, check_keys
 from clpipe.inputs.render_cameras import read_views
 
 # Keys that nerfstudio's parser of transforms.json reads, per file and per frame (version 1.1).
@@ -24,7 +24,7 @@ integer_depth_scale sharpness driver_parameters envmap normal_file_path n_frames
 
 @pytest.mark.parametrize("name", [*NERFSTUDIO.split(), *INSTANT_NGP.split()])
 def test_each_key_of_a_parser_has_a_disposition(name):
-    assert KEYS[name].meaning
+    assert TRANSFORMS.statements[name].meaning
 
 
 def view_of(tmp_path, **keys):
@@ -81,7 +81,29 @@ def test_a_model_of_colmap_is_rejected_by_its_name(tmp_path, model):
     (tmp_path / "cameras.txt").write_text(f"1 {model} 48 32 40 24 16 0.1\n")
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
     [view] = read_views(tmp_path)
-    assert view.problem.startswith(f"its camera has the model {model}, but renders have no lens")
+    assert re.match(
+        rf"its camera has the model {model} \(.*\), but renders have no lens", view.problem
+    )
+
+
+def test_a_distortion_of_colmap_has_its_name(tmp_path):
+    (tmp_path / "cameras.txt").write_text("1 FULL_OPENCV 48 32 40 40 24 16 0 0 0 0 0 0.02 0 0\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
+    [view] = read_views(tmp_path)
+    assert "has distortion (k4 0.02)" in view.problem
+
+
+def test_all_models_of_colmap_have_a_disposition():
+    # colmap/sensor/models.h, version 4
+    models = """SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV OPENCV_FISHEYE FULL_OPENCV FOV
+    SIMPLE_RADIAL_FISHEYE RADIAL_FISHEYE THIN_PRISM_FISHEYE RAD_TAN_THIN_PRISM_FISHEYE
+    SIMPLE_DIVISION DIVISION SIMPLE_FISHEYE FISHEYE EUCM EQUIRECTANGULAR"""
+    assert {*models.split()} == {*COLMAP.statements}
+
+
+def test_an_unknown_key_of_a_colour_is_named(tmp_path, caplog):
+    assert not view_of(tmp_path, color_space="acescg", note="x").problem
+    assert "clpipe does not know its color_space, and does not use it" in caplog.text
 
 
 def test_a_file_without_views_is_rejected(tmp_path):

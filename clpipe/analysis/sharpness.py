@@ -50,7 +50,7 @@ def slanted_edge(contrast: float, angle: float, size: int = 120, middle: float =
     """Return a render of a grey slanted edge, (size, size, 3), in linear light.
 
     >>> edge = slanted_edge(4, 0, size=8)
-    >>> edge[0, [0, -1], 0].round(2).tolist()
+    >>> edge[0, [0, -1], 0].astype(float).round(2).tolist()
     [0.09, 0.36]
 
     Args:

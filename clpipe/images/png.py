@@ -1,7 +1,7 @@
 """Reads the colour chunks of a PNG (PNG specification, third edition, 2025)."""
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,13 +36,17 @@ class PngColours:
     unknown: str = ""
 
 
-def png_colours(path: Path) -> PngColours:
-    """Return the colours that the chunks of a PNG state, from the chunk of highest priority.
+def read_chunks(path: Path) -> dict[bytes, bytes]:
+    """Return the chunks of a PNG before its samples, by name; b"" stands for a long content.
 
     Raises:
         OSError: the file cannot be read.
     """
-    chunks = dict(_chunks(path))
+    return dict(_chunks(path))
+
+
+def png_colours(chunks: Mapping[bytes, bytes]) -> PngColours:
+    """Return the colours that the chunks of a PNG state, from the chunk of highest priority."""
     if len(chunks.get(b"cICP", b"")) == 4:
         primaries, number = chunks[b"cICP"][:2]
         unknown = "" if primaries in PRIMARIES else f"primaries {primaries}"

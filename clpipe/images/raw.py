@@ -24,6 +24,7 @@ from clpipe.images.encoding import SIMULATED
 from clpipe.images.pixels import DEFAULT_MAX_PIXELS, MAX_PIXELS, check_size
 from clpipe.images.tags import DATE
 from clpipe.images.two_lights import TEMPERATURES, Light, camera_to_srgb
+from clpipe.images.vocabularies import dng_warnings, raw_compression
 from clpipe.reference.cfa import PATTERNS
 from clpipe.reference.filter_array import MONO
 
@@ -80,6 +81,7 @@ class RawInfo:
     aperture: float | None
     focal_length: float | None  # mm
     taken: str  # "YYYY:MM:DD HH:MM:SS", or ""
+    unused: tuple[str, ...] = ()  # sentences about what the file states, and clpipe does not use
 
     @property
     def black_level(self) -> int:
@@ -135,6 +137,7 @@ def read_raw_info(path: Path, max_pixels: int = DEFAULT_MAX_PIXELS) -> RawInfo:
             aperture=exif.number("FNumber", aperture),
             focal_length=exif.number("FocalLength", focal_length),
             taken=next(filter(DATE.fullmatch, map(exif.text, DATE_TAGS)), ""),
+            unused=tuple(dng_warnings(path)),
         )
 
 
@@ -224,6 +227,11 @@ def _open_raw(path: Path, max_pixels: int) -> Iterator[Any]:
     except rawpy.LibRawError as error:
         reason = error.args[0].decode() if isinstance(error.args[0], bytes) else str(error)
         hint = f"; {DUMP_HINT}" if path.suffix.lower() == ".raw" else ""
+        if compression := raw_compression(path):
+            raise ImageError(
+                f"{path}: its compression, {compression}, is not supported by LibRaw; convert it "
+                "to a DNG with lossless compression"
+            ) from None
         raise ImageError(
             f"{path}: the file is damaged, or LibRaw does not support it: {reason}{hint}"
         ) from None

@@ -1,5 +1,6 @@
 """Reads what a file states about its samples: colours, transfer curve, alpha, orientation."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from clpipe.images.colour_names import ColourSpace, space_of
 from clpipe.images.openimageio import radiance_header
 from clpipe.images.pixels import convert_by_rows
 from clpipe.images.tags import FLIPS, upright
+from clpipe.images.vocabularies import vocabulary_warnings
 
 
 @dataclass(frozen=True)
@@ -107,8 +109,10 @@ def read_statements(path: Path, file: Any, xyz: bool = False) -> Statements:
     warnings += notes
     chromaticities = chromaticities or (space and space.chromaticities)
     curve = ""
+    chunks: Mapping[bytes, bytes] = {}
     if format_ == "png":
-        colours = png_colours(path)
+        chunks = png_chunks(path)
+        colours = png.png_colours(chunks)
         chromaticities = chromaticities or colours.chromaticities
         if colours.curve not in ("", "srgb", "linear"):
             curve = f"{colours.curve} ({colours.chunk} chunk)"
@@ -116,6 +120,7 @@ def read_statements(path: Path, file: Any, xyz: bool = False) -> Statements:
             curve = colours.curve
         if colours.unknown:
             warnings.append(f"its cICP chunk states unknown {colours.unknown}; it is read as sRGB")
+    warnings += vocabulary_warnings(path, format_, spec, chunks)
     stated = spec.getattribute("Orientation") if format_ != "openexr" else 1
     if header:
         stated = header.orientation  # OpenImageIO 3.2 swaps two of the eight orientations
@@ -150,14 +155,14 @@ def _named_space(path: Path, spec: Any) -> tuple[ColourSpace | None, list[str]]:
     return space, warnings
 
 
-def png_colours(path: Path) -> png.PngColours:
-    """Return the colours that a PNG states.
+def png_chunks(path: Path) -> dict[bytes, bytes]:
+    """Return the chunks of a PNG before its samples, by name.
 
     Raises:
         ImageError: the file cannot be read.
     """
     with read_errors(path):
-        return png.png_colours(path)
+        return png.read_chunks(path)
 
 
 def _profile(spec: Any) -> str:

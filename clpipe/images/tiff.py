@@ -1,13 +1,17 @@
-"""The bytes of a TIFF file: fields and directories, little-endian (TIFF 6.0, 1992).
+"""The bytes of a TIFF file: fields and directories, written little-endian (TIFF 6.0, 1992).
 
 A function named after a TIFF type makes a field of that type from its values.
 """
 
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import BinaryIO
 
 from clpipe.base.types import Array
 
@@ -27,6 +31,14 @@ class Field:
 
 
 Directory = dict[int, Field]  # fields by tag number
+
+# Codes of TIFF's types for :mod:`struct`: bytes, text, numbers, fractions, signed ones, floats, and
+# those of BigTIFF.
+CODES = {1: "B", 2: "B", 3: "H", 4: "I", 5: "II", 6: "b", 7: "B", 8: "h", 9: "i", 10: "ii"}
+CODES |= {11: "f", 12: "d", 13: "I", 16: "Q", 17: "q", 18: "Q"}
+SUB_DIRECTORIES = 330  # the tag with their offsets
+MOST_DIRECTORIES = 64
+MOST_BYTES = 1 << 16  # of the values of a field; more are left out
 
 
 def _numbers(type_: int, code: str, *values: float) -> Field:
@@ -128,3 +140,44 @@ def exif_fields(tags: Mapping[str, float | str]) -> Directory:
         tag, make_field = types[name]
         fields[tag] = make_field(value)
     return fields
+
+
+def read_directories(path: Path) -> Iterator[dict[int, tuple[float, ...]]]:
+    """Yield the values of a TIFF's first directory by their tags, then those of its parts.
+
+    Directories that are damaged, or of another format, are left out,
+    because the reader of the pixels reports it better.
+    """
+    with suppress(OSError, LookupError, OverflowError, struct.error), path.open("rb") as file:
+        start = file.read(16)
+        order = {b"II": "<", b"MM": ">"}[start[:2]]
+        (version,) = struct.unpack_from(f"{order}H", start, 2)
+        big = {42: False, 43: True}[version]
+        offsets = [struct.unpack_from(f"{order}{'Q' if big else 'I'}", start, 8 if big else 4)[0]]
+        for offset in islice(offsets, MOST_DIRECTORIES):
+            directory = _read_directory(file, offset, order, big)
+            offsets += map(int, directory.get(SUB_DIRECTORIES, ()))
+            yield directory
+
+
+def _read_directory(
+    file: BinaryIO, offset: int, order: str, big: bool
+) -> dict[int, tuple[float, ...]]:
+    count_code, entry_code, inside = ("Q", "HHQ8s", 8) if big else ("H", "HHI4s", 4)
+    file.seek(offset)
+    (count,) = struct.unpack(f"{order}{count_code}", file.read(8 if big else 2))
+    entries = file.read(min(count, 1 << 16) * (20 if big else 12))
+    found: dict[int, tuple[float, ...]] = {}
+    for tag, type_, number, data in struct.iter_unpack(f"{order}{entry_code}", entries):
+        codes = CODES.get(type_, "") * min(number, MOST_BYTES)
+        size = struct.calcsize(order + codes)
+        content = data[:size]
+        if size > inside:
+            file.seek(struct.unpack(f"{order}{'Q' if big else 'I'}", data)[0])
+            content = file.read(size)
+        values = struct.unpack(order + codes, content)
+        if len(CODES.get(type_, "")) == 2:
+            fractions = zip(values[::2], values[1::2], strict=True)
+            values = tuple(above / below if below else 0.0 for above, below in fractions)
+        found[tag] = values
+    return found

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.text import whole_number
+from clpipe.inputs.annotation_keys import BOP, name_unknown
 from clpipe.inputs.annotations import (
     MAX_COORDINATE,
     MAX_PIXELS,
@@ -92,6 +93,9 @@ def read_bop(path: Path) -> Bop:
         matrix = camera.get("cam_K", [0] * 9) if isinstance(camera, dict) else None
         if not isinstance(matrix, list) or len(matrix) != 9 or not all(map(_is_number, matrix)):
             reject(path.with_name(CAMERAS), f"{image}.cam_K", matrix, "nine numbers")
+    objects_of_all = [each for render in renders for each in render.content]
+    records = [record for each in objects_of_all for record in (each.pose, each.info)]
+    name_unknown(path, BOP, [*records, *cameras.values()])
     return Bop(path, renders, cameras)
 
 

@@ -7,70 +7,76 @@ lens distortion, so keys of a lens must state none.
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
-Disposition = Literal["used", "no lens", "ignored"]
+from clpipe.base.vocabulary import Vocabulary
 
-
-@dataclass(frozen=True)
-class Key:
-    """A key of a camera file.
-
-    Args:
-        name: the key.
-        disposition: "used" by clpipe; "no lens" if it must be 0, false or empty; or "ignored".
-        meaning: what it says; for ignored keys, why that does not matter.
-    """
-
-    name: str
-    disposition: Disposition
-    meaning: str
-
-
-_MEANINGS: dict[Disposition, dict[str, str]] = {
-    "used": {
-        "focal length in px": "fl_x fl_y",
-        "principal point in px": "cx cy",
-        "image size in px": "w h",
-        "angle of view in radians": "camera_angle_x camera_angle_y",
-        "camera to world, OpenGL axes": "transform_matrix",
-        "name of the image": "file_path",
-        "model of the camera": "camera_model camera_type",
-        "the cameras of all images": "frames",
+TRANSFORMS = Vocabulary.of(
+    "transforms.json",
+    "nerfstudio's parser (1.1), instant-ngp's loader, the NeRF authors' scenes, Agisoft's model",
+    {
+        "used": {
+            "focal length in px": "fl_x fl_y",
+            "principal point in px": "cx cy",
+            "image size in px": "w h",
+            "angle of view in radians": "camera_angle_x camera_angle_y",
+            "camera to world, OpenGL axes": "transform_matrix",
+            "name of the image": "file_path",
+            "model of the camera": "camera_model camera_type",
+            "the cameras of all images": "frames",
+        },
+        "rejected": {
+            "radial distortion": "k1 k2 k3 k4 k5 k6 k7",
+            "tangential distortion": "p1 p2 p3 p4",
+            "thin prism distortion": "s1 s2 s3 s4 sx1 sy1",
+            "tilt of the sensor": "tau_x tau_y tauX tauY",
+            "skew of the pixels": "b1 b2 skew",
+            "distortion coefficients": "distortion_params distortion",
+            "fisheye lens": "is_fisheye ftheta_p0 ftheta_p1 ftheta_p2 ftheta_p3 ftheta_p4",
+            "latitude-longitude lens": "latlong",
+            "shift of the lens": "shift_x shift_y",
+        },
+        "ignored": {
+            "the scene's box, not the camera's": "aabb_scale aabb scale offset up near far",
+            "how training uses the images": "train_filenames val_filenames test_filenames "
+            "auto_scale_poses_override orientation_override sharpness n_extra_learnable_dims "
+            "white_transparent black_transparent from_na enable_depth_loading enable_ray_loading",
+            "other files": "ply_file_path depth_file_path mask_path mask_file_path depth_path "
+            "hash_path envmap normal_file_path sparse_filename",
+            "how poses were transformed, which clpipe's views need not undo": "applied_transform "
+            "applied_scale camera_extrinsics n_frames",
+            "the unit of depths, which carried layers do not change": "depth_unit_scale_factor "
+            "integer_depth_scale",
+            "where an image came from": "colmap_im_id camera_id timestamp time rotation fps "
+            "driver_parameters light_file",
+        },
     },
-    "no lens": {
-        "radial distortion": "k1 k2 k3 k4 k5 k6 k7",
-        "tangential distortion": "p1 p2 p3 p4",
-        "thin prism distortion": "s1 s2 s3 s4 sx1 sy1",
-        "tilt of the sensor": "tau_x tau_y tauX tauY",
-        "skew of the pixels": "b1 b2 skew",
-        "distortion coefficients": "distortion_params distortion",
-        "fisheye lens": "is_fisheye ftheta_p0 ftheta_p1 ftheta_p2 ftheta_p3 ftheta_p4",
-        "latitude-longitude lens": "latlong",
-        "shift of the lens": "shift_x shift_y",
-    },
-    "ignored": {
-        "the scene's box, not the camera's": "aabb_scale aabb scale offset up near far",
-        "how training uses the images": "train_filenames val_filenames test_filenames "
-        "auto_scale_poses_override orientation_override sharpness n_extra_learnable_dims "
-        "white_transparent black_transparent from_na enable_depth_loading enable_ray_loading",
-        "other files": "ply_file_path depth_file_path mask_path mask_file_path depth_path "
-        "hash_path envmap normal_file_path sparse_filename",
-        "how poses were transformed, which clpipe's views need not undo": "applied_transform "
-        "applied_scale camera_extrinsics n_frames",
-        "the unit of depths, which carried layers do not change": "depth_unit_scale_factor "
-        "integer_depth_scale",
-        "where an image came from": "colmap_im_id camera_id timestamp time rotation fps "
-        "driver_parameters light_file",
-    },
+)
+# For COLMAP's models that can describe a pinhole: all parameters, in their order.
+COLMAP_MODELS = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
 }
-KEYS = {
-    name: Key(name, disposition, meaning)
-    for disposition, meanings in _MEANINGS.items()
-    for meaning, names in meanings.items()
-    for name in names.split()
-}
+OF_PINHOLE = ("f", "fx", "fy", "cx", "cy")  # the parameters that are not of a lens
+COLMAP = Vocabulary.of(
+    "COLMAP cameras.txt",
+    "colmap/sensor/models.h (4.0)",
+    {
+        "used": {"a pinhole, with distortion of 0 only": " ".join(COLMAP_MODELS)},
+        "rejected": {
+            "fisheye": "OPENCV_FISHEYE SIMPLE_RADIAL_FISHEYE RADIAL_FISHEYE SIMPLE_FISHEYE FISHEYE",
+            "fisheye with thin prism": "THIN_PRISM_FISHEYE RAD_TAN_THIN_PRISM_FISHEYE",
+            "field of view": "FOV",
+            "division": "SIMPLE_DIVISION DIVISION",
+            "enhanced unified": "EUCM",
+            "panorama": "EQUIRECTANGULAR",
+        },
+    },
+)
 # Unknown keys with such names may describe a lens.
 LENS_LIKE = re.compile(
     r"[bkpst]_?\d{1,2}|xi|alpha|beta|.*(distort|fisheye|skew|tilt|prism|lens|fov|shear|radial"
@@ -89,7 +95,7 @@ def check_keys(values: Mapping[str, Any]) -> None:
     >>> check_keys({"k1": 0, "is_fisheye": False, "aabb_scale": 16})
     """
     for name, value in values.items():
-        known = KEYS.get(name)
+        known = TRANSFORMS.statements.get(name)
         if name == "camera_type" and str(value).lower() not in PERSPECTIVE:
             raise ValueError(
                 f"camera_type: found {value!r}, but renders are perspective pictures; remove it, "
@@ -97,7 +103,7 @@ def check_keys(values: Mapping[str, Any]) -> None:
             )
         if _states_nothing(value):
             continue
-        is_lens = known.disposition == "no lens" if known else LENS_LIKE.fullmatch(name)
+        is_lens = known.disposition == "rejected" if known else LENS_LIKE.fullmatch(name)
         if is_lens:
             meaning = known.meaning if known else "an unknown key, which may describe a lens"
             raise ValueError(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import RequestError
+from clpipe.inputs.annotation_keys import COCO, name_unknown
 from clpipe.inputs.annotations import MAX_COORDINATE, MAX_PIXELS, AnnotatedRender, Record, reject
 
 REQUIRED_LISTS = ("images", "annotations", "categories")
@@ -78,6 +79,7 @@ def read_coco(path: Path, values: Any) -> Coco:
             reject(path, place, f"image_id {each['image_id']!r}", expected)
         _check(path, place, each, size_by_name[names[each["image_id"]]])
         of_image[each["image_id"]].append(each)
+    name_unknown(path, COCO, [values, *images, *annotations])
     return Coco(path, values, of_image)
 
 

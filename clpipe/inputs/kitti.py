@@ -14,6 +14,7 @@ import numpy as np
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import read_named_text
 from clpipe.base.types import Doubles
+from clpipe.inputs.annotation_keys import KITTI, name_unknown
 from clpipe.inputs.annotations import MAX_BYTES, MAX_COORDINATE, AnnotatedRender, reject
 
 FIELD_COUNT = 15  # fields of a line, without a score
@@ -72,6 +73,7 @@ def read_kitti(folder: Path) -> Kitti:
         calibration_file = folder.parent / CALIBRATION / path.name
         if calibration_file.is_file():
             calibrations[path.stem] = _calibration(calibration_file)
+    name_unknown(folder, KITTI, calibrations.values())
     return Kitti(folder, renders, calibrations)
 
 

@@ -104,7 +104,7 @@ class RawLoader:
         if isinstance(image.facts, Dump):
             warnings += input_warnings(image, chain)
             return chain, replace(image, warnings=tuple(warnings))
-        warnings += brightness_warnings(image, chain)
+        warnings += [*image.facts.unused, *brightness_warnings(image, chain)]
         white = getattr(chain.steps[0].method, "white_level", 65535.0)
         if np.count_nonzero(image.pixels >= white) > image.pixels.size / 2:
             warnings.append(f"most samples are at or above the white level of {white:g} DN")

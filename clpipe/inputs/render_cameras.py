@@ -2,6 +2,7 @@
 folder with COLMAP's text model.
 """
 
+import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,20 +14,18 @@ import numpy as np
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import parse_json, read_named, read_named_text
 from clpipe.base.types import Array
-from clpipe.inputs.camera_keys import check_keys
+from clpipe.inputs.camera_keys import (
+    COLMAP,
+    COLMAP_MODELS,
+    LENS_LIKE,
+    OF_PINHOLE,
+    TRANSFORMS,
+    check_keys,
+)
 from clpipe.inputs.manifest import MANIFEST_BYTES
 from clpipe.reference.pose import from_opengl, from_quaternion
 
-# For COLMAP's models that can describe a pinhole: the parameters before the distortion
-# coefficients.
-FOCAL_LENGTHS = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fx", "fy", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy"),
-    "RADIAL": ("f", "cx", "cy"),
-    "OPENCV": ("fx", "fy", "cx", "cy"),
-    "FULL_OPENCV": ("fx", "fy", "cx", "cy"),
-}
+log = logging.getLogger(__name__)
 
 ANGLES = ("camera_angle_x", "camera_angle_y")  # keys of a transforms.json
 ANGLE_TOLERANCE = 0.01  # relative, of the focal length that an angle means
@@ -98,6 +97,12 @@ def read_views(path: Path) -> list[View]:
     for key, parse in PARSERS.items():
         listed = values.get(key) if isinstance(values, dict) else None
         if isinstance(listed, list) and listed:
+            if parse is _from_frame:
+                keys = {k for each in [values, *listed] if isinstance(each, dict) for k in each}
+                # The view of a key like those of lenses has a problem.
+                others = sorted(key for key in keys if not LENS_LIKE.fullmatch(key))
+                for sentence in TRANSFORMS.warnings(others):
+                    log.warning("--poses %s: %s", path, sentence)
             return [
                 _parse_view(path, number, each, values, parse) for number, each in enumerate(listed)
             ]
@@ -252,15 +257,17 @@ def _from_image(name: str, pose: Sequence[str], camera: Sequence[str]) -> View:
     )
     if not q.any():
         raise ValueError("its quaternion is 0")
-    names = FOCAL_LENGTHS.get(model, ())
     parameters = number_array("PARAMS", [_number(text) for text in texts], None).tolist()
-    if names and len(parameters) < len(names):
+    every = COLMAP_MODELS.get(model, "").split()
+    names = [name for name in every if name in OF_PINHOLE]
+    if every and len(parameters) < len(names):
         raise ValueError(
             f"its camera has {len(parameters)} parameters, but {model} needs {' '.join(names)}"
         )
-    rest = {f"parameter {i + 1}": value for i, value in enumerate(parameters) if i >= len(names)}
-    _check_pinhole(model, rest)
-    values: dict[str, Any] = dict(zip(names, parameters, strict=False))
+    known = dict(zip(every, parameters, strict=False))
+    unknown = {f"parameter {i + 1}": v for i, v in enumerate(parameters) if i >= len(every)}
+    _check_pinhole(model, {k: v for k, v in (known | unknown).items() if k not in OF_PINHOLE})
+    values: dict[str, Any] = {name: known[name] for name in names}
     if "f" in values:
         values = {"fx": values.pop("f"), **values}
     values |= {"rotation": from_quaternion(q.tolist()).tolist(), "translation": t.tolist()}
@@ -315,12 +322,14 @@ def _check_pinhole(model: str, coefficients: Mapping[str, Any]) -> None:
     Raises:
         ValueError: it has.
     """
-    distortion = ", ".join(f"{k} {v}" for k, v in coefficients.items() if v)
-    if distortion or model not in FOCAL_LENGTHS:
-        known = model in FOCAL_LENGTHS
+    if model not in COLMAP_MODELS:
+        known = COLMAP.statements.get(model)
+        what = f"has the model {model}" + (f" ({known.meaning})" if known else "")
+    elif distortion := ", ".join(f"{k} {v}" for k, v in coefficients.items() if v):
         what = f"of the model {model} has distortion ({distortion})"
-        what = what if known else f"has the model {model}"
-        raise ValueError(
-            f"its camera {what}, but renders have no lens distortion; remove it from the file, and "
-            "let clpipe warp the picture (see clpipe stages distortion)"
-        )
+    else:
+        return
+    raise ValueError(
+        f"its camera {what}, but renders have no lens distortion; remove it from the file, and let "
+        "clpipe warp the picture (see clpipe stages distortion)"
+    )

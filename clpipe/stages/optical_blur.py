@@ -194,7 +194,7 @@ class Lens(Method):
     >>> dot = np.zeros((3, 5, 3), np.float32)
     >>> dot[1, 2] = 1
     >>> run_reference(Lens(), dot)[1, :, 0].astype(float).round(2).tolist()
-    [0.0, 0.08, 0.62, 0.08, 0.0]
+    [0.01, 0.12, 0.32, 0.12, 0.01]
     """
 
     method: ClassVar = "lens"

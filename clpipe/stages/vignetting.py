@@ -147,8 +147,8 @@ class CosineFourth(FocalLengthMethod, PrincipalPointMethod):
 def relative_radius(image: Floats) -> Floats:
     """Return the squared distance of each pixel from the centre, 1 at the corner pixel.
 
-    >>> relative_radius(np.zeros((1, 3, 3), np.float32)).tolist()
-    [[1.0, 0.0, 1.0]]
+    >>> relative_radius(np.zeros((3, 3, 3), np.float32))[0].astype(float).round(3).tolist()
+    [1.0, 0.5, 1.0]
     """
     sides: Floats = np.maximum(np.array(image.shape[:2], np.float32) - 1, 1)
     corner = (sides * sides).sum(keepdims=True) * np.float32(0.25)

@@ -6,18 +6,25 @@ MkDocs calls this hook. :func:`pages` works without MkDocs.
 import base64
 import json
 import re
+from collections.abc import Sequence
 from inspect import cleandoc
 from pathlib import Path
 from typing import Any
 
 from click.testing import CliRunner
 
+from clpipe.base.vocabulary import DISPOSITIONS, Vocabulary
 from clpipe.chain.registry import all_stages
 from clpipe.commands.main import main
+from clpipe.images.colour_names import ALIASES, DATA, DECODERS, LINEAR, PRIMARIES
+from clpipe.images.vocabularies import DNG, JPEG, OPENEXR, PNG, TIFF
+from clpipe.inputs.annotation_keys import BOP, COCO, KITTI
+from clpipe.inputs.camera_keys import COLMAP, TRANSFORMS
 from clpipe.stage import Method
 from tools import ROOT
 
 NOTEBOOK = "first_steps"
+VOCABULARIES = (OPENEXR, PNG, TIFF, JPEG, DNG, TRANSFORMS, COLMAP, COCO, BOP, KITTI)
 
 
 def pages() -> dict[str, str | bytes]:
@@ -27,6 +34,7 @@ def pages() -> dict[str, str | bytes]:
         "cameras.md": cameras_page(),
         "configurations.md": configurations_page(),
         "cli.md": cli_page(),
+        "statements.md": statements_page(),
         "changelog.md": (ROOT / "CHANGELOG.md").read_text("utf-8"),
         "security.md": (ROOT / "SECURITY.md").read_text("utf-8"),
         "contributing.md": (ROOT / "CONTRIBUTING.md").read_text("utf-8").replace("](docs/", "]("),
@@ -47,9 +55,9 @@ def cell(text: object) -> str:
     return str(text).replace("|", "\\|")
 
 
-def table(headings: list[str], rows: list[list[object]]) -> str:
+def table(headings: list[str], rows: Sequence[Sequence[object]]) -> str:
     """Format a table in Markdown."""
-    lines = [headings, ["---"] * len(headings), *rows]
+    lines: list[Sequence[object]] = [headings, ["---"] * len(headings), *rows]
     return "\n".join("| " + " | ".join(map(cell, line)) + " |" for line in lines) + "\n"
 
 
@@ -76,6 +84,38 @@ def sources(method: type[Method]) -> str:
         if not (ROOT / file).is_file():
             raise FileNotFoundError(file)
     return ", ".join(map(code, files))
+
+
+def statements_page() -> str:
+    """Generate the page of what files of other programs state, and what becomes of it."""
+    rows: list[list[object]] = [[word, meaning] for word, meaning in DISPOSITIONS.items()]
+    parts = [
+        "# Statements in files\n\n"
+        "This page is generated from the tables that the readers use. It lists what the files of "
+        "other programs can state, and what clpipe does with it. If a file states something else "
+        "whose name is like those of colours, lenses or time, a warning names it.\n\n"
+        + table(["in the tables below", "means"], rows)
+    ]
+    for vocabulary in VOCABULARIES:
+        parts.append(f"## {vocabulary.format}\n\nSource: {vocabulary.source}.\n\n")
+        parts.append(table(["", "what is stated", "names"], _statement_rows(vocabulary)))
+    encodings = ", ".join(map(code, [LINEAR, *DECODERS]))
+    colours = ", ".join(map(code, PRIMARIES))
+    parts.append(
+        "## Names of colour spaces in OpenEXR\n\nA name of the Color Interop Forum consists of an "
+        f"encoding ({encodings}), primaries ({colours}), and `scene` or `display`, such as "
+        f"`lin_ap1_scene`. Names of values that are not colours are {', '.join(map(code, DATA))}. "
+        "Other programs' names:\n\n"
+    )
+    parts.append(table(["name", "meaning"], [[code(a), code(b)] for a, b in ALIASES.items()]))
+    return "\n".join(parts)
+
+
+def _statement_rows(vocabulary: Vocabulary) -> list[list[object]]:
+    groups: dict[tuple[str, str], list[str]] = {}
+    for each in vocabulary.statements.values():
+        groups.setdefault((each.disposition, each.meaning), []).append(code(each.name))
+    return [[word, meaning, ", ".join(names)] for (word, meaning), names in groups.items()]
 
 
 def stages_page() -> str:

@@ -1,0 +1,317 @@
+"""What picture files can state, and what becomes of it: one vocabulary for each format."""
+
+from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from PIL import TiffTags
+
+from clpipe.base.vocabulary import Vocabulary
+from clpipe.images.attributes import PREFIX
+from clpipe.images.tiff import read_directories
+
+# OpenImageIO's names of OpenEXR's attributes, where they differ.
+OIIO_NAMES = {
+    "expTime": "ExposureTime",
+    "aperture": "FNumber",
+    "owner": "Copyright",
+    "comments": "ImageDescription",
+    "capDate": "DateTime",
+    "pixelAspectRatio": "PixelAspectRatio",
+    "xDensity": "XResolution",
+    "envmap": "textureformat",
+}
+LIBRARY = ("oiio:", "openexr:", PREFIX)  # prefixes of what libraries and clpipe add
+OPENEXR = Vocabulary.of(
+    "OpenEXR",
+    "Standard Attributes (openexr.com, 3.4), the Color Interop Forum and ACES (SMPTE ST 2065-4)",
+    {
+        "used": {
+            "where the pixels are": "displayWindow dataWindow",
+            "the channels": "channels name type view multiView",
+            "how samples are stored": "lineOrder compression tiles version chunkCount",
+            "primaries and white": "chromaticities",
+            "white that becomes neutral": "adoptedNeutral",
+            "colour space": "colorInteropID oiio:ColorSpace acesImageContainerFlag",
+            "exposure time, s": "expTime",
+            "focal length, mm": "nominalFocalLength effectiveFocalLength",
+            "size of the sensor, mm": "sensorOverallDimensions",
+            "projection of a panorama": "envmap",
+        },
+        "named": {
+            "width of a pixel over its height": "pixelAspectRatio",
+            "luminance of white, cd/m2": "whiteLuminance",
+            "the intended colour rendering": "renderingTransform",
+            "the intended look": "lookModTransform",
+            "the frame before it was cropped": "originalDataWindow",
+        },
+        "ignored": {
+            "a view's own projection, which --poses states": "screenWindowCenter "
+            "screenWindowWidth worldToCamera worldToNDC",
+            "the noise depends on --iso": "isoSpeed",
+            "the colours are those of the render": "cameraCCTSetting cameraTintSetting "
+            "cameraColorBalance",
+            "clpipe has its own lens and sensor": "aperture tStop focus lensMake lensModel "
+            "lensSerialNumber lensFirmwareVersion pinholeFocalLength entrancePupilOffset "
+            "sensorCenterOffset sensorPhotositePitch sensorAcquisitionRectangle shutterAngle",
+            "when and where the picture was made": "capDate utcOffset longitude latitude altitude "
+            "keyCode timeCode imageCounter reelName framesPerSecond captureRate",
+            "who made it, with what": "owner comments cameraMake cameraModel cameraSerialNumber "
+            "cameraFirmwareVersion cameraUuid cameraLabel ascFramingDecisionList",
+            "size of a print": "xDensity",
+            "how a texture is repeated": "wrapmodes",
+            "deep pictures, which are rejected": "deepImageState maxSamplesPerPixel",
+            "names of labels, which stay numbers": "idManifest",
+            "how samples were stored": "dwaCompressionLevel",
+        },
+    },
+)
+PNG = Vocabulary.of(
+    "PNG",
+    "PNG Specification, third edition (W3C 2025), 11",
+    {
+        "used": {
+            "size and samples": "IHDR PLTE IDAT IEND",
+            "transparency": "tRNS",
+            "primaries and curve": "cICP sRGB cHRM",
+            "EXIF, such as orientation": "eXIf",
+        },
+        "checked": {"the transfer curve, against --transfer": "gAMA"},
+        "named": {
+            "an ICC profile": "iCCP",
+            "luminance of the display": "mDCV cLLI",
+            "an animation, of which the first picture is read": "acTL fcTL fdAT",
+        },
+        "ignored": {
+            "the significant bits of a sample, which scale nothing": "sBIT",
+            "a background for viewers": "bKGD",
+            "size of a print": "pHYs",
+            "text and dates": "tEXt zTXt iTXt tIME",
+            "helps to quantize colours": "hIST sPLT",
+        },
+    },
+)
+TIFF = Vocabulary.of(
+    "TIFF",
+    "TIFF 6.0 (1992) and its supplements",
+    {
+        "used": {
+            "size": "ImageWidth ImageLength",
+            "samples and their type": "BitsPerSample SampleFormat SamplesPerPixel ExtraSamples "
+            "PlanarConfiguration ColorMap",
+            "how samples are stored": "Compression FillOrder StripOffsets RowsPerStrip "
+            "StripByteCounts Predictor TileWidth TileLength TileOffsets TileByteCounts T4Options "
+            "T6Options JPEGTables JPEGProc JPEGInterchangeFormat JPEGInterchangeFormatLength "
+            "JPEGRestartInterval JPEGLosslessPredictors JPEGPointTransforms JPEGQTables "
+            "JPEGDCTables JPEGACTables",
+            "how samples become colours": "PhotometricInterpretation YCbCrCoefficients "
+            "YCbCrSubSampling YCbCrPositioning",
+            "the upper edge": "Orientation",
+            "lens, exposure and date": "ExifIFD",
+        },
+        "named": {
+            "the white of its colours": "WhitePoint",
+            "the primaries of its colours": "PrimaryChromaticities",
+            "its transfer curve": "TransferFunction TransferRange",
+            "its levels of black and white": "ReferenceBlackWhite",
+            "an ICC profile": "ICCProfile",
+            "the curve of its greys": "GrayResponseCurve GrayResponseUnit",
+        },
+        "ignored": {
+            "kind and number of the page": "NewSubfileType SubfileType PageName PageNumber SubIFDs",
+            "names, dates and programs": "DocumentName ImageDescription Make Model Software "
+            "DateTime Artist HostComputer Copyright XMP IptcNaaInfo PhotoshopInfo GPSInfoIFD",
+            "size and place of a print": "XResolution YResolution ResolutionUnit XPosition "
+            "YPosition",
+            "range of samples, which clpipe measures": "MinSampleValue MaxSampleValue "
+            "SMinSampleValue SMaxSampleValue",
+            "how it is printed": "Threshholding CellWidth CellLength HalftoneHints InkSet "
+            "InkNames NumberOfInks DotRange TargetPrinter",
+            "free space in the file": "FreeOffsets FreeByteCounts",
+        },
+    },
+)
+JPEG = Vocabulary.of(
+    "JPEG",
+    "ITU-T T.81 (1992) and T.871 (2011), Exif 2.3 (2010)",
+    {
+        "used": {
+            "samples, with YCbCr as JFIF or Adobe state it": "JFIF Adobe",
+            "orientation, lens, exposure and date": "Exif",
+        },
+        "named": {
+            "an ICC profile": "ICC_PROFILE",
+            "another colour space than sRGB": "Exif:ColorSpace",
+        },
+        "ignored": {
+            "previews and gain maps: the picture itself is complete": "MPF",
+            "text": "XMP Photoshop COM",
+        },
+    },
+)
+# Numbers of DNG's own tags.
+DNG_TAGS = {
+    50706: "DNGVersion", 50707: "DNGBackwardVersion", 50708: "UniqueCameraModel",
+    50709: "LocalizedCameraModel", 50710: "CFAPlaneColor", 50711: "CFALayout",
+    50712: "LinearizationTable", 50713: "BlackLevelRepeatDim", 50714: "BlackLevel",
+    50715: "BlackLevelDeltaH", 50716: "BlackLevelDeltaV", 50717: "WhiteLevel",
+    50718: "DefaultScale", 50719: "DefaultCropOrigin", 50720: "DefaultCropSize",
+    50721: "ColorMatrix1", 50722: "ColorMatrix2", 50723: "CameraCalibration1",
+    50724: "CameraCalibration2", 50725: "ReductionMatrix1", 50726: "ReductionMatrix2",
+    50727: "AnalogBalance", 50728: "AsShotNeutral", 50729: "AsShotWhiteXY",
+    50730: "BaselineExposure", 50731: "BaselineNoise", 50732: "BaselineSharpness",
+    50733: "BayerGreenSplit", 50734: "LinearResponseLimit", 50735: "CameraSerialNumber",
+    50736: "LensInfo", 50737: "ChromaBlurRadius", 50738: "AntiAliasStrength",
+    50739: "ShadowScale", 50740: "DNGPrivateData", 50741: "MakerNoteSafety",
+    50778: "CalibrationIlluminant1", 50779: "CalibrationIlluminant2", 50780: "BestQualityScale",
+    50781: "RawDataUniqueID", 50827: "OriginalRawFileName", 50828: "OriginalRawFileData",
+    50829: "ActiveArea", 50830: "MaskedAreas", 50831: "AsShotICCProfile",
+    50832: "AsShotPreProfileMatrix", 50833: "CurrentICCProfile", 50834: "CurrentPreProfileMatrix",
+    50879: "ColorimetricReference", 50931: "CameraCalibrationSignature",
+    50932: "ProfileCalibrationSignature", 50933: "ExtraCameraProfiles",
+    50934: "AsShotProfileName", 50935: "NoiseReductionApplied", 50936: "ProfileName",
+    50937: "ProfileHueSatMapDims", 50938: "ProfileHueSatMapData1", 50939: "ProfileHueSatMapData2",
+    50940: "ProfileToneCurve", 50941: "ProfileEmbedPolicy", 50942: "ProfileCopyright",
+    50964: "ForwardMatrix1", 50965: "ForwardMatrix2", 50966: "PreviewApplicationName",
+    50967: "PreviewApplicationVersion", 50968: "PreviewSettingsName",
+    50969: "PreviewSettingsDigest", 50970: "PreviewColorSpace", 50971: "PreviewDateTime",
+    50972: "RawImageDigest", 50973: "OriginalRawFileDigest", 50974: "SubTileBlockSize",
+    50975: "RowInterleaveFactor", 50981: "ProfileLookTableDims", 50982: "ProfileLookTableData",
+    51008: "OpcodeList1", 51009: "OpcodeList2", 51022: "OpcodeList3", 51041: "NoiseProfile",
+    51043: "TimeCodes", 51044: "FrameRate", 51058: "TStop", 51081: "ReelName",
+    51089: "OriginalDefaultFinalSize", 51090: "OriginalBestQualityFinalSize",
+    51091: "OriginalDefaultCropSize", 51105: "CameraLabel", 51107: "ProfileHueSatMapEncoding",
+    51108: "ProfileLookTableEncoding", 51109: "BaselineExposureOffset", 51110: "DefaultBlackRender",
+    51111: "NewRawImageDigest", 51112: "RawToPreviewGain", 51125: "DefaultUserCrop",
+    51177: "DepthFormat", 51178: "DepthNear", 51179: "DepthFar", 51180: "DepthUnits",
+    51181: "DepthMeasureType", 51182: "EnhanceParams", 52525: "ProfileGainTableMap",
+    52526: "SemanticName", 52528: "SemanticInstanceID", 52529: "CalibrationIlluminant3",
+    52530: "CameraCalibration3", 52531: "ColorMatrix3", 52532: "ForwardMatrix3",
+    52533: "IlluminantData1", 52534: "IlluminantData2", 52535: "IlluminantData3",
+    52536: "MaskSubArea", 52537: "ProfileHueSatMapData3", 52538: "ReductionMatrix3",
+    52543: "RGBTables", 52544: "ProfileGainTableMap2", 52547: "ColumnInterleaveFactor",
+    52548: "ImageSequenceInfo", 52550: "ImageStats", 52551: "ProfileDynamicRange",
+    52552: "ProfileGroupName", 52553: "JXLDistance", 52554: "JXLEffort", 52555: "JXLDecodeSpeed",
+}  # fmt: skip
+DNG = Vocabulary.of(
+    "DNG",
+    "Digital Negative Specification 1.7.1 (Adobe 2023)",
+    {
+        "used": {
+            "the filter array": "CFAPlaneColor CFALayout",
+            "levels": "LinearizationTable BlackLevelRepeatDim BlackLevel BlackLevelDeltaH "
+            "BlackLevelDeltaV WhiteLevel MaskedAreas",
+            "the visible area": "ActiveArea",
+            "colours for two lights": "ColorMatrix1 ColorMatrix2 CameraCalibration1 "
+            "CameraCalibration2 AnalogBalance CalibrationIlluminant1 CalibrationIlluminant2",
+            "white balance": "AsShotNeutral AsShotWhiteXY",
+            "noise, for clpipe calibrate": "NoiseProfile",
+            "how samples are stored": "SubTileBlockSize RowInterleaveFactor ColumnInterleaveFactor",
+            "the camera": "UniqueCameraModel DNGVersion DNGBackwardVersion",
+        },
+        "named": {
+            "corrections of defects, shading and distortion": "OpcodeList1 OpcodeList2 OpcodeList3",
+            "gains for parts of the picture": "ProfileGainTableMap ProfileGainTableMap2",
+            "colours of a finished picture, not of a scene": "ColorimetricReference",
+            "colours for a third light": "ColorMatrix3",
+            "the spectrum of a light": "IlluminantData1 IlluminantData2 IlluminantData3",
+            "brightness, in EV": "BaselineExposure BaselineExposureOffset",
+            "four colours to three": "ReductionMatrix1 ReductionMatrix2 ReductionMatrix3",
+            "pixels that are not square": "DefaultScale",
+        },
+        "ignored": {
+            "clpipe shows the whole visible area": "DefaultCropOrigin DefaultCropSize "
+            "DefaultUserCrop OriginalDefaultCropSize OriginalDefaultFinalSize "
+            "OriginalBestQualityFinalSize BestQualityScale",
+            "another way to the same colours": "ForwardMatrix1 ForwardMatrix2 ForwardMatrix3 "
+            "CameraCalibration3 CalibrationIlluminant3 CameraCalibrationSignature",
+            "a converter's look, in place of which clpipe has its own": "ProfileName "
+            "ProfileHueSatMapDims ProfileHueSatMapData1 ProfileHueSatMapData2 "
+            "ProfileHueSatMapData3 ProfileHueSatMapEncoding ProfileLookTableDims "
+            "ProfileLookTableData ProfileLookTableEncoding ProfileToneCurve RGBTables "
+            "ProfileDynamicRange ProfileGroupName ProfileCalibrationSignature "
+            "ProfileEmbedPolicy ProfileCopyright ExtraCameraProfiles AsShotProfileName "
+            "AsShotICCProfile AsShotPreProfileMatrix CurrentICCProfile CurrentPreProfileMatrix "
+            "DefaultBlackRender ShadowScale",
+            "hints for a converter's sharpening and denoising": "BaselineNoise BaselineSharpness "
+            "BayerGreenSplit LinearResponseLimit ChromaBlurRadius AntiAliasStrength "
+            "NoiseReductionApplied EnhanceParams RawToPreviewGain ImageStats",
+            "the lens and the camera's name": "LensInfo LocalizedCameraModel CameraSerialNumber "
+            "CameraLabel TStop",
+            "of other files and previews": "DNGPrivateData MakerNoteSafety RawDataUniqueID "
+            "OriginalRawFileName OriginalRawFileData OriginalRawFileDigest RawImageDigest "
+            "NewRawImageDigest PreviewApplicationName PreviewApplicationVersion "
+            "PreviewSettingsName PreviewSettingsDigest PreviewColorSpace PreviewDateTime",
+            "of sequences": "TimeCodes FrameRate ReelName ImageSequenceInfo",
+            "depth and masks beside the picture": "DepthFormat DepthNear DepthFar DepthUnits "
+            "DepthMeasureType SemanticName SemanticInstanceID MaskSubArea",
+            "how samples were compressed": "JXLDistance JXLEffort JXLDecodeSpeed",
+        },
+    },
+)
+# Compressions that LibRaw cannot decode, by the number in the tag Compression.
+COMPRESSIONS = {52546: "JPEG XL", 34892: "lossy JPEG", 50000: "Zstandard", 50002: "JPEG XL"}
+COMPRESSIONS |= {34925: "LZMA", 50001: "WebP"}
+COMPRESSION, DEFAULT_SCALE = 259, 50718  # tags
+EXIF_SRGB = 1  # of Exif's ColorSpace
+OWN_SENTENCES = ("PixelAspectRatio", "whiteLuminance", "ICCProfile", "iCCP")  # with their values
+
+_OPENEXR_NAMES = {OIIO_NAMES.get(name, name): name for name in OPENEXR.statements}
+
+
+def vocabulary_warnings(path: Path, format_: str, spec: Any, chunks: Iterable[bytes]) -> list[str]:
+    """Return sentences about what a file states, and clpipe does not use.
+
+    Args:
+        path: the file.
+        format_: OpenImageIO's name of its format.
+        spec: its ``oiio.ImageSpec``.
+        chunks: the names of the chunks of a PNG.
+    """
+    if format_ == "openexr":
+        return list(_openexr_warnings(tuple(each.name for each in spec.extra_attribs)))
+    if format_ == "png":
+        names = (name.decode("latin-1") for name in chunks)
+        return PNG.warnings(name for name in names if name not in OWN_SENTENCES)
+    if format_ == "jpeg":
+        space = spec.getattribute("Exif:ColorSpace")
+        has_profile = spec.getattribute("ICCProfile") is not None
+        is_other = space not in (None, EXIF_SRGB) and not has_profile
+        return JPEG.warnings(["Exif:ColorSpace"] if is_other else ())
+    if format_ == "tiff":
+        return TIFF.warnings(name for name in tiff_tags(path) if name not in OWN_SENTENCES)
+    return []
+
+
+@lru_cache(maxsize=256)
+def _openexr_warnings(names: tuple[str, ...]) -> tuple[str, ...]:
+    stated = (_OPENEXR_NAMES.get(name, name) for name in names if name not in OWN_SENTENCES)
+    return tuple(OPENEXR.warnings(name for name in stated if not name.startswith(LIBRARY)))
+
+
+def tiff_tags(path: Path) -> list[str]:
+    """Return the names of the tags of a TIFF's first page; [] if they are damaged."""
+    return [TiffTags.lookup(tag).name for tag in next(read_directories(path), ())]
+
+
+def dng_warnings(path: Path) -> list[str]:
+    """Return sentences about what a DNG states, and clpipe does not use; [] for other raws."""
+    stated = {
+        DNG_TAGS[tag]
+        for directory in read_directories(path)
+        for tag, values in directory.items()
+        if tag in DNG_TAGS and any(values) and not (tag == DEFAULT_SCALE and {*values} == {1})
+    }
+    return DNG.warnings(sorted(stated)) if "DNGVersion" in stated else []
+
+
+def raw_compression(path: Path) -> str:
+    """Return the compression of a raw that LibRaw cannot decode; "" if there is none.
+
+    >>> raw_compression(Path("missing.dng"))
+    ''
+    """
+    found = [int(n) for each in read_directories(path) for n in each.get(COMPRESSION, ())]
+    names = [f"{COMPRESSIONS[n]} (number {n})" for n in found if n in COMPRESSIONS]
+    return names[0] if names else ""
