@@ -118,7 +118,8 @@ class Clips(GroupSink[SequenceClips]):
             yield from frames
 
     def finish(self, group: SequenceClips, outcomes: list[Outcome]) -> list[Outcome]:
-        named = [*map(self.named, outcomes)]
+        # The last one names the clips. It is one of those that were made, if there are any.
+        named = sorted(map(self.named, outcomes), key=lambda each: each.status == DONE)
         if failed := group.jobs_with(FAILED):
             log.warning(
                 "%s: no clip is written, because the frame %s failed. The other frames are kept, "
