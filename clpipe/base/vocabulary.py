@@ -1,8 +1,7 @@
 """Vocabularies: what files of a format can state, and what becomes of each statement.
 
-Each reader of other programs' files has one. A statement that is not in it, and whose name is like
-those of colours, lenses or time, is named in a warning, because dropping it may change what the
-pixels mean.
+Each reader of other programs' files has one. A warning names statements that are not in it, and
+whose names are like those of colours, lenses or time. Dropping them may change what pixels mean.
 """
 
 import re

@@ -244,7 +244,7 @@ DNG = Vocabulary.of(
             "NewRawImageDigest PreviewApplicationName PreviewApplicationVersion "
             "PreviewSettingsName PreviewSettingsDigest PreviewColorSpace PreviewDateTime",
             "of sequences": "TimeCodes FrameRate ReelName ImageSequenceInfo",
-            "depth and masks beside the picture": "DepthFormat DepthNear DepthFar DepthUnits "
+            "depth and masks next to the picture": "DepthFormat DepthNear DepthFar DepthUnits "
             "DepthMeasureType SemanticName SemanticInstanceID MaskSubArea",
             "how samples were compressed": "JXLDistance JXLEffort JXLDecodeSpeed",
         },
