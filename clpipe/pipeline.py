@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Unpack
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Unpack
 
 import numpy as np
 from xxhash import xxh3_64_hexdigest
@@ -26,6 +26,7 @@ from clpipe.chain.paths import resolve_paths
 from clpipe.chain.python_words import errors_in_python, python_words
 from clpipe.chain.registry import load_stage_file, loaded_stage_files
 from clpipe.chain.settings import Settings, overlay, settings_from
+from clpipe.chain.unused import Images, unused_values
 from clpipe.engine.clipping import WARNING_SHARE, clipped_share, clipping_text
 from clpipe.engine.device import Device, open_device
 from clpipe.engine.options import RunOptions
@@ -94,6 +95,8 @@ class Pipeline(ReadOnly):
         DeviceError: there is no usable device.
     """
 
+    _is_sequence: ClassVar[bool] = False  # whether images are frames of a sequence
+
     @errors_in_python()
     @check_argument_types
     def __init__(
@@ -114,6 +117,9 @@ class Pipeline(ReadOnly):
         self._selector = None if device is None else str(device)
         self._count = 0
         self._open()
+        images = Images(self._is_sequence, from_files=False)
+        for note in unused_values(self._settings, self.chain, images):
+            warn(note)
 
     def _open(self) -> None:
         """Build the chain, and open the device in this process."""

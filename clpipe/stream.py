@@ -60,6 +60,12 @@ class Shot:
     result: Result
 
 
+class _Frames(Pipeline):
+    """A pipeline for the frames of a sequence."""
+
+    _is_sequence = True
+
+
 class Stream:
     """A camera for a running simulation. Call it with each frame, or put and get frames.
 
@@ -115,7 +121,7 @@ class Stream:
         **settings: "Unpack[Keywords]",
     ) -> None:
         self.dropped = 0
-        self._pipeline = Pipeline(config, device=device, until=until, keep=keep, **settings)
+        self._pipeline = _Frames(config, device=device, until=until, keep=keep, **settings)
         self._name = name
         self._is_srgb = transfer == "srgb"
         self._drop = drop

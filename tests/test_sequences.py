@@ -17,6 +17,7 @@ from clpipe.batch.memory_budget import MemoryBudget
 from clpipe.camera.control import AutoIso, Control, ControlLoop
 from clpipe.chain.drawing import draw_values
 from clpipe.chain.draws import Drift
+from clpipe.chain.files import load_settings
 from clpipe.chain.limits import Limits
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.runner import Runner
@@ -136,7 +137,7 @@ def test_the_documented_defaults_of_the_loops_are_those_of_the_code():
 
 
 def test_video_is_the_default_chain_with_temporal_denoising():
-    stages = [*clpipe.Pipeline("video", device="numpy").settings.stages]
+    stages = [*load_settings("video").stages]
     stages.remove("temporal_denoise")
     assert tuple(stages) == DEFAULT_CHAIN
 

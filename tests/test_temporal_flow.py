@@ -162,8 +162,9 @@ def test_a_stream_takes_flow(device):
                 shot = stream.get()
         return shot.image.astype(float)
 
+    stages = [stage for stage in LONG if stage != STAGE]
     clean = clpipe.Pipeline(
-        device="numpy", iso=6400, stages=LONG, sensor_noise={"method": "none"}
+        device="numpy", iso=6400, stages=stages, sensor_noise={"method": "none"}
     ).process(frames[-1])
     errors = [(last(each) - clean.image)[10:-10, 10:-10].std() for each in (flows, unknown)]
     assert errors[0] < 0.8 * errors[1]

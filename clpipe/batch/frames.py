@@ -1,6 +1,5 @@
 """Frames of sequences whose chains have state: their order, their state, and what is recomputed."""
 
-import logging
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from itertools import groupby
@@ -8,13 +7,10 @@ from itertools import groupby
 from clpipe.base.errors import RequestError
 from clpipe.batch.execution import ExecutionOptions
 from clpipe.chain.chain import Chain
-from clpipe.chain.python_words import python_words
 from clpipe.chain.rendition import Rendition
 from clpipe.engine.state import State, has_state, keeps_state
 from clpipe.inputs.find import Job, Place
 from clpipe.outputs.recipes import Recipe
-
-log = logging.getLogger(__name__)
 
 
 def check_frames(
@@ -24,7 +20,7 @@ def check_frames(
 
     Args:
         chain: the chain of the first image.
-        is_sequence: whether the images are frames of sequences. If not, this logs a warning.
+        is_sequence: whether the images are frames of sequences.
         execution: the options of the run.
         dask: the address of a Dask scheduler, or None.
 
@@ -34,10 +30,7 @@ def check_frames(
     if not has_state(chain):
         return
     step = next(step.name for step in chain.steps if keeps_state(step))
-    if not is_sequence:
-        text = "%s changes only frames of sequences; add --sequence, or remove it"
-        log.warning(python_words(text), step)
-    elif dask is not None or (execution.processes or 1) > 1:
+    if is_sequence and (dask is not None or (execution.processes or 1) > 1):
         option = "--processes" if dask is None else "--dask"
         raise RequestError(
             f"{option}: {step} needs the frames of a sequence in one process; remove {option} or "

@@ -42,6 +42,8 @@ from clpipe.batch.work import ImageWorker
 from clpipe.chain.isos import draw_note
 from clpipe.chain.python_words import errors_in_python, python_words
 from clpipe.chain.request import Request
+from clpipe.chain.unused import Images as KnownImages
+from clpipe.chain.unused import unused_values
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.state import has_state
 from clpipe.inputs.carry_rows import rows_note
@@ -137,6 +139,12 @@ class Run:
         if images.sequence:
             check_flow(self._loader, self.jobs)
         check_frames(self._chain, images.sequence, execution, dask)
+        if not images.known_jobs:  # otherwise another run has named them
+            rate = images.clips.video.rate if images.clips else None
+            needs_rows = request.truth_at == "rows"
+            known = KnownImages(images.sequence, needs_rows=needs_rows, rate=rate)
+            for note in unused_values(self._loader.settings, self._chain, known):
+                log.warning("%s", note)
         check_render_options(request, self._chain.source)
         self._request = request.with_outputs(self._chain)
         self.writer = OutputWriter(execution.output, self._request)

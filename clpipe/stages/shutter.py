@@ -135,7 +135,12 @@ class Rows(Method):
         return resolved.with_defaults(flicker_depth=self.depth)
 
     def next_context(self, context: Context) -> Context:
-        return replace(context, light_changes=self.subframes > 1 or bool(self.depth))
+        return replace(context, light_changes=self.changes_light)
+
+    @property
+    def changes_light(self) -> bool:
+        """Whether the light changes during an exposure, by motion or by flicker."""
+        return self.subframes > 1 or bool(self.depth)
 
     @property
     def depth(self) -> float:
