@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,8 @@ def test_a_clip_contains_the_pictures_in_temporal_order(clpipe, frames):
     clpipe(
         "run", "in", "-o", "plain", "--sequence", "--format", "png", *RUN[6:], "--truth", "clean"
     )
-    names = ["cam0.jsonl", "cam0.mkv", "cam0.truth_clean.jsonl", "cam0.truth_clean.mkv", "run.csv"]
+    names = [f"cam0{each}" for each in (".mkv", ".mkv.jsonl")]
+    names += [f"cam0.truth_clean{each}" for each in (".mkv", ".mkv.jsonl")] + ["run.csv"]
     assert written(OUT) == names
     for suffix in ("", ".truth_clean"):
         found = list(read_video(OUT / f"cam0{suffix}.mkv"))
@@ -70,7 +72,7 @@ def test_a_frame_is_done_when_its_clip_exists(clpipe, frames):
 def test_records_contain_the_sidecar_of_each_frame(clpipe, frames):
     clpipe("run", frames(numbers=[1, 2, 4]), *RUN, "--fps", "30000/1001")
     clpipe("run", "in", "-o", "plain", "--sequence", "--format", "png", *RUN[6:])
-    found = records("out/cam0.jsonl")
+    found = records("out/cam0.mkv.jsonl")
     assert [record["index"] for record in found] == [0, 1, 3]  # frame 3 is missing
     for n, record in zip((1, 2, 4), found, strict=True):
         sidecar = json.loads(Path(f"plain/cam0/f{n}.json").read_text())
@@ -84,10 +86,10 @@ def test_a_named_clip_is_one_sequence(clpipe, frames):
     frames("in")
     clpipe("run", "in", "-o", "clip.mp4", *RUN[6:], "--bit-depth", 10, "--codec", "h265")
     assert written(Path()) == [
-        "clip.jsonl",
         "clip.mp4",
+        "clip.mp4.csv",
+        "clip.mp4.jsonl",
         *(f"in/f{n}.exr" for n in range(5)),
-        "run.csv",
     ]
     found = video_info(Path("clip.mp4"))
     assert (found.codec, found.bits, found.frames) == ("hevc", 10, 5)
@@ -119,7 +121,7 @@ def test_one_changed_frame_makes_its_clip_again(clpipe, frames, write_exr):
     write_exr("in/b/f3.exr", np.full((16, 24, 3), 0.2, np.float32))
     clpipe("run", "in", *RUN)
     changed = {name for name, stamp in stamps().items() if stamp != before[name]}
-    assert changed == {"b.mkv", "b.jsonl"}
+    assert changed == {"b.mkv", "b.mkv.jsonl"}
     assert list(statuses(OUT).values()).count("skipped") == 5
     assert len(list(read_video(OUT / "b.mkv"))) == 5
 
@@ -198,8 +200,8 @@ def test_frames_of_several_sizes_fail(clpipe, frames, write_exr):
 
 
 def test_an_odd_size_fails_before_frames_are_made(clpipe, frames):
-    result = clpipe("run", frames(size=(16, 25)), "-o", "out", "--format", "mp4", status=1)
-    assert "25x16 px, but h264 needs an even width and height" in result.output
+    result = clpipe("run", frames(size=(16, 25)), "-o", "out", "--format", "mp4", status=2)
+    assert "--codec: the picture has 25x16 px, but h264 needs an even width" in result.output
     assert not list(OUT.glob("*.mp4"))
 
 
@@ -223,7 +225,7 @@ def test_new_clips_replace_decoded_frames(clpipe, frames):
 def test_files_of_other_programs_are_not_overwritten(clpipe, frames):
     frames()
     OUT.mkdir()
-    for name in ("cam0.mkv", "cam0.jsonl"):
+    for name in ("cam0.mkv", "cam0.mkv.jsonl"):
         (OUT / name).write_text("mine")
         result = clpipe("run", "in", *RUN, status=2)
         assert f"{name}: clpipe did not write this file" in result.output
@@ -273,13 +275,15 @@ def test_a_missing_library_is_noticed_early(frames, monkeypatch):
         api.run(frames(), "clip.mp4")
 
 
-def test_the_log_keeps_its_name(frames):
-    with pytest.raises(RequestError, match=r"run\.jsonl: the log of the run and the sequence run"):
-        api.run(frames("in/run"), "out", format="mp4")
+def test_a_sequence_may_have_the_name_of_the_log(clpipe, frames):
+    clpipe("run", frames("in/run"), *RUN)
+    assert Path("out/run.mkv.jsonl").is_file()
+    assert "5 of 5 images" in clpipe("status", "out").output
 
 
 def test_rates():
-    assert parse_rate(str(23.976)) == pytest.approx(23.976, abs=1e-6)
+    assert parse_rate(str(23.976)) == Fraction(24000, 1001)
+    assert parse_rate("12.5") == Fraction(25, 2)
     assert parse_bit_rate(str(2.5e6)) == 2_500_000
     for text in ("x", "0", "-1", "1/0", "inf"):
         with pytest.raises(RequestError, match="--fps: found"):
@@ -294,3 +298,108 @@ def test_a_report_needs_single_pictures(clpipe, frames):
     assert "out: its pictures are in clips, such as cam0.mkv, but a report needs single" in stderr
     clpipe("run", "in", "-o", "out/plain", "--sequence", *RUN[6:])
     clpipe("report", "out/plain")
+
+
+def times_of(path):
+    """Return the times of a clip's frames in s, and their mean levels."""
+    import av
+
+    with av.open(path) as container:
+        found = [*container.decode(video=0)]
+    times = [float(each.pts * each.time_base) for each in found]
+    return times, [each.to_ndarray(format="gray").mean() for each in found]
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+@pytest.mark.parametrize(
+    ("gaps", "expected"),
+    [
+        ("hold", [0, 1, 4, 5]),
+        ("black", [0, 1, 2, 3, 4, 5]),
+        ("cut", [0, 1, 2, 3]),
+    ],
+)
+def test_a_gap_keeps_its_time_in_the_clip(clpipe, frames, suffix, gaps, expected):
+    frames("in", numbers=(3, 4, 7, 8), size=(32, 48))
+    options = ("--fps", 20, "--gaps", gaps, "--device", "numpy", "--decoded")
+    clpipe("run", "in", "-o", f"film.{suffix}", *options)
+    times, levels = times_of(f"film.{suffix}")
+    assert times == pytest.approx([each / 20 for each in expected], abs=2e-3)
+    assert [n for n, level in enumerate(levels) if level < 20] == [2, 3] * (gaps == "black")
+    found = records(f"film.{suffix}.jsonl")
+    assert [record["index"] for record in found] == [0, 1, 4, 5]
+    decoded = sorted(Path("film.decoded").iterdir())
+    assert [path.name for path in decoded] == [f"f{n}.png" for n in (3, 4, 7, 8)]
+    assert all(np.asarray(Image.open(path)).mean() > 50 for path in decoded)
+
+
+def test_another_treatment_of_gaps_makes_the_clip_again(clpipe, frames):
+    frames("in", numbers=(3, 4, 6))
+    run = ("run", "in", "-o", "film.mkv", *RUN[4:])
+    clpipe(*run)
+    assert len(times_of("film.mkv")[0]) == 3
+    clpipe(*run, "--gaps", "black")
+    assert len(times_of("film.mkv")[0]) == 4
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [("mp4", "h264"), ("mkv", "ffv1"), ("mp4", "h265")])
+@pytest.mark.parametrize("source", ["names", "column"])
+def test_a_clip_has_the_times_of_its_frames(clpipe, write_exr, suffix, codec, source):
+    """The rate may vary: the third interval is one and a half times as long."""
+    given = [0, 0.04, 0.08, 0.14, 0.18]
+    stamps = [f"{1305031102 + each:.6f}" for each in given]
+    names = stamps if source == "names" else [f"f{n}" for n in range(5)]
+    for name in names:
+        write_exr(f"in/{name}.exr", np.full((32, 48, 3), 0.3, np.float32))
+    if source == "column":
+        rows = "".join(f"in/{n}.exr,{s}\n" for n, s in zip(names, stamps, strict=True))
+        Path("list.csv").write_text(f"path,time\n{rows}")
+    inputs = "in" if source == "names" else "list.csv"
+    options = ("--codec", codec, "--device", "numpy")
+    stderr = clpipe("run", inputs, "-o", f"film.{suffix}", *options).stderr
+    assert "1 sequence of 5 frames, 25 frames per second from their times" in stderr
+    assert times_of(f"film.{suffix}")[0] == pytest.approx(given, abs=1e-3)
+    found = records(f"film.{suffix}.jsonl")
+    assert [record["time"] for record in found] == pytest.approx(given)
+    assert found[3]["index"] == pytest.approx(3.5)
+    stderr = clpipe("run", inputs, "-o", f"x.{suffix}", *options, "--fps", 30, status=2).stderr
+    assert "--fps: found 30, but the times of" in stderr and "are of 25 frames per s" in stderr
+
+
+def test_the_settings_of_a_timed_clip_make_it_again(clpipe, write_exr):
+    for n in range(3):
+        write_exr(f"in/f{n}.exr", np.full((32, 48, 3), 0.1 * (n + 1), np.float32))
+    Path("list.csv").write_text("path,time\nin/f0.exr,0\nin/f1.exr,0.1\nin/f2.exr,0.4\n")
+    clpipe("run", "list.csv", "-o", "a.mkv", *RUN[4:])
+    assert "0.4" in Path("a.mkv.csv").read_text()
+    clpipe("run", "a.mkv.csv", "-o", "b.mkv", *RUN[4:])
+    assert Path("a.mkv").read_bytes() == Path("b.mkv").read_bytes()
+
+
+def test_frames_of_a_sequence_have_all_a_time_or_none(clpipe, frames):
+    frames("in")
+    Path("list.csv").write_text("path,time\nin/f0.exr,0\nin/f1.exr,\n")
+    stderr = clpipe("run", "list.csv", "-o", "a.mkv", *RUN[4:], status=2).stderr
+    assert "f1.exr" in stderr and "this frame has no time, but others of its sequence" in stderr
+    Path("list.csv").write_text("path,time\nin/f0.exr,now\n")
+    stderr = clpipe("run", "list.csv", "-o", "a.mkv", *RUN[4:], status=2).stderr
+    assert "time: found 'now', but expected a number: seconds" in stderr
+
+
+def test_two_containers_of_one_name_have_their_own_records(clpipe, frames):
+    frames("in")
+    for suffix in ("mkv", "mp4"):
+        clpipe("run", "in", "-o", f"film.{suffix}", "--device", "numpy")
+    assert records("film.mkv.jsonl")[0]["clip"]["name"] == "film.mkv"
+    assert records("film.mp4.jsonl")[0]["clip"]["name"] == "film.mp4"
+    assert (
+        "5 of them were there already"
+        in clpipe("run", "in", "-o", "film.mkv", "--device", "numpy").output
+    )
+
+
+@pytest.mark.parametrize("name", ["film.mov", "film.avi", "film.webm"])
+def test_other_containers_are_no_directories(clpipe, frames, name):
+    stderr = clpipe("run", frames(), "-o", name, status=2).stderr
+    assert f"--output: found {name}, but clpipe writes clips as .mp4 or .mkv" in stderr
+    assert not Path(name).exists()

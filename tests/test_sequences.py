@@ -25,7 +25,7 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.manifest import read_manifest
 from clpipe.inputs.metering import write_exposures
-from clpipe.inputs.sequences import in_sequences
+from clpipe.inputs.sequences import in_sequences, summary
 from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import ROOT
 
@@ -477,11 +477,27 @@ def test_numbers_of_frames_have_decimals():
         ("1305031102175", "1305031102211", "1305031102243"),
     ],
 )
-def test_time_stamps_order_frames(stamps, caplog):
+def test_time_stamps_are_times(stamps):
+    """Intervals of 36 and 32 ms; the shorter one is the median."""
     names = [f"{stamp}.exr" for stamp in stamps]
     [frames] = sequences_of(*names[::-1]).values()
-    assert frames == list(zip(names, range(3), strict=True))
-    assert "its numbers are time stamps" in caplog.text
+    assert [name for name, _ in frames] == names
+    assert [place for _, place in frames] == pytest.approx([0, 36 / 32, 68 / 32], abs=4e-3)
+
+
+def test_a_gap_between_time_stamps_is_named(caplog):
+    stamps = [1_403_636_579_763_555_584 + n * 50_000_000 for n in (0, 1, 2, 5, 6)]
+    jobs = in_sequences([Job(Path(f"{each}.png"), f"{each}.png") for each in stamps])
+    assert [job.place.index for job in jobs] == [0, 1, 2, 5, 6]
+    assert {job.place.interval for job in jobs} == {0.05}
+    assert "2 of 7 frames are missing: 2 after 0.1 s" in caplog.text
+    assert "5 frames, 20 frames per second from their times" in summary(jobs)
+
+
+def test_numbers_that_are_dates_are_no_time_stamps():
+    names = ("20231128123045.exr", "20231128123046.exr")
+    jobs = in_sequences([Job(Path(name), name) for name in names])
+    assert [(job.place.index, job.place.interval) for job in jobs] == [(0, None), (1, None)]
 
 
 def test_a_large_gap_is_no_time_stamp(caplog):
@@ -522,3 +538,49 @@ def test_a_frame_without_a_picture_fails_if_the_first_has_one(clpipe):
     result = clpipe("run", "in", "-o", "out", "--sequence", "--device", "numpy", status=1)
     assert "f.3.exr: has no layer with the finished picture" in result.stderr
     assert "2 of 3 images done, 1 failed" in result.stderr
+
+
+STAMPS = [1_403_636_579_763_555_584 + n * 50_000_000 for n in (0, 1, 2, 4)]
+
+
+@pytest.mark.parametrize(
+    ("name", "folder", "row"),
+    [
+        ("rgb.txt", "rgb", "{seconds:.6f} rgb/{stamp}.exr"),
+        ("cam0/data.csv", "cam0/data", "{stamp},{stamp}.exr"),
+    ],
+)
+def test_lists_of_datasets_have_times(clpipe, write_exr, name, folder, row):
+    for stamp in STAMPS:
+        write_exr(f"{folder}/{stamp}.exr", np.full((8, 8, 3), 0.2, np.float32))
+    rows = [row.format(stamp=each, seconds=each / 1e9) for each in STAMPS[::-1]]
+    Path(name).write_text("\n".join(["#timestamp [ns],filename", *rows, ""]))
+    result = clpipe("run", name, "-o", "out", "--sequence", "--device", "numpy")
+    assert "1 sequence of 4 frames, 20 frames per second from their times" in result.stderr
+    assert "1 of 5 frames are missing: 1 after 0.1 s" in result.stderr
+    assert len([*Path("out").rglob("*.jpg")]) == 4
+
+
+def test_other_lists_are_rejected(clpipe):
+    Path("groundtruth.txt").write_text("1305031098.6659 1.35 0.63 1.63 0.65 0.61 -0.29 -0.32\n")
+    stderr = clpipe("run", "groundtruth.txt", "-o", "out", "--sequence", status=2).stderr
+    assert "groundtruth.txt, row 1: found '1305031098.6659 1.35 0.63" in stderr
+    assert "expected a time stamp and the path of an image" in stderr
+
+
+def test_loops_follow_the_time_between_frames():
+    """Half an interval, twice, changes as much as a whole one, also at the highest speed."""
+    for speed in (0.0, 0.1):
+        control = Control(delay=0, smoothing=4.0, speed=speed, hysteresis=0.0)
+        whole, halves = ControlLoop(control), ControlLoop(control)
+        assert whole.next(0.0) == halves.next(0.0) == 0
+        halves.next(2.0, 0.5)
+        assert halves.next(2.0, 0.5) == pytest.approx(whole.next(2.0), rel=1e-12)
+
+
+def test_a_long_gap_takes_no_time():
+    loop = ControlLoop(Control())
+    loop.next(0.0)
+    loop.next(1.0)
+    loop.hold(10**12)
+    assert loop.next(1.0) == pytest.approx(1)

@@ -18,7 +18,15 @@ from clpipe.batch.execution import ExecutionOptions, parse_failures
 from clpipe.batch.images import Images
 from clpipe.batch.session import Run
 from clpipe.chain.formats import format_named
-from clpipe.chain.options import DEFAULT_PATCHES, OPTIONS, Moments, RedoName, Transfer, check_option
+from clpipe.chain.options import (
+    DEFAULT_PATCHES,
+    OPTIONS,
+    Gaps,
+    Moments,
+    RedoName,
+    Transfer,
+    check_option,
+)
 from clpipe.chain.python_words import errors_in_python
 from clpipe.chain.rendition import parse_bracket
 from clpipe.chain.request import Request
@@ -71,6 +79,7 @@ def run(
     crf: int | None = None,
     bit_rate: float | str | None = None,
     fps: float | str | None = None,
+    gaps: Gaps | None = None,
     decoded: bool | None = None,
     frames: int | None = None,
     bracket: Sequence[float] | None = None,
@@ -160,7 +169,10 @@ def run(
         bit_depth: the bits per sample of clips, 8 or 10. None is 8.
         crf: the constant rate factor of clips. Smaller is better, and 51 is worst. None is 18.
         bit_rate: the mean bit rate of clips in bits per second, such as 8M, instead of ``crf``.
-        fps: the frames per second of clips, such as 30000/1001. None is 24.
+        fps: the frames per second of clips, such as 30000/1001. None is that of the frames' times,
+            or 24.
+        gaps: what a clip shows at the places of missing frames: "hold", which is the default, shows
+            the frame before, "black" a black one, and "cut" nothing.
         decoded: also decode each clip, and write its frames to OUT/SEQUENCE.decoded/NAME.png.
         frames: the number of frames of a burst. Each frame has its own noise, and the burst its
             ground truth.

@@ -13,6 +13,8 @@ from itertools import groupby
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import numpy as np
+
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import create_parents, discard, shorten_name, sync_folder
 from clpipe.batch.clips import Clip, ClipOptions, SequenceClips, clips_of
@@ -152,8 +154,10 @@ class Clips(GroupSink[SequenceClips]):
                     written += [clip.path, clip.records_path]
                 if self.options.decoded and not all(path.exists() for path in decoded):
                     create_parents(decoded[0])
-                    for path, frame in zip(decoded, read_video(clip.path), strict=True):
-                        write_png(path, frame)
+                    shown = self.options.shown(pictures)
+                    for (_, job), frame in zip(shown, read_video(clip.path), strict=True):
+                        if job:
+                            write_png(clip.decoded_path(job), frame)
         except ImageError as error:
             self.writer.check_folder()
             return replace(last, status=FAILED, error=str(error))
@@ -172,10 +176,12 @@ class Clips(GroupSink[SequenceClips]):
             discard(path)  # a killed run left it
         create_parents(clip.path)
         ending = extension_of(self.writer.formats[0])
-        with VideoWriter(clip.path, self.options.video) as video:
-            for job in jobs:
-                path = self.writer.path(job, ending, clip.rendition)
-                video.add(read_whole_numbers(path, colours=True))
+        with VideoWriter(clip.path, self.options.video_of(jobs[0])) as video:
+            for time, job in self.options.shown(jobs):
+                if job:
+                    path = self.writer.path(job, ending, clip.rendition)
+                    frame = read_whole_numbers(path, colours=True)
+                video.add(frame if job else np.zeros_like(frame), time)
         clip.write_records(jobs, sequence.jobs_with(LEFT_OUT), self.writer, self.options)
         sync_folder(clip.path.parent)
 

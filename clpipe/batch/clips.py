@@ -2,30 +2,32 @@
 
 import json
 import re
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from fractions import Fraction
 from itertools import groupby
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.base.about import __version__
-from clpipe.base.errors import RequestError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.extras import require
 from clpipe.base.files import sha256_of, write_atomic
 from clpipe.base.reading import check_regular
 from clpipe.batch.outcome import Outcome
-from clpipe.batch.run_log import log_name
 from clpipe.batch.tars import STAGING
 from clpipe.chain.formats import CLIP_FORMATS
+from clpipe.chain.options import Gaps
 from clpipe.chain.rendition import FLOAT_MOSAICS, Rendition
-from clpipe.images.video import VideoOptions
-from clpipe.inputs.find import Job, Shard
-from clpipe.inputs.sequences import sequence_of
+from clpipe.images.video import VIDEO_SUFFIXES, VideoOptions
+from clpipe.inputs.find import Job
+from clpipe.inputs.sequences import rate_of, sequence_of
+from clpipe.inputs.times import standard_rate
 from clpipe.outputs.existing import ExistingFiles, match_sidecar
 from clpipe.outputs.sidecar import DIGEST_KEY, SIDECAR, read_sidecar, to_json
 from clpipe.outputs.writer import OutputWriter
 
+SETTINGS = ".csv"  # next to a named clip: the settings of its frames, instead of run.csv
 RECORDS = ".jsonl"  # next to a clip: the sidecar of each frame, one per line
 DECODED = ".decoded"  # the directory of a clip's decoded frames
 
@@ -48,23 +50,72 @@ class ClipOptions:
         video: how they are encoded.
         decoded: whether each clip is decoded to PNGs.
         name: the name of the only clip. "" names clips like their sequences.
+        gaps: what is shown at the places of missing frames.
+        has_rate: whether the user has set the frame rate.
     """
 
     suffix: str
     video: VideoOptions
     decoded: bool
     name: str
+    gaps: Gaps = "hold"
+    has_rate: bool = False
 
-    def record(self) -> dict[str, Any]:
+    def check_size(self, width: int, height: int) -> None:
+        """Check that clips can contain pictures of a size in px.
+
+        Raises:
+            RequestError: the codec cannot store them.
+        """
+        try:
+            self.video.check_size(width, height)
+        except ImageError as error:
+            raise RequestError(f"--codec: {error}") from None
+
+    def shown(self, jobs: Sequence[Job]) -> Iterator[tuple[Fraction, Job | None]]:
+        """Yield the frames of a clip, each with its time in s. None is a black frame."""
+        start: float | None = None
+        last, rate = 0, self.video_of(jobs[0]).rate
+        for count, job in enumerate(jobs):
+            place = job.place
+            assert place
+            start = place.index if start is None else start
+            shown = count if self.gaps == "cut" else place.index - start
+            interval = Fraction(place.interval or 0) or 1 / rate
+            missing = range(last + 1, round(shown)) if self.gaps == "black" else ()
+            yield from ((each * interval, None) for each in missing)
+            last = round(shown)
+            yield Fraction(shown) * interval, job
+
+    def video_of(self, job: Job) -> VideoOptions:
+        """Return how the clip of a frame's sequence is encoded, with the rate of its times.
+
+        Raises:
+            RequestError: the sequence has times, but the user has set a frame rate.
+        """
+        rate = rate_of(job)
+        if rate is None:
+            return self.video
+        if self.has_rate and rate != self.video.rate:
+            raise RequestError(
+                f"--fps: found {float(self.video.rate):.6g}, but the times of {sequence_of(job)} "
+                f"are of {float(rate):.6g} frames per second; remove --fps, or the times"
+            )
+        return replace(self.video, rate=rate, has_times=self.gaps != "cut")
+
+    def record(self, job: Job) -> dict[str, Any]:
         """Return what determines the bytes of a clip, besides its frames, as JSON values."""
-        return {**asdict(self.video), "rate": str(self.video.rate)}
+        video = self.video_of(job)
+        return {**asdict(video), "rate": str(video.rate), "gaps": self.gaps}
 
 
 def parse_rate(text: str) -> Fraction:
     """Return frames per second, from a number or a fraction.
 
+    Numbers near a rate of NTSC mean that rate.
+
     >>> parse_rate("24"), parse_rate("30000/1001"), parse_rate("29.97")
-    (Fraction(24, 1), Fraction(30000, 1001), Fraction(2997, 100))
+    (Fraction(24, 1), Fraction(30000, 1001), Fraction(30000, 1001))
 
     Raises:
         RequestError: the text is neither, or not between 0 and 1000.
@@ -73,7 +124,7 @@ def parse_rate(text: str) -> Fraction:
     rate = Fraction(text) if is_rate else Fraction(0)
     if not 0 < rate <= 1000:
         raise RequestError(f"--fps: found {text!r}; expected a number, such as 24 or 30000/1001")
-    return rate.limit_denominator(1001)
+    return standard_rate(rate)
 
 
 def parse_bit_rate(text: str) -> int:
@@ -109,14 +160,20 @@ def take_clip_options(options: dict[str, Any]) -> ClipOptions | None:
         RequestError: options contradict each other, or PyAV is missing.
     """
     video = {to: options.pop(name) for name, to in VIDEO_FIELDS.items() if name in options}
-    decoded = options.pop("decoded", False)
+    decoded, gaps = options.pop("decoded", False), options.pop("gaps", None)
     output: Path = options["output"]
     suffix = output.suffix.lower()[1:]
     is_file = suffix in CLIP_FORMATS and not output.is_dir()
+    if f".{suffix}" in VIDEO_SUFFIXES and not is_file and not output.is_dir():
+        raise RequestError(
+            f"--output: found {output.name}, but clpipe writes clips as "
+            f"{' or '.join(f'.{each}' for each in CLIP_FORMATS)}; use one of these"
+        )
     formats = dict.fromkeys([*options.get("format", ()), *([suffix] if is_file else [])])
     if not formats.keys() & CLIP_FORMATS:
-        if video or decoded:
-            name = next((n for n, to in VIDEO_FIELDS.items() if to in video), "decoded")
+        if video or decoded or gaps:
+            names = [n for n, to in VIDEO_FIELDS.items() if to in video]
+            name = (*names, *["gaps"] * bool(gaps), "decoded")[0]
             raise RequestError(
                 f"--{name.replace('_', '-')}: this option needs a clip; use -o NAME.mp4, or "
                 "--format mp4"
@@ -138,7 +195,10 @@ def take_clip_options(options: dict[str, Any]) -> ClipOptions | None:
             f"--truth: found {mosaics[0]}, but a clip contains only pictures; remove it"
         )
     name = output.stem if is_file else ""
-    clips = ClipOptions(f".{next(iter(formats))}", VideoOptions(**video), decoded, name)
+    own = VideoOptions(**video)
+    clips = ClipOptions(
+        f".{next(iter(formats))}", own, decoded, name, gaps or "hold", "rate" in video
+    )
     clips.video.check_suffix(clips.suffix)
     require("a clip", "video")
     options["output"] = output.parent if is_file else output
@@ -164,7 +224,7 @@ class Clip:
     @property
     def records_path(self) -> Path:
         """The file with the records of its frames."""
-        return self.path.with_suffix(RECORDS)
+        return self.path.with_name(f"{self.path.name}{RECORDS}")
 
     def decoded_path(self, job: Job) -> Path:
         """Return the path of a decoded frame."""
@@ -194,7 +254,8 @@ class Clip:
             clip = records[0]["clip"]
             pictures = [job for job in jobs if job.stem not in clip["left_out"]]
             names = [record["name"] for record in records]
-            if (clip["encoding"], names) != (options.record(), [job.stem for job in pictures]):
+            stems = [job.stem for job in pictures]
+            if (clip["encoding"], names) != (options.record(jobs[0]), stems):
                 return ExistingFiles.NOTHING
             if (clip["sha256"], clip["size"]) != sha256_of(self.path):
                 return ExistingFiles.NOTHING
@@ -223,14 +284,17 @@ class Clip:
         """
         digest, size = sha256_of(self.path)
         clip = {"name": self.path.name, "size": size, "sha256": digest}
-        clip |= {"encoding": options.record(), "left_out": [job.stem for job in left_out]}
+        clip |= {"encoding": options.record(jobs[0]), "left_out": [job.stem for job in left_out]}
         clip["software"] = f"clpipe {__version__}"  # marks the file as written by clpipe
         lines = []
         for job in jobs:
             assert job.place
             sidecar = read_sidecar(writer.path(job, SIDECAR, self.rendition))
             del sidecar[DIGEST_KEY]
-            record = {**sidecar, "index": job.place.index, "clip": clip}
+            place = job.place
+            record = {**sidecar, "index": place.index, "clip": clip}
+            if place.interval:
+                record["time"] = round(place.index * place.interval, 9)
             lines.append(f"{to_json(record)}\n".encode())
         write_atomic(self.records_path, *lines)
 
@@ -281,8 +345,10 @@ def clips_of(
             f"--output: found {options.name}{options.suffix} for {len(groups)} sequences "
             f"({', '.join([*groups][:3])}); use -o OUT --format {options.suffix[1:]}"
         )
+    for frames in groups.values():
+        options.video_of(frames[0])
     found = {}
-    owners = {writer.folder / log_name(Shard()): "the log of the run"}
+    owners: dict[Path, str] = {}
     for sequence, frames in groups.items():
         path = writer.folder / (options.name or sequence)
         clips = [

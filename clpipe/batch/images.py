@@ -8,6 +8,7 @@ from pathlib import Path
 from clpipe.base.errors import RequestError
 from clpipe.batch.clips import ClipOptions
 from clpipe.batch.tars import Tar, split_into_tars
+from clpipe.chain.python_words import python_words
 from clpipe.inputs.find import Job, Shard, find_jobs
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.poses import assign_views
@@ -48,6 +49,13 @@ class Images:
         """Whether the output directory will hold all pictures, as files, when the run ends."""
         return bool(self.inputs) and not self.per_tar and not self.clips and self.shard.of == 1
 
+    def _rate_text(self) -> str:
+        """Return the frame rate of clips without times, with its source; "" without clips."""
+        if not self.clips:
+            return ""
+        rate, source = self.clips.video.rate, "--fps" if self.clips.has_rate else "the default"
+        return python_words(f"{rate} frames per second from {source}")
+
     def jobs(self, loader: ImageLoader, output: Path) -> tuple[list[Job], list[Tar]]:
         """Return the jobs of this part of the run, and the tars that they go into.
 
@@ -68,7 +76,7 @@ class Images:
                 )
             jobs = in_sequences(jobs)
             if jobs and not self.known_jobs:
-                log.info(summary(jobs))
+                log.info(summary(jobs, self._rate_text()))
             names = self.shard.select(list(dict.fromkeys(map(sequence_of, jobs))))
             if not self.per_tar:
                 return [job for job in jobs if sequence_of(job) in names], []

@@ -25,6 +25,7 @@ from clpipe.batch.checks import (
     check_render_options,
 )
 from clpipe.batch.clip_sink import Clips
+from clpipe.batch.clips import SETTINGS
 from clpipe.batch.execution import ExecutionOptions
 from clpipe.batch.frames import check_frames
 from clpipe.batch.images import Images
@@ -52,6 +53,7 @@ from clpipe.inputs.flow import check_flow
 from clpipe.inputs.lenses import lens_notes
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.metering import write_exposures
+from clpipe.inputs.sequences import rate_of
 from clpipe.outputs.existing import Redo, pictures_without_input
 from clpipe.outputs.folder import output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
@@ -140,7 +142,7 @@ class Run:
             check_flow(self._loader, self.jobs)
         check_frames(self._chain, images.sequence, execution, dask)
         if not images.known_jobs:  # otherwise another run has named them
-            rate = images.clips.video.rate if images.clips else None
+            rate = rate_of(self.jobs[0]) or (images.clips.video.rate if images.clips else None)
             needs_rows = request.truth_at == "rows"
             known = KnownImages(images.sequence, needs_rows=needs_rows, rate=rate)
             for note in unused_values(self._loader.settings, self._chain, known):
@@ -151,6 +153,10 @@ class Run:
         self.writer.check(self._chain, self.jobs)
         if images.clips:
             check_clip_chain(self._chain)
+            claim = self._loader.claim(self.jobs[0])
+            if claim.width and not self.jobs[0].is_panorama:
+                size = self._chain.size(claim.width, claim.height)
+                images.clips.check_size(*size)
             self.sink()  # raises an error if two clips would have one name
         if execution.trace:
             check_trace(execution.trace)
@@ -244,8 +250,14 @@ class Run:
             yield from self._log_outcomes(running, run_log, trace)
             self._finish_folders(folders)
             if frames and not self.summary.interrupted:
-                name = Path(log_name(images.shard)).with_suffix(".csv")
-                write_exposures(execution.output / name, frames)
+                write_exposures(execution.output / self._settings_name(), frames)
+
+    def _settings_name(self) -> str:
+        """The name of the file with the settings of all frames."""
+        clips = self.images.clips
+        if clips and clips.name:
+            return f"{clips.name}{clips.suffix}{SETTINGS}"
+        return str(Path(log_name(self.images.shard)).with_suffix(".csv"))
 
     def _end(self) -> None:
         self._is_active = False

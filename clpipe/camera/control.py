@@ -51,13 +51,22 @@ class ControlLoop:
 
     def __init__(self, control: Control) -> None:
         self._control = control
-        self._share = -math.expm1(-1 / control.smoothing) if control.smoothing else 1.0
         self._metered: deque[float] = deque(maxlen=control.delay + 1)
         self._target = self._value = 0.0
 
-    def next(self, metered: float) -> float:
-        """Return the value of the next frame, whose metered value is ``metered``."""
+    def next(self, metered: float | None, frames: float = 1.0) -> float:
+        """Return the value of the next frame, after a time in frames.
+
+        Args:
+            metered: the metered value of the frame; None is that of the frame before. Without one,
+                the value is 0.
+            frames: the time since the frame before, in usual intervals. Less than one changes less.
+        """
         control = self._control
+        if metered is None:
+            if not self._metered:
+                return self._value
+            metered = self._metered[-1]
         if not self._metered:
             self._target = self._value = metered
             self._metered.extend([metered] * control.delay)
@@ -65,20 +74,19 @@ class ControlLoop:
         seen = self._metered[0]
         if abs(seen - self._target) > control.hysteresis:
             self._target = seen
-        step = self._share * (self._target - self._value)
-        if control.speed:
-            step = min(max(step, -control.speed), control.speed)
+        share = -math.expm1(-frames / control.smoothing) if control.smoothing else 1.0
+        step = share * (self._target - self._value)
+        if speed := control.speed * frames:
+            step = min(max(step, -speed), speed)
         self._value += step
         return self._value
 
-    def hold(self, frames: int = 1) -> float:
-        """Let frames pass as if each had the last metered value, and return the last one's value.
-
-        Without a frame that was metered, the value is 0.
-        """
-        for _ in range(frames if self._metered else 0):
-            self.next(self._metered[-1])
-        return self._value
+    def hold(self, frames: int) -> None:
+        """Let frames pass as if each had the last metered value."""
+        for _ in range(frames):
+            before = self._value
+            if self.next(None) == before and len({*self._metered}) < 2:
+                break  # it has settled
 
 
 class AutoIso:

@@ -109,7 +109,7 @@ def draw_values(
     constants: Mapping[str, Any],
     limits: LimitsOf,
     seed_text: str,
-    frame: int = 0,
+    frame: float = 0,
 ) -> dict[str, Any]:
     """Return a value for each draw, by name.
 

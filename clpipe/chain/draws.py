@@ -176,12 +176,12 @@ class Drift(RangeDraw):
     drift: Ends
     frames: Annotated[float, Field(ge=1)] = 100.0
 
-    def knots(self, frame: int) -> tuple[int, int]:
+    def knots(self, frame: float) -> tuple[int, int]:
         """Return the numbers of the two draws that a frame is between."""
         first = math.floor(frame / self.frames)
         return first, first + 1
 
-    def between(self, frame: int, first: float, second: float) -> float:
+    def between(self, frame: float, first: float, second: float) -> float:
         """Return the uniform number of a frame from those of its two draws."""
         angle = (frame / self.frames % 1) * math.pi / 2
         normal = math.cos(angle) * _normal(first) + math.sin(angle) * _normal(second)

@@ -20,6 +20,7 @@ from clpipe.reference.carried import RESAMPLING
 
 Moments = Literal["start", "middle", "end", "all", "rows"]
 Transfer = Literal["srgb", "linear"]
+Gaps = Literal["hold", "black", "cut"]
 RedoName = Literal["missing", "old", "damaged", "all"]
 
 MAX_PATCHES = 9999  # patches per image; file names have four digits
@@ -156,6 +157,14 @@ _ALL = (
         "RATE",
     ),
     Key("fps", str, "The frames per second of clips, such as 30000/1001.", "RATE", "24"),
+    Key(
+        "gaps",
+        str,
+        "What a clip shows at the places of missing frames: hold shows the frame before, black a "
+        "black one, and cut nothing, so that the clip is shorter.",
+        default_text="hold",
+        choices=get_args(Gaps),
+    ),
     Key(
         "decoded",
         bool,

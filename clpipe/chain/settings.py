@@ -98,7 +98,7 @@ class Settings:
             set_dotted(record, key, draw.record())
         return record
 
-    def drawn(self, name: str, frame: int = 0) -> "Settings":
+    def drawn(self, name: str, frame: float = 0) -> "Settings":
         """Return the settings with a value for each draw; the same object if there are no draws.
 
         The values depend only on the seed and the image's name (see :mod:`clpipe.chain.draws`).
@@ -131,7 +131,7 @@ class Settings:
         drawn = overlay(self, values)
         return with_changes(drawn, {"pushed": True}) if pushed else drawn
 
-    def drawn_values(self, name: str, frame: int) -> dict[str, Any]:
+    def drawn_values(self, name: str, frame: float) -> dict[str, Any]:
         """Return the values of :meth:`drawn` that are drawn, nested like a configuration."""
         drawn = self.drawn(name, frame)
         constants = drawn.constants() if self.draws else {}

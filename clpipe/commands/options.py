@@ -29,7 +29,7 @@ GROUPS = {
     "Renders": "+views +path box +frames +resolution +samples denoise time_limit blender palette",
     "Pictures": "+output +format +keep bracket +patch patches_per_image augment webdataset licence "
     "author",
-    "Clips": "codec crf bit_rate bit_depth fps decoded",
+    "Clips": "codec crf bit_rate bit_depth fps gaps decoded",
     "Truth": "+truth +carry truth_at",
     "Inputs": "+sequence +poses +annotations +exclude layer transfer dump max_pixels",
     "Batches": "+device +redo jobs processes memory shard dask max_failures dry_run quiet "

@@ -64,6 +64,7 @@ class VideoOptions:
         crf: the constant rate factor, 0 to 51. Smaller is better. None is :data:`DEFAULT_CRF`.
         bit_rate: the mean bit rate in bits per second, instead of ``crf``.
         rate: frames per second.
+        has_times: whether frames have times of their own, instead of equal intervals.
 
     Raises:
         RequestError: the values do not fit together.
@@ -78,6 +79,7 @@ class VideoOptions:
     crf: int | None = None
     bit_rate: int | None = None
     rate: Fraction = Fraction(24)
+    has_times: bool = False
 
     def __post_init__(self) -> None:
         if (self.codec, self.bits) not in ENCODERS:
@@ -91,6 +93,11 @@ class VideoOptions:
             raise RequestError(f"found {' and '.join(found)}; remove one of them")
         if found and self.is_lossless:
             raise RequestError(f"found {found[0]}, but ffv1 is lossless; remove crf and bit_rate")
+
+    @property
+    def time_base(self) -> Fraction:
+        """The unit of times in s: an interval between frames, or 1/90000 for other times."""
+        return Fraction(1, 90000) if self.has_times else 1 / self.rate
 
     @property
     def is_lossless(self) -> bool:
@@ -178,6 +185,7 @@ class VideoWriter:
         self.path = path
         self.options = options
         self.count = 0
+        self._last = -1  # the time of the last frame, in units of the time base
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -206,11 +214,12 @@ class VideoWriter:
             self._container.mux(packets)
 
     @CpuTimer("encode")
-    def add(self, frame: Array) -> None:
+    def add(self, frame: Array, time: Fraction | None = None) -> None:
         """Add the next frame.
 
         Args:
             frame: (height, width, 3) sRGB, uint8 for 8 bits, or uint16 in full range for 10 bits.
+            time: when it is shown, in s; None is an interval after the frame before.
 
         Raises:
             ImageError: its size differs from that of the first frame, or is odd; or the file
@@ -229,8 +238,9 @@ class VideoWriter:
                 f"it have {stream.width}x{stream.height} px; frames of one video have one size"
             )
         encoded = self._frame(frame)
-        encoded.pts = self.count
-        encoded.time_base = 1 / options.rate
+        encoded.time_base = options.time_base
+        given = self.count / options.rate if time is None else time
+        encoded.pts = self._last = max(round(given / options.time_base), self._last + 1)
         self._container.mux(stream.encode(encoded))
         self.count += 1
 
@@ -240,8 +250,9 @@ class VideoWriter:
         name, pixels = ENCODERS[options.codec, options.bits]
         stream = self._container.add_stream(name, rate=options.rate)
         stream.width, stream.height, stream.pix_fmt = width, height, pixels
-        stream.time_base = 1 / options.rate
+        stream.time_base = options.time_base
         context = stream.codec_context
+        context.time_base = options.time_base
         context.thread_count = THREADS
         context.color_primaries, context.color_trc = BT709_PRIMARIES, SRGB_CURVE
         context.colorspace = RGB_MATRIX if options.is_lossless else BT709

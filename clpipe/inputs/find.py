@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -49,14 +50,17 @@ class Place:
     Args:
         key: the name of the sequence among the inputs. Its random draws depend on it.
         sequence: its path in the output directory, without extension.
-        index: the place of the frame in temporal order, from 0. Missing frames are counted.
+        index: the place of the frame in temporal order, from 0. Missing frames are counted. It is
+            no whole number between equal intervals.
         count: the number of places.
+        interval: the time between two places in s; None is not known.
     """
 
     key: str
     sequence: str
-    index: int
+    index: float
     count: int
+    interval: float | None = None
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,7 @@ class Job:
         is_panorama: whether its files are views of a panorama and not sub-frames.
         place: its place in a sequence; None if it is a single image.
         first: the file of the first frame of its sequence.
+        time: when it was taken, in s; None is not known.
     """
 
     path: Path
@@ -96,6 +101,7 @@ class Job:
     is_panorama: bool = False
     place: Place | None = None
     first: Path | None = None
+    time: Fraction | None = None
 
     def check(self) -> None:
         """Raise the known problem of this job, if there is one.
@@ -180,7 +186,15 @@ def find_jobs(
             jobs += [Job(p, p.relative_to(path).as_posix(), named_by_user=False) for p in files]
         elif path.suffix.lower() in MANIFEST_SUFFIXES:
             jobs += [
-                Job(row.path, row.key, row.name, True, row.values, row.frames, row.location)
+                Job(
+                    row.path,
+                    row.key,
+                    row.name,
+                    values=row.values,
+                    frames=row.frames,
+                    location=row.location,
+                    time=row.time,
+                )
                 for row in read_manifest(path)
             ]
         elif glob.has_magic(text) and not os.path.exists(text):

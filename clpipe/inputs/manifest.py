@@ -2,9 +2,11 @@
 
 import csv
 import io
+import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
@@ -27,9 +29,11 @@ from clpipe.inputs.tables import (
     TOP_LEVEL_KEYS,
     csv_records,
     json_records,
+    list_records,
 )
+from clpipe.inputs.times import decimal_text, seconds_of
 
-MANIFEST_SUFFIXES = (".csv", ".jsonl")
+MANIFEST_SUFFIXES = (".csv", ".jsonl", ".txt")
 # No other setting depends on these keys, and their values often differ by row.
 INDEPENDENT_KEYS = (
     "seed",
@@ -49,6 +53,7 @@ class Row:
         values: its settings, nested like a configuration.
         frames: the number of frames; None uses the request's number.
         location: the manifest and the row, for messages.
+        time: when it was taken, in s; None is not known.
     """
 
     path: Path
@@ -57,6 +62,7 @@ class Row:
     values: Mapping[str, Any]
     frames: int | None
     location: str
+    time: Fraction | None = None
 
     @property
     def stem(self) -> str:
@@ -71,10 +77,13 @@ def read_manifest(path: Path) -> list[Row]:
     text if it is not valid TOML. An empty cell sets nothing. A .jsonl file has one object per line,
     nested like a configuration or with dotted keys, and null sets nothing.
 
-    Columns are ``path``, ``key``, ``name``, ``frames``, ``iso``, ``camera``, ``lens``,
+    Columns are ``path``, ``key``, ``name``, ``time``, ``frames``, ``iso``, ``camera``, ``lens``,
     ``focal_length``, ``aperture``, ``focus_distance``, ``seed``, ``noise_key`` and ``skip`` (a
     list, or names with spaces between them). Any ``stage.parameter`` is a column, including those
     of loaded stage files. File names are relative to the manifest.
+
+    A .txt file, or a .csv file that begins with #, is a list of images with time stamps, see
+    :func:`clpipe.inputs.tables.list_records`.
 
     Without the column ``key``, the key of a row is its name. Without either, it is the path
     relative to the manifest's folder, or the file's name if the file is outside that folder.
@@ -87,7 +96,9 @@ def read_manifest(path: Path) -> list[Row]:
             message describes the first wrong row, and counts the others.
     """
     text = _text(path)
-    read = json_records if path.suffix.lower() == ".jsonl" else csv_records
+    read = {".jsonl": json_records, ".txt": list_records}.get(path.suffix.lower(), csv_records)
+    if text.startswith("#"):  # EuroC's data.csv
+        read = list_records
     errors: list[str] = []
     rows: list[Row] = []
     by_stem: dict[str, Row] = {}
@@ -125,6 +136,7 @@ def manifest_text(folder: Path, rows: Sequence[Row]) -> bytes:
         below = os.path.relpath(path, os.path.abspath(folder))
         key = "" if row.key == (row.name or key_of(folder, row.path)) else row.key
         cells = {"path": path if below.startswith("../") else below, "key": key, "name": row.name}
+        cells["time"] = "" if row.time is None else decimal_text(row.time)
         cells["frames"] = "" if row.frames is None else str(row.frames)
         for key, value in resolve_paths(Path.cwd(), row.values).items():
             table = value if key not in TOP_LEVEL_KEYS and isinstance(value, Mapping) else None
@@ -299,7 +311,29 @@ def _row(
     image_path = join_url(folder, path)
     key = key or name or (image_path.name if is_url(path) else key_of(folder, image_path))
     values = resolve_paths(folder, values)
-    return Row(image_path, key, name, shared.setdefault(repr(values), values), frames, location)
+    time = _time(record.get("time"))
+    shared_values = shared.setdefault(repr(values), values)
+    return Row(image_path, key, name, shared_values, frames, location, time)
+
+
+def _time(value: Any) -> Fraction | None:
+    """Return a time in s from a number of seconds or from a time stamp.
+
+    Raises:
+        RequestError: it is no finite number.
+    """
+    if value is None:
+        return None
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float | Fraction)
+        or not math.isfinite(value)
+    ):
+        raise RequestError(
+            f"time: found {value!r}, but expected a number: seconds, or a time stamp in s, ms or ns"
+        )
+    time = Fraction(str(value))  # the decimals of a float, not its binary digits
+    return seconds_of(time) or time
 
 
 def check_output_name(name: str, column: str = "name") -> None:

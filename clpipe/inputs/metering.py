@@ -86,7 +86,7 @@ class Meter:
         self._on_device = on_device
         self._runners: dict[Device | None, Runner] = {}
         # Each loop, and the place of the last frame that it followed.
-        self._loops: dict[str, tuple[ControlLoop, int]] = {}
+        self._loops: dict[str, tuple[ControlLoop, float]] = {}
         self._iso: AutoIso | None = None
 
     def read(
@@ -94,7 +94,7 @@ class Meter:
         chain: Chain,
         image: Array,
         image_key: str,
-        place: int,
+        place: float,
         chain_of: Callable[[Mapping[str, Any]], Chain],
     ) -> Reading:
         """Return the settings of the next frame.
@@ -106,7 +106,7 @@ class Meter:
             chain: the chain of the frame.
             image: the frame, as for :meth:`clpipe.engine.runner.Runner.run`.
             image_key: the key of its noise.
-            place: its place in the sequence.
+            place: its place in the sequence, in frames.
             chain_of: returns the chain of the frame with further settings.
 
         Raises:
@@ -127,8 +127,9 @@ class Meter:
         def follow(name: str, ev: float | None) -> float:
             loop, last = self._loops.get(name) or (ControlLoop(control), place - 1)
             self._loops[name] = loop, place
-            loop.hold(place - last - 1)
-            return loop.hold() if ev is None else loop.next(ev)
+            missing = max(round(place - last) - 1, 0)
+            loop.hold(missing)
+            return loop.next(ev, place - last - missing)
 
         if exposure:
             method = exposure.method
@@ -277,7 +278,7 @@ def write_exposures(path: Path, jobs: Sequence[Job]) -> None:
     """
     rows = []
     for job in jobs:
-        own = job.values, job.frames, job.location
+        own = job.values, job.frames, job.location, job.time
         for file in job.paths:
             is_named = file is job.path and not job.is_panorama  # a panorama's key names no view
             key = job.key if is_named else str(PurePosixPath(job.key).with_name(file.name))

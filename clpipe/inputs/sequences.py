@@ -4,7 +4,7 @@ import logging
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import lru_cache
@@ -18,6 +18,7 @@ from clpipe.base.urls import may_be_url
 from clpipe.images.layers import find_picture
 from clpipe.images.openimageio import open_image
 from clpipe.inputs.find import Job, Place
+from clpipe.inputs.times import decimal_text, seconds_of, standard_rate, timing_of
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +32,6 @@ OTHER_WORDS: tuple[str, ...] = ("cam", "camera", "view", "v", "ver", "version", 
 OTHER_WORDS += ("sc", "scene", "seq")
 OTHER_WORDS += ("sequence", "id", "part", "eye", "rig", "sensor", "run", "obj", "object", "seed")
 MAX_GAPS = 5  # the most gaps that a message lists
-STAMP = 10**8  # the smallest time stamp: seconds, milliseconds or nanoseconds since 1970
 MAX_PLACES = 10**7  # in a sequence; with more, numbers only order the frames
 MAX_NAMES = 3  # sequences that a summary names
 
@@ -68,12 +68,25 @@ def numbers_of(job: Job) -> list[Fraction]:
     return [Fraction(number) for number in split_numbers(job.key)[1]]
 
 
-def summary(jobs: Sequence[Job]) -> str:
+def rate_of(job: Job) -> Fraction | None:
+    """Return the frames per second of a job's sequence, from the times of its frames, if known."""
+    interval = job.place.interval if job.place else None
+    return standard_rate(1 / Fraction(interval)) if interval else None
+
+
+def summary(jobs: Sequence[Job], rate: str = "") -> str:
     """Return a sentence about the sequences of jobs.
+
+    Args:
+        jobs: the frames.
+        rate: the frame rate of sequences without times, with its source.
 
     >>> names = [f"cam{camera}_f{number}.exr" for camera in "01" for number in "123"]
     >>> summary(in_sequences([Job(Path(name), name) for name in names]))
     '2 sequences of 3 frames: cam0_f, cam1_f'
+    >>> names = [f"{10**9 + n}.250.exr" for n in range(3)]
+    >>> summary(in_sequences([Job(Path(name), name) for name in names]))
+    '1 sequence of 3 frames, 1 frame per second from their times: frames'
     """
     counts = Counter(map(sequence_of, jobs))
     low, high = min(counts.values()), max(counts.values())
@@ -81,7 +94,12 @@ def summary(jobs: Sequence[Job]) -> str:
     names = ", ".join(list(counts)[:MAX_NAMES])
     more = f" and {len(counts) - MAX_NAMES} more" if len(counts) > MAX_NAMES else ""
     of = f"{len(counts)} sequence{'s' * (len(counts) > 1)} of {frames} frame{'s' * (high > 1)}"
-    return f"{of}: {names}{more}"
+    rates = sorted({each for each in map(rate_of, jobs) if each})
+    if rates:
+        low_, high_ = (f"{float(each):.6g}" for each in (rates[0], rates[-1]))
+        per = low_ if low_ == high_ else f"{low_} to {high_}"
+        rate = f"{per} frame{'s' * (per != '1')} per second from their times"
+    return f"{of}{', ' * bool(rate)}{rate}: {names}{more}"
 
 
 def in_sequences(jobs: Sequence[Job]) -> list[Job]:
@@ -92,7 +110,9 @@ def in_sequences(jobs: Sequence[Job]) -> list[Job]:
     else the last one, but none after a word such as cam. Each value of the others is then a
     sequence, such as a camera of a rig. Names without numbers keep the order of the jobs.
 
-    Time stamps only order the frames. Their times are not used.
+    Frames have times if all of a sequence have one, or have time stamps as their numbers, see
+    :func:`~clpipe.inputs.times.seconds_of`. Their places are then in units of the median interval,
+    and no whole numbers if the intervals differ.
 
     A sequence has the name of its directory, or of its files if the directory has several. Gaps are
     logged. Missing frames keep their places, so that the time between the other frames is right.
@@ -102,7 +122,8 @@ def in_sequences(jobs: Sequence[Job]) -> list[Job]:
     [('f.9.exr', 0), ('f.10.exr', 1), ('f.12.exr', 3)]
 
     Raises:
-        RequestError: two frames of a sequence have the same number.
+        RequestError: two frames of a sequence have the same number or time, or only some have a
+            time.
     """
     sequences: dict[str, list[tuple[Fraction, Job]]] = {}
     for written, members in by_pattern(jobs).items():
@@ -186,27 +207,34 @@ def _name(pattern: str, numbers: Sequence[str], frame: int) -> str:
 
 
 def _placed(key: str, frames: Sequence[tuple[Fraction, Job]]) -> Iterator[Job]:
-    """Yield the jobs of a sequence with their places, in temporal order."""
+    """Yield the jobs of a sequence with their places, in temporal order.
+
+    Raises:
+        RequestError: two frames have the same number, or only some have a time.
+    """
+    times = _times(frames)
+    if times:
+        frames = [(time, job) for time, (_, job) in zip(times, frames, strict=True)]
     numbers = sorted({number for number, _ in frames})
-    unit = math.lcm(*(number.denominator for number in numbers))
-    step = Fraction(math.gcd(*(int((n - numbers[0]) * unit) for n in numbers)) or unit, unit)
-    count = int((numbers[-1] - numbers[0]) / step) + 1
-    if count > MAX_PLACES or (numbers[0] >= STAMP and count > len(numbers)):
-        text = "its numbers are time stamps: frames have their order, but equal intervals"
-        log.warning("%s: %s", printable(key), text)
-        places = {number: place for place, number in enumerate(numbers)}
-        frames = [(Fraction(places[number]), job) for number, job in frames]
-        numbers = sorted(map(Fraction, places.values()))
-        step, count = Fraction(1), len(numbers)
-    gaps = [(a + step, b - step) for a, b in pairwise(numbers) if b > a + step]
-    if gaps:
-        texts = [
-            f"{float(a):g}" if a == b else f"{float(a):g} to {float(b):g}"
-            for a, b in gaps[:MAX_GAPS]
+    timing = timing_of(numbers) if times and len(numbers) > 1 else None
+    places = timing.places if timing else _places(numbers)
+    count = round(places[numbers[-1]]) + 1
+    interval = float(timing.interval) if timing else None
+    if count > MAX_PLACES:
+        log.warning("%s: its numbers only order the frames, which are far apart", printable(key))
+        places, count, interval = (
+            {number: n for n, number in enumerate(numbers)},
+            len(numbers),
+            None,
+        )
+    elif gaps := _gaps(places):
+        found = [
+            f"{n} after {decimal_text(a - numbers[0])} s" if times else _missing_text(a, b, n + 1)
+            for a, b, n in gaps[:MAX_GAPS]
         ]
         more = f", and {len(gaps) - MAX_GAPS} more gaps" if len(gaps) > MAX_GAPS else ""
-        missing = f"{count - len(numbers)} of {count} frames are missing: {', '.join(texts)}{more}"
-        log.warning("%s: %s", printable(key), missing)
+        missing = f"{sum(gap[2] for gap in gaps)} of {count} frames are missing: {', '.join(found)}"
+        log.warning("%s: %s%s", printable(key), missing, more)
     by_place: dict[Place, Job] = {}
     first = min(frames, key=lambda frame: frame[0])[1].path
     for number, job in sorted(frames, key=lambda frame: frame[0]):
@@ -214,15 +242,60 @@ def _placed(key: str, frames: Sequence[tuple[Fraction, Job]]) -> Iterator[Job]:
         folder = PurePosixPath(job.stem).parent
         is_folder = folder.name == PurePosixPath(key).name
         sequence = str(folder if is_folder else folder / PurePosixPath(key).name)
-        place = Place(key, sequence, int((number - numbers[0]) / step), count)
+        place = Place(key, sequence, places[number], count, interval)
         # The run itself rejects two jobs with the same outputs.
         if place in by_place and by_place[place].stem != job.stem:
+            at = f"at {decimal_text(number)} s" if times else f"frame {float(number):g}"
             raise RequestError(
-                f"{by_place[place].label} and {job.label} are both frame {float(number):g} of the "
-                f"sequence {sequence}; remove or rename one of them"
+                f"{by_place[place].label} and {job.label} are both {at} of the sequence "
+                f"{sequence}; remove or rename one of them"
             )
         by_place[place] = job
         yield replace(job, place=place, first=first)
+
+
+def _times(frames: Sequence[tuple[Fraction, Job]]) -> list[Fraction]:
+    """Return the times of frames in s: their own, or else the time stamps in their names.
+
+    Returns:
+        The time of each frame; nothing if they have none.
+
+    Raises:
+        RequestError: only some have a time of their own.
+    """
+    own = [job.time for _, job in frames]
+    found = [time for time in own if time is not None]
+    if 0 < len(found) < len(own):
+        raise RequestError(
+            f"{frames[own.index(None)][1].label}: this frame has no time, but others of its "
+            "sequence have; give each of them one in the column time"
+        )
+    stamps = [seconds_of(number) for number, _ in frames]
+    return found or ([each for each in stamps if each] if all(stamps) else [])
+
+
+def _places(numbers: Sequence[Fraction]) -> dict[Fraction, float]:
+    """Return the place of each number, in steps of their greatest common divisor."""
+    unit = math.lcm(*(number.denominator for number in numbers))
+    step = Fraction(math.gcd(*(int((n - numbers[0]) * unit) for n in numbers)) or unit, unit)
+    return {number: int((number - numbers[0]) / step) for number in numbers}
+
+
+def _gaps(places: Mapping[Fraction, float]) -> list[tuple[Fraction, Fraction, int]]:
+    """Return the numbers on both sides of each gap, and how many frames are missing there."""
+    found = pairwise(places.items())
+    return [(a, b, missing) for (a, p), (b, q) in found if (missing := round(q - p) - 1) > 0]
+
+
+def _missing_text(before: Fraction, after: Fraction, steps: int) -> str:
+    """Return the missing numbers between two.
+
+    >>> _missing_text(Fraction(2), Fraction(4), 2), _missing_text(Fraction(2), Fraction(8), 3)
+    ('3', '4 to 6')
+    """
+    step = (after - before) / steps
+    first, last = float(before + step), float(after - step)
+    return f"{first:g}" if first == last else f"{first:g} to {last:g}"
 
 
 def check_same_layer(path: Path, layer: str, first: Path) -> None:

@@ -6,8 +6,10 @@ A row is parsed only when its record is called, so that one wrong row does not h
 import csv
 import io
 import json
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,7 @@ Record = Callable[[], dict[str, Any]]
 
 TEXT_COLUMNS = ("path", "key", "name")  # columns that are not parsed as TOML values
 
-NON_SETTINGS = (*TEXT_COLUMNS, "frames")  # columns that are not settings
+NON_SETTINGS = (*TEXT_COLUMNS, "time", "frames")  # columns that are not settings
 
 # Columns with settings that do not belong to a table.
 TOP_LEVEL_KEYS = tuple(key for key in KEYS if key not in (CODE, "dump", "stages"))
@@ -98,6 +100,34 @@ def _by_column(columns: Sequence[str], cells: Sequence[str]) -> dict[str, Any]:
     pairs = zip(columns, cells, strict=True)
     filled = {column: cell for column, cell in pairs if cell.strip()}
     return {k: v if k in TEXT_COLUMNS else toml_value(v.strip()) for k, v in filled.items()}
+
+
+def list_records(path: Path, text: str, _check_column: object) -> Iterator[tuple[int, Record]]:
+    """Yield the rows of a list of images with time stamps, as of the TUM and EuroC datasets.
+
+    A row of TUM's rgb.txt is a time stamp and a file. The files of EuroC's data.csv are in the
+    folder data beside it. Lines that begin with # are comments.
+
+    For the arguments, see :func:`csv_records`.
+    """
+    folder = "data/" if path.suffix.lower() == ".csv" else ""
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.strip() and not line.startswith("#"):
+            yield number, partial(_from_list, folder, re.split(r"[ ,\t]+", line.strip()))
+
+
+def _from_list(folder: str, words: Sequence[str]) -> dict[str, Any]:
+    """Return the path and the time of a row of a list.
+
+    Raises:
+        RequestError: the row has no time stamp, or not one file.
+    """
+    if len(words) != 2 or not re.fullmatch(r"\d+(\.\d*)?", words[0]):
+        raise RequestError(
+            f"found {' '.join(words)[:60]!r}, but expected a time stamp and the path of an image. "
+            "For other columns, use a manifest with the columns path and time"
+        )
+    return {"path": folder + words[1], "time": Fraction(words[0])}
 
 
 def json_records(

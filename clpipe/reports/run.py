@@ -170,6 +170,8 @@ def read_run(folder: Path) -> Run:
     for picture in found:
         run.add(picture)
     for path in sorted(folder.glob(LOGS)):
+        if path.with_suffix("").suffix in CLIPS:
+            continue  # the records of a clip
         try:
             run.logs += read_log(path)
         except (OSError, ValueError) as error:
