@@ -194,3 +194,46 @@ def test_a_dataset_leaves_out_what_is_excluded(write_exr, tmp_path):
     write_exr("in/b.exr", np.full((4, 6, 3), 0.25))
     (sample,) = clpipe_api.Dataset(tmp_path / "in", device="numpy", exclude="b*")
     assert sample["key"] == "a.exr"
+
+
+@pytest.mark.parametrize(
+    ("pattern", "numbers"),
+    [
+        ("f.%04d.exr", ["0998", "1001", "1003", "1004", "10000"]),
+        ("f.####.exr", ["0998", "1001", "1003", "1004", "10000"]),
+        ("f.@@@@.exr", ["0998", "1001", "1003", "1004", "10000"]),
+        ("f.$F4.exr", ["0998", "1001", "1003", "1004", "10000"]),
+        ("f.%d.exr", ["-7", "3", "1001", "1003", "1004", "10000"]),
+        ("f.#.exr", ["-7", "3", "0998", "1001", "1003", "1004", "10000"]),
+        ("f.1001-1004x2####.exr", ["1001", "1003"]),
+        ("f.0-999,1004-1004%04d.exr", ["0998", "1004"]),
+    ],
+)
+def test_patterns_of_numbered_files(tmp_path, pattern, numbers):
+    for number in ("-7", "3", "0998", "1001", "1003", "1004", "10000"):
+        (tmp_path / f"f.{number}.exr").touch()
+    for other in ("f.a.exr", "f.1001.png", "g.1001.exr", "f.1001.b.exr"):
+        (tmp_path / other).touch()
+    jobs = find_jobs([str(tmp_path / pattern)], tmp_path / "out")
+    found = [job.key.split(".")[1] for job in jobs]
+    assert found == numbers
+
+
+def test_missing_numbers_of_a_range_are_named(tmp_path, caplog):
+    (tmp_path / "f.1001.exr").touch()
+    pattern = str(tmp_path / "f.1001-1009x2####.exr")
+    assert len(find_jobs([pattern], tmp_path / "out")) == 1
+    assert "4 of 5 frames are missing: 1003, 1005, 1007, 1009" in caplog.text
+    for wrong, message in (
+        ("f.7-9####.exr", "no file matches this pattern of numbers"),
+        ("f.9-7####.exr", "the range 9-7 has no numbers; use FIRST-LASTxSTEP"),
+        ("f.1-9x0####.exr", "the range 1-9x0 has no numbers"),
+    ):
+        with pytest.raises(RequestError, match=message):
+            find_jobs([str(tmp_path / wrong)], tmp_path / "out")
+
+
+def test_a_file_with_the_name_of_a_pattern_is_a_file(tmp_path):
+    (tmp_path / "a#1.exr").touch()
+    [job] = find_jobs([str(tmp_path / "a#1.exr")], tmp_path / "out")
+    assert job.key == "a#1.exr"

@@ -23,6 +23,7 @@ from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import PICTURE_SUFFIXES, RENDER_SUFFIXES
 from clpipe.inputs.companions import owner_of
 from clpipe.inputs.manifest import MANIFEST_SUFFIXES, read_manifest
+from clpipe.inputs.numbered import numbered_files
 
 T = TypeVar("T")
 
@@ -160,7 +161,8 @@ def find_jobs(
     see :func:`without_companions`.
 
     Args:
-        inputs: files, folders (all images in them, at any depth), globs and manifests.
+        inputs: files, folders (all images in them, at any depth), globs, patterns of numbered
+            files and manifests.
         output: the output directory. If it is inside an input folder, its files are skipped.
         endings: extensions of the files that are taken from folders.
         exclude: patterns of files to skip in folders and globs, see :class:`Exclusion`.
@@ -197,10 +199,7 @@ def find_jobs(
                 )
                 for row in read_manifest(path)
             ]
-        elif glob.has_magic(text) and not os.path.exists(text):
-            matches = sorted(m for m in glob.glob(text, recursive=True) if os.path.isfile(m))
-            if not matches:
-                raise RequestError(f"{text}: no file matches this pattern; correct it")
+        elif (matches := numbered_files(text) or _glob_files(text)) is not None:
             jobs += [Job(Path(m), Path(m).name) for m in matches if m not in excluded]
         else:
             check_input(path)
@@ -213,6 +212,20 @@ def find_jobs(
     if not jobs:
         raise RequestError("every file is excluded by --exclude; use a narrower pattern")
     return jobs
+
+
+def _glob_files(text: str) -> list[str] | None:
+    """Return the files that a glob matches; None if the text is no glob, or names a file.
+
+    Raises:
+        RequestError: no file matches.
+    """
+    if not glob.has_magic(text) or os.path.exists(text):
+        return None
+    matches = sorted(m for m in glob.glob(text, recursive=True) if os.path.isfile(m))
+    if not matches:
+        raise RequestError(f"{text}: no file matches this pattern; correct it")
+    return matches
 
 
 def without_companions(jobs: Sequence[Job]) -> list[Job]:
