@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.about import __version__
+from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.spec import RunSpec, shifted
@@ -170,7 +171,7 @@ def probe_worker(spec: DaskSpec, probe: str, size: int | None) -> WorkerEnvironm
         return f"does not see the output directory {output}"
     if reason := write_problem(output):
         return f"{output}: {reason}"
-    if size is not None and (not path.exists() or path.stat().st_size != size):
+    if size is not None and stamp_of(path)[0] != size:
         return f"does not see the input {path}"
     return environment
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.memory import parse_size
 from clpipe.base.user_warnings import warn
@@ -59,7 +60,7 @@ def jobs_of(
     job_by_key: dict[str, Job] = {}
     for job in jobs:
         # Files that were found in directories exist.
-        if job.named_by_user and not job.path.exists():
+        if job.named_by_user and stamp_of(job.path) == (0, 0):
             raise RequestError(f"{job.label}: there is no such file or folder")
         other = job_by_key.setdefault(job.key, job)
         if other is not job:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import ImageError
+from clpipe.images.clip_frames import clip_of, clip_size
 from clpipe.images.colour import CIE_XYZ, SRGB, to_linear_srgb
 from clpipe.images.colour_names import space_of
 from clpipe.images.layers import picture_channels
@@ -74,6 +75,10 @@ def claim_of(path: Path, mosaic: bool = False) -> MemoryClaim | None:
         mosaic: whether only a single channel is read.
     """
     try:
+        if clip := clip_of(path):
+            width, height = clip_size(clip)
+            pixels = width * height * 3 * FLOAT
+            return MemoryClaim(width, height, pixels, 2 * pixels)
         if path.suffix.lower() in RAW_SUFFIXES:
             return mosaic_claim(*raw_size(path))
         with open_image(path) as file:

@@ -8,9 +8,11 @@ import numpy as np
 import OpenImageIO as oiio
 
 from clpipe.base.cpu_time import CpuTimer
+from clpipe.base.digests import digests
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.images.attributes import clpipe_attributes, photograph_attributes, shot_attributes
+from clpipe.images.clip_frames import clip_of, read_clip_frame
 from clpipe.images.colour import SRGB, to_linear_srgb
 from clpipe.images.colour_names import DECODERS
 from clpipe.images.layers import find_picture, picture_channels
@@ -27,7 +29,7 @@ from clpipe.images.pixels import (
     overscan_margins,
     windows_overlap,
 )
-from clpipe.images.samples import digest_of, read_part, read_samples, with_digest
+from clpipe.images.samples import WAYS, digest_of, read_part, read_samples, with_digest
 from clpipe.images.statements import Statements, over_black, read_statements
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.panorama import Panorama
@@ -207,6 +209,8 @@ def read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
 def _read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
     """Do the same as :func:`read_source`, but without naming options in errors."""
     transfer = options.transfer if kind is Kind.RGB else None
+    if transfer is None and kind is not Kind.DISPLAY and clip_of(path):
+        raise ImageError(f"{path}: a frame of a clip is no linear light", WAYS)
     if transfer and (encoded := _read_encoded(path, options.max_pixels)):
         return _as_light(path, encoded, transfer)
     if kind is not Kind.DISPLAY:
@@ -241,6 +245,12 @@ def _read_encoded(path: Path, max_pixels: int) -> _Encoded | None:
     Raises:
         ImageError: as for :func:`read_finished`.
     """
+    if clip_of(path):
+        frame = read_clip_frame(path, max_pixels)
+        pixels = frame.pixels / np.float32(np.iinfo(frame.pixels.dtype).max)
+        digest = digests([str(path)])[str(path)]
+        stated = Statements(frame.chromaticities, warnings=frame.warnings)
+        return _Encoded(SourceImage(pixels, digest, "", (), {}), None, stated, is_grey=False)
     with open_image(path) as file:
         spec = file.spec()
         names = list(spec.channelnames)

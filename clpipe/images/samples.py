@@ -19,6 +19,7 @@ from clpipe.images.pixels import DEFAULT_MAX_PIXELS, check_size, display_window
 from clpipe.reference.geometry import Margins
 
 LARGE_FILE = 4 << 20  # bytes; for smaller files, starting a thread takes longer than the SHA-256
+WAYS = "For a render, add --transfer srgb or --transfer linear. For a photograph, use -c unprocess"
 MAX_CHANNEL_SPAN = 8  # channels; the channels of a picture may be hundreds apart
 
 
@@ -75,8 +76,7 @@ def read_part(
         raise ImageError(
             f"{path}: this {file.format_name().upper()} file has samples of type {spec.format}, "
             "but linear light in floats is expected",
-            "For a render, add --transfer srgb or --transfer linear. For a photograph, use -c "
-            "unprocess",
+            WAYS,
         )
     width, height = margins.image_size(spec.full_width, spec.full_height)
     check_size(path, width, height, max_pixels)

@@ -192,7 +192,7 @@ class VideoWriter:
         import av
 
         with ExitStack() as stack:
-            stack.enter_context(_errors(self.path, "written"))
+            stack.enter_context(video_errors(self.path, "written"))
             file = stack.enter_context(atomic_file(self.path))
             self._container = stack.enter_context(
                 av.open(file, "w", CONTAINERS[self.path.suffix], {"fflags": "+bitexact"})
@@ -300,7 +300,7 @@ def video_info(path: Path) -> VideoInfo:
         RequestError: PyAV is missing.
         ImageError: the file cannot be read, or contains no video.
     """
-    with _opened(path) as (container, stream):
+    with opened_video(path) as (container, stream):
         context = stream.codec_context
         assert context.format
         return VideoInfo(
@@ -331,14 +331,14 @@ def read_video(path: Path) -> Iterator[Array]:
         RequestError: PyAV is missing.
         ImageError: the file cannot be read, or contains no video.
     """
-    with _opened(path) as (container, stream):
+    with opened_video(path) as (container, stream):
         stream.thread_type = "AUTO"
         for frame in container.decode(stream):
-            yield _rgb(frame)
+            yield to_rgb(frame)
 
 
-def _rgb(frame: "av.VideoFrame") -> Array:
-    """Return a decoded frame as RGB, see :func:`read_video`."""
+def to_rgb(frame: "av.VideoFrame") -> Array:
+    """Return a decoded frame as RGB, (height, width, 3), see :func:`read_video`."""
     bits = frame.format.components[0].bits
     if frame.format.is_rgb:
         if bits == 8 or not frame.format.name.startswith("gbrp"):
@@ -362,22 +362,31 @@ def _rgb(frame: "av.VideoFrame") -> Array:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+def opened_video(path: Path) -> Iterator[tuple[Any, Any]]:
     """Open a video file for reading, and yield its container and first video stream."""
     require(f"{path}: reading a video", "video")
     import av
 
-    with _errors(path, "read"), av.open(path) as container:
-        if not container.streams.video:
-            raise ImageError(f"{path}: this file contains no video")
-        stream = container.streams.video[0]
-        check_size(path, stream.width, stream.height, DEFAULT_MAX_PIXELS)
-        yield container, stream
+    with video_errors(path, "read"), av.open(path) as container:
+        yield container, video_stream(path, container)
+
+
+def video_stream(path: Path, container: Any) -> Any:
+    """Return the first video stream of an open container.
+
+    Raises:
+        ImageError: there is none, or its frames are too large.
+    """
+    if not container.streams.video:
+        raise ImageError(f"{path}: this file contains no video")
+    stream = container.streams.video[0]
+    check_size(path, stream.width, stream.height, DEFAULT_MAX_PIXELS)
+    return stream
 
 
 @contextmanager
-def _errors(path: Path, done: str) -> Iterator[None]:
-    """Convert FFmpeg's errors to an ImageError about a file."""
+def video_errors(path: Path, done: str) -> Iterator[None]:
+    """Convert FFmpeg's errors in the ``with`` block to an ImageError about a file."""
     from av.error import FFmpegError
 
     try:

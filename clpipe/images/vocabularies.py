@@ -259,6 +259,39 @@ OWN_SENTENCES = ("PixelAspectRatio", "whiteLuminance", "ICCProfile", "iCCP")  # 
 
 _OPENEXR_NAMES = {OIIO_NAMES.get(name, name): name for name in OPENEXR.statements}
 
+CLIP = Vocabulary.of(
+    "Clips",
+    "ITU-T H.273 (2024) and FFmpeg's names of streams and metadata",
+    {
+        "used": {
+            "samples": "codec pixel_format width height",
+            "primaries": "color_primaries",
+            "matrix from luma and chroma to RGB, or RGB": "colorspace",
+            "limited or full range": "color_range",
+            "which side is up": "rotation rotate",
+            "when frames are shown": "pts time_base average_rate",
+        },
+        "checked": {"the transfer curve, which must be one for SDR": "color_trc"},
+        "named": {
+            "width of a pixel over its height": "sample_aspect_ratio",
+            "fields that were taken one after the other": "interlaced",
+            "opacity": "alpha",
+            "unknown primaries; it is read as sRGB": "unknown_primaries",
+            "further video streams, of which the first is read": "other_streams",
+            "two views in a frame": "stereo_mode",
+        },
+        "ignored": {
+            "what wrote the file": "encoder ENCODER vendor_id handler_name major_brand "
+            "minor_version compatible_brands _STATISTICS_WRITING_APP",
+            "when, where and by whom it was made": "creation_time timecode location date artist "
+            "copyright",
+            "text": "title comment description language",
+            "sizes of streams": "DURATION BPS NUMBER_OF_FRAMES NUMBER_OF_BYTES",
+            "other streams": "audio subtitle",
+        },
+    },
+)
+
 
 def vocabulary_warnings(path: Path, format_: str, spec: Any, chunks: Iterable[bytes]) -> list[str]:
     """Return sentences about what a file states, and clpipe does not use.

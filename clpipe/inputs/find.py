@@ -5,7 +5,7 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from fractions import Fraction
 from functools import cached_property
@@ -19,8 +19,10 @@ from clpipe.base.url_text import is_glob, is_url, local, name_in
 from clpipe.base.urls import forget_stamps, list_urls, path_of, url_of
 from clpipe.chain.python_words import python_words
 from clpipe.chain.rendition import Rendition
+from clpipe.images.clip_frames import clip_times, frame_path
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import PICTURE_SUFFIXES, RENDER_SUFFIXES
+from clpipe.images.video import VIDEO_SUFFIXES
 from clpipe.inputs.companions import owner_of
 from clpipe.inputs.manifest import MANIFEST_SUFFIXES, read_manifest
 from clpipe.inputs.numbered import numbered_files
@@ -161,8 +163,8 @@ def find_jobs(
     see :func:`without_companions`.
 
     Args:
-        inputs: files, folders (all images in them, at any depth), globs, patterns of numbered
-            files and manifests.
+        inputs: files, clips, folders (all images in them, at any depth), globs, patterns of
+            numbered files and manifests.
         output: the output directory. If it is inside an input folder, its files are skipped.
         endings: extensions of the files that are taken from folders.
         exclude: patterns of files to skip in folders and globs, see :class:`Exclusion`.
@@ -208,10 +210,39 @@ def find_jobs(
             jobs.append(Job(path, path.name))
     for pattern in excluded.unused:
         log.warning(python_words("--exclude %s matches no file"), pattern)
-    jobs = without_companions(jobs)
+    jobs = without_companions([each for job in jobs for each in _frames(job, endings)])
     if not jobs:
         raise RequestError("every file is excluded by --exclude; use a narrower pattern")
     return jobs
+
+
+def _frames(job: Job, endings: Sequence[str]) -> Iterator[Job]:
+    """Yield the jobs of a clip's frames, with their times, or a job of another file itself.
+
+    Raises:
+        RequestError: the chain starts on linear light, the clip is at a URL, or PyAV is missing.
+    """
+    path = job.path
+    if path.suffix.lower() not in VIDEO_SUFFIXES:
+        yield job
+        return
+    if job.location:
+        raise RequestError(
+            f"{job.location}: {path.name} is a clip; list its frames, such as "
+            f"{frame_path(Path(path.name), 0).as_posix()}, or give the clip as an input"
+        )
+    if path.suffix.lower() not in endings:
+        raise RequestError(f"{path}: this is a clip. {FINISHED}")
+    if url_of(path):
+        raise RequestError(f"{job.display_name}: a clip at a URL is not read; copy it here")
+    try:
+        times = clip_times(path)
+    except ImageError as error:
+        yield replace(job, problem=str(error).removeprefix(f"{path}: "))
+        return
+    for number, time in enumerate(times):
+        name = frame_path(Path(job.key).with_suffix(""), number).as_posix()
+        yield replace(job, path=frame_path(path, number), key=name, time=time)
 
 
 def _glob_files(text: str) -> list[str] | None:

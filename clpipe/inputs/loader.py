@@ -34,6 +34,7 @@ from clpipe.images.read import (
     SourceImage,
     read_source,
 )
+from clpipe.images.video import VIDEO_SUFFIXES
 from clpipe.inputs.carry import CarriedLayers, carry, merge_moments
 from clpipe.inputs.carry_panorama import carry_panorama
 from clpipe.inputs.find import Job
@@ -144,8 +145,8 @@ class ImageLoader:
     def endings(self) -> tuple[str, ...]:
         """Return the extensions of the files that are taken from folders."""
         if self.request.start_at is None and self.reads is Kind.DISPLAY:
-            return PICTURE_SUFFIXES
-        pictures = PICTURE_SUFFIXES if self.request.transfer else ()
+            return (*PICTURE_SUFFIXES, *VIDEO_SUFFIXES)
+        pictures = (*PICTURE_SUFFIXES, *VIDEO_SUFFIXES) if self.request.transfer else ()
         return (*RENDER_SUFFIXES, *pictures, *RAW_SUFFIXES)
 
     def first_chain(self, jobs: Sequence[Job]) -> Chain:
@@ -284,7 +285,7 @@ class ImageLoader:
             return read_source(path, self.reads, options)
         except ImageError as error:
             if type(error) is ImageError:  # a subclass says more
-                error.error_class = "damaged" if path.exists() else "not_found"
+                error.error_class = "damaged" if any(stamp_of(path)) else "not_found"
             raise
 
     def enter(self, job: Job, source: SourceImage) -> LoadedImage | None:

@@ -52,7 +52,7 @@ class Timing:
     """When the frames of a sequence were taken.
 
     Args:
-        interval: the most usual time between two frames in s: the median.
+        interval: the usual time between two frames in s: the mean of intervals like the median.
         places: the place of each frame by its time, in intervals from the first frame.
     """
 
@@ -66,7 +66,10 @@ def timing_of(times: Sequence[Fraction]) -> Timing:
     >>> [*timing_of([Fraction(each, 100) for each in (0, 4, 8, 16, 18)]).places.values()]
     [0, 1, 2, 4, 4.5]
     """
-    interval = median_low([b - a for a, b in pairwise(times)])
+    intervals = [b - a for a, b in pairwise(times)]
+    median = median_low(intervals)
+    usual = [each for each in intervals if round(each / median) == 1]
+    interval = sum(usual, Fraction()) / len(usual)
     places = {time: (time - times[0]) / interval for time in times}
     exact = {time: int(n) if n.denominator == 1 else float(n) for time, n in places.items()}
     return Timing(interval, exact)

@@ -1,0 +1,234 @@
+"""Frames of clips as pictures. The path of a frame is that of its clip with a number: a.mp4/000012.
+
+H.264, H.265, FFV1 and everything else that FFmpeg decodes are read through PyAV. Samples are sRGB,
+whichever of the usual curves the clip states, because that is how players show them.
+"""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from clpipe.base.digests import stamp_of
+from clpipe.base.errors import ImageError
+from clpipe.base.extras import require
+from clpipe.base.types import Array
+from clpipe.images.pixels import check_size
+from clpipe.images.png import PRIMARIES
+from clpipe.images.video import (
+    VIDEO_SUFFIXES,
+    opened_video,
+    to_rgb,
+    video_errors,
+    video_stream,
+)
+from clpipe.images.vocabularies import CLIP
+
+if TYPE_CHECKING:
+    import av
+
+DIGITS = 6  # of a frame's number, at least
+RECENT = 8  # decoded frames that are kept, because threads ask for frames almost in order
+MAX_SKIPPED = 48  # frames that are decoded in vain rather than searched for
+MAX_OPEN = 4  # clips that stay open
+
+# Codes of ITU-T H.273 (2024), tables 2 and 3.
+CHROMATICITIES = {code: PRIMARIES[code] for code in (9, 11, 12)}
+SRGB_LIKE = (1, 2, 5, 6, 7)  # BT.709, none, and those of BT.601, which are near
+SDR_CURVES = (1, 2, 4, 5, 6, 7, 13, 14, 15)
+CURVES = {8: "linear light", 16: "PQ (SMPTE ST 2084)", 18: "HLG (ARIB STD-B67)"}
+
+
+@dataclass(frozen=True)
+class ClipFrame:
+    """A frame of a clip.
+
+    Args:
+        pixels: (height, width, 3) uint8 or uint16, upright, in full range.
+        chromaticities: x and y of red, green, blue and white; None means sRGB.
+        warnings: sentences about what the clip states and clpipe does not use.
+    """
+
+    pixels: Array
+    chromaticities: Any
+    warnings: tuple[str, ...]
+
+
+def clip_of(path: Path) -> Path | None:
+    """Return the clip that a path names a frame of, or None.
+
+    >>> clip_of(Path("a.png")) is None
+    True
+    """
+    clip = path.parent
+    if clip.suffix.lower() not in VIDEO_SUFFIXES or not path.name.isdecimal():
+        return None
+    return clip if clip.is_file() else None
+
+
+def frame_path(clip: Path, number: int) -> Path:
+    """Return the path of a frame, from 0.
+
+    >>> frame_path(Path("a.mp4"), 12).as_posix()
+    'a.mp4/000012'
+    """
+    return clip / f"{number:0{DIGITS}}"
+
+
+def clip_times(clip: Path) -> tuple[Fraction, ...]:
+    """Return the times of a clip's frames in s, in ascending order, from 0.
+
+    Raises:
+        RequestError: PyAV is missing.
+        ImageError: the clip cannot be read.
+    """
+    return _reader(clip, stamp_of(clip)).times
+
+
+def clip_size(clip: Path) -> tuple[int, int]:
+    """Return the width and height in px of a clip's frames.
+
+    Raises:
+        RequestError, ImageError: as for :func:`clip_times`.
+    """
+    return _reader(clip, stamp_of(clip)).size
+
+
+def read_clip_frame(path: Path, max_pixels: int) -> ClipFrame:
+    """Read a frame of a clip.
+
+    Args:
+        path: its path, see :func:`frame_path`.
+        max_pixels: a larger frame is rejected.
+
+    Raises:
+        RequestError: PyAV is missing.
+        ImageError: there is no such frame, it cannot be decoded, or the clip is not SDR.
+    """
+    clip = path.parent
+    reader = _reader(clip, stamp_of(clip))
+    check_size(path, *reader.size, max_pixels)
+    frame = reader.frame(path, int(path.name))
+    if frame.color_trc not in SDR_CURVES:
+        curve = CURVES.get(frame.color_trc, f"number {frame.color_trc} of ITU-T H.273")
+        raise ImageError(
+            f"{path}: the transfer curve of this clip is {curve}, but clpipe reads clips as sRGB; "
+            "convert it to SDR first"
+        )
+    pixels = np.rot90(to_rgb(frame), frame.rotation // 90)
+    chromaticities = CHROMATICITIES.get(frame.color_primaries)
+    return ClipFrame(np.ascontiguousarray(pixels), chromaticities, tuple(reader.warnings(frame)))
+
+
+@lru_cache(maxsize=MAX_OPEN)
+def _reader(clip: Path, _stamp: object) -> "_Reader":
+    return _Reader(clip)
+
+
+class _Reader:
+    """Decodes the frames of a clip, in any order, but fastest in theirs."""
+
+    def __init__(self, clip: Path) -> None:
+        require(f"{clip}: reading a video", "video")
+        self._clip = clip
+        self._lock = threading.Lock()  # guards what decodes
+        with opened_video(clip) as (container, stream):
+            packets = [p for p in container.demux(stream) if p.size and not p.is_discard]
+            rate, base = stream.average_rate or Fraction(24), stream.time_base or Fraction(1)
+            self.size = stream.width, stream.height
+            self._stated = _statements(container, stream)
+        stamps = sorted({packet.pts for packet in packets if packet.pts is not None})
+        if len(stamps) < len(packets):  # some files have no times, or not for each frame
+            stamps = []
+        self._stamps = stamps
+        self._numbers = {stamp: number for number, stamp in enumerate(stamps)}
+        # Times of Matroska are rounded to milliseconds.
+        regular = [number / rate for number in range(len(packets))]
+        times = [(stamp - stamps[0]) * base for stamp in stamps]
+        rounded = all(abs(a - b) < base for a, b in zip(times, regular, strict=bool(times)))
+        self.times = tuple(regular if rounded else times)
+        self._container: Any = None
+        self._decoded: Iterator[av.VideoFrame] = iter(())
+        self._next = 0  # the number of the frame that is decoded next
+        self._recent: OrderedDict[int, av.VideoFrame] = OrderedDict()
+
+    def warnings(self, frame: "av.VideoFrame") -> list[str]:
+        """Return a sentence for each statement that is not used."""
+        pixels = frame.format.name
+        stated = {**self._stated, "interlaced": frame.interlaced_frame}
+        stated["alpha"] = "yuva" in pixels or pixels[:4] in ("rgba", "bgra", "argb", "abgr", "gbra")
+        return CLIP.warnings(name for name, value in stated.items() if value)
+
+    def frame(self, path: Path, number: int) -> "av.VideoFrame":
+        """Return a decoded frame.
+
+        Raises:
+            ImageError: there is no such frame, or it cannot be decoded.
+        """
+        if number >= len(self.times):
+            raise ImageError(f"{path}: this clip has {len(self.times)} frames, from 0")
+        with self._lock, video_errors(path, "decoded"):
+            if number not in self._recent:
+                self._decode(number)
+            frame = self._recent.get(number)
+        if frame is None:
+            raise ImageError(f"{path}: this frame is damaged, and cannot be decoded")
+        return frame
+
+    def _decode(self, number: int) -> None:
+        """Decode frames up to one, which is then among the recent ones if it is intact."""
+        from av.error import FFmpegError
+
+        if self._container is None or not 0 <= number - self._next <= MAX_SKIPPED:
+            self._seek(number, "AUTO")
+        try:
+            self._advance(number)
+        except FFmpegError:
+            self._seek(number, "NONE")  # threads report errors of later frames
+            self._advance(number)
+
+    def _advance(self, number: int) -> None:
+        """Decode the next frames, up to one or to the end of the file."""
+        try:
+            for frame in self._decoded:
+                found = self._numbers.get(frame.pts, -1) if self._stamps else self._next
+                self._recent[found] = frame
+                self._next = found + 1
+                if len(self._recent) > RECENT:
+                    self._recent.popitem(last=False)
+                if found >= number:
+                    return
+        finally:
+            if self._next <= number:  # the file has ended, or is damaged
+                self._container = None
+
+    def _seek(self, number: int, threads: str) -> None:
+        """Continue at the last key frame before a frame."""
+        import av
+
+        self._container = av.open(self._clip)
+        stream = video_stream(self._clip, self._container)
+        stream.thread_type = threads
+        stream.codec_context.options = {"err_detect": "explode"}  # otherwise damage is hidden
+        self._next = 0
+        if self._stamps:
+            self._container.seek(self._stamps[number], stream=stream)
+        self._decoded = self._container.decode(stream)
+
+
+def _statements(container: Any, stream: Any) -> dict[str, Any]:
+    """Return what a clip states about all of its frames, by names of :data:`CLIP`."""
+    aspect = stream.sample_aspect_ratio or stream.codec_context.sample_aspect_ratio
+    primaries = stream.codec_context.color_primaries
+    return {
+        "sample_aspect_ratio": aspect and aspect != 1,
+        "unknown_primaries": primaries not in (*SRGB_LIKE, *CHROMATICITIES),
+        "other_streams": len(container.streams.video) > 1,
+        **dict.fromkeys((*container.metadata, *stream.metadata), True),
+    }
