@@ -26,11 +26,13 @@ def projected(x, y, camera):
     """Places in px of directions x / z, y / z: OpenCV's formulas, written down once more."""
     k = camera["distortion"]
     r2 = x * x + y * y
-    if camera["model"] == "FULL_OPENCV":
+    if camera["model"] in ("FULL_OPENCV", "OPENCV_THIN_PRISM"):
         above = 1 + k["k1"] * r2 + k["k2"] * r2**2 + k["k3"] * r2**3
         grown = above / (1 + k["k4"] * r2 + k["k5"] * r2**2 + k["k6"] * r2**3)
         dx = 2 * k["p1"] * x * y + k["p2"] * (r2 + 2 * x * x)
         dy = k["p1"] * (r2 + 2 * y * y) + 2 * k["p2"] * x * y
+        if camera["model"] == "OPENCV_THIN_PRISM":
+            dx, dy = dx + k["s1"] * r2 + k["s2"] * r2**2, dy + k["s3"] * r2 + k["s4"] * r2**2
         x, y = x * grown + dx, y * grown + dy
     elif camera["model"] == "OPENCV_FISHEYE":
         r = np.sqrt(r2)
@@ -45,6 +47,7 @@ def projected(x, y, camera):
     [
         (BROWN | PLACE, "FULL_OPENCV"),
         (BROWN | PLACE | {"fit": True, "k4": 0.05, "k5": 0.01}, "FULL_OPENCV"),
+        (BROWN | PLACE | {"s1": 0.004, "s2": -0.01, "s3": -0.003, "s4": 0.02}, "OPENCV_THIN_PRISM"),
         ({"method": "fisheye", "fx": 600.0, "k1": 0.02, "k2": -0.01, **PLACE}, "OPENCV_FISHEYE"),
         ({"method": "poly3", "k1": -0.03, **PLACE}, "FULL_OPENCV"),
         ({"method": "poly5", "k1": -0.03, "k2": 0.004, "kr": 1.001, **PLACE}, "FULL_OPENCV"),

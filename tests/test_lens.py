@@ -26,6 +26,7 @@ from tests.test_tiles import in_less_memory
 BARREL = {"method": "brown_conrady", "focal_length": 30.0, "sensor_width": 36.0, "k1": -0.3}
 BROWN = BrownConrady(
     **{"fx": 1000.0, "fy": 980.0, "cx": 610.0, "k1": -0.15, "k2": 0.03, "k4": 0.02, "k6": 0.01},
+    **{"s1": 0.003, "s2": -0.002, "s3": -0.004, "s4": 0.001},
     **{"p1": 0.002, "p2": -0.001, "kr": 1.002, "vb": 0.997, "cb": 0.001, "bb": -0.0005},
 )
 LENSES = {
@@ -48,6 +49,8 @@ def bent_by_opencv(x, y):
     ratio = (1 - 0.15 * r2 + 0.03 * r2**2) / (1 + 0.02 * r2 + 0.01 * r2**3)
     bent_x = x * ratio + 2 * 0.002 * x * y - 0.001 * (r2 + 2 * x * x)
     bent_y = y * ratio + 0.002 * (r2 + 2 * y * y) - 2 * 0.001 * x * y
+    bent_x += 0.003 * r2 - 0.002 * r2**2
+    bent_y += -0.004 * r2 + 0.001 * r2**2
     return bent_x * 1000.0 + 610.0, bent_y * 980.0 + 400.0
 
 

@@ -161,6 +161,19 @@ def test_points_are_where_each_file_says(clpipe, renders, is_bent):
             assert np.abs(seen(f"o/{name}", where) - where).max() < 0.05
 
 
+def test_a_thin_prism_is_only_in_cameras_json(clpipe, renders):
+    """Neither COLMAP nor nerfstudio has a model of perspective pictures with a thin prism."""
+    options = sets("distortion", **BENT, s1=0.004, s4=-0.002)
+    run = ("run", renders, "-o", "o", "--poses", "cameras.json", *RUN, "distortion", *options)
+    stderr = clpipe(*run).stderr
+    for file in ("sparse/0", "transforms.json"):
+        assert f"and 1 more are not in {file}, which has no model with a thin prism" in stderr
+    views = json.loads(Path("o/cameras.json").read_text())["views"]
+    assert {view["model"] for view in views} == {"OPENCV_THIN_PRISM"}
+    assert views[0]["distortion"]["s4"] == -0.002
+    assert not Path("o/sparse").exists() and not Path("o/transforms.json").exists()
+
+
 @pytest.mark.parametrize(
     "form", ["transforms.json", "model", "model/sparse/0", "o", "o/cameras.json"]
 )

@@ -100,6 +100,10 @@ class Distortion(TypedDict, total=False):
     k6: Number
     p1: Number
     p2: Number
+    s1: Number
+    s2: Number
+    s3: Number
+    s4: Number
     unit: Number
     a: Number
     b: Number

@@ -106,7 +106,7 @@ def list_records(path: Path, text: str, _check_column: object) -> Iterator[tuple
     """Yield the rows of a list of images with time stamps, as of the TUM and EuroC datasets.
 
     A row of TUM's rgb.txt is a time stamp and a file. The files of EuroC's data.csv are in the
-    folder data beside it. Lines that begin with # are comments.
+    folder data next to it. Lines that begin with # are comments.
 
     For the arguments, see :func:`csv_records`.
     """

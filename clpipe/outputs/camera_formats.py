@@ -9,7 +9,7 @@ from typing import Any
 from clpipe.base.about import __version__
 from clpipe.outputs.output_pictures import OutputPicture, lens_record
 from clpipe.outputs.sidecar import json_text
-from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE
+from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE, THIN_PRISM
 from clpipe.reference.pose import to_opengl, to_quaternion
 
 CAMERAS, TRANSFORMS, COLMAP = "cameras.json", "transforms.json", "sparse/0"
@@ -18,6 +18,8 @@ NOTE = (
     f"clpipe {__version__}: K in px, the first pixel's centre at (0.5, 0.5); "
     "x_cam = R X + t, OpenCV's axes; models and coefficients are COLMAP's"
 )
+
+PRISM = "not in {}, which has no model with a thin prism"
 
 OPENGL_NOTE = (
     f"clpipe {__version__}: camera to world, OpenGL's axes; the first pixel's centre at (0.5, 0.5)"
@@ -88,15 +90,22 @@ def colmap(
     camera_ids = {}
     for each in pictures:
         camera, names = each.camera, COEFFICIENTS[each.camera.model]
+        if camera.model == THIN_PRISM:
+            skipped[PRISM.format(COLMAP)].append(each.file)
+            continue
         values = [camera.fx, camera.fy, camera.cx, camera.cy]
         values += [camera.distortion[name] for name in names]
         size = f"{camera.width} {camera.height}"
         camera_ids[each.file] = numbers[f"{camera.model} {size} {_text(values)}"]
+    if not camera_ids:
+        return {}
     cameras = [f"{number} {text}" for text, number in numbers.items()]
     files = {"cameras.txt": ("CAMERA_ID MODEL WIDTH HEIGHT PARAMS", cameras)}
     if posed:
         images = []
         for number, each in enumerate(posed, 1):
+            if each.file not in camera_ids:
+                continue
             if any(letter.isspace() for letter in each.file):
                 reason = "not in images.txt, which allows no spaces in names"
                 skipped[reason].append(each.file)
@@ -149,6 +158,10 @@ def nerfstudio(
         skipped: receives the names of pictures that the format cannot hold, by reason.
         splits: "train", "val" or "test" for each picture, by its name in sidecars.
     """
+    prisms = [each.file for each in pictures if each.camera.model == THIN_PRISM]
+    if prisms:
+        skipped[PRISM.format(TRANSFORMS)] += prisms
+        pictures = [each for each in pictures if each.file not in prisms]
     fisheyes = [each for each in pictures if each.camera.model == OPENCV_FISHEYE]
     is_fisheye = len(fisheyes) == len(pictures)
     model = OPENCV_FISHEYE if is_fisheye else OPENCV

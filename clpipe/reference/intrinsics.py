@@ -17,10 +17,13 @@ from clpipe.base.types import Array
 PINHOLE, OPENCV, FULL_OPENCV = "PINHOLE", "OPENCV", "FULL_OPENCV"
 OPENCV_FISHEYE = "OPENCV_FISHEYE"
 POLYNOMIAL = "POLYNOMIAL"  # not a model of COLMAP
+THIN_PRISM = "OPENCV_THIN_PRISM"  # OpenCV's 12 coefficients, also not a model of COLMAP
+DECENTRING = ("p1", "p2", "s1", "s2", "s3", "s4")  # coefficients that are not radial
 COEFFICIENTS = {
     PINHOLE: (),
     OPENCV: ("k1", "k2", "p1", "p2"),
     FULL_OPENCV: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    THIN_PRISM: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"),
     OPENCV_FISHEYE: ("k1", "k2", "k3", "k4"),
 }
 

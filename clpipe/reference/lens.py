@@ -13,7 +13,14 @@ from clpipe.base.cache import cached_hash
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.reference.geometry import NO_MARGINS, Margins
-from clpipe.reference.intrinsics import FULL_OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
+from clpipe.reference.intrinsics import (
+    DECENTRING,
+    FULL_OPENCV,
+    OPENCV_FISHEYE,
+    PINHOLE,
+    THIN_PRISM,
+    Intrinsics,
+)
 from clpipe.reference.radial import (
     RESIDUAL,
     STRAIGHT,
@@ -33,6 +40,7 @@ class DistortionMap:
     Args:
         radial: the model of green, and without lateral colour of all channels.
         tangential: p1 and p2 of Brown and Conrady's model.
+        prism: s1 to s4 of OpenCV's thin prism.
         focal: fx and fy in px, the model's unit.
         relative_focal_length: without ``focal``, the focal length over the longer side. Without
             either, the unit is that of lateral colour.
@@ -49,6 +57,7 @@ class DistortionMap:
 
     radial: Radial = STRAIGHT
     tangential: tuple[float, float] = (0.0, 0.0)
+    prism: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     focal: tuple[float, float] | None = None
     relative_focal_length: float | None = None
     centre: tuple[float | None, float | None] = (None, None)
@@ -62,7 +71,8 @@ class DistortionMap:
     def is_identity(self) -> bool:
         """Whether it leaves every image unchanged."""
         models = self.radial, self.red, self.blue
-        return all(each.is_identity for each in models) and not any(self.tangential)
+        is_straight = all(each.is_identity for each in models)
+        return is_straight and not any((*self.tangential, *self.prism))
 
     def unit(self, width: int, height: int) -> tuple[float, float]:
         """Return r = 1 for an image of this size, in px across and down."""
@@ -154,9 +164,10 @@ class DistortionMap:
         if self.radial.of_angle:
             return Intrinsics(width, height, *parameters, OPENCV_FISHEYE, named)
         denominator = {f"k{i + 3}": c * ratio ** (2 * i) for i, c in enumerate(below) if i}
-        p1, p2 = self.tangential
-        named |= {**denominator, "p1": p1, "p2": p2}
-        return Intrinsics(width, height, *parameters, FULL_OPENCV, named, residual)
+        shifts = *self.tangential, *self.prism
+        named |= denominator | dict(zip(DECENTRING, shifts, strict=True))
+        name = THIN_PRISM if any(self.prism) else FULL_OPENCV
+        return Intrinsics(width, height, *parameters, name, named, residual)
 
     def scale(self, width: int, height: int) -> float:
         """Return the factor by which ``fit`` lengthens an image's focal length; 1 without it.
@@ -239,13 +250,13 @@ class _ScaledLens:
         dx, dy = dx * ratio / self.unit[0], dy * ratio / self.unit[1]
         ratio = inverse_ratio(lens.radial, np.hypot(dx, dy), self.farthest)
         ux, uy = dx * ratio, dy * ratio
-        if any(lens.tangential):
-            ux, uy = self._with_tangential(ux, uy, dx, dy)
+        if any((*lens.tangential, *lens.prism)):
+            ux, uy = self._with_decentring(ux, uy, dx, dy)
         return self.centre[0] + ux * self.unit[0], self.centre[1] + uy * self.unit[1]
 
-    def _with_tangential(self, ux: Array, uy: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
+    def _with_decentring(self, ux: Array, uy: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
         """Newton's method in two dimensions, from the inverse of the radial part."""
-        lens, (p1, p2) = self.lens, self.lens.tangential
+        lens, (p1, p2), (s1, s2, s3, s4) = self.lens, self.lens.tangential, self.lens.prism
         farthest = inversion_radius(lens.radial, self.farthest)
         initial = ux, uy
         slope = np.zeros(())
@@ -260,14 +271,18 @@ class _ScaledLens:
             )
             ratio = distorted / r
             curvature = (slope - ratio) / (r * r)  # slope of the ratio over r, divided by r
-            fx = ux * ratio + 2 * p1 * ux * uy + p2 * (r * r + 2 * ux * ux) - dx
-            fy = uy * ratio + p1 * (r * r + 2 * uy * uy) + 2 * p2 * ux * uy - dy
-            xx = ratio + ux * ux * curvature + 2 * p1 * uy + 6 * p2 * ux
-            xy = ux * uy * curvature + 2 * p1 * ux + 2 * p2 * uy
-            yy = ratio + uy * uy * curvature + 6 * p1 * uy + 2 * p2 * ux
-            determinant = xx * yy - xy * xy
+            square = r * r
+            fx = ux * ratio + 2 * p1 * ux * uy + p2 * (square + 2 * ux * ux) - dx
+            fy = uy * ratio + p1 * (square + 2 * uy * uy) + 2 * p2 * ux * uy - dy
+            fx, fy = fx + square * (s1 + s2 * square), fy + square * (s3 + s4 * square)
+            across, down = 2 * s1 + 4 * s2 * square, 2 * s3 + 4 * s4 * square
+            xx = ratio + ux * ux * curvature + 2 * p1 * uy + (6 * p2 + across) * ux
+            both = ux * uy * curvature + 2 * p1 * ux + 2 * p2 * uy
+            xy, yx = both + across * uy, both + down * ux
+            yy = ratio + uy * uy * curvature + (6 * p1 + down) * uy + 2 * p2 * ux
+            determinant = xx * yy - xy * yx
             safe = np.where(np.abs(determinant) > 1e-6, determinant, 1e-6)
-            ux, uy = ux - (yy * fx - xy * fy) / safe, uy - (xx * fy - xy * fx) / safe
+            ux, uy = ux - (yy * fx - xy * fy) / safe, uy - (xx * fy - yx * fx) / safe
             if max(np.abs(fx).max(initial=0), np.abs(fy).max(initial=0)) < RESIDUAL:
                 break
         wrong = ~((determinant > 0) & (np.hypot(fx, fy) < 1e-9))

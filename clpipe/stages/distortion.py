@@ -183,7 +183,8 @@ class BrownConrady(FocalLengthDistortion):
 
     The radial factor is ``R = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)``. x
     and y start at the principal point and are in focal lengths (Brown, "Decentering distortion of
-    lenses", 1966; OpenCV, "Camera calibration and 3D reconstruction").
+    lenses", 1966; OpenCV, "Camera calibration and 3D reconstruction"). A thin prism adds
+    ``s1 r^2 + s2 r^4`` to x_d, and ``s3 r^2 + s4 r^4`` to y_d (Weng et al., PAMI 1992).
 
     >>> import numpy as np
     >>> lens = BrownConrady(fx=100.0, fy=100.0, k1=-0.1).lens()
@@ -193,10 +194,12 @@ class BrownConrady(FocalLengthDistortion):
     """
 
     method: ClassVar = "brown_conrady"
-    summary: ClassVar = "model of OpenCV and COLMAP: radial k1 to k6, tangential p1 and p2"
+    summary: ClassVar = (
+        "model of OpenCV: radial k1 to k6, tangential p1 and p2, thin prism s1 to s4"
+    )
     example: ClassVar = {
         **{"focal_length": 20.0, "sensor_width": 24.0, "k1": -0.2, "k4": 0.05, "p1": 0.002},
-        **{"p2": -0.003, "vr": 1.01, "bb": 0.01},
+        **{"p2": -0.003, "s1": 0.002, "s4": -0.004, "vr": 1.01, "bb": 0.01},
     }
 
     k1: Coefficient = parameter(0.0, "Radial coefficient of r^2.")
@@ -207,13 +210,18 @@ class BrownConrady(FocalLengthDistortion):
     k6: Coefficient = parameter(0.0, "Radial coefficient of r^6 in the denominator.")
     p1: Coefficient = parameter(0.0, "Tangential coefficient, vertical.")
     p2: Coefficient = parameter(0.0, "Tangential coefficient, horizontal.")
+    s1: Coefficient = parameter(0.0, "Thin prism, horizontal coefficient of r^2.")
+    s2: Coefficient = parameter(0.0, "Thin prism, horizontal coefficient of r^4.")
+    s3: Coefficient = parameter(0.0, "Thin prism, vertical coefficient of r^2.")
+    s4: Coefficient = parameter(0.0, "Thin prism, vertical coefficient of r^4.")
 
     def radial(self) -> Radial:
         denominator = (0.0, self.k4, 0.0, self.k5, 0.0, self.k6)
         return Radial.of(1.0, 0.0, self.k1, 0.0, self.k2, 0.0, self.k3, denominator=denominator)
 
     def lens(self) -> DistortionMap:
-        return replace(super().lens(), tangential=(self.p1, self.p2))
+        prism = self.s1, self.s2, self.s3, self.s4
+        return replace(super().lens(), tangential=(self.p1, self.p2), prism=prism)
 
 
 class Fisheye(FocalLengthDistortion):
