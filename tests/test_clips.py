@@ -83,7 +83,7 @@ def test_records_contain_the_sidecar_of_each_frame(clpipe, frames):
 
 
 def test_a_named_clip_is_one_sequence(clpipe, frames):
-    frames("in")
+    frames("in", size=(16, 64))
     clpipe("run", "in", "-o", "clip.mp4", *RUN[6:], "--bit-depth", 10, "--codec", "h265")
     assert written(Path()) == [
         "clip.mp4",
@@ -203,6 +203,8 @@ def test_an_odd_size_fails_before_frames_are_made(clpipe, frames):
     result = clpipe("run", frames(size=(16, 25)), "-o", "out", "--format", "mp4", status=2)
     assert "--codec: the picture has 25x16 px, but h264 needs an even width" in result.output
     assert not list(OUT.glob("*.mp4"))
+    narrow = ("run", frames(size=(64, 48)), "-o", "a.mp4", "--codec", "h265")
+    assert "48x64 px, but h265 needs a width of 64 px" in clpipe(*narrow, status=2).output
 
 
 def test_decoded_frames_show_what_the_codec_did(clpipe, frames):
@@ -350,7 +352,7 @@ def test_a_clip_has_the_times_of_its_frames(clpipe, write_exr, suffix, codec, so
     stamps = [f"{1305031102 + each:.6f}" for each in given]
     names = stamps if source == "names" else [f"f{n}" for n in range(5)]
     for name in names:
-        write_exr(f"in/{name}.exr", np.full((32, 48, 3), 0.3, np.float32))
+        write_exr(f"in/{name}.exr", np.full((32, 64, 3), 0.3, np.float32))
     if source == "column":
         rows = "".join(f"in/{n}.exr,{s}\n" for n, s in zip(names, stamps, strict=True))
         Path("list.csv").write_text(f"path,time\n{rows}")

@@ -36,6 +36,7 @@ VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov", ".webm", ".avi")  # files that are rea
 CONTAINERS = {".mp4": "mp4", ".mkv": "matroska"}  # files that are written, with FFmpeg's names
 
 DEFAULT_CRF = 18  # noise looks like in the frames
+H265_WIDTH = 64  # px; of some narrower pictures, x265 4.2 writes outside its memory
 REORDERED = 2  # the most frames that x265 waits for before it knows decoding times
 THREADS = 4  # of an encoder; their number changes the bytes of H.264
 
@@ -120,12 +121,18 @@ class VideoOptions:
         """Check that the codec can store frames of a size in px.
 
         Raises:
-            ImageError: the width or height is odd, but chroma has half the resolution.
+            ImageError: the width or height is odd, but chroma has half the resolution; or the
+                encoder cannot encode such narrow pictures.
         """
         if not self.is_lossless and (width % 2 or height % 2):
             raise ImageError(
                 f"the picture has {width}x{height} px, but {self.codec} needs an even width and "
                 "height; resize it, or use the codec ffv1"
+            )
+        if self.codec == "h265" and width < H265_WIDTH:
+            raise ImageError(
+                f"the picture has {width}x{height} px, but h265 needs a width of {H265_WIDTH} px "
+                "at least; use the codec h264 or ffv1"
             )
 
 
