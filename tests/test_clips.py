@@ -405,3 +405,9 @@ def test_other_containers_are_no_directories(clpipe, frames, name):
     stderr = clpipe("run", frames(), "-o", name, status=2).stderr
     assert f"--output: found {name}, but clpipe writes clips as .mp4 or .mkv" in stderr
     assert not Path(name).exists()
+
+
+def test_the_records_of_a_clip_are_no_sidecar(clpipe, frames):
+    clpipe("run", frames("in"), "-o", "film.mkv", "--device", "numpy")
+    stderr = clpipe("replay", "film.mkv.jsonl", "-o", "again", status=2).stderr
+    assert "film.mkv.jsonl: this file has the records of a clip or a run" in stderr

@@ -1,6 +1,7 @@
 """The choice of a render's picture layer: by known names, never by the alphabet."""
 
 import json
+import re
 
 import numpy as np
 import OpenEXR
@@ -9,6 +10,7 @@ import pytest
 from clpipe.base.errors import ImageError, NoPictureError
 from clpipe.chain.carry import AovSpec
 from clpipe.images.kinds import is_aov
+from clpipe.images.layers import PICTURE_LAYERS
 from clpipe.images.read import ReadOptions, read_image, read_source
 from clpipe.inputs.companions import LayerFinder
 from clpipe.stage import Kind
@@ -168,3 +170,63 @@ def test_a_step_finds_the_depth_of_the_pictures_own_view(tmp_path, picture, foun
     planes_written(str(tmp_path / "a.exr"), STEREO, multiView=["left", "right"])
     [source] = LayerFinder(tmp_path / "a.exr", (), picture).find(AovSpec("Depth", "depth"))
     assert source.location.name == found
+
+
+# The passes and AOVs of the manuals; what is none of a picture, its data or its light is not here.
+PASSES = {
+    "Blender": """Combined; Depth; Mist; Position; Normal; Vector; UV; Denoising Normal;
+    Denoising Albedo; Denoising Depth; IndexOB; IndexMA; DiffDir; DiffInd; DiffCol;
+    GlossDir; GlossInd; GlossCol; TransDir; TransInd; TransCol; VolumeDir; VolumeInd;
+    SubsurfaceDir; SubsurfaceInd; SubsurfaceCol; Emit; Env; Shadow; AO; CryptoObject00;
+    CryptoMaterial00; CryptoAsset00; Noisy Image; Debug Sample Count;
+    Debug Render Time; Shadow Catcher; Freestyle; Transp; Guiding Color; GreasePencil;
+    Volume Scatter; Volume Transmit; Volume Majorant""",
+    "Arnold": """RGBA; A; AA_inv_density; ID; N; Z; P; Pref; albedo; background; coat; coat_albedo;
+    coat_direct; coat_indirect; cputime; diffuse; diffuse_albedo; diffuse_direct;
+    diffuse_indirect; direct; emission; highlight; indirect; motionvector; opacity;
+    raycount; shadow; shadow_diff; shadow_mask; shadow_matte; sheen; sheen_albedo;
+    sheen_direct; sheen_indirect; specular; specular_albedo; specular_direct;
+    specular_indirect; sss; sss_albedo; sss_direct; sss_indirect; transmission;
+    transmission_albedo; transmission_direct; transmission_indirect; volume;
+    volume_albedo; volume_direct; volume_indirect; volume_opacity; volume_Z;
+    denoise_albedo; crypto_asset; crypto_material; crypto_object""",
+    "V-Ray": """effectsResult; RGB color; alpha; atmosphere; background; bumpNormals; caustics;
+    coatFilter; diffuse; diffuseFilter; extraTex; GI; lighting; lightSelect;
+    materialID; matteShadow; MultiMatteElement; nodeID; normals; noiseLevel;
+    objectSelect; rawGI; rawLight; rawReflection; rawRefraction; rawShadow; reflection;
+    reflectionFilter; refraction; renderID; sampleRate; selfIllumination; shadow;
+    sheenFilter; specular; SSS2; toon; totalLight; velocity; worldPositions; zDepth;
+    denoiser; wireColor; lightingAnalysis""",
+    "RenderMan": """Ci; albedo; beauty; cpuTime; curvature; dPcameradtime; dPdtime; dPdu; dPdv;
+    dPdw;
+    diffuse; diffuseU; directDiffuse; directDiffuseLobe; directSpecular; emissive; id;
+    id2; indirectDiffuse; indirectSpecular; lighting; mse; motionBack; motionFore; Nn;
+    Ngn; Non; normal; occluded; outsideIOR; PRadius; Pref; rawId; rayId; sampleCount;
+    shadow; specular; st; subsurface; subsurfaceLobe; Tn; transmissive; unoccluded;
+    variance; Vn; VLen; z; zfiltered; __depth; __Nworld; __Pworld; __st""",
+    "Karma": """C; beauty; beautyunshadowed; combineddiffuse; combineddiffuseunshadowed;
+    combinedemission; combinedglossyreflection; combinedvolume; coat; directdiffuse;
+    directdiffuseunshadowed; directemission; directglossyreflection; directvolume;
+    emission; glossyreflection; glossytransmission; indirectdiffuse; indirectemission;
+    indirectglossyreflection; indirectvolume; rayorigin; raytime; sss; visiblelights;
+    N; P; Pz; depth; albedo; primid; cputime; deviceoverflow; element""",
+    "LuxCore": """RGB_IMAGEPIPELINE; RGBA_IMAGEPIPELINE; RGB; RGBA; ALPHA; DEPTH; POSITION;
+    GEOMETRY_NORMAL; SHADING_NORMAL; AVG_SHADING_NORMAL; MATERIAL_ID; OBJECT_ID; UV;
+    DIRECT_DIFFUSE; DIRECT_GLOSSY; EMISSION; INDIRECT_DIFFUSE; INDIRECT_GLOSSY;
+    INDIRECT_SPECULAR; DIRECT_SHADOW_MASK; INDIRECT_SHADOW_MASK; RADIANCE_GROUP;
+    SAMPLECOUNT; CONVERGENCE; RAYCOUNT; BY_MATERIAL_ID; IRRADIANCE; ALBEDO; NOISE;
+    CAUSTIC""",
+    "Mitsuba": """depth; position; uv; geo_normal; sh_normal; albedo; dp_du; dp_dv; duv_dx; duv_dy;
+    prim_index; shape_index""",
+    "Unreal": """FinalImage; LightingOnly; DetailLighting; ReflectionsOnly; Unlit; WorldNormal;
+    WorldDepth; SceneDepth; MotionVectors; ObjectMaterialHashes; AmbientOcclusion;
+    CustomStencil; BaseColor; Roughness; Metallic; Specular""",
+}
+
+
+@pytest.mark.parametrize("program", PASSES)
+def test_each_published_pass_is_a_picture_or_an_aov(program):
+    names = [" ".join(each.split()) for each in PASSES[program].split(";")]
+    plain = {name: re.sub(r"[^a-z0-9]", "", name.lower()) for name in names}
+    assert [n for n in names if not is_aov(n) and plain[n] not in PICTURE_LAYERS] == []
+    assert len([n for n in names if not is_aov(n)]) <= 4  # its pictures

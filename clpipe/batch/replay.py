@@ -10,6 +10,7 @@ from clpipe.base.about import __version__
 from clpipe.base.digests import digests
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.urls import fetch, path_of
+from clpipe.batch.clips import RECORDS
 from clpipe.chain.registry import code_files
 from clpipe.chain.rendition import BASELINES, TRUTHS, Rendition
 from clpipe.chain.request import Request
@@ -142,6 +143,11 @@ def _values(path: Path) -> Mapping[str, Any]:
         RequestError: the file is not a sidecar, or was written by another version. The picture
             depends on the frames before it.
     """
+    if path.suffix == RECORDS:
+        raise RequestError(
+            f"{path}: this file has the records of a clip or a run; clpipe replay takes the "
+            "sidecar of a picture (NAME.json). To repeat a clip, run its settings (NAME.csv) again"
+        )
     try:
         values = read_sidecar(path)
     except FileNotFoundError:

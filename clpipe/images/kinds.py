@@ -30,9 +30,39 @@ BLENDER_VECTORS: tuple[Vector, ...] = ((0, 1), (1, -1)), ((2, -1), (3, 1))
 
 MIN_CHANNELS: dict[LayerKind, int] = {"flow": 2, "normal": 3}  # smallest number of channels
 
-# Layers that renderers write next to the picture: data, and single components of the light. The
-# names are from the manuals of Blender, LuxCore, RenderMan, Arnold, V-Ray, Houdini and Unreal, in
-# lower case, with _ between and around words.
+# Layers that renderers write next to the picture, as their manuals name them, without spaces.
+AOVS = {
+    "Blender": "Position UV DenoisingAlbedo Freestyle GreasePencil NoisyImage DebugSampleCount "
+    "DebugRenderTime GuidingColor VolumeScatter VolumeTransmit VolumeMajorant",
+    "Blender's light": "DiffDir DiffInd DiffCol GlossDir GlossInd GlossCol TransDir TransInd "
+    "TransCol VolumeDir VolumeInd SubsurfaceDir SubsurfaceInd SubsurfaceCol Emit Env Shadow AO "
+    "ShadowCatcher Transp",
+    "Arnold": "A AA_inv_density N P Pref background coat coat_direct coat_indirect cputime diffuse "
+    "diffuse_direct direct emission highlight indirect opacity raycount shadow_matte sheen "
+    "sheen_direct specular sss transmission volume volume_direct volume_opacity volume_Z",
+    "V-Ray": "alpha bumpNormals extraTex MultiMatteElement matteShadow nodeID noiseLevel renderID "
+    "objectSelect sampleRate worldPositions denoiser wireColor coatFilter diffuseFilter "
+    "sheenFilter",
+    "V-Ray's light": "atmosphere caustics GI lighting lightSelect rawGI rawLight rawReflection "
+    "rawRefraction rawShadow reflection refraction selfIllumination SSS2 toon totalLight",
+    "RenderMan": "curvature dPcameradtime dPdtime dPdu dPdv dPdw mse motionBack motionFore Nn Ngn "
+    "Non outsideIOR PRadius rawId rayId sampleCount st Tn variance Vn VLen zfiltered Nworld Pworld",
+    "RenderMan's light": "directDiffuse directSpecular emissive indirectDiffuse indirectSpecular "
+    "occluded unoccluded subsurface transmissive",
+    "Karma": "beautyunshadowed combineddiffuse combinedemission combinedglossyreflection "
+    "combinedvolume directdiffuse directemission directvolume glossyreflection glossytransmission "
+    "rayorigin raytime visiblelights Pz primid deviceoverflow element",
+    "LuxCore": "GEOMETRY_NORMAL SHADING_NORMAL AVG_SHADING_NORMAL DIRECT_DIFFUSE DIRECT_GLOSSY "
+    "INDIRECT_GLOSSY DIRECT_SHADOW_MASK RADIANCE_GROUP CONVERGENCE BY_MATERIAL_ID IRRADIANCE NOISE",
+    "Mitsuba": "dp_du dp_dv duv_dx duv_dy prim_index shape_index",
+    "Unreal": "LightingOnly DetailLighting ReflectionsOnly Unlit WorldNormal WorldDepth SceneDepth "
+    "ObjectMaterialHashes AmbientOcclusion CustomStencil Roughness Metallic",
+}
+_AOV_NAMES = {
+    re.sub(r"[^a-z0-9]", "", each.lower()) for all_ in AOVS.values() for each in all_.split()
+}
+# Parts of their names, also for layers that are not listed, in lower case, with _ between and
+# around words.
 AOV_PATTERN = re.compile(
     "|".join(
         (
@@ -88,6 +118,8 @@ def is_aov(name: str) -> bool:
     >>> [is_aov(name) for name in ("Combined", "composition", "RGB_IMAGEPIPELINE", "video", "")]
     [False, False, False, False, False]
     """
+    if re.sub(r"[^a-z0-9]", "", name.lower()) in _AOV_NAMES:
+        return True
     words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)
     return bool(kind_from_name(name) or AOV_PATTERN.search(f"_{'_'.join(words)}_".lower()))
 

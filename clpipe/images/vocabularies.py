@@ -9,6 +9,8 @@ from PIL import TiffTags
 
 from clpipe.base.vocabulary import Vocabulary
 from clpipe.images.attributes import PREFIX
+from clpipe.images.kinds import AOVS, KIND_NAMES
+from clpipe.images.layers import PICTURE_LAYERS
 from clpipe.images.tiff import read_directories
 
 # OpenImageIO's names of OpenEXR's attributes, where they differ.
@@ -288,6 +290,22 @@ CLIP = Vocabulary.of(
             "text": "title comment description language",
             "sizes of streams": "DURATION BPS NUMBER_OF_FRAMES NUMBER_OF_BYTES",
             "other streams": "audio subtitle",
+        },
+    },
+)
+
+LAYERS = Vocabulary.of(
+    "Layers of renders",
+    "the manuals of Blender 5, Arnold, V-Ray, RenderMan, Karma, LuxCore, Mitsuba and Unreal; "
+    "spaces and case do not matter",
+    {
+        "used": {
+            "the picture": " ".join(filter(None, PICTURE_LAYERS)),
+            **{f"{kind}, with --carry": " ".join(names) for kind, names in KIND_NAMES.items()},
+        },
+        "rejected": {
+            f"as the picture, unless --layer names it; from {program}": names
+            for program, names in AOVS.items()
         },
     },
 )

@@ -17,14 +17,14 @@ from clpipe.base.vocabulary import DISPOSITIONS, Vocabulary
 from clpipe.chain.registry import all_stages
 from clpipe.commands.main import main
 from clpipe.images.colour_names import ALIASES, DATA, DECODERS, LINEAR, PRIMARIES
-from clpipe.images.vocabularies import CLIP, DNG, JPEG, OPENEXR, PNG, TIFF
+from clpipe.images.vocabularies import CLIP, DNG, JPEG, LAYERS, OPENEXR, PNG, TIFF
 from clpipe.inputs.annotation_keys import BOP, COCO, KITTI
 from clpipe.inputs.camera_keys import COLMAP, TRANSFORMS
 from clpipe.stage import Method
 from tools import ROOT
 
 NOTEBOOK = "first_steps"
-VOCABULARIES = (OPENEXR, PNG, TIFF, JPEG, DNG, CLIP, TRANSFORMS, COLMAP, COCO, BOP, KITTI)
+VOCABULARIES = (OPENEXR, LAYERS, PNG, TIFF, JPEG, DNG, CLIP, TRANSFORMS, COLMAP, COCO, BOP, KITTI)
 
 
 def pages() -> dict[str, str | bytes]:
