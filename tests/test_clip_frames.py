@@ -7,6 +7,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
@@ -288,3 +289,43 @@ def test_a_frame_is_not_larger_than_allowed(tmp_path):
         read_clip_frame(frame_path(clip, 0), 100)
     with pytest.raises(RequestError, match="a clip at a URL is not read"):
         find_jobs(["memory://a/b.mkv"], tmp_path, endings=(".mkv",))
+
+
+def depths(count=3, size=(32, 64)):
+    """Return depths in mm of 16 bits, which differ in each frame."""
+    ramp = np.add.outer(np.arange(size[0]) * 300, np.arange(size[1])).astype(np.uint16)
+    return [ramp + np.uint16(20000 * n) for n in range(count)]
+
+
+@pytest.mark.parametrize("form", ["clip", "folder", "pattern"])
+def test_depth_next_to_a_clip_is_carried_without_loss(clpipe, form):
+    """A lossless clip of 16 bits, or a directory of PNGs."""
+    Path("in").mkdir()
+    write("in/film.mkv", count=3)
+    carry = "depth"
+    if form == "clip":
+        frames = [av.VideoFrame.from_ndarray(each, "gray16le") for each in depths()]
+        encode("in/film_depth.mkv", frames)
+    else:
+        folder = Path("in", "film_depth" if form == "folder" else "z")
+        folder.mkdir()
+        for number, each in enumerate(depths()):
+            Image.fromarray(each).save(folder / f"{number:06}.png")
+        carry = "depth" if form == "folder" else "depth=z/{name}.png"
+    options = ("-c", "unprocess", "--carry", carry, "--device", "numpy")
+    inputs = "in/film.mkv" if form == "pattern" else "in"
+    if form == "folder":
+        options = (*options, "--exclude", "film_depth")
+    clpipe("run", inputs, "-o", "out", *options)
+    assert sorted(path.name for path in Path("out").iterdir() if path.is_dir()) == ["film"]
+    for number, each in enumerate(depths()):
+        with OpenEXR.File(f"out/film/{number:06}.carried.exr") as file:
+            (name,) = [each for each in file.channels() if each.lower().startswith("depth")]
+            assert np.array_equal(file.channels()[name].pixels, each)
+
+
+def test_a_missing_depth_names_where_it_was_looked_for(clpipe):
+    write("film.mkv", count=1)
+    options = ("-c", "unprocess", "--carry", "depth", "--device", "numpy")
+    stderr = clpipe("run", "film.mkv", "-o", "out", *options, status=1).stderr
+    assert "there is no film_depth.mkv/000000 or film_depth/000000.png next to its clip" in stderr

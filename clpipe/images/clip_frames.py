@@ -38,6 +38,8 @@ RECENT = 8  # decoded frames that are kept, because threads ask for frames almos
 MAX_SKIPPED = 48  # frames that are decoded in vain rather than searched for
 MAX_OPEN = 4  # clips that stay open
 
+GREY = ("gray", "gray16le", "gray16be")
+
 # Codes of ITU-T H.273 (2024), tables 2 and 3.
 CHROMATICITIES = {code: PRIMARIES[code] for code in (9, 11, 12)}
 SRGB_LIKE = (1, 2, 5, 6, 7)  # BT.709, none, and those of BT.601, which are near
@@ -124,6 +126,24 @@ def read_clip_frame(path: Path, max_pixels: int) -> ClipFrame:
     pixels = np.rot90(to_rgb(frame), frame.rotation // 90)
     chromaticities = CHROMATICITIES.get(frame.color_primaries)
     return ClipFrame(np.ascontiguousarray(pixels), chromaticities, tuple(reader.warnings(frame)))
+
+
+def read_clip_samples(path: Path) -> Array:
+    """Read a frame of a clip of depths or labels: its whole numbers, unchanged.
+
+    Args:
+        path: its path, see :func:`frame_path`.
+
+    Returns:
+        (height, width) for a grey clip, of 8 or 16 bits; else (height, width, 3).
+
+    Raises:
+        RequestError, ImageError: as for :func:`read_clip_frame`.
+    """
+    clip = path.parent
+    frame = _reader(clip, stamp_of(clip)).frame(path, int(path.name))
+    samples = frame.to_ndarray() if frame.format.name in GREY else to_rgb(frame)
+    return np.ascontiguousarray(np.rot90(samples, frame.rotation // 90))
 
 
 @lru_cache(maxsize=MAX_OPEN)

@@ -10,6 +10,7 @@ import OpenImageIO as oiio
 
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.types import Array
+from clpipe.images.clip_frames import clip_of, read_clip_samples
 from clpipe.images.kinds import kind_from_name
 from clpipe.images.layers import MAX_PARTS, full_name, stated_views, view_of
 from clpipe.images.openimageio import open_image
@@ -95,6 +96,10 @@ def find_layers(path: Path) -> list[LayerLocation]:
     """
     found: list[LayerLocation] = []
     views: list[str] = []
+    if clip_of(path):
+        samples = read_clip_samples(path)
+        channels = tuple("RGB") if samples.ndim == 3 else ("Y",)
+        return [LayerLocation("", 0, channels, tuple(range(len(channels))), oiio.UINT16)]
     with open_image(path) as file:
         several = file.seek_subimage(1, 0)
         part = 0
@@ -172,6 +177,11 @@ def read_layer(
     Raises:
         ImageError: the file is damaged or too large.
     """
+    if clip_of(path):
+        samples = read_clip_samples(path)
+        height, width = samples.shape[:2]
+        check_size(path, width, height, max_pixels)
+        return samples.reshape(height, width, -1).astype(np.uint32), (0, 0), (width, height)
     with open_image(path) as file:
         file.seek_subimage(location.part, 0)
         spec = file.spec()
@@ -200,6 +210,8 @@ def cryptomatte_attributes(path: Path, part: int) -> dict[str, str]:
     Raises:
         ImageError: the file is damaged.
     """
+    if clip_of(path):
+        return {}
     with open_image(path) as file:
         file.seek_subimage(part, 0)
         listed = file.spec().extra_attribs

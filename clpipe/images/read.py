@@ -8,7 +8,6 @@ import numpy as np
 import OpenImageIO as oiio
 
 from clpipe.base.cpu_time import CpuTimer
-from clpipe.base.digests import digests
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.images.attributes import clpipe_attributes, photograph_attributes, shot_attributes
@@ -248,9 +247,10 @@ def _read_encoded(path: Path, max_pixels: int) -> _Encoded | None:
     if clip_of(path):
         frame = read_clip_frame(path, max_pixels)
         pixels = frame.pixels / np.float32(np.iinfo(frame.pixels.dtype).max)
-        digest = digests([str(path)])[str(path)]
         stated = Statements(frame.chromaticities, warnings=frame.warnings)
-        return _Encoded(SourceImage(pixels, digest, "", (), {}), None, stated, is_grey=False)
+        return _Encoded(
+            SourceImage(pixels, digest_of(path), "", (), {}), None, stated, is_grey=False
+        )
     with open_image(path) as file:
         spec = file.spec()
         names = list(spec.channelnames)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 
-from clpipe.base.digests import stamp_of
+from clpipe.base.digests import digests, stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.base.types import Array
@@ -169,4 +169,6 @@ def digest_of(path: Path) -> str:
     try:  # a context manager would take longer, for each image
         return sha256_of(path)[0]
     except OSError as error:
+        if digest := digests([str(path)]).get(str(path)):  # a frame of a clip
+            return digest
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None

@@ -12,6 +12,7 @@ from clpipe.base.errors import ImageError
 from clpipe.base.text import one_line, quote_alternatives, similar_names
 from clpipe.base.url_text import local
 from clpipe.chain.carry import AovSpec
+from clpipe.images.clip_frames import clip_of
 from clpipe.images.kinds import MIN_CHANNELS, flow_directions, flow_vectors, kind_from_name
 from clpipe.images.passes import LayerLocation, find_layers, layer_kind
 from clpipe.reference.carried import RESAMPLING, LayerKind, Vector
@@ -135,11 +136,15 @@ class LayerFinder:
         hint = f" (did you mean {quote_alternatives(similar)}?)" if similar else ""
         files = [file.name for file in self.layers if file != self.path]
         where = f"the file and {', '.join(files)} have" if files else "the file has"
-        expected = f"{self.path.stem}_{one_line(spec.name)}.exr"
+        clip, layer = clip_of(self.path), one_line(spec.name)
+        expected = f"{self.path.stem}_{layer}.exr next to it"
+        if clip:
+            below = f"{clip.stem}_{layer}", self.path.name
+            expected = "{0}.mkv/{1} or {0}/{1}.png next to its clip".format(*below)
         raise ImageError(
             f"{self.path}: --carry: there is no layer '{one_line(spec.name)}'{hint}; {where} "
             f"{', '.join(map(one_line, names)) or 'no layers besides the picture'}, and there "
-            f"is no {expected} next to it; render the layer into one of these files"
+            f"is no {expected}; render the layer into one of these files"
         )
 
     def _of_picture(self, name: str, locations: Sequence[LayerLocation]) -> Sequence[LayerLocation]:
@@ -200,7 +205,9 @@ class LayerFinder:
         """Return whether a companion contains a layer according to its name or pattern."""
         if file == self.path:
             return False
-        return bool(self.patterns) or _layer_suffix(self.path, file.name).lower() == name.lower()
+        clip = clip_of(self.path)
+        own = _layer_suffix(clip, file.parent.name) if clip else _layer_suffix(self.path, file.name)
+        return bool(self.patterns) or own.lower() == name.lower()
 
     def _has_no_picture(self, file: Path) -> bool:
         """Return whether a file can be read and contains no picture."""
@@ -259,20 +266,27 @@ def companions_of(path: Path, patterns: Sequence[str] = ()) -> list[Path]:
     """Return the companions of an image: files next to it that contain its layers.
 
     Without patterns, a companion has the image's name, then ``_``, ``.`` or ``-``, and more before
-    the extension: ``view00_depth.exr`` is a companion of ``view00.exr``.
+    the extension: ``view00_depth.exr`` is a companion of ``view00.exr``. Companions of a clip's
+    frame are in a clip or a folder that is named after the clip: ``a_depth.mkv/000012`` or
+    ``a_depth/000012.png`` for ``a.mp4/000012``. A pattern is then relative to the clip's folder,
+    and ``{name}`` is the frame's number.
 
     Raises:
         ImageError: a file that a pattern names is missing.
     """
-    named = [path.parent / local(pattern).replace("{name}", path.stem) for pattern in patterns]
+    clip = clip_of(path)
+    folder = (clip or path).parent
+    named = [folder / local(pattern).replace("{name}", path.stem) for pattern in patterns]
     for file, pattern in zip(named, patterns, strict=True):
-        if not file.is_file():
+        if not any(stamp_of(file)):
             raise ImageError(
                 f"{path}: its companion {file} does not exist; correct the pattern in "
                 f"--carry ...={pattern}, or render the file"
             )
     if patterns:
         return named
+    if clip:
+        return _companions_of_frame(path, clip)
     names = _names_in(str(path.parent), stamp_of(path.parent)[1])
     found = []
     for name in names[bisect_left(names, path.stem) :]:
@@ -281,6 +295,20 @@ def companions_of(path: Path, patterns: Sequence[str] = ()) -> list[Path]:
         if Path(name).suffix.lower() in SUFFIXES and _layer_suffix(path, name) not in ("", CARRIED):
             found.append(path.with_name(name))
     return sorted(found, key=lambda file: (SUFFIXES.index(file.suffix.lower()), file.name))
+
+
+def _companions_of_frame(path: Path, clip: Path) -> list[Path]:
+    """Return the companions of a frame of a clip, see :func:`companions_of`."""
+    found = []
+    for name in _names_in(str(clip.parent), stamp_of(clip.parent)[1]):
+        other = clip.with_name(name)
+        if name == clip.name or not _layer_suffix(clip, name):
+            continue
+        if clip_of(other / path.name):
+            found.append(other / path.name)
+        files = (other / f"{path.name}{suffix}" for suffix in SUFFIXES)
+        found += [file for file in files if file.is_file()]
+    return found
 
 
 @lru_cache(maxsize=8)

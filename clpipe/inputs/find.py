@@ -210,7 +210,7 @@ def find_jobs(
             jobs.append(Job(path, path.name))
     for pattern in excluded.unused:
         log.warning(python_words("--exclude %s matches no file"), pattern)
-    jobs = without_companions([each for job in jobs for each in _frames(job, endings)])
+    jobs = [frame for job in without_companions(jobs) for frame in _frames(job, endings)]
     if not jobs:
         raise RequestError("every file is excluded by --exclude; use a narrower pattern")
     return jobs
