@@ -181,7 +181,7 @@ PASSES = {
     CryptoMaterial00; CryptoAsset00; Noisy Image; Debug Sample Count;
     Debug Render Time; Shadow Catcher; Freestyle; Transp; Guiding Color; GreasePencil;
     Volume Scatter; Volume Transmit; Volume Majorant""",
-    "Arnold": """RGBA; A; AA_inv_density; ID; N; Z; P; Pref; albedo; background; coat; coat_albedo;
+    "Arnold": """RGBA; AA_inv_density; ID; N; Z; P; Pref; albedo; background; coat; coat_albedo;
     coat_direct; coat_indirect; cputime; diffuse; diffuse_albedo; diffuse_direct;
     diffuse_indirect; direct; emission; highlight; indirect; motionvector; opacity;
     raycount; shadow; shadow_diff; shadow_mask; shadow_matte; sheen; sheen_albedo;

@@ -37,7 +37,7 @@ AOVS = {
     "Blender's light": "DiffDir DiffInd DiffCol GlossDir GlossInd GlossCol TransDir TransInd "
     "TransCol VolumeDir VolumeInd SubsurfaceDir SubsurfaceInd SubsurfaceCol Emit Env Shadow AO "
     "ShadowCatcher Transp",
-    "Arnold": "A AA_inv_density N P Pref background coat coat_direct coat_indirect cputime diffuse "
+    "Arnold": "AA_inv_density N P Pref background coat coat_direct coat_indirect cputime diffuse "
     "diffuse_direct direct emission highlight indirect opacity raycount shadow_matte sheen "
     "sheen_direct specular sss transmission volume volume_direct volume_opacity volume_Z",
     "V-Ray": "alpha bumpNormals extraTex MultiMatteElement matteShadow nodeID noiseLevel renderID "
