@@ -2,8 +2,8 @@
 
     .venv/bin/python -m tools.lines
 
-Comments, docstrings and blank lines do not count. Lowering a budget is a normal commit. A commit that
-raises one says why the lines are worth more than what could go.
+Comments, docstrings and blank lines do not count. Lowering a budget is a normal commit. A commit
+that raises one says why the lines are worth more than what could go.
 """
 
 import ast
