@@ -277,6 +277,16 @@ def test_what_a_clip_states_and_clpipe_does_not_use_is_named(clpipe):
     assert "its alpha (opacity) is not used" in result.stderr
 
 
+def test_a_truncated_clip_is_named(clpipe):
+    data = write("a.mkv", count=30).read_bytes()
+    Path("a.mkv").write_bytes(data[: len(data) // 2])
+    write("b.mkv", count=3)
+    run = ("run", "a.mkv", "b.mkv", "-o", "out", "-c", "unprocess", "--device", "numpy")
+    stderr = clpipe(*run).stderr
+    assert "a.mkv/000000: warning: its missing_frames (frames after the last one" in stderr
+    assert "b.mkv/000000: warning" not in stderr
+
+
 def test_a_dataset_reads_clips(tmp_path):
     write(tmp_path / "a.mkv", count=3)
     data = api.Dataset(tmp_path / "a.mkv", "unprocess", device="numpy", until="mosaic")

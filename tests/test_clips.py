@@ -388,6 +388,21 @@ def test_frames_of_a_sequence_have_all_a_time_or_none(clpipe, frames):
     assert "time: found 'now', but expected a number: seconds" in stderr
 
 
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        (("0", "1e-6"), "are of 1e+06 frames per second, but clips have 1000 at most"),
+        (("0", "1e300"), "time: found 1e+300, which is neither seconds nor a time stamp"),
+        (("0", "true"), "time: found True, but expected a number"),
+    ],
+)
+def test_impossible_times_are_rejected(clpipe, frames, times, message):
+    frames("in")
+    rows = "".join(f"in/f{n}.exr,{time}\n" for n, time in enumerate(times))
+    Path("list.csv").write_text(f"path,time\n{rows}")
+    assert message in clpipe("run", "list.csv", "-o", "a.mkv", *RUN[4:], status=2).stderr
+
+
 def test_two_containers_of_one_name_have_their_own_records(clpipe, frames):
     frames("in")
     for suffix in ("mkv", "mp4"):

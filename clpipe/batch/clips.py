@@ -28,6 +28,7 @@ from clpipe.outputs.sidecar import DIGEST_KEY, SIDECAR, read_sidecar, to_json
 from clpipe.outputs.writer import OutputWriter
 
 SETTINGS = ".csv"  # next to a named clip: the settings of its frames, instead of run.csv
+MAX_RATE = 1000  # frames per second
 RECORDS = ".jsonl"  # next to a clip: the sidecar of each frame, one per line
 DECODED = ".decoded"  # the directory of a clip's decoded frames
 
@@ -96,6 +97,11 @@ class ClipOptions:
         rate = rate_of(job)
         if rate is None:
             return self.video
+        if not 1 / MAX_RATE <= rate <= MAX_RATE:
+            raise RequestError(
+                f"the times of {sequence_of(job)} are of {float(rate):.6g} frames per second, but "
+                f"clips have {MAX_RATE} at most; correct the times"
+            )
         if self.has_rate and rate != self.video.rate:
             raise RequestError(
                 f"--fps: found {float(self.video.rate):.6g}, but the times of {sequence_of(job)} "
@@ -122,7 +128,7 @@ def parse_rate(text: str) -> Fraction:
     """
     is_rate = re.fullmatch(r"\d+(\.\d+)?|\d+/0*[1-9]\d*", text)
     rate = Fraction(text) if is_rate else Fraction(0)
-    if not 0 < rate <= 1000:
+    if not 0 < rate <= MAX_RATE:
         raise RequestError(f"--fps: found {text!r}; expected a number, such as 24 or 30000/1001")
     return standard_rate(rate)
 

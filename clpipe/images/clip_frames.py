@@ -163,6 +163,7 @@ class _Reader:
             rate, base = stream.average_rate or Fraction(24), stream.time_base or Fraction(1)
             self.size = stream.width, stream.height
             self._stated = _statements(container, stream)
+            is_alone, duration = len(container.streams) == 1, container.duration or 0
         stamps = sorted({packet.pts for packet in packets if packet.pts is not None})
         if len(stamps) < len(packets):  # some files have no times, or not for each frame
             stamps = []
@@ -173,6 +174,8 @@ class _Reader:
         times = [(stamp - stamps[0]) * base for stamp in stamps]
         rounded = all(abs(a - b) < base for a, b in zip(times, regular, strict=bool(times)))
         self.times = tuple(regular if rounded else times)
+        ends = [Fraction(), *self.times][-1] + 2 / rate + (stamps[0] * base if stamps else 0)
+        self._stated["missing_frames"] = is_alone and duration / 10**6 > ends
         self._container: Any = None
         self._decoded: Iterator[av.VideoFrame] = iter(())
         self._next = 0  # the number of the frame that is decoded next

@@ -281,6 +281,7 @@ CLIP = Vocabulary.of(
             "unknown primaries; it is read as sRGB": "unknown_primaries",
             "further video streams, of which the first is read": "other_streams",
             "two views in a frame": "stereo_mode",
+            "frames after the last one, which its duration counts": "missing_frames",
         },
         "ignored": {
             "what wrote the file": "encoder ENCODER vendor_id handler_name major_brand "

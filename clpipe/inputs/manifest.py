@@ -31,7 +31,7 @@ from clpipe.inputs.tables import (
     json_records,
     list_records,
 )
-from clpipe.inputs.times import decimal_text, seconds_of
+from clpipe.inputs.times import LATEST, decimal_text, seconds_of
 
 MANIFEST_SUFFIXES = (".csv", ".jsonl", ".txt")
 # No other setting depends on these keys, and their values often differ by row.
@@ -333,7 +333,10 @@ def _time(value: Any) -> Fraction | None:
             f"time: found {value!r}, but expected a number: seconds, or a time stamp in s, ms or ns"
         )
     time = Fraction(str(value))  # the decimals of a float, not its binary digits
-    return seconds_of(time) or time
+    time = seconds_of(time) or time
+    if abs(time) > LATEST:
+        raise RequestError(f"time: found {value!r}, which is neither seconds nor a time stamp")
+    return time
 
 
 def check_output_name(name: str, column: str = "name") -> None:
