@@ -191,6 +191,8 @@ def test_a_damaged_clip_fails_alone(clpipe):
     stderr = clpipe(*run, status=1).stderr
     assert "b.mkv: this video cannot be read" in stderr
     assert len([*Path("out/a").glob("*.jpg")]) == 2
+    stderr = clpipe("run", "b.mkv", "-o", "c.mp4", "-c", "unprocess", status=1).stderr
+    assert "b.mkv: this video cannot be read" in stderr
 
 
 def test_frames_after_a_damaged_one_are_read(tmp_path):

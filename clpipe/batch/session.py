@@ -153,10 +153,10 @@ class Run:
         self.writer.check(self._chain, self.jobs)
         if images.clips:
             check_clip_chain(self._chain)
-            claim = self._loader.claim(self.jobs[0])
-            if claim.width and not self.jobs[0].is_panorama:
-                size = self._chain.size(claim.width, claim.height)
-                images.clips.check_size(*size)
+            first = self.jobs[0]
+            if self._loader.has_readable_header(first) and not first.is_panorama:
+                claim = self._loader.claim(first)
+                images.clips.check_size(*self._chain.size(claim.width, claim.height))
             self.sink()  # raises an error if two clips would have one name
         if execution.trace:
             check_trace(execution.trace)
