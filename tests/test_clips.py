@@ -6,6 +6,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
@@ -426,3 +427,13 @@ def test_the_records_of_a_clip_are_no_sidecar(clpipe, frames):
     clpipe("run", frames("in"), "-o", "film.mkv", "--device", "numpy")
     stderr = clpipe("replay", "film.mkv.jsonl", "-o", "again", status=2).stderr
     assert "film.mkv.jsonl: this file has the records of a clip or a run" in stderr
+
+
+def test_an_odd_overscan_has_an_even_picture(clpipe):
+    header = {"displayWindow": ((0, 0), (47, 31)), "dataWindow": ((-1, -1), (49, 33))}
+    header = {key: tuple(map(np.int32, value)) for key, value in header.items()}
+    for frame in range(2):
+        picture = np.full((35, 51, 3), 0.2, np.float32)
+        OpenEXR.File(header, {"RGB": picture}).write(f"f{frame}.exr")
+    clpipe("run", "f0.exr", "f1.exr", "-o", "film.mp4", "--device", "numpy")
+    assert video_info(Path("film.mp4")).height == 32

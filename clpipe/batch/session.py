@@ -8,12 +8,12 @@ import os
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 
 from clpipe.base.about import full_version
-from clpipe.base.errors import OutputError, RequestError
+from clpipe.base.errors import ImageError, OutputError, RequestError
 from clpipe.base.files import discard
 from clpipe.base.processors import available_processors
 from clpipe.base.transfers import TRANSFERS
@@ -47,6 +47,7 @@ from clpipe.chain.unused import Images as KnownImages
 from clpipe.chain.unused import unused_values
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.state import has_state
+from clpipe.images.claims import display_size
 from clpipe.inputs.carry_rows import rows_note
 from clpipe.inputs.find import Job
 from clpipe.inputs.flow import check_flow
@@ -154,9 +155,10 @@ class Run:
         if images.clips:
             check_clip_chain(self._chain)
             first = self.jobs[0]
-            if self._loader.has_readable_header(first) and not first.is_panorama:
-                claim = self._loader.claim(first)
-                images.clips.check_size(*self._chain.size(claim.width, claim.height))
+            if not first.is_panorama and not self._loader.raw.is_raw(first.path):
+                with suppress(ImageError):  # the frame itself then fails
+                    width, height = self._chain.size(*display_size(first.path))
+                    images.clips.check_size(width, height)
             self.sink()  # raises an error if two clips would have one name
         if execution.trace:
             check_trace(execution.trace)

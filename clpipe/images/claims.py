@@ -62,6 +62,8 @@ def display_size(path: Path) -> tuple[int, int]:
     Raises:
         ImageError: it cannot be opened.
     """
+    if clip := clip_of(path):
+        return clip_size(clip)
     with open_image(path) as file:
         spec = file.spec()
         return spec.full_width, spec.full_height
