@@ -117,7 +117,6 @@ def test_what_ends_a_run_of_bands():
     assert banded(sums)[0].bands.parts[-1].sums
     kept = make_plan(make_chain(settings_from({})), keep=["normalize"], cpu=CPU)
     assert all(kept.slots[image.number] for _, image in kept.kept)
-    assert not banded(make_plan(make_chain(settings_from({})), incremental=True, cpu=CPU))
     assert not banded(plan_of(cpu=None))
 
 

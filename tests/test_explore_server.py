@@ -90,9 +90,8 @@ def test_the_server_answers_with_pixels(served, explorer):
     assert abs(small.mean() - first.mean()) < 2
     _, none = pixels_of(answer(served, "develop", question | part | {"left": 1000, "by": 0}))
     assert none.size == 0
-    ran = [launch for launch in facts["launches"] if launch["ms"] is not None]
-    assert ran
-    assert all(launch["ms"] > 0 for launch in ran)
+    assert facts["launches"]
+    assert all(launch["ms"] > 0 for launch in facts["launches"])
 
 
 def test_nobody_without_the_token_gets_an_answer(served):

@@ -300,9 +300,9 @@ def test_what_a_plan_makes_is_what_the_passes_say(seed):
         chain, symbols = random_chain(random), Symbols()
         keep = [name for name in chain.names if random.random() < 0.25]
         encode, final = random.random() < 0.5 or not keep, random.random() < 0.5
-        half, fold, incremental = (random.random() < share for share in (0.5, 0.8, 0.3))
+        half, fold = (random.random() < share for share in (0.5, 0.8))
         cpu = random.choice([None, Cpu(2, 1 << 18)])
-        plan = make_plan(chain, half, keep, encode, final, fold, False, incremental, cpu)
+        plan = make_plan(chain, half, keep, encode, final, fold, False, cpu)
         expected, last = results_of_passes(chain, symbols), chain.names[-1]
         done = Execution(plan, symbols)
         assert not done.sums and not done.reduced
@@ -314,7 +314,7 @@ def test_what_a_plan_makes_is_what_the_passes_say(seed):
             assert plan.final and done.stored(plan.final) == expected[last]
         check_sizes(plan, chain)
         used = [slot for slots in plan.slots for slot in slots]
-        assert plan.slot_count == len(used if incremental else set(used))
+        assert plan.slot_count == len(set(used))
 
 
 def check_sizes(plan: Plan, chain: Chain) -> None:

@@ -170,11 +170,7 @@ class Device:
         for work in works:
             tiling = self.tiling(work, memory)
             patches = [Member(e, work, number) for number, e in enumerate(tiling.patches)]
-            if (
-                len(tiling.phases) > 1
-                or plan.incremental
-                or not (patches or len(tiling.tiles) == 1)
-            ):
+            if len(tiling.phases) > 1 or not (patches or len(tiling.tiles) == 1):
                 self.flow.start_tiled(flight, work, tiling, calls, borders, self.memory)
             else:
                 members += patches or [Member(tiling.tiles[0], work, is_whole=True)]

@@ -9,7 +9,7 @@ together.
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -22,7 +22,6 @@ from clpipe.engine.bindings import slot_buffer, step_buffer
 from clpipe.engine.buffers import Pool, aligned_empty, copy_encoded, copy_plane
 from clpipe.engine.extents import Extents
 from clpipe.engine.ir import Border, Launch
-from clpipe.engine.launch_cache import LaunchCache
 from clpipe.engine.stack import Call, Stack
 from clpipe.engine.tiles import Phase, Tiling, source_bytes
 from clpipe.engine.transfers import Staged, ZeroCopy
@@ -88,7 +87,6 @@ class Flow:
         self._fetch_events: list[
             Any
         ] = []  # events of fetches from buffers that the next stack writes to
-        self._launch_cache = LaunchCache()
 
     def new_queue(self) -> Any:
         """Return a queue that executes commands in order, and times them."""
@@ -120,17 +118,9 @@ class Flow:
         borders: Callable[[Launch], Iterator[Call]],
         memory: int,
     ) -> None:
-        """Enqueue one image, phase by phase, with at most ``memory`` bytes of buffers.
-
-        For an incremental plan, launches are skipped if their results are still on the device.
-        """
-        previous, updated = self.reset_launch_cache(), LaunchCache()
+        """Enqueue one image, phase by phase, with at most ``memory`` bytes of buffers."""
         self.reserve(tiling.sizes, memory)
         is_whole = len(tiling.tiles) == 1 and not tiling.patches
-        if work.plan.incremental and is_whole:
-            image = work.source, work.options.unchanged, tiling.tiles[0], work.bind
-            numbers, updated = previous.next(calls, self.pool, *image)
-            tiling = replace(tiling, phases=(Phase((), numbers, ()),))
 
         def stack(place: int, extents: Extents, numbers: Sequence[int], phase: Phase) -> Stack:
             is_patch = tiling.patches and phase is tiling.phases[-1]
@@ -151,11 +141,9 @@ class Flow:
             for place, extents in enumerate(tiles):
                 self._submit(flight, stack(place, extents, phase.each, phase))
             self._launch(flight, stack(0, tiles[0], phase.last, phase), {}, [])
-        self._launch_cache = updated
 
     def start(self, flight: Flight, stack: Stack, sizes: Mapping[str, int], memory: int) -> None:
         """Enqueue a stack that needs buffers of these sizes; all take at most ``memory`` bytes."""
-        self.reset_launch_cache()
         member = stack.members[0]
         if state := member.work.options.state:
             state.begin_frame(self, member.work.plan, member.extents)
@@ -163,11 +151,6 @@ class Flow:
             memory -= state.bytes
         self.reserve(sizes, memory)
         self._submit(flight, stack)
-
-    def reset_launch_cache(self) -> LaunchCache:
-        """Return the launch cache, and start an empty one, because buffers will be overwritten."""
-        previous, self._launch_cache = self._launch_cache, LaunchCache()
-        return previous
 
     def reserve(self, sizes: Mapping[str, int], memory: int) -> None:
         """Allocate buffers of these sizes (bytes by name), with at most ``memory`` bytes in all."""

@@ -206,7 +206,6 @@ class Plan:
         final: the last image as float planes, if requested.
         encoded: the kind of the eight-bit pixels, if requested.
         border: the width of the planes' borders in pixels.
-        incremental: whether all images stay on the device, so that launches can be skipped.
         states: each step with state, with its results for the frame before and for this frame. None
             stands for the former in a plan of a first frame.
         resamplings: the resampling from each level to the next.
@@ -222,7 +221,6 @@ class Plan:
     final: Image | None = None
     encoded: Kind | None = None
     border: int = 0
-    incremental: bool = False
     states: tuple[tuple[str, Image | None, Image], ...] = ()
     resamplings: tuple[Resampler, ...] = ()
 

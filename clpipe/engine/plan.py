@@ -37,11 +37,6 @@ from clpipe.stage import (
     TableLookup,
 )
 
-# In incremental plans, borders are multiples of this width. Plans whose widest stencils differ a
-# little then have the same plane layout. The default chain's border is 4 pixels; with 8 it takes
-# 5 % longer (PoCL, two cores).
-INCREMENTAL_BORDER = 4
-
 
 class _Planner:
     def __init__(self, source: Kind, fold: bool) -> None:
@@ -197,7 +192,6 @@ def make_plan(
     final: bool = False,
     fold: bool = True,
     planar: bool = False,
-    incremental: bool = False,
     cpu: Cpu | None = None,
     frame: Frame = Frame.SINGLE,
 ) -> Plan:
@@ -213,8 +207,6 @@ def make_plan(
         fold: whether a stencil may recompute passes at its taps. It may not for images one pixel
             wide or high, because mirroring changes their Bayer phase.
         planar: whether the source is stored as consecutive planes, not interleaved.
-        incremental: whether images share no slots, so that a launch can be skipped if its results
-            are still on the device.
         cpu: the CPU on whose cores launches run in bands. None runs each over the whole image.
         frame: which frame of a sequence the image is. For any but a single image, the results of
             steps with state are kept for the next frame.
@@ -255,8 +247,8 @@ def make_plan(
     results = [*kept.values(), final_image] if final_image else kept.values()
     before = [*planner.previous.values()]
     results = [*results, *before, *(after for *_, after in states)]
-    pinned = {image.number for image in (planner.images if incremental else results)}
-    if cpu and not incremental:
+    pinned = {image.number for image in results}
+    if cpu:
         launches = in_bands(launches, pinned, cpu)
     slots, count = assign_slots(launches, planner.images, pinned, before)
     stencils = [op for x in launches if isinstance(x, Launch) for op in x.ops]
@@ -273,8 +265,7 @@ def make_plan(
         kept=tuple(kept.items()),
         final=final_image,
         encoded=chain.result if encode else None,
-        border=-(-border // INCREMENTAL_BORDER) * INCREMENTAL_BORDER if incremental else border,
-        incremental=incremental,
+        border=border,
         states=tuple(states),
         resamplings=tuple(planner.resamplings),
     )

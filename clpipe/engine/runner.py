@@ -92,9 +92,6 @@ class Runner:
         keep: the steps whose images are returned.
         encode: whether the last image is returned in eight bits.
         final: whether the last image is returned in float.
-        incremental: whether the device keeps all intermediate images. If an image that is processed
-            whole is run again, only the last launch and those affected by a change run again. The
-            results are the same; this needs less time and more memory.
         bands: whether launches run in bands on a CPU. The results are the same.
     """
 
@@ -105,7 +102,6 @@ class Runner:
         keep: Sequence[str] = (),
         encode: bool = True,
         final: bool = False,
-        incremental: bool = False,
         bands: bool = True,
     ) -> None:
         self.chain = chain
@@ -113,7 +109,6 @@ class Runner:
         self.keep = tuple(keep)
         self.encode = encode
         self.final = final
-        self.incremental = incremental
         self.bands = bands
         self._arguments = chain.arguments
         self._exposures = exposures_of(chain)
@@ -127,7 +122,7 @@ class Runner:
         A chain that differs only in run-time values is neither planned nor compiled again.
         """
         results = self.keep, self.encode, self.final
-        other = Runner(chain, self.device, *results, self.incremental, self.bands)
+        other = Runner(chain, self.device, *results, self.bands)
         other._plans, other._tables = self._plans, self._tables
         return other
 
@@ -152,7 +147,7 @@ class Runner:
 
         On a CPU, launches run in bands unless ``bands`` is false.
         """
-        bands &= self.bands and not self.incremental
+        bands &= self.bands
         cpu = self.device.info.cpu if self.device and bands else None
         chain, key = self.chain, (half, fold, planar, cpu, frame)
 
@@ -160,7 +155,7 @@ class Runner:
             ops = chain_ops(chain, self._arguments, Frame.LATER)
             structure = (*key, chain.source, chain.result, ops)
             results = self.keep, self.encode, self.final
-            options = chain, half, *results, fold, planar, self.incremental, cpu, frame
+            options = chain, half, *results, fold, planar, cpu, frame
             return self._plans.get(structure, lambda: make_plan(*options))
 
         return self._plans.get(
@@ -176,7 +171,7 @@ class Runner:
 
     def _plan_for_frame(self, image: Array, state: State) -> Plan:
         """Return the plan for the next frame of a sequence."""
-        assert self.device and not self.incremental
+        assert self.device
         plan = self.plan_for(image, Frame.LATER)
         width, height = image.shape[1::-1]
         extents = whole_image(plan, width, height, self.device.info.lanes)

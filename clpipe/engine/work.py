@@ -47,7 +47,7 @@ class Work(Generic[R]):
         """Whether the image must not share launches, for example because it is timed."""
         options = self.options
         is_usual = options.download and options.timings is None and options.into is None
-        return self.plan.incremental or options.state is not None or not is_usual
+        return options.state is not None or not is_usual
 
 
 @dataclass(frozen=True, eq=False)

@@ -292,9 +292,7 @@ class Explorer:
         """Return a runner of a chain. It shares plans with earlier runners."""
         encode = chain.result is Kind.DISPLAY
         if encode not in self._runners:
-            self._runners[encode] = Runner(
-                chain, self.device, (), encode, not encode, incremental=True
-            )
+            self._runners[encode] = Runner(chain, self.device, (), encode, not encode)
         return self._runners[encode].for_chain(chain)
 
 
@@ -321,12 +319,8 @@ def _finite_estimates(estimates: Mapping[str, Mapping[str, float]]) -> dict[str,
 
 
 def _launch_times(launches: Sequence[AnyLaunch], timings: Sequence[Timing]) -> list[dict[str, Any]]:
-    """Return the launches of a plan with their times in ms. None marks reused results."""
-    seconds: dict[str, list[float]] = {}
+    """Return the launches of a plan with their times in ms."""
+    seconds = dict.fromkeys((each.name for each in (*launches, *timings)), 0.0)
     for timing in timings:
-        if not timing.transfer:
-            seconds.setdefault(timing.name, []).append(timing.seconds)
-    return [
-        {"name": each.name, "ms": sum(found) * 1e3 if (found := seconds.get(each.name)) else None}
-        for each in launches
-    ]
+        seconds[timing.name] += timing.seconds
+    return [{"name": each.name, "ms": seconds[each.name] * 1e3} for each in launches]

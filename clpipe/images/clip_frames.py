@@ -68,10 +68,10 @@ def clip_of(path: Path) -> Path | None:
     >>> clip_of(Path("a.png")) is None
     True
     """
-    clip = path.parent
-    if clip.suffix.lower() not in VIDEO_SUFFIXES or not path.name.isdecimal():
+    if not path.name.isdecimal():  # first, because it is fast
         return None
-    return clip if clip.is_file() else None
+    clip = path.parent
+    return clip if clip.suffix.lower() in VIDEO_SUFFIXES and clip.is_file() else None
 
 
 def frame_path(clip: Path, number: int) -> Path:
