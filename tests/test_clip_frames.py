@@ -13,7 +13,7 @@ from PIL import Image
 
 import clpipe as api
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.images.clip_frames import clip_times, frame_path, read_clip_frame
+from clpipe.images.clip_frames import _reader, clip_times, frame_path, read_clip_frame
 from clpipe.images.video import VideoOptions, VideoWriter, read_video
 from clpipe.inputs.find import find_jobs
 from tests.conftest import statuses
@@ -75,6 +75,30 @@ def test_frames_are_the_same_in_any_order(tmp_path, name, options):
     with ThreadPoolExecutor(4) as threads:
         found = list(threads.map(lambda number: read(clip, number), range(COUNT)))
     assert all(map(np.array_equal, found, expected))
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("open.mp4", {"x264-params": "b-adapt=0:bframes=3:keyint=7:open-gop=1:scenecut=0"}),
+        ("open.mkv", {"x264-params": "b-adapt=0:bframes=3:keyint=7:open-gop=1:scenecut=0"}),
+        ("b.avi", {"bf": "3"}),
+    ],
+)
+def test_frames_that_need_those_before_their_key_frame(tmp_path, name, options):
+    """Open groups of pictures; and AVI, which has no times of presentation."""
+    path = tmp_path / name
+    with av.open(path, "w") as file:
+        stream = file.add_stream("libx264", rate=25, options={"crf": "1", **options})
+        stream.height, stream.width, stream.pix_fmt = 32, 64, "yuv420p"
+        for number in range(40):
+            grey = np.full((32, 64, 3), 20 + 5 * number, np.uint8)
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(grey, "rgb24")))
+        file.mux(stream.encode(None))
+    for number in (*np.random.default_rng(0).permutation(40), 5, 6, 20, 6):
+        _reader.cache_clear()
+        found = read(path, int(number)).mean()
+        assert abs(found - 20 - 5 * number) < 2
 
 
 @pytest.mark.parametrize("rate", [24, Fraction(30000, 1001), 60])
@@ -309,14 +333,23 @@ def depths(count=3, size=(32, 64)):
     return [ramp + np.uint16(20000 * n) for n in range(count)]
 
 
-@pytest.mark.parametrize("form", ["clip", "folder", "pattern"])
+@pytest.mark.parametrize("form", ["clip", "ten bits", "folder", "pattern"])
 def test_depth_next_to_a_clip_is_carried_without_loss(clpipe, form):
     """A lossless clip of 16 bits, or a directory of PNGs."""
     Path("in").mkdir()
     write("in/film.mkv", count=3)
     carry = "depth"
+    expected = depths()
     if form == "clip":
-        frames = [av.VideoFrame.from_ndarray(each, "gray16le") for each in depths()]
+        frames = [av.VideoFrame.from_ndarray(each, "gray16le") for each in expected]
+        encode("in/film_depth.mkv", frames)
+    elif form == "ten bits":
+        expected = [each % 1024 for each in expected]
+        frames = [av.VideoFrame(64, 32, "gray10le") for _ in expected]
+        for frame, each in zip(frames, expected, strict=True):
+            line = np.zeros((32, frame.planes[0].line_size // 2), np.uint16)
+            line[:, :64] = each
+            frame.planes[0].update(line)
         encode("in/film_depth.mkv", frames)
     else:
         folder = Path("in", "film_depth" if form == "folder" else "z")
@@ -326,14 +359,33 @@ def test_depth_next_to_a_clip_is_carried_without_loss(clpipe, form):
         carry = "depth" if form == "folder" else "depth=z/{name}.png"
     options = ("-c", "unprocess", "--carry", carry, "--device", "numpy")
     inputs = "in/film.mkv" if form == "pattern" else "in"
-    if form == "folder":
-        options = (*options, "--exclude", "film_depth")
     clpipe("run", inputs, "-o", "out", *options)
     assert sorted(path.name for path in Path("out").iterdir() if path.is_dir()) == ["film"]
-    for number, each in enumerate(depths()):
+    for number, each in enumerate(expected):
         with OpenEXR.File(f"out/film/{number:06}.carried.exr") as file:
             (name,) = [each for each in file.channels() if each.lower().startswith("depth")]
             assert np.array_equal(file.channels()[name].pixels, each)
+
+
+def test_a_clip_that_keeps_no_numbers_is_no_depth(clpipe):
+    write("film.mkv", count=1)
+    write("film_depth.mp4", "h264", count=1)
+    options = ("-c", "unprocess", "--carry", "depth", "--device", "numpy")
+    stderr = clpipe("run", "film.mkv", "-o", "out", *options, status=1).stderr
+    assert "this clip has the codec h264 and pixels of yuv420p, which do not keep" in stderr
+
+
+def test_a_frame_or_a_clip_without_frames_is_named_directly(clpipe):
+    write("film.mkv", count=3)
+    run = ("-o", "out", "-c", "unprocess", "--device", "numpy")
+    clpipe("run", "film.mkv/000001", *run)
+    clpipe("run", "film.mkv", "-o", "all", *run[2:])
+    name = "film/000001.jpg"
+    assert Path("out", name).read_bytes() == Path("all", name).read_bytes()
+    data = Path("film.mkv").read_bytes()
+    Path("cut.mkv").write_bytes(data[: data.index(b"\x1f\x43\xb6\x75")])  # before the cluster
+    stderr = clpipe("run", "cut.mkv", *run, status=1).stderr
+    assert re.search("cut.mkv: this (clip has no frames|video cannot be read)", stderr)
 
 
 def test_a_missing_depth_names_where_it_was_looked_for(clpipe):

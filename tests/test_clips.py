@@ -386,7 +386,7 @@ def test_frames_of_a_sequence_have_all_a_time_or_none(clpipe, frames):
     assert "f1.exr" in stderr and "this frame has no time, but others of its sequence" in stderr
     Path("list.csv").write_text("path,time\nin/f0.exr,now\n")
     stderr = clpipe("run", "list.csv", "-o", "a.mkv", *RUN[4:], status=2).stderr
-    assert "time: found 'now', but expected a number: seconds" in stderr
+    assert "time: found now, but expected a number: seconds" in stderr
 
 
 @pytest.mark.parametrize(
@@ -402,6 +402,17 @@ def test_impossible_times_are_rejected(clpipe, frames, times, message):
     rows = "".join(f"in/f{n}.exr,{time}\n" for n, time in enumerate(times))
     Path("list.csv").write_text(f"path,time\n{rows}")
     assert message in clpipe("run", "list.csv", "-o", "a.mkv", *RUN[4:], status=2).stderr
+
+
+def test_an_hour_between_frames(clpipe, frames):
+    frames("in")
+    Path("list.csv").write_text("path,time\nin/f0.exr,0\nin/f1.exr,3600\nin/f2.exr,7200\n")
+    stderr = clpipe("run", "list.csv", "-o", "a.mkv", *RUN[4:]).stderr
+    assert "0.000277778 frames per second from their times" in stderr
+    assert times_of("a.mkv")[0] == [0, 3600, 7200]
+    Path("list.csv").write_text("path,time\nin/f0.exr,0\nin/f1.exr,0.1\nin/f2.exr,7200\n")
+    run = ("run", "list.csv", "-o", "b.mkv", *RUN[4:], "--gaps", "black")
+    assert "71998 frames of in are missing, but 10000 black" in clpipe(*run, status=2).stderr
 
 
 def test_two_containers_of_one_name_have_their_own_records(clpipe, frames):

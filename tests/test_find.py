@@ -233,6 +233,20 @@ def test_missing_numbers_of_a_range_are_named(tmp_path, caplog):
             find_jobs([str(tmp_path / wrong)], tmp_path / "out")
 
 
+def test_patterns_with_special_characters(tmp_path):
+    names = ("gl[1]b/f.1001.exr", "shot-1001.exr", "shot-1003.exr", "100%d_0001.exr")
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    for pattern, expected in (
+        ("gl[1]b/f.####.exr", ["f.1001.exr"]),
+        ("shot-1001-1003####.exr", ["shot-1001.exr", "shot-1003.exr"]),
+        ("100%d_%04d.exr", ["100%d_0001.exr"]),
+    ):
+        jobs = find_jobs([str(tmp_path / pattern)], tmp_path / "out")
+        assert [job.key for job in jobs] == expected
+
+
 def test_a_file_with_the_name_of_a_pattern_is_a_file(tmp_path):
     (tmp_path / "a#1.exr").touch()
     [job] = find_jobs([str(tmp_path / "a#1.exr")], tmp_path / "out")

@@ -584,3 +584,10 @@ def test_a_long_gap_takes_no_time():
     loop.next(1.0)
     loop.hold(10**12)
     assert loop.next(1.0) == pytest.approx(1)
+
+
+def test_names_with_a_number_and_a_time_stamp():
+    names = [f"frame{n:04}_{1305031102000 + 40 * n}.exr" for n in (0, 1, 3)]
+    jobs = in_sequences([Job(Path(name), name) for name in names])
+    assert [job.place.index for job in jobs] == [0, 1, 3]
+    assert {(job.place.sequence, job.place.interval) for job in jobs} == {("frame", 0.04)}

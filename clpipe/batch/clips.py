@@ -29,6 +29,7 @@ from clpipe.outputs.writer import OutputWriter
 
 SETTINGS = ".csv"  # next to a named clip: the settings of its frames, instead of run.csv
 MAX_RATE = 1000  # frames per second
+MAX_BLACK = 10_000  # frames that fill the gaps of a clip
 RECORDS = ".jsonl"  # next to a clip: the sidecar of each frame, one per line
 DECODED = ".decoded"  # the directory of a clip's decoded frames
 
@@ -97,7 +98,7 @@ class ClipOptions:
         rate = rate_of(job)
         if rate is None:
             return self.video
-        if not 1 / MAX_RATE <= rate <= MAX_RATE:
+        if rate > MAX_RATE:
             raise RequestError(
                 f"the times of {sequence_of(job)} are of {float(rate):.6g} frames per second, but "
                 f"clips have {MAX_RATE} at most; correct the times"
@@ -351,8 +352,14 @@ def clips_of(
             f"--output: found {options.name}{options.suffix} for {len(groups)} sequences "
             f"({', '.join([*groups][:3])}); use -o OUT --format {options.suffix[1:]}"
         )
-    for frames in groups.values():
+    for sequence, frames in groups.items():
         options.video_of(frames[0])
+        place = frames[0].place
+        if options.gaps == "black" and place and place.count - len(frames) > MAX_BLACK:
+            raise RequestError(
+                f"--gaps: {place.count - len(frames)} frames of {sequence} are missing, but "
+                f"{MAX_BLACK} black frames are allowed; use hold or cut"
+            )
     found = {}
     owners: dict[Path, str] = {}
     for sequence, frames in groups.items():

@@ -36,9 +36,10 @@ if TYPE_CHECKING:
 DIGITS = 6  # of a frame's number, at least
 RECENT = 8  # decoded frames that are kept, because threads ask for frames almost in order
 MAX_SKIPPED = 48  # frames that are decoded in vain rather than searched for
+KEYS = 3  # key frames before a frame at which decoding is tried
 MAX_OPEN = 4  # clips that stay open
 
-GREY = ("gray", "gray16le", "gray16be")
+LOSSLESS_COLOURS = ("rgb24", "bgr24", "bgr0", "gbrp")  # of 8 bits
 
 # Codes of ITU-T H.273 (2024), tables 2 and 3.
 CHROMATICITIES = {code: PRIMARIES[code] for code in (9, 11, 12)}
@@ -138,12 +139,27 @@ def read_clip_samples(path: Path) -> Array:
         (height, width) for a grey clip, of 8 or 16 bits; else (height, width, 3).
 
     Raises:
-        RequestError, ImageError: as for :func:`read_clip_frame`.
+        RequestError, ImageError: as for :func:`read_clip_frame`, or the clip keeps no numbers.
     """
     clip = path.parent
-    frame = _reader(clip, stamp_of(clip)).frame(path, int(path.name))
-    samples = frame.to_ndarray() if frame.format.name in GREY else to_rgb(frame)
+    reader = _reader(clip, stamp_of(clip))
+    frame = reader.frame(path, int(path.name))
+    name = frame.format.name
+    if not reader.is_lossless or not (name.startswith("gray") or name in LOSSLESS_COLOURS):
+        raise ImageError(
+            f"{path}: this clip has the codec {reader.codec} and pixels of {name}, which do not "
+            "keep depths or labels; use FFV1 with grey of 8 to 16 bits"
+        )
+    samples = _grey(frame) if name.startswith("gray") else to_rgb(frame)
     return np.ascontiguousarray(np.rot90(samples, frame.rotation // 90))
+
+
+def _grey(frame: "av.VideoFrame") -> Array:
+    """Return the numbers of a grey frame, of 8 to 16 bits, as they are stored."""
+    (plane,) = frame.planes
+    order = ">" if frame.format.name.endswith("be") else "<"
+    dtype = np.uint8 if frame.format.components[0].bits == 8 else np.dtype(f"{order}u2")
+    return np.frombuffer(plane, dtype).reshape(plane.height, -1)[:, : plane.width]
 
 
 @lru_cache(maxsize=MAX_OPEN)
@@ -162,13 +178,19 @@ class _Reader:
             packets = [p for p in container.demux(stream) if p.size and not p.is_discard]
             rate, base = stream.average_rate or Fraction(24), stream.time_base or Fraction(1)
             self.size = stream.width, stream.height
+            self.codec = stream.codec_context.name
+            self.is_lossless = stream.codec_context.codec.lossless
             self._stated = _statements(container, stream)
+            is_avi = container.format.name == "avi"
             is_alone, duration = len(container.streams) == 1, container.duration or 0
         stamps = sorted({packet.pts for packet in packets if packet.pts is not None})
-        if len(stamps) < len(packets):  # some files have no times, or not for each frame
+        # Some files have no times, or not for each frame. AVI has times of decoding only.
+        if len(stamps) < len(packets) or is_avi:
             stamps = []
         self._stamps = stamps
         self._numbers = {stamp: number for number, stamp in enumerate(stamps)}
+        self._keys = sorted(self._numbers[p.pts] for p in packets if p.is_keyframe and stamps)
+        self._broken = len(packets)  # the first frame that decoding from the start does not reach
         # Times of Matroska are rounded to milliseconds.
         regular = [number / rate for number in range(len(packets))]
         times = [(stamp - stamps[0]) * base for stamp in stamps]
@@ -205,16 +227,33 @@ class _Reader:
         return frame
 
     def _decode(self, number: int) -> None:
-        """Decode frames up to one, which is then among the recent ones if it is intact."""
+        """Decode frames up to one, which is then among the recent ones if it is intact.
+
+        Decoding begins at the key frame before it. If that fails, because frames refer to those
+        before their key frame, it begins earlier, and at last at the beginning of the file.
+        """
         from av.error import FFmpegError
 
+        before = [key for key in self._keys if key <= number][: -KEYS - 1 : -1]
+        starts = [each for each in (*before, 0) if each or number < self._broken]
         if self._container is None or not 0 <= number - self._next <= MAX_SKIPPED:
-            self._seek(number, "AUTO")
-        try:
-            self._advance(number)
-        except FFmpegError:
-            self._seek(number, "NONE")  # threads report errors of later frames
-            self._advance(number)
+            self._seek(starts.pop(0) if starts else 0, "AUTO")
+        error: FFmpegError | None = None
+        while True:
+            try:
+                self._advance(number)
+                error = None
+            except FFmpegError as caught:
+                error = caught
+            if number in self._recent:
+                return
+            if not starts:
+                break
+            start = starts.pop(0)
+            self._seek(start, "AUTO" if start else "NONE")  # threads report later errors
+        self._broken = min(self._broken, number)
+        if error:
+            raise error
 
     def _advance(self, number: int) -> None:
         """Decode the next frames, up to one or to the end of the file."""
@@ -232,7 +271,7 @@ class _Reader:
                 self._container = None
 
     def _seek(self, number: int, threads: str) -> None:
-        """Continue at the last key frame before a frame."""
+        """Continue at a key frame, or at the beginning."""
         import av
 
         self._container = av.open(self._clip)
@@ -240,8 +279,9 @@ class _Reader:
         stream.thread_type = threads
         stream.codec_context.options = {"err_detect": "explode"}  # otherwise damage is hidden
         self._next = 0
-        if self._stamps:
+        if number:
             self._container.seek(self._stamps[number], stream=stream)
+            self._next = number
         self._decoded = self._container.decode(stream)
 
 

@@ -19,7 +19,7 @@ from clpipe.base.url_text import is_glob, is_url, local, name_in
 from clpipe.base.urls import forget_stamps, list_urls, path_of, url_of
 from clpipe.chain.python_words import python_words
 from clpipe.chain.rendition import Rendition
-from clpipe.images.clip_frames import clip_times, frame_path
+from clpipe.images.clip_frames import clip_of, clip_times, frame_path
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import PICTURE_SUFFIXES, RENDER_SUFFIXES
 from clpipe.images.video import VIDEO_SUFFIXES
@@ -204,10 +204,11 @@ def find_jobs(
         elif (matches := numbered_files(text) or _glob_files(text)) is not None:
             jobs += [Job(Path(m), Path(m).name) for m in matches if m not in excluded]
         else:
-            check_input(path)
+            clip = clip_of(path)
+            check_input(clip or path)
             if reason := NON_IMAGES.get(path.suffix.lower()):
                 raise RequestError(f"{path}: {reason}")
-            jobs.append(Job(path, path.name))
+            jobs.append(Job(path, f"{clip.stem}/{path.name}" if clip else path.name))
     for pattern in excluded.unused:
         log.warning(python_words("--exclude %s matches no file"), pattern)
     jobs = [frame for job in without_companions(jobs) for frame in _frames(job, endings)]
@@ -240,6 +241,8 @@ def _frames(job: Job, endings: Sequence[str]) -> Iterator[Job]:
     except ImageError as error:
         yield replace(job, problem=str(error).removeprefix(f"{path}: "))
         return
+    if not times:
+        yield replace(job, problem="this clip has no frames")
     for number, time in enumerate(times):
         name = frame_path(Path(job.key).with_suffix(""), number).as_posix()
         yield replace(job, path=frame_path(path, number), key=name, time=time)
@@ -262,11 +265,17 @@ def _glob_files(text: str) -> list[str] | None:
 def without_companions(jobs: Sequence[Job]) -> list[Job]:
     """Return the jobs without companions of other jobs' images, according to their names.
 
-    For example, ``view00_depth.exr`` is skipped if ``view00.exr`` is a job. Files that a manifest
-    lists always stay.
+    For example, ``view00_depth.exr`` is skipped if ``view00.exr`` is a job, and the files of a
+    folder ``film_depth`` if ``film.mp4`` is one. Files that a manifest lists always stay.
     """
     stems = {str(job.path.with_suffix("")) for job in jobs}
-    found = [job for job in jobs if not job.location and owner_of(job.path) in stems]
+    clips = {str(j.path.with_suffix("")) for j in jobs if j.path.suffix.lower() in VIDEO_SUFFIXES}
+    found = [
+        job
+        for job in jobs
+        if not job.location
+        and (owner_of(job.path) in stems or (clips and owner_of(job.path.parent) in clips))
+    ]
     if found:
         are = "1 file is a companion" if len(found) == 1 else f"{len(found)} files are companions"
         first = printable(str(found[0].path))

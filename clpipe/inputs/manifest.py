@@ -330,7 +330,8 @@ def _time(value: Any) -> Fraction | None:
         or not math.isfinite(value)
     ):
         raise RequestError(
-            f"time: found {value!r}, but expected a number: seconds, or a time stamp in s, ms or ns"
+            f"time: found {value}, but expected a number: seconds, or a time stamp in s, ms, us or "
+            "ns since 1970"
         )
     time = Fraction(str(value))  # the decimals of a float, not its binary digits
     time = seconds_of(time) or time

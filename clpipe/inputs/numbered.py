@@ -11,7 +11,8 @@ from clpipe.base.text import printable
 
 log = logging.getLogger(__name__)
 
-RANGE = r"-?\d+-(?:-?\d+)(?:x\d+)?"
+# A minus after a letter or a digit is a separator, not a sign.
+RANGE = r"(?:(?<![A-Za-z0-9])-)?\d+-(?:-?\d+)(?:x\d+)?"
 # %04d as in C, #### and @@@@ as in Nuke, $F4 as in Houdini; before it perhaps 1001-1100x2.
 TOKEN = re.compile(
     rf"(?P<ranges>(?<!\d){RANGE}(?:,{RANGE})*)?(?:%(?P<width>0\d+)?d|(?P<marks>#+|@+)|\$F(?P<places>\d*))"
@@ -36,9 +37,11 @@ def numbered_files(text: str) -> list[str] | None:
         RequestError: no file matches, or a range has no numbers.
     """
     folder, name = os.path.split(text)
-    token = TOKEN.search(name)
-    if not token or os.path.lexists(text):
+    tokens = [*TOKEN.finditer(name)]
+    if not tokens or os.path.lexists(text):
         return None
+    token = tokens[-1]
+    folder = glob.escape(folder) if os.path.isdir(folder) else folder
     before, after = name[: token.start()], name[token.end() :]
     ranges = [_range(text, each) for each in (token["ranges"] or "").split(",") if each]
     width = int(token["width"] or token["places"] or 0) or len(token["marks"] or "1")

@@ -129,8 +129,12 @@ def in_sequences(jobs: Sequence[Job]) -> list[Job]:
     for written, members in by_pattern(jobs).items():
         pattern, names = with_decimals(written, [split_numbers(job.key)[1] for job in members])
         frame = _frame_column(names, words_of(pattern))
-        for place, (numbers, job) in enumerate(zip(names, members, strict=True)):
-            name = _name(pattern, numbers, frame)
+        stamp = _stamp_column(names, frame)
+        for place, (numbers, member) in enumerate(zip(names, members, strict=True)):
+            name = _name(pattern, numbers, (frame, stamp))
+            job = member
+            if stamp is not None and member.time is None:
+                job = replace(member, time=seconds_of(Fraction(numbers[stamp])))
             number = Fraction(numbers[frame]) if numbers else Fraction(place)
             sequences.setdefault(name, []).append((number, job))
     folders = [PurePosixPath(name).parent for name in sequences]
@@ -195,14 +199,27 @@ def _frame_column(names: Sequence[Sequence[str]], words: Sequence[str]) -> int:
     return max(ranks)[-1] if ranks else 0
 
 
-def _name(pattern: str, numbers: Sequence[str], frame: int) -> str:
-    """Return the name of a sequence: the names of its files without the frame's number.
+def _stamp_column(names: Sequence[Sequence[str]], frame: int) -> int | None:
+    """Return which other numbers of names are time stamps that differ; None if none are.
 
-    >>> _name("rig/frame_{}_cam{}", ["0001", "2"], 0), _name("{}", ["7"], 0)
+    >>> _stamp_column([["0001", "1305031102175"], ["0002", "1305031102211"]], 0)
+    1
+    """
+    for n, texts in enumerate(zip(*names, strict=True)):
+        stamps = {seconds_of(Fraction(text)) for text in texts}
+        if n != frame and None not in stamps and len(stamps) > 1:
+            return n
+    return None
+
+
+def _name(pattern: str, numbers: Sequence[str], omitted: Sequence[int | None]) -> str:
+    """Return the name of a sequence: the names of its files without some of their numbers.
+
+    >>> _name("rig/frame_{}_cam{}", ["0001", "2"], [0]), _name("{}", ["7"], [0])
     ('rig/frame_cam2', 'frames')
     """
     path = PurePosixPath(pattern)
-    filled = path.name.format(*("" if n == frame else text for n, text in enumerate(numbers)))
+    filled = path.name.format(*("" if n in omitted else text for n, text in enumerate(numbers)))
     return str(path.with_name(re.sub(r"([._-])[._-]+", r"\1", filled).strip("._-") or "frames"))
 
 

@@ -42,9 +42,13 @@ def standard_rate(rate: Fraction) -> Fraction:
 
     >>> standard_rate(Fraction("29.97")), standard_rate(Fraction("23.976"))
     (Fraction(30000, 1001), Fraction(24000, 1001))
+    >>> standard_rate(Fraction(1, 3600))
+    Fraction(1, 3600)
     """
     near = [each for each in NTSC if abs(rate / each - 1) < SAME_RATE]
-    return near[0] if near and rate != round(rate) else rate.limit_denominator(1001)
+    if near and rate != round(rate):
+        return near[0]
+    return rate.limit_denominator(1001) if rate > 1 else 1 / (1 / rate).limit_denominator(1001)
 
 
 @dataclass(frozen=True)
