@@ -13,6 +13,7 @@ from PIL import Image
 
 import clpipe as api
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.images.claims import display_size
 from clpipe.images.clip_frames import _reader, clip_times, frame_path, read_clip_frame
 from clpipe.images.video import VideoOptions, VideoWriter, read_video
 from clpipe.inputs.find import find_jobs
@@ -99,6 +100,14 @@ def test_frames_that_need_those_before_their_key_frame(tmp_path, name, options):
         _reader.cache_clear()
         found = read(path, int(number)).mean()
         assert abs(found - 20 - 5 * number) < 2
+
+
+def test_several_threads_may_read_one_frame(tmp_path):
+    clip = write(tmp_path / "a.mkv", count=2)
+    expected = list(read_video(clip))
+    with ThreadPoolExecutor(8) as threads:
+        found = list(threads.map(lambda number: read(clip, number // 100 % 2), range(1000)))
+    assert all(np.array_equal(each, expected[n // 100 % 2]) for n, each in enumerate(found))
 
 
 @pytest.mark.parametrize("rate", [24, Fraction(30000, 1001), 60])
@@ -253,6 +262,7 @@ def test_rotated_clips_are_upright(tmp_path, angle, turns):
             file.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
         file.mux(stream.encode(None))
     expected = np.rot90(picture, turns).mean(-1) > 200
+    assert display_size(frame_path(path, 0)) == expected.shape[::-1]
     assert ((read(path, 1).mean(-1) > 200) == expected).mean() > 0.95
 
 

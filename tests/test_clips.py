@@ -395,6 +395,8 @@ def test_frames_of_a_sequence_have_all_a_time_or_none(clpipe, frames):
         (("0", "1e-6"), "are of 1e+06 frames per second, but clips have 1000 at most"),
         (("0", "1e300"), "time: found 1e+300, which is neither seconds nor a time stamp"),
         (("0", "true"), "time: found True, but expected a number"),
+        (("0", "nan"), "time: found nan, but expected a number"),
+        (("0", "1" + 400 * "0"), "which is neither seconds nor a time stamp"),
     ],
 )
 def test_impossible_times_are_rejected(clpipe, frames, times, message):
@@ -402,6 +404,25 @@ def test_impossible_times_are_rejected(clpipe, frames, times, message):
     rows = "".join(f"in/f{n}.exr,{time}\n" for n, time in enumerate(times))
     Path("list.csv").write_text(f"path,time\n{rows}")
     assert message in clpipe("run", "list.csv", "-o", "a.mkv", *RUN[4:], status=2).stderr
+
+
+def test_changed_times_make_the_clip_again(clpipe, frames):
+    frames("in")
+    for time in ("0.2", "0.3"):
+        Path("list.csv").write_text(
+            f"path,time\nin/f0.exr,0\nin/f1.exr,0.1\nin/f2.exr,{time}\nin/f3.exr,0.4\n"
+        )
+        clpipe("run", "list.csv", "-o", "a.mkv", *RUN[4:])
+        assert times_of("a.mkv")[0] == [0, 0.1, float(time), 0.4]
+
+
+def test_black_frames_between_places_that_are_not_whole(clpipe, frames):
+    frames("in")
+    Path("list.csv").write_text("path,time\nin/f0.exr,0\nin/f1.exr,0.1\nin/f2.exr,0.28\n")
+    clpipe("run", "list.csv", "-o", "a.mkv", *RUN[4:], "--gaps", "black")
+    times, levels = times_of("a.mkv")
+    assert times == pytest.approx([0, 0.1, 0.2, 0.28])
+    assert [level < 20 for level in levels] == [False, False, True, False]
 
 
 def test_an_hour_between_frames(clpipe, frames):

@@ -242,6 +242,7 @@ def test_patterns_with_special_characters(tmp_path):
         ("gl[1]b/f.####.exr", ["f.1001.exr"]),
         ("shot-1001-1003####.exr", ["shot-1001.exr", "shot-1003.exr"]),
         ("100%d_%04d.exr", ["100%d_0001.exr"]),
+        ("100%d_*.exr", ["100%d_0001.exr"]),
     ):
         jobs = find_jobs([str(tmp_path / pattern)], tmp_path / "out")
         assert [job.key for job in jobs] == expected

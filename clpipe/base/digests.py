@@ -1,6 +1,7 @@
 """SHA-256 of files, recomputed only if a file has changed."""
 
 import hashlib
+import os
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import lru_cache
@@ -22,7 +23,7 @@ def stamp_of(path: Path) -> tuple[int, int]:
     try:
         info = path.stat()
     except (OSError, ValueError):  # the file is missing, or the name is invalid
-        if path.parent.is_file():
+        if os.path.isfile(path.parent):
             return stamp_of(path.parent)
         url = url_of(path)
         return stamp_of_url(url) if url else (0, 0)
@@ -55,7 +56,7 @@ def joint_digest(digests: Sequence[str]) -> str:
 @lru_cache(maxsize=1024)
 def _digest(file: str, size: int, modified: int) -> str:
     path = Path(file)
-    if path.parent.is_file():
+    if os.path.isfile(path.parent):
         with _hashing:  # once, if several threads read frames of a large file
             return joint_digest([_digest(str(path.parent), size, modified), path.name])
     return sha256_of(path)[0]

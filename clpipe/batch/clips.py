@@ -76,18 +76,15 @@ class ClipOptions:
 
     def shown(self, jobs: Sequence[Job]) -> Iterator[tuple[Fraction, Job | None]]:
         """Yield the frames of a clip, each with its time in s. None is a black frame."""
-        start: float | None = None
-        last, rate = 0, self.video_of(jobs[0]).rate
-        for count, job in enumerate(jobs):
-            place = job.place
-            assert place
-            start = place.index if start is None else start
-            shown = count if self.gaps == "cut" else place.index - start
-            interval = Fraction(place.interval or 0) or 1 / rate
-            missing = range(last + 1, round(shown)) if self.gaps == "black" else ()
-            yield from ((each * interval, None) for each in missing)
-            last = round(shown)
-            yield Fraction(shown) * interval, job
+        places = [job.place for job in jobs if job.place]
+        interval = Fraction(places[0].interval or 0) or 1 / self.video_of(jobs[0]).rate
+        last = Fraction(0)
+        for count, (job, place) in enumerate(zip(jobs, places, strict=True)):
+            shown = Fraction(count if self.gaps == "cut" else place.index - places[0].index)
+            missing = round(shown - last) - 1 if self.gaps == "black" else 0
+            yield from (((last + each) * interval, None) for each in range(1, missing + 1))
+            yield shown * interval, job
+            last = shown
 
     def video_of(self, job: Job) -> VideoOptions:
         """Return how the clip of a frame's sequence is encoded, with the rate of its times.
@@ -266,6 +263,11 @@ class Clip:
                 return ExistingFiles.NOTHING
             if (clip["sha256"], clip["size"]) != sha256_of(self.path):
                 return ExistingFiles.NOTHING
+            if any(
+                record | _times(job) != record
+                for record, job in zip(records, pictures, strict=True)
+            ):
+                return ExistingFiles.NOTHING
             found = [*map(matched, pictures, records)]
         except (OSError, ValueError, LookupError, TypeError, RequestError):
             return ExistingFiles.NOTHING  # they are missing or damaged
@@ -295,15 +297,18 @@ class Clip:
         clip["software"] = f"clpipe {__version__}"  # marks the file as written by clpipe
         lines = []
         for job in jobs:
-            assert job.place
             sidecar = read_sidecar(writer.path(job, SIDECAR, self.rendition))
             del sidecar[DIGEST_KEY]
-            place = job.place
-            record = {**sidecar, "index": place.index, "clip": clip}
-            if place.interval:
-                record["time"] = round(place.index * place.interval, 9)
+            record = {**sidecar, **_times(job), "clip": clip}
             lines.append(f"{to_json(record)}\n".encode())
         write_atomic(self.records_path, *lines)
+
+
+def _times(job: Job) -> dict[str, float | None]:
+    """Return the place of a frame in its sequence, and its time in s if it has one."""
+    assert job.place
+    index, interval = job.place.index, job.place.interval
+    return {"index": index, "time": round(index * interval, 9) if interval else None}
 
 
 @dataclass

@@ -5,8 +5,8 @@ whichever of the usual curves the clip states, because that is how players show 
 """
 
 import threading
-from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -21,13 +21,7 @@ from clpipe.base.extras import require
 from clpipe.base.types import Array
 from clpipe.images.pixels import check_size
 from clpipe.images.png import PRIMARIES
-from clpipe.images.video import (
-    VIDEO_SUFFIXES,
-    opened_video,
-    to_rgb,
-    video_errors,
-    video_stream,
-)
+from clpipe.images.video import VIDEO_SUFFIXES, opened_video, to_rgb, video_errors, video_stream
 from clpipe.images.vocabularies import CLIP
 
 if TYPE_CHECKING:
@@ -37,7 +31,7 @@ DIGITS = 6  # of a frame's number, at least
 RECENT = 8  # decoded frames that are kept, because threads ask for frames almost in order
 MAX_SKIPPED = 48  # frames that are decoded in vain rather than searched for
 KEYS = 3  # key frames before a frame at which decoding is tried
-MAX_OPEN = 4  # clips that stay open
+MAX_OPEN = 16  # clips that stay open
 
 LOSSLESS_COLOURS = ("rgb24", "bgr24", "bgr0", "gbrp")  # of 8 bits
 
@@ -114,19 +108,16 @@ def read_clip_frame(path: Path, max_pixels: int) -> ClipFrame:
         RequestError: PyAV is missing.
         ImageError: there is no such frame, it cannot be decoded, or the clip is not SDR.
     """
-    clip = path.parent
-    reader = _reader(clip, stamp_of(clip))
-    check_size(path, *reader.size, max_pixels)
-    frame = reader.frame(path, int(path.name))
-    if frame.color_trc not in SDR_CURVES:
-        curve = CURVES.get(frame.color_trc, f"number {frame.color_trc} of ITU-T H.273")
-        raise ImageError(
-            f"{path}: the transfer curve of this clip is {curve}, but clpipe reads clips as sRGB; "
-            "convert it to SDR first"
-        )
-    pixels = np.rot90(to_rgb(frame), frame.rotation // 90)
-    chromaticities = CHROMATICITIES.get(frame.color_primaries)
-    return ClipFrame(np.ascontiguousarray(pixels), chromaticities, tuple(reader.warnings(frame)))
+    check_size(path, *clip_size(path.parent), max_pixels)
+    with _frame(path) as (reader, frame):
+        if frame.color_trc not in SDR_CURVES:
+            curve = CURVES.get(frame.color_trc, f"number {frame.color_trc} of ITU-T H.273")
+            raise ImageError(
+                f"{path}: the transfer curve of this clip is {curve}, but clpipe reads clips as "
+                "sRGB; convert it to SDR first"
+            )
+        chromaticities = CHROMATICITIES.get(frame.color_primaries)
+        return ClipFrame(_upright(frame, to_rgb), chromaticities, tuple(reader.warnings(frame)))
 
 
 def read_clip_samples(path: Path) -> Array:
@@ -141,17 +132,30 @@ def read_clip_samples(path: Path) -> Array:
     Raises:
         RequestError, ImageError: as for :func:`read_clip_frame`, or the clip keeps no numbers.
     """
-    clip = path.parent
-    reader = _reader(clip, stamp_of(clip))
-    frame = reader.frame(path, int(path.name))
-    name = frame.format.name
-    if not reader.is_lossless or not (name.startswith("gray") or name in LOSSLESS_COLOURS):
-        raise ImageError(
-            f"{path}: this clip has the codec {reader.codec} and pixels of {name}, which do not "
-            "keep depths or labels; use FFV1 with grey of 8 to 16 bits"
-        )
-    samples = _grey(frame) if name.startswith("gray") else to_rgb(frame)
-    return np.ascontiguousarray(np.rot90(samples, frame.rotation // 90))
+    with _frame(path) as (reader, frame):
+        name = frame.format.name
+        if not reader.is_lossless or not (name.startswith("gray") or name in LOSSLESS_COLOURS):
+            raise ImageError(
+                f"{path}: this clip has the codec {reader.codec} and pixels of {name}, which do "
+                "not keep depths or labels; use FFV1 with grey of 8 to 16 bits"
+            )
+        return _upright(frame, _grey if name.startswith("gray") else to_rgb)
+
+
+@contextmanager
+def _frame(path: Path) -> "Iterator[tuple[_Reader, av.VideoFrame]]":
+    """Yield a frame, which no other thread uses meanwhile, and the reader of its clip.
+
+    PyAV crashes if two threads convert one frame.
+    """
+    reader = _reader(path.parent, stamp_of(path.parent))
+    frame, guard = reader.frame(path, int(path.name))
+    with guard:
+        yield reader, frame
+
+
+def _upright(frame: "av.VideoFrame", convert: "Callable[[av.VideoFrame], Array]") -> Array:
+    return np.ascontiguousarray(np.rot90(convert(frame), frame.rotation // 90))
 
 
 def _grey(frame: "av.VideoFrame") -> Array:
@@ -172,6 +176,8 @@ class _Reader:
 
     def __init__(self, clip: Path) -> None:
         require(f"{clip}: reading a video", "video")
+        from av.error import FFmpegError
+
         self._clip = clip
         self._lock = threading.Lock()  # guards what decodes
         with opened_video(clip) as (container, stream):
@@ -181,6 +187,10 @@ class _Reader:
             self.codec = stream.codec_context.name
             self.is_lossless = stream.codec_context.codec.lossless
             self._stated = _statements(container, stream)
+            with suppress(FFmpegError, StopIteration):  # reading a frame then reports damage
+                container.seek(0)
+                if next(container.decode(stream)).rotation % 180:
+                    self.size = self.size[::-1]
             is_avi = container.format.name == "avi"
             is_alone, duration = len(container.streams) == 1, container.duration or 0
         stamps = sorted({packet.pts for packet in packets if packet.pts is not None})
@@ -201,7 +211,8 @@ class _Reader:
         self._container: Any = None
         self._decoded: Iterator[av.VideoFrame] = iter(())
         self._next = 0  # the number of the frame that is decoded next
-        self._recent: OrderedDict[int, av.VideoFrame] = OrderedDict()
+        # Decoded frames, each with the lock of the thread that converts it.
+        self._recent: dict[int, tuple[av.VideoFrame, threading.Lock]] = {}
 
     def warnings(self, frame: "av.VideoFrame") -> list[str]:
         """Return a sentence for each statement that is not used."""
@@ -210,8 +221,8 @@ class _Reader:
         stated["alpha"] = "yuva" in pixels or pixels[:4] in ("rgba", "bgra", "argb", "abgr", "gbra")
         return CLIP.warnings(name for name, value in stated.items() if value)
 
-    def frame(self, path: Path, number: int) -> "av.VideoFrame":
-        """Return a decoded frame.
+    def frame(self, path: Path, number: int) -> "tuple[av.VideoFrame, threading.Lock]":
+        """Return a decoded frame, and the lock to hold while it is converted.
 
         Raises:
             ImageError: there is no such frame, or it cannot be decoded.
@@ -221,10 +232,10 @@ class _Reader:
         with self._lock, video_errors(path, "decoded"):
             if number not in self._recent:
                 self._decode(number)
-            frame = self._recent.get(number)
-        if frame is None:
+            found = self._recent.get(number)
+        if found is None:
             raise ImageError(f"{path}: this frame is damaged, and cannot be decoded")
-        return frame
+        return found
 
     def _decode(self, number: int) -> None:
         """Decode frames up to one, which is then among the recent ones if it is intact.
@@ -260,10 +271,10 @@ class _Reader:
         try:
             for frame in self._decoded:
                 found = self._numbers.get(frame.pts, -1) if self._stamps else self._next
-                self._recent[found] = frame
+                self._recent[found] = frame, threading.Lock()
                 self._next = found + 1
                 if len(self._recent) > RECENT:
-                    self._recent.popitem(last=False)
+                    del self._recent[next(iter(self._recent))]
                 if found >= number:
                     return
         finally:

@@ -64,35 +64,15 @@ _AOV_NAMES = {
 # Parts of their names, also for layers that are not listed, in lower case, with _ between and
 # around words.
 AOV_PATTERN = re.compile(
-    "|".join(
-        (
-            *(
-                "albedo",
-                "base_?colou?r",
-                "depth",
-                "normal(?!i[sz])",
-                "crypto",
-                "occlusion",
-                "noisy",
-            ),
-            *(
-                "denoising",
-                "(?<!com)position",
-                "velocity",
-                "motion_?vec",
-                "optical_?flow",
-                "tangent",
-            ),
-            *("shadow", "diffuse", "gloss[yi]", "specular", "reflect", "refract", "transmi[st]"),
-            *("subsurface", "emissi(on|ve)", "illuminat", "irradiance", "caustic", "indirect"),
-            *("light_?(select|group)", "lighting", "wire_?colou?r", "(sample|ray)_?(rate|count)"),
-            *("matte", "mask", "opacity", "convergence", "variance", "roughness", "metallic"),
-            *("curvature", "cpu_?time", "(material|object|instance|render|shape|prim)_?id"),
-            "_(diff|gloss|trans|volume|subsurface)_?(dir|ind|col)_",
-            "_(ids?|index_?(ob|ma)|ao|nn?|p|pref|pworld|z|st|uvw?|sss|gi|mse|var)_",
-            "_(emit|env|mist|alpha|mtlid|unlit|freestyle)_",
-        )
-    )
+    "albedo|base_?colou?r|depth|normal(?!i[sz])|crypto|occlusion|noisy|denoising|(?<!com)position"
+    "|velocity|motion_?vec|optical_?flow|tangent|shadow|diffuse|gloss[yi]|specular|reflect|refract"
+    "|transmi[st]|subsurface|emissi(on|ve)|illuminat|irradiance|caustic|indirect"
+    "|light_?(select|group)|lighting|wire_?colou?r|(sample|ray)_?(rate|count)|matte|mask|opacity"
+    "|convergence|variance|roughness|metallic|curvature|cpu_?time"
+    "|(material|object|instance|render|shape|prim)_?id"
+    "|_(diff|gloss|trans|volume|subsurface)_?(dir|ind|col)_"
+    "|_(ids?|index_?(ob|ma)|ao|nn?|p|pref|pworld|z|st|uvw?|sss|gi|mse|var)_"
+    "|_(emit|env|mist|alpha|mtlid|unlit|freestyle)_"
 )
 
 

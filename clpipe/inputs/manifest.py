@@ -324,11 +324,8 @@ def _time(value: Any) -> Fraction | None:
     """
     if value is None:
         return None
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, int | float | Fraction)
-        or not math.isfinite(value)
-    ):
+    is_number = isinstance(value, int | float | Fraction) and not isinstance(value, bool)
+    if not is_number or not -math.inf < value < math.inf:
         raise RequestError(
             f"time: found {value}, but expected a number: seconds, or a time stamp in s, ms, us or "
             "ns since 1970"

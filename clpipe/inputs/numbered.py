@@ -38,7 +38,7 @@ def numbered_files(text: str) -> list[str] | None:
     """
     folder, name = os.path.split(text)
     tokens = [*TOKEN.finditer(name)]
-    if not tokens or os.path.lexists(text):
+    if not tokens or os.path.lexists(text) or glob.has_magic(name):
         return None
     token = tokens[-1]
     folder = glob.escape(folder) if os.path.isdir(folder) else folder

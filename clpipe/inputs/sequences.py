@@ -235,7 +235,7 @@ def _placed(key: str, frames: Sequence[tuple[Fraction, Job]]) -> Iterator[Job]:
     numbers = sorted({number for number, _ in frames})
     timing = timing_of(numbers) if times and len(numbers) > 1 else None
     places = timing.places if timing else _places(numbers)
-    count = round(places[numbers[-1]]) + 1
+    count = math.ceil(places[numbers[-1]]) + 1
     interval = float(timing.interval) if timing else None
     if count > MAX_PLACES:
         log.warning("%s: its numbers only order the frames, which are far apart", printable(key))

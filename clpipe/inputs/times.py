@@ -7,7 +7,7 @@ from itertools import pairwise
 from statistics import median_low
 
 UNITS = (1, 10**3, 10**6, 10**9)  # of time stamps, per second
-EARLIEST, LATEST = 10**8, 42 * 10**8  # s since 1970: from 1973 to 2103
+EARLIEST, LATEST = 5 * 10**8, 42 * 10**8  # s since 1970: from 1985 to 2103
 
 # Frames per second of NTSC and of its multiples, which are often written with decimals.
 NTSC = [Fraction(each * 1000, 1001) for each in (24, 30, 48, 60, 120)]
@@ -30,11 +30,11 @@ def seconds_of(stamp: Fraction) -> Fraction | None:
 def decimal_text(time: Fraction) -> str:
     """Return a time in s with at most nine decimals.
 
-    >>> decimal_text(Fraction(1, 24)), decimal_text(Fraction(3))
-    ('0.041666667', '3.0')
+    >>> decimal_text(Fraction(1, 24)), decimal_text(Fraction(-5, 2)), decimal_text(Fraction(3))
+    ('0.041666667', '-2.5', '3.0')
     """
-    whole, decimals = divmod(round(time * 10**9), 10**9)
-    return f"{whole}.{decimals:09}".rstrip("0") + "0" * (not decimals)
+    whole, decimals = divmod(round(abs(time) * 10**9), 10**9)
+    return "-" * (time < 0) + f"{whole}.{decimals:09}".rstrip("0") + "0" * (not decimals)
 
 
 def standard_rate(rate: Fraction) -> Fraction:
