@@ -202,14 +202,14 @@ def read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
     try:
         return _read_source(path, kind, options)
     except ImageError as error:
-        raise error.with_way from None
+        is_frame = not options.transfer and kind is not Kind.DISPLAY and clip_of(path)
+        other = ImageError(f"{path}: a frame of a clip is no linear light", WAYS)
+        raise (other if is_frame else error).with_way from None
 
 
 def _read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
     """Do the same as :func:`read_source`, but without naming options in errors."""
     transfer = options.transfer if kind is Kind.RGB else None
-    if transfer is None and kind is not Kind.DISPLAY and clip_of(path):
-        raise ImageError(f"{path}: a frame of a clip is no linear light", WAYS)
     if transfer and (encoded := _read_encoded(path, options.max_pixels)):
         return _as_light(path, encoded, transfer)
     if kind is not Kind.DISPLAY:
