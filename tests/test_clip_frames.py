@@ -15,7 +15,8 @@ import clpipe as api
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.images.claims import display_size
 from clpipe.images.clip_frames import _reader, clip_times, frame_path, read_clip_frame
-from clpipe.images.video import VideoOptions, VideoWriter, read_video
+from clpipe.images.video import VideoOptions, VideoWriter
+from clpipe.images.video_reading import read_video
 from clpipe.inputs.find import find_jobs
 from tests.conftest import statuses
 

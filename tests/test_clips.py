@@ -14,7 +14,7 @@ import clpipe as api
 from clpipe.base.errors import RequestError
 from clpipe.batch import clip_sink
 from clpipe.batch.clips import parse_bit_rate, parse_rate
-from clpipe.images.video import read_video, video_info
+from clpipe.images.video_reading import read_video, video_info
 from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import statuses, written
 

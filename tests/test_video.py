@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.images.video import VideoOptions, VideoWriter, read_video, video_info
+from clpipe.images.video import VideoOptions, VideoWriter
+from clpipe.images.video_reading import read_video, video_info
 
 pytest.importorskip("av", reason="needs PyAV: pip install av")
 

@@ -11,7 +11,7 @@ from clpipe.analysis.pictures import Picture
 from clpipe.analysis.report import NoiseReport
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Doubles, Floats, Mask
-from clpipe.images.video import read_video, video_info
+from clpipe.images.video_reading import read_video, video_info
 from clpipe.outputs.noise_areas import select_flat
 from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.stage import Kind

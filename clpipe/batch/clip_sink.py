@@ -26,7 +26,8 @@ from clpipe.chain.formats import extension_of
 from clpipe.chain.rendition import Rendition
 from clpipe.images.read import SourceImage
 from clpipe.images.samples import read_whole_numbers
-from clpipe.images.video import VideoOptions, VideoWriter, read_video
+from clpipe.images.video import VideoOptions, VideoWriter
+from clpipe.images.video_reading import read_video
 from clpipe.images.write import write_png
 from clpipe.inputs.find import Job
 from clpipe.inputs.sequences import sequence_of

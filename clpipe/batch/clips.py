@@ -19,7 +19,8 @@ from clpipe.batch.tars import STAGING
 from clpipe.chain.formats import CLIP_FORMATS
 from clpipe.chain.options import Gaps
 from clpipe.chain.rendition import FLOAT_MOSAICS, Rendition
-from clpipe.images.video import VIDEO_SUFFIXES, VideoOptions
+from clpipe.images.video import VideoOptions
+from clpipe.images.video_reading import VIDEO_SUFFIXES
 from clpipe.inputs.find import Job
 from clpipe.inputs.sequences import rate_of, sequence_of
 from clpipe.inputs.times import standard_rate

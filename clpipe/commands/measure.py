@@ -21,7 +21,7 @@ from clpipe.base.extras import require
 from clpipe.base.files import check_suffix
 from clpipe.commands.options import EXISTING, Command, OutputPath, json_option
 from clpipe.commands.printing import Rows, number, show, show_json
-from clpipe.images.video import VIDEO_SUFFIXES
+from clpipe.images.video_reading import VIDEO_SUFFIXES
 from clpipe.outputs.noise_areas import FLAT, HALVED, PICTURE
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.stage import Kind

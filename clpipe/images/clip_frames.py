@@ -21,7 +21,13 @@ from clpipe.base.extras import require
 from clpipe.base.types import Array
 from clpipe.images.pixels import check_size
 from clpipe.images.png import PRIMARIES
-from clpipe.images.video import VIDEO_SUFFIXES, opened_video, to_rgb, video_errors, video_stream
+from clpipe.images.video_reading import (
+    VIDEO_SUFFIXES,
+    opened_video,
+    to_rgb,
+    video_errors,
+    video_stream,
+)
 from clpipe.images.vocabularies import CLIP
 
 if TYPE_CHECKING:

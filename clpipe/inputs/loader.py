@@ -34,7 +34,7 @@ from clpipe.images.read import (
     SourceImage,
     read_source,
 )
-from clpipe.images.video import VIDEO_SUFFIXES
+from clpipe.images.video_reading import VIDEO_SUFFIXES
 from clpipe.inputs.carry import CarriedLayers, carry, merge_moments
 from clpipe.inputs.carry_panorama import carry_panorama
 from clpipe.inputs.find import Job
