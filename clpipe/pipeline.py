@@ -26,7 +26,7 @@ from clpipe.chain.paths import resolve_paths
 from clpipe.chain.python_words import errors_in_python, python_words
 from clpipe.chain.registry import load_stage_file, loaded_stage_files
 from clpipe.chain.settings import Settings, overlay, settings_from
-from clpipe.chain.unused import Images, unused_values
+from clpipe.chain.unused import ImageFacts, unused_values
 from clpipe.engine.clipping import WARNING_SHARE, clipped_share, clipping_text
 from clpipe.engine.device import Device, open_device
 from clpipe.engine.options import RunOptions
@@ -117,7 +117,7 @@ class Pipeline(ReadOnly):
         self._selector = None if device is None else str(device)
         self._count = 0
         self._open()
-        images = Images(self._is_sequence, from_files=False)
+        images = ImageFacts(self._is_sequence, from_files=False)
         for note in unused_values(self._settings, self.chain, images):
             warn(note)
 

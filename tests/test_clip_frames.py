@@ -320,8 +320,25 @@ def test_a_truncated_clip_is_named(clpipe):
     write("b.mkv", count=3)
     run = ("run", "a.mkv", "b.mkv", "-o", "out", "-c", "unprocess", "--device", "numpy")
     stderr = clpipe(*run).stderr
-    assert re.search(r"a.mkv/0000\d\d: warning: its missing_frames \(frames after", stderr)
+    stated = r"a.mkv/0000\d\d: warning: it states a duration of 1\.25 s, but its last frame is at"
+    assert re.search(stated, stderr)
     assert not re.search(r"b.mkv/\d+: warning", stderr)
+
+
+def test_further_streams_and_unknown_primaries_are_named(tmp_path):
+    path = tmp_path / "a.mkv"
+    pixels = av.VideoFrame.from_ndarray(np.zeros((16, 16, 3), np.uint8), "rgb24")
+    with av.open(path, "w") as file:
+        streams = [file.add_stream("ffv1", rate=25) for _ in range(2)]
+        for stream in streams:
+            stream.height, stream.width, stream.pix_fmt = 16, 16, "bgr0"
+            stream.codec_context.color_primaries = 22
+        for stream in streams:
+            file.mux(stream.encode(pixels.reformat(format="bgr0")))
+            file.mux(stream.encode(None))
+    found = read_clip_frame(frame_path(path, 0), LIMIT).warnings
+    assert "it has several video streams; only the first one was read" in found
+    assert "its primaries, number 22 of ITU-T H.273, are not known; it is read as sRGB" in found
 
 
 def test_a_dataset_reads_clips(tmp_path):

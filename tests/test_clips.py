@@ -13,8 +13,10 @@ from PIL import Image
 import clpipe as api
 from clpipe.base.errors import RequestError
 from clpipe.batch import clip_sink
-from clpipe.batch.clips import parse_bit_rate, parse_rate
+from clpipe.batch.clips import ClipOptions, parse_bit_rate, parse_rate
+from clpipe.images.video import VideoOptions
 from clpipe.images.video_reading import read_video, video_info
+from clpipe.inputs.find import Job, Place
 from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import statuses, written
 
@@ -215,7 +217,7 @@ def test_decoded_frames_show_what_the_codec_did(clpipe, frames):
     clpipe("run", "in", *lossy, "--decoded")
     assert stamps().items() >= before.items()  # the clip is decoded, but not made again
     for n, frame in enumerate(read_video(OUT / "cam0.mp4")):
-        assert np.array_equal(frame, Image.open(f"out/cam0.decoded/f{n}.png"))
+        assert np.array_equal(frame, Image.open(f"out/cam0.mp4.decoded/f{n}.png"))
 
 
 def test_new_clips_replace_decoded_frames(clpipe, frames):
@@ -331,7 +333,7 @@ def test_a_gap_keeps_its_time_in_the_clip(clpipe, frames, suffix, gaps, expected
     assert [n for n, level in enumerate(levels) if level < 20] == [2, 3] * (gaps == "black")
     found = records(f"film.{suffix}.jsonl")
     assert [record["index"] for record in found] == [0, 1, 4, 5]
-    decoded = sorted(Path("film.decoded").iterdir())
+    decoded = sorted(Path(f"film.{suffix}.decoded").iterdir())
     assert [path.name for path in decoded] == [f"f{n}.png" for n in (3, 4, 7, 8)]
     assert all(np.asarray(Image.open(path)).mean() > 50 for path in decoded)
 
@@ -423,6 +425,17 @@ def test_black_frames_between_places_that_are_not_whole(clpipe, frames):
     times, levels = times_of("a.mkv")
     assert times == pytest.approx([0, 0.1, 0.2, 0.28])
     assert [level < 20 for level in levels] == [False, False, True, False]
+
+
+def test_cut_frames_have_equal_intervals():
+    """Even if the times are of a rate that differs a little from the clip's."""
+    own = {"decoded": False, "name": "", "gaps": "cut", "has_rate": False}
+    options = ClipOptions(".mkv", VideoOptions("ffv1"), **own)
+    places = [Place("s", "s", n, 5000, 1 / 29.975) for n in range(5000)]
+    jobs = [Job(Path(f"{n}.exr"), f"{n}.exr", place=place) for n, place in enumerate(places)]
+    rate = options.video_of(jobs[0]).rate
+    assert rate == Fraction(30000, 1001)
+    assert [time * rate for time, _ in options.shown(jobs)] == [*range(5000)]
 
 
 def test_an_hour_between_frames(clpipe, frames):

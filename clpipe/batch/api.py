@@ -169,11 +169,12 @@ def run(
         bit_depth: the bits per sample of clips, 8 or 10. None is 8.
         crf: the constant rate factor of clips. Smaller is better, and 51 is worst. None is 18.
         bit_rate: the mean bit rate of clips in bits per second, such as 8M, instead of ``crf``.
-        fps: the frames per second of clips, such as 30000/1001. None is 24.
+        fps: the frames per second of clips, such as 30000/1001. None is that of the frames' times,
+            or 24.
         gaps: what a clip shows at the places of missing frames: hold shows the frame before, black
             a black one, and cut nothing, so that the clip is shorter. The choices are "hold",
             "black", "cut". None is hold.
-        decoded: also decode each clip, and write its frames to OUT/SEQUENCE.decoded/NAME.png.
+        decoded: also decode each clip, and write its frames to OUT/CLIP.decoded/NAME.png.
         frames: the number of frames of a burst. Each frame has its own noise, and the burst its
             ground truth.
         bracket: the exposures of a bracket, in EV relative to the exposure that is set. Each

@@ -2,13 +2,16 @@
 
 from pathlib import Path
 
-from clpipe.base.errors import RequestError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import check_folder
 from clpipe.base.urls import url_of
 from clpipe.batch.execution import ExecutionOptions
 from clpipe.chain.chain import Chain
 from clpipe.chain.request import Request
+from clpipe.images.claims import display_size
 from clpipe.images.read import PICTURE_SUFFIXES
+from clpipe.images.video import VideoOptions
+from clpipe.inputs.find import Job
 from clpipe.stage import Kind
 
 
@@ -73,3 +76,24 @@ def check_clip_chain(chain: Chain) -> None:
             f"--until: the chain ends in {chain.result.label}, but a clip contains pictures; "
             "remove --until, or write images to a directory, with --sequence"
         )
+
+
+def check_clip_size(chain: Chain, job: Job, video: VideoOptions) -> None:
+    """Check that a clip can contain pictures of the size of an image's.
+
+    An image that cannot be opened passes, because it fails later. A panorama does as well, because
+    it has several files.
+
+    Raises:
+        RequestError: the codec cannot store them.
+    """
+    if job.is_panorama:
+        return
+    try:
+        size = display_size(job.path)
+    except ImageError:
+        return
+    try:
+        video.check_size(*chain.size(*size))
+    except ImageError as error:
+        raise RequestError(f"--codec: {error}") from None

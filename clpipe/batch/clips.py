@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.base.about import __version__
-from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
 from clpipe.base.files import sha256_of, write_atomic
 from clpipe.base.reading import check_regular
@@ -61,24 +61,14 @@ class ClipOptions:
     video: VideoOptions
     decoded: bool
     name: str
-    gaps: Gaps = "hold"
-    has_rate: bool = False
-
-    def check_size(self, width: int, height: int) -> None:
-        """Check that clips can contain pictures of a size in px.
-
-        Raises:
-            RequestError: the codec cannot store them.
-        """
-        try:
-            self.video.check_size(width, height)
-        except ImageError as error:
-            raise RequestError(f"--codec: {error}") from None
+    gaps: Gaps
+    has_rate: bool
 
     def shown(self, jobs: Sequence[Job]) -> Iterator[tuple[Fraction, Job | None]]:
         """Yield the frames of a clip, each with its time in s. None is a black frame."""
         places = [job.place for job in jobs if job.place]
-        interval = Fraction(places[0].interval or 0) or 1 / self.video_of(jobs[0]).rate
+        video = self.video_of(jobs[0])
+        interval = Fraction(places[0].interval or 0) if video.has_times else 1 / video.rate
         last = Fraction(0)
         for count, (job, place) in enumerate(zip(jobs, places, strict=True)):
             shown = Fraction(count if self.gaps == "cut" else place.index - places[0].index)
@@ -165,7 +155,7 @@ def take_clip_options(options: dict[str, Any]) -> ClipOptions | None:
         RequestError: options contradict each other, or PyAV is missing.
     """
     video = {to: options.pop(name) for name, to in VIDEO_FIELDS.items() if name in options}
-    decoded, gaps = options.pop("decoded", False), options.pop("gaps", None)
+    single = {name: options.pop(name) for name in ("gaps", "decoded") if name in options}
     output: Path = options["output"]
     suffix = output.suffix.lower()[1:]
     is_file = suffix in CLIP_FORMATS and not output.is_dir()
@@ -176,11 +166,11 @@ def take_clip_options(options: dict[str, Any]) -> ClipOptions | None:
         )
     formats = dict.fromkeys([*options.get("format", ()), *([suffix] if is_file else [])])
     if not formats.keys() & CLIP_FORMATS:
-        if video or decoded or gaps:
-            names = [n for n, to in VIDEO_FIELDS.items() if to in video]
-            name = (*names, *["gaps"] * bool(gaps), "decoded")[0]
+        given = [n for n, to in VIDEO_FIELDS.items() if to in video]
+        given += [name for name, value in single.items() if value]
+        if given:
             raise RequestError(
-                f"--{name.replace('_', '-')}: this option needs a clip; use -o NAME.mp4, or "
+                f"--{given[0].replace('_', '-')}: this option needs a clip; use -o NAME.mp4, or "
                 "--format mp4"
             )
         return None
@@ -200,9 +190,13 @@ def take_clip_options(options: dict[str, Any]) -> ClipOptions | None:
             f"--truth: found {mosaics[0]}, but a clip contains only pictures; remove it"
         )
     name = output.stem if is_file else ""
-    own = VideoOptions(**video)
     clips = ClipOptions(
-        f".{next(iter(formats))}", own, decoded, name, gaps or "hold", "rate" in video
+        f".{next(iter(formats))}",
+        VideoOptions(**video),
+        single.get("decoded", False),
+        name,
+        single.get("gaps", "hold"),
+        "rate" in video,
     )
     clips.video.check_suffix(clips.suffix)
     require("a clip", "video")
@@ -233,7 +227,8 @@ class Clip:
 
     def decoded_path(self, job: Job) -> Path:
         """Return the path of a decoded frame."""
-        return self.path.with_suffix(DECODED) / f"{PurePosixPath(job.stem).name}.png"
+        folder = self.path.with_name(f"{self.path.name}{DECODED}")
+        return folder / f"{PurePosixPath(job.stem).name}.png"
 
     def find(
         self, jobs: Sequence[Job], writer: OutputWriter, options: ClipOptions, verify: bool

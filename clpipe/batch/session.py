@@ -8,18 +8,19 @@ import os
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 from clpipe.base.about import full_version
-from clpipe.base.errors import ImageError, OutputError, RequestError
+from clpipe.base.errors import OutputError, RequestError
 from clpipe.base.files import discard
 from clpipe.base.processors import available_processors
 from clpipe.base.transfers import TRANSFERS
 from clpipe.base.urls import url_of
 from clpipe.batch.checks import (
     check_clip_chain,
+    check_clip_size,
     check_output,
     check_processes,
     check_render_options,
@@ -43,11 +44,9 @@ from clpipe.batch.work import ImageWorker
 from clpipe.chain.isos import draw_note
 from clpipe.chain.python_words import errors_in_python, python_words
 from clpipe.chain.request import Request
-from clpipe.chain.unused import Images as KnownImages
-from clpipe.chain.unused import unused_values
+from clpipe.chain.unused import ImageFacts, unused_values
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.state import has_state
-from clpipe.images.claims import display_size
 from clpipe.inputs.carry_rows import rows_note
 from clpipe.inputs.find import Job
 from clpipe.inputs.flow import check_flow
@@ -145,8 +144,8 @@ class Run:
         if not images.known_jobs:  # otherwise another run has named them
             rate = rate_of(self.jobs[0]) or (images.clips.video.rate if images.clips else None)
             needs_rows = request.truth_at == "rows"
-            known = KnownImages(images.sequence, needs_rows=needs_rows, rate=rate)
-            for note in unused_values(self._loader.settings, self._chain, known):
+            facts = ImageFacts(images.sequence, needs_rows=needs_rows, rate=rate)
+            for note in unused_values(self._loader.settings, self._chain, facts):
                 log.warning("%s", note)
         check_render_options(request, self._chain.source)
         self._request = request.with_outputs(self._chain)
@@ -154,11 +153,8 @@ class Run:
         self.writer.check(self._chain, self.jobs)
         if images.clips:
             check_clip_chain(self._chain)
-            first = self.jobs[0]
-            if not first.is_panorama and not self._loader.raw.is_raw(first.path):
-                with suppress(ImageError):  # the frame itself then fails
-                    width, height = self._chain.size(*display_size(first.path))
-                    images.clips.check_size(width, height)
+            if not self._loader.raw.is_raw(self.jobs[0].path):
+                check_clip_size(self._chain, self.jobs[0], images.clips.video)
             self.sink()  # raises an error if two clips would have one name
         if execution.trace:
             check_trace(execution.trace)

@@ -156,7 +156,13 @@ _ALL = (
         "The mean bit rate of clips in bits per second, such as 8M, instead of --crf.",
         "RATE",
     ),
-    Key("fps", str, "The frames per second of clips, such as 30000/1001.", "RATE", "24"),
+    Key(
+        "fps",
+        str,
+        "The frames per second of clips, such as 30000/1001.",
+        "RATE",
+        "that of the frames' times, or 24",
+    ),
     Key(
         "gaps",
         str,
@@ -168,7 +174,7 @@ _ALL = (
     Key(
         "decoded",
         bool,
-        "Also decode each clip, and write its frames to OUT/SEQUENCE.decoded/NAME.png.",
+        "Also decode each clip, and write its frames to OUT/CLIP.decoded/NAME.png.",
     ),
     Key(
         "frames",

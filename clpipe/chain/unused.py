@@ -19,8 +19,8 @@ OF_ROWS = ("exposure_time", "line_time", "frame_time")  # parameters of a shutte
 
 
 @dataclass(frozen=True)
-class Images:
-    """What is known of the images of a chain.
+class ImageFacts:
+    """Facts about the images of a chain.
 
     Args:
         is_sequence: whether they are frames of sequences.
@@ -40,13 +40,13 @@ class Images:
         return f"{'add --sequence' if self.from_files else 'use clpipe.Stream'}, or remove it"
 
 
-def unused_values(settings: Settings, chain: Chain, images: Images) -> list[str]:
+def unused_values(settings: Settings, chain: Chain, images: ImageFacts) -> list[str]:
     """Return a sentence for each value that is set, but that nothing uses.
 
     >>> from clpipe.chain.making import make_chain
     >>> from clpipe.chain.settings import overlay
     >>> settings = overlay(Settings(), {"control": {"delay": 3}})
-    >>> unused_values(settings, make_chain(settings), Images())
+    >>> unused_values(settings, make_chain(settings), ImageFacts())
     ['control.delay acts only on frames of sequences; add sequence, or remove it']
 
     Args:
@@ -58,7 +58,7 @@ def unused_values(settings: Settings, chain: Chain, images: Images) -> list[str]
     return [python_words(sentence) for sentence in found]
 
 
-def _of_sequences(settings: Settings, chain: Chain, images: Images) -> Iterator[str]:
+def _of_sequences(settings: Settings, chain: Chain, images: ImageFacts) -> Iterator[str]:
     own = ", ".join(f"{CONTROL}.{name}" for name in settings.table(CONTROL))
     loops = Auto, EstimatedGains
     if own and not images.is_sequence:
@@ -80,7 +80,7 @@ def _of_sequences(settings: Settings, chain: Chain, images: Images) -> Iterator[
             yield f"{step.name} changes only frames of sequences; {images.remedy}"
 
 
-def _of_shutter(settings: Settings, chain: Chain, images: Images) -> Iterator[str]:
+def _of_shutter(settings: Settings, chain: Chain, images: ImageFacts) -> Iterator[str]:
     shutter = chain.step_in(StageRole.SHUTTER)
     if shutter is None or not isinstance(shutter.method, Rows):
         return

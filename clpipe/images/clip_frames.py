@@ -192,7 +192,7 @@ class _Reader:
             self.size = stream.width, stream.height
             self.codec = stream.codec_context.name
             self.is_lossless = stream.codec_context.codec.lossless
-            self._stated = _statements(container, stream)
+            self._stated, self._notes = _statements(container, stream)
             with suppress(FFmpegError, StopIteration):  # reading a frame then reports damage
                 container.seek(0)
                 if next(container.decode(stream)).rotation % 180:
@@ -212,8 +212,12 @@ class _Reader:
         times = [(stamp - stamps[0]) * base for stamp in stamps]
         rounded = all(abs(a - b) < base for a, b in zip(times, regular, strict=bool(times)))
         self.times = tuple(regular if rounded else times)
-        ends = [Fraction(), *self.times][-1] + 2 / rate + (stamps[0] * base if stamps else 0)
-        self._stated["missing_frames"] = is_alone and duration / 10**6 > ends
+        last = [Fraction(), *self.times][-1] + (stamps[0] * base if stamps else 0)
+        if is_alone and duration / 10**6 > last + 2 / rate:
+            self._notes.append(
+                f"it states a duration of {duration / 10**6:.6g} s, but its last frame is at "
+                f"{float(last):.6g} s, so it may be truncated"
+            )
         self._container: Any = None
         self._decoded: Iterator[av.VideoFrame] = iter(())
         self._next = 0  # the number of the frame that is decoded next
@@ -225,7 +229,7 @@ class _Reader:
         pixels = frame.format.name
         stated = {**self._stated, "interlaced": frame.interlaced_frame}
         stated["alpha"] = "yuva" in pixels or pixels[:4] in ("rgba", "bgra", "argb", "abgr", "gbra")
-        return CLIP.warnings(name for name, value in stated.items() if value)
+        return [*self._notes, *CLIP.warnings(name for name, value in stated.items() if value)]
 
     def frame(self, path: Path, number: int) -> "tuple[av.VideoFrame, threading.Lock]":
         """Return a decoded frame, and the lock to hold while it is converted.
@@ -302,13 +306,15 @@ class _Reader:
         self._decoded = self._container.decode(stream)
 
 
-def _statements(container: Any, stream: Any) -> dict[str, Any]:
-    """Return what a clip states about all of its frames, by names of :data:`CLIP`."""
+def _statements(container: Any, stream: Any) -> tuple[dict[str, Any], list[str]]:
+    """Return what a clip states about all frames, by names of :data:`CLIP`, and sentences."""
     aspect = stream.sample_aspect_ratio or stream.codec_context.sample_aspect_ratio
+    names = dict.fromkeys((*container.metadata, *stream.metadata), True)
+    notes = []
+    if len(container.streams.video) > 1:
+        notes.append("it has several video streams; only the first one was read")
     primaries = stream.codec_context.color_primaries
-    return {
-        "sample_aspect_ratio": aspect and aspect != 1,
-        "unknown_primaries": primaries not in (*SRGB_LIKE, *CHROMATICITIES),
-        "other_streams": len(container.streams.video) > 1,
-        **dict.fromkeys((*container.metadata, *stream.metadata), True),
-    }
+    if primaries not in (*SRGB_LIKE, *CHROMATICITIES):
+        text = "its primaries, number {} of ITU-T H.273, are not known; it is read as sRGB"
+        notes.append(text.format(primaries))
+    return {"sample_aspect_ratio": aspect and aspect != 1, **names}, notes

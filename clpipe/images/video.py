@@ -5,7 +5,7 @@ players with colour management show like a JPEG. Other players ignore the curve 
 to an sRGB display, which is also right. With the curve of BT.709, some players brighten the
 shadows.
 
-The same frames give the same bytes: the number of threads is fixed, and files have no times and no
+The same frames give the same bytes: the number of threads is fixed, and files have no dates and no
 random numbers. Another version of an encoder may give other bytes.
 """
 
@@ -137,6 +137,7 @@ class VideoWriter:
     """Writes a video. The file appears when the context ends without an error.
 
     >>> import tempfile
+    >>> from clpipe.images.video_reading import read_video
     >>> folder = tempfile.TemporaryDirectory()
     >>> path = Path(folder.name, "clip.mkv")
     >>> with VideoWriter(path, VideoOptions("ffv1")) as video:

@@ -273,15 +273,16 @@ CLIP = Vocabulary.of(
             "which side is up": "rotation rotate",
             "when frames are shown": "pts time_base average_rate",
         },
-        "checked": {"the transfer curve, which must be one for SDR": "color_trc"},
+        "checked": {
+            "the transfer curve, which must be one for SDR": "color_trc",
+            "the end of the last frame": "duration",
+        },
         "named": {
             "width of a pixel over its height": "sample_aspect_ratio",
             "fields that were taken one after the other": "interlaced",
             "opacity": "alpha",
-            "unknown primaries; it is read as sRGB": "unknown_primaries",
-            "further video streams, of which the first is read": "other_streams",
+            "video streams after the first": "nb_streams",
             "two views in a frame": "stereo_mode",
-            "frames after the last one, which its duration counts": "missing_frames",
         },
         "ignored": {
             "what wrote the file": "encoder ENCODER vendor_id handler_name major_brand "

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,7 +30,7 @@ from clpipe.inputs.tables import (
     json_records,
     list_records,
 )
-from clpipe.inputs.times import LATEST, decimal_text, seconds_of
+from clpipe.inputs.times import decimal_text, time_of
 
 MANIFEST_SUFFIXES = (".csv", ".jsonl", ".txt")
 # No other setting depends on these keys, and their values often differ by row.
@@ -311,30 +310,10 @@ def _row(
     image_path = join_url(folder, path)
     key = key or name or (image_path.name if is_url(path) else key_of(folder, image_path))
     values = resolve_paths(folder, values)
-    time = _time(record.get("time"))
+    stamp = record.get("time")
+    time = None if stamp is None else time_of(stamp)
     shared_values = shared.setdefault(repr(values), values)
     return Row(image_path, key, name, shared_values, frames, location, time)
-
-
-def _time(value: Any) -> Fraction | None:
-    """Return a time in s from a number of seconds or from a time stamp.
-
-    Raises:
-        RequestError: it is no finite number.
-    """
-    if value is None:
-        return None
-    is_number = isinstance(value, int | float | Fraction) and not isinstance(value, bool)
-    if not is_number or not -math.inf < value < math.inf:
-        raise RequestError(
-            f"time: found {value}, but expected a number: seconds, or a time stamp in s, ms, us or "
-            "ns since 1970"
-        )
-    time = Fraction(str(value))  # the decimals of a float, not its binary digits
-    time = seconds_of(time) or time
-    if abs(time) > LATEST:
-        raise RequestError(f"time: found {value!r}, which is neither seconds nor a time stamp")
-    return time
 
 
 def check_output_name(name: str, column: str = "name") -> None:

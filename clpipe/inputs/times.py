@@ -1,10 +1,14 @@
 """Times of the frames of a sequence: from time stamps in names, from tables, and from clips."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
 from statistics import median_low
+from typing import Any
+
+from clpipe.base.errors import RequestError
 
 UNITS = (1, 10**3, 10**6, 10**9)  # of time stamps, per second
 EARLIEST, LATEST = 5 * 10**8, 42 * 10**8  # s since 1970: from 1985 to 2103
@@ -25,6 +29,28 @@ def seconds_of(stamp: Fraction) -> Fraction | None:
     (None, None)
     """
     return next((stamp / unit for unit in UNITS if EARLIEST <= stamp / unit < LATEST), None)
+
+
+def time_of(value: Any) -> Fraction:
+    """Return the time of a column's value in s: a number of seconds, or a time stamp.
+
+    >>> time_of(-0.5), time_of(1305031102500)
+    (Fraction(-1, 2), Fraction(2610062205, 2))
+
+    Raises:
+        RequestError: it is neither.
+    """
+    is_number = isinstance(value, int | float | Fraction) and not isinstance(value, bool)
+    if not is_number or not -math.inf < value < math.inf:
+        raise RequestError(
+            f"time: found {value}, but expected a number: seconds, or a time stamp in s, ms, us or "
+            "ns since 1970"
+        )
+    time = Fraction(str(value))  # the decimals of a float, not its binary digits
+    time = seconds_of(time) or time
+    if abs(time) > LATEST:
+        raise RequestError(f"time: found {value!r}, which is neither seconds nor a time stamp")
+    return time
 
 
 def decimal_text(time: Fraction) -> str:
