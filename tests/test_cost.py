@@ -66,13 +66,9 @@ def measured(folder: Path) -> dict[str, tuple[float, float]]:
 
     rng = np.random.default_rng(0)
     (folder / "in").mkdir()
-
-    def add_renders(numbers):
-        for i in numbers:
-            pixels = rng.random((96, 96, 3)).astype(np.float32) / 2
-            write_exr(folder / f"in/r{i:03}.exr", pixels, "RGB", {}, half=True)
-
-    add_renders(range(50))
+    for i in range(50):
+        pixels = rng.random((96, 96, 3)).astype(np.float32) / 2
+        write_exr(folder / f"in/r{i:03}.exr", pixels, "RGB", {}, half=True)
     count, found = Counter(), {}
 
     drawn = {"camera": {"choice": CAMERAS}, "iso": {"log_uniform": [200, 3200]}}
@@ -98,7 +94,6 @@ def measured(folder: Path) -> dict[str, tuple[float, float]]:
     found["process with settings"] = count.of(*changed)
 
     (folder / "out").mkdir()
-    add_renders(range(50, 98))
     worker, jobs = worker_of(folder)
     (device,) = open_devices()
 
@@ -107,8 +102,7 @@ def measured(folder: Path) -> dict[str, tuple[float, float]]:
         assert [outcome.status for outcome in outcomes] == ["done"] * len(part)
 
     run(jobs[:2])
-    few = count.of(partial(run, jobs[2:18]), partial(run, jobs[18:34]))
-    many = count.of(partial(run, jobs[34:66]), partial(run, jobs[66:]))
+    few, many = count.of(lambda: run(jobs[2:18])), count.of(lambda: run(jobs[18:]))
     found["image of run"] = tuple((b - a) / 16 for a, b in zip(few, many, strict=True))
     return found
 

@@ -202,9 +202,7 @@ def read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
     try:
         return _read_source(path, kind, options)
     except ImageError as error:
-        is_frame = not options.transfer and kind is not Kind.DISPLAY and clip_of(path)
-        other = ImageError(f"{path}: a frame of a clip is no linear light", WAYS)
-        raise (other if is_frame else error).with_way from None
+        raise error.with_way from None
 
 
 def _read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
@@ -213,6 +211,8 @@ def _read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
     if transfer and (encoded := _read_encoded(path, options.max_pixels)):
         return _as_light(path, encoded, transfer)
     if kind is not Kind.DISPLAY:
+        if clip_of(path):
+            raise ImageError(f"{path}: a frame of a clip is no linear light", WAYS)
         mosaic = len(kind.channels) == 1
         overscan = options.overscan and kind is Kind.RGB
         return read_image(path, mosaic, options.layer, options.max_pixels, overscan)
@@ -248,9 +248,8 @@ def _read_encoded(path: Path, max_pixels: int) -> _Encoded | None:
         frame = read_clip_frame(path, max_pixels)
         pixels = frame.pixels / np.float32(np.iinfo(frame.pixels.dtype).max)
         stated = Statements(frame.chromaticities, warnings=frame.warnings)
-        return _Encoded(
-            SourceImage(pixels, digest_of(path), "", (), {}), None, stated, is_grey=False
-        )
+        image = SourceImage(pixels, digest_of(path), "", (), {})
+        return _Encoded(image, None, stated, is_grey=False)
     with open_image(path) as file:
         spec = file.spec()
         names = list(spec.channelnames)
