@@ -14,6 +14,7 @@ from clpipe.images.exr_header import read_header
 from clpipe.images.openexr import open_exr, read_channels
 from clpipe.images.pixels import BLOCK, HALF_MAX, clip_to_half, make_finite
 from clpipe.images.read import read_image
+from tests.conftest import run_python
 from tests.exr import exr
 
 COMPRESSIONS = ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB")
@@ -194,6 +195,30 @@ def test_standard_output_is_that_of_the_other_threads(tmp_path, capsys):
         thread.join()
     assert capsys.readouterr().out.split() == list(map(str, range(200)))
     assert sys.stdout is stdout
+
+
+PRINTING = """
+import sys, threading, time
+from clpipe.images.openexr import _discard_stdout
+
+def discard():
+    while time.monotonic() < end:
+        with _discard_stdout():
+            pass
+
+sys.setswitchinterval(1e-5)
+end = time.monotonic() + 1.5
+threads = [threading.Thread(target=discard) for _ in range(2)]
+for thread in threads:
+    thread.start()
+while time.monotonic() < end:
+    print("a", "b", "c")
+"""
+
+
+def test_printing_does_not_crash_while_other_threads_are_silent():
+    """CPython's print uses sys.stdout without a reference of its own."""
+    assert "a b c" in run_python("-c", PRINTING).stdout
 
 
 def test_a_closed_standard_output_is_left_alone(tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ part on standard output, and raises no exception.
 import contextlib
 import sys
 import threading
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -131,6 +132,9 @@ class _FilteredStdout:
 _thread = threading.local()
 _lock = threading.Lock()  # guards _silent, and the replacement of sys.stdout
 _silent: list[threading.Thread] = []
+# Replacements of sys.stdout. They stay in memory, because print() in another thread may still use
+# one after sys.stdout has changed, without a reference of its own (CPython issue 130163).
+_kept: deque[_FilteredStdout] = deque(maxlen=16)
 
 
 @contextlib.contextmanager
@@ -138,7 +142,9 @@ def _discard_stdout() -> Iterator[None]:
     """Discard what this thread writes to standard output. Other threads are not affected."""
     with _lock:
         if not _silent and sys.stdout is not None:
-            sys.stdout = _FilteredStdout(sys.stdout)
+            if not _kept or _kept[-1].stream is not sys.stdout:
+                _kept.append(_FilteredStdout(sys.stdout))
+            sys.stdout = _kept[-1]
         _silent.append(threading.current_thread())
     _thread.is_silent = True
     try:
