@@ -30,7 +30,8 @@ from clpipe.chain.unused import ImageFacts, unused_values
 from clpipe.engine.clipping import WARNING_SHARE, clipped_share, clipping_text
 from clpipe.engine.device import Device, open_device
 from clpipe.engine.options import RunOptions
-from clpipe.engine.runner import Result, Runner
+from clpipe.engine.runner import Result
+from clpipe.engine.service import Service, picture
 from clpipe.engine.state import State
 from clpipe.images.arrays import as_array, as_image
 from clpipe.images.kinds import MIN_CHANNELS, flow_vectors
@@ -49,14 +50,14 @@ class Prepared(NamedTuple):
     """An image that :meth:`Pipeline.prepare` has prepared.
 
     Args:
-        runner: runs its chain, which holds only weak references to ``layers``.
+        chain: its chain, which holds only weak references to ``layers``.
         pixels: its pixels.
         own_key: its image key.
         layers: the layers that steps read, by step.
         warnings: warnings about the image.
     """
 
-    runner: Runner
+    chain: Chain
     pixels: Array
     own_key: str
     layers: Mapping[str, ImageLayer]
@@ -123,16 +124,15 @@ class Pipeline(ReadOnly):
 
     def _open(self) -> None:
         """Build the chain, and open the device in this process."""
-        self._lock = threading.Lock()  # lets one thread use the device at a time
-        chain = self._chain(self._settings)
-        kept = chain.select(self._keep)
-        encode = chain.result is Kind.DISPLAY
-        device = open_device(self._selector)
-        self._runner = Runner(chain, device, kept, encode=encode, final=not encode)
+        self._lock = threading.Lock()  # guards the count of images
+        self._default_chain = self._chain(self._settings)
+        self._kept = self._default_chain.select(self._keep)
+        self._service = Service([open_device(self._selector)])
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the arguments, because a device cannot leave its process."""
-        state = {k: v for k, v in vars(self).items() if k not in ("_lock", "_runner", "_settings")}
+        names = "_chain_range", "_keep", "_selector", "_count"
+        state = {name: vars(self)[name] for name in names}
         code = loaded_stage_files(base_name(name) for name in self._settings.stages)
         return {**state, "settings": self._settings.record(), "stage_files": code}
 
@@ -148,8 +148,7 @@ class Pipeline(ReadOnly):
         return make_chain(settings, start_at=start_at, until=until)
 
     def __repr__(self) -> str:
-        device = self._runner.device
-        device_name = device.info.label if device else "numpy"
+        device_name = self.device.info.label if self.device else "numpy"
         return f"Pipeline({self._settings.label}, {self.chain.label}, on {device_name})"
 
     @property
@@ -160,12 +159,12 @@ class Pipeline(ReadOnly):
     @property
     def device(self) -> Device | None:
         """The device; None is NumPy."""
-        return self._runner.device
+        return self._service.devices[0]
 
     @property
     def chain(self) -> Chain:
         """The steps of the chain, each with its resolved parameters."""
-        return self._runner.chain
+        return self._default_chain
 
     def process(
         self,
@@ -223,7 +222,7 @@ class Pipeline(ReadOnly):
             prepared = self.prepare(image, key, arrays, overscan, settings)
             for text in prepared.warnings:
                 warn(f"{key}: {python_words(text)}")
-            result, chain = self.develop(prepared), prepared.runner.chain
+            result, chain = self.develop(prepared), prepared.chain
         share = clipped_share(result, chain) or 0.0
         # Photographs are already clipped.
         if share >= WARNING_SHARE and chain.source is not Kind.DISPLAY:
@@ -238,9 +237,9 @@ class Pipeline(ReadOnly):
         Raises:
             ImageError: the image is too large.
         """
-        seed = noise_key(prepared.runner.chain.settings, prepared.own_key)
-        with self._lock:
-            return prepared.runner.run(prepared.pixels, seed, RunOptions(state=state))
+        chain, options = prepared.chain, RunOptions(state=state)
+        seed = noise_key(chain.settings, prepared.own_key)
+        return self._service.run(picture(chain, prepared.pixels, seed, self._kept, options))
 
     def prepare(
         self,
@@ -256,14 +255,14 @@ class Pipeline(ReadOnly):
         Arguments and errors are those of :meth:`process`. ``arrays`` are its layers, by kind. If
         the image was prepared before, with other settings, ``earlier`` saves time.
         """
-        runner = self._runner_for(key, settings)
-        for name in runner.chain.light_layer_steps:
+        chain = self._chain_for(key, settings)
+        for name in chain.light_layer_steps:
             raise RequestError(
                 f"{name}: it needs a layer of flickering light, which an array does not have. "
                 "Use clpipe run, which reads the layer from the render's file"
             )
         try:
-            checked = earlier.pixels if earlier else as_image(image, runner.chain.source)
+            checked = earlier.pixels if earlier else as_image(image, chain.source)
         except ImageError as error:
             raise ImageError(f"{key}: {error}" if key else str(error)) from None
         margins = margins_of_array(overscan, checked)
@@ -276,16 +275,15 @@ class Pipeline(ReadOnly):
             cropped = array if array is None or kept else margins.cropped(array)
             return layer_of_array(chain, step, cropped, width, height)
 
-        entered = prepare_image(runner.chain, checked, margins, layer)
+        entered = prepare_image(chain, checked, margins, layer)
         unread = sorted(arrays.keys() - {each.kind for each in entered.layers.values()})
         notes = [f"no step reads the {kind}. Set {READERS[kind]} to use it" for kind in unread]
         texts = (*notes, *entered.warnings)
         chain, pixels = entered.chain, entered.pixels
-        runner = runner if chain is runner.chain else runner.for_chain(chain)
         if earlier:
-            return Prepared(runner, pixels, earlier.own_key, entered.layers, texts)
+            return Prepared(chain, pixels, earlier.own_key, entered.layers, texts)
         digest = "" if chain.settings.noise_key else digest_of(pixels)
-        return Prepared(runner, pixels, image_key(key, digest), entered.layers, texts)
+        return Prepared(chain, pixels, image_key(key, digest), entered.layers, texts)
 
     __call__ = process
 
@@ -338,30 +336,24 @@ class Pipeline(ReadOnly):
             raise ImageError(f"found {pixels.shape[2]} channels; {kind} has {least} or more")
         vectors = flow_vectors("", ("",) * pixels.shape[2]) if kind == "flow" else ()
         margins = margins_of_array(overscan, layer)
-        entered = prepare_image(self._runner_for(key, settings).chain, pixels, margins)
+        entered = prepare_image(self._chain_for(key, settings), pixels, margins)
         source_layer = Layer(kind, entered.pixels, vectors=vectors)
         size = entered.pixels.shape[1::-1]
         (warped,), valid = warp([source_layer], entered.chain.geometry, *size)
         return warped if layer.ndim == 3 else warped[..., 0], valid
 
-    def _runner_for(self, key: str, settings: Mapping[str, Any]) -> Runner:
-        """Return the runner of an image, with its own draws and settings.
+    def _chain_for(self, key: str, settings: Mapping[str, Any]) -> Chain:
+        """Return the chain of an image, with its own draws and settings.
 
         Raises:
             DeviceError: this process was forked from the one that opened the device.
         """
         if self.device:
             self.device.check_process()
-        image_settings = (
-            overlay(self._settings, resolve_paths(None, plain(settings)))
-            if settings
-            else self._settings
-        )
-        return (
-            self._runner.for_chain(self._chain(image_settings.drawn(key)))
-            if settings or image_settings.draws
-            else self._runner
-        )
+        own = self._settings
+        if settings:
+            own = overlay(own, resolve_paths(None, plain(settings)))
+        return self._chain(own.drawn(key)) if settings or own.draws else self.chain
 
     def process_many(
         self, images: Iterable[Array | tuple[Array, str | Mapping[str, Any]]]

@@ -65,6 +65,10 @@ class _Frames(Pipeline):
 
     _is_sequence = True
 
+    def meter(self) -> Meter:
+        """Return the meter of a sequence."""
+        return Meter(self._service.run)
+
 
 class Stream:
     """A camera for a running simulation. Call it with each frame, or put and get frames.
@@ -125,7 +129,7 @@ class Stream:
         self._name = name
         self._is_srgb = transfer == "srgb"
         self._drop = drop
-        self._meter, self._state = self._new_meter(), State()
+        self._meter, self._state = self._pipeline.meter(), State()
         self._issued = Issued()
         self._numbers = itertools.count()
         # One frame waits while another is developed.
@@ -354,7 +358,7 @@ class Stream:
         as_image(self._light(frame), self._pipeline.chain.source)
         height, width = frame.shape[:2]
         layers = _by_kind(np.ones((height, width)), np.zeros((height, width, 2)))
-        meter, state = self._new_meter(), State()
+        meter, state = self._pipeline.meter(), State()
         for index in range(2) if self._pipeline.device else ():  # NumPy compiles nothing
             self._develop(index, frame, layers, meter, state)
 
@@ -367,9 +371,6 @@ class Stream:
         except (DeviceError, DeviceFailedError):
             self._state = State()  # the next frame starts again
             raise
-
-    def _new_meter(self) -> Meter:
-        return Meter(lambda work: work(self._pipeline.device))
 
     def _light(self, frame: Array) -> Array:
         """Return the light of a frame.
@@ -410,15 +411,15 @@ class Stream:
             return pipeline.prepare(first.pixels, key, arrays, NO_MARGINS, settings, first)
 
         reading = meter.read(
-            first.runner.chain,
+            first.chain,
             first.pixels,
             first.own_key,
             index,
-            lambda values: prepared_with(values).runner.chain,
+            lambda values: prepared_with(values).chain,
         )
         prepared = prepared_with(reading.values) if reading.values else first
         result = pipeline.develop(prepared, state)
-        is_raw = prepared.runner.chain.result is Kind.RAW
+        is_raw = prepared.chain.result is Kind.RAW
         image = result.image.astype(np.uint16) if is_raw else result.image
         settings = merged(drawn, reading.values)
         return Shot(index, image, settings, reading.metered, result), prepared.warnings

@@ -32,7 +32,7 @@ def test_one_image(camera, render):
 @pytest.mark.slow
 def test_overrides_hold_for_one_image_and_compile_nothing(camera, render):
     plain = camera.process(render, "a")
-    compiled = len(camera._runner.device._programs)
+    compiled = len(camera.device._programs)
     noisy = camera.process(
         render,
         "a",
@@ -40,7 +40,7 @@ def test_overrides_hold_for_one_image_and_compile_nothing(camera, render):
         sensor_noise={"a": 5e-3, "b": 1e-5},
         inverse_white_balance={"red_gain": 1.9, "blue_gain": 1.2},
     )
-    assert len(camera._runner.device._programs) == compiled
+    assert len(camera.device._programs) == compiled
     steps = [np.diff(shot.kept["quantize"][:, ::2], axis=1).std() for shot in (plain, noisy)]
     assert steps[1] > steps[0]
     fresh = clpipe.Pipeline(

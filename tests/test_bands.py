@@ -94,7 +94,7 @@ def test_tiles_patches_and_stacks_run_in_bands(device, monkeypatch):
     image = example(Kind.RGB, (301, 203), half=True)
     whole = Runner(runner.chain, device, bands=False).run(image, "k")
     boxes = boxes_of(whole.image.shape)
-    patches = runner.submit(image, "k", RunOptions(boxes=boxes))()
+    patches = runner.run(image, "k", RunOptions(boxes=boxes))
     for box, patch in zip(boxes, patches.image, strict=True):
         assert np.array_equal(patch, whole.image[box.top : box.bottom, box.left : box.right])
 

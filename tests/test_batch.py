@@ -32,6 +32,7 @@ from clpipe.batch.work import ImageWorker
 from clpipe.chain.formats import extension_of
 from clpipe.chain.request import Request
 from clpipe.commands.progress import Reporter
+from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
 from clpipe.images import write
 from clpipe.inputs.find import Job, Shard, parse_shard
@@ -184,13 +185,13 @@ def test_several_devices_share_a_run(clpipe, renders, tmp_path):
 def test_devices_develop_at_the_same_time(renders, tmp_path, monkeypatch):
     renders(8)
     (tmp_path / "out").mkdir()
-    start, both = ImageWorker.start, threading.Barrier(2)
+    work, both = Runner.work, threading.Barrier(2)
 
-    def together(self, submitted):
+    def together(self, *arguments):
         both.wait(GUARD)  # for the other device's image
-        return start(self, submitted)
+        return work(self, *arguments)
 
-    monkeypatch.setattr(ImageWorker, "start", together)
+    monkeypatch.setattr(Runner, "work", together)
     worker, jobs = worker_of(tmp_path)
     batch = Batch(worker, [None, None])
     outcomes = list(batch.run(jobs))
@@ -810,30 +811,31 @@ def test_a_thread_that_dies_ends_the_run(renders, tmp_path, monkeypatch):
         assert len(caught) == 1 and "a mistake of ours" in caught[0]
 
 
-def test_what_a_device_leaves_another_does(renders, tmp_path, monkeypatch, caplog):
+def test_what_a_device_leaves_another_does(device, renders, tmp_path, caplog):
     renders(8)
     (tmp_path / "out").mkdir()
     worker, jobs = worker_of(tmp_path)
-    broken, is_broken = [], threading.Event()
+    is_broken = threading.Event()
 
-    def start(self, submitted):
-        if threading.current_thread().name == "device 0":
-            broken.append(submitted[0][0].job)
+    class Broken(Device):
+        def submit(self, works):
             is_broken.set()
             raise DeviceError("it is given up")
-        assert is_broken.wait(GUARD)
-        return right(self, submitted)
 
-    right = ImageWorker.start
-    monkeypatch.setattr(ImageWorker, "start", start)
-    outcomes = list(Batch(worker, [None, None]).run(jobs))
+    class Other(Device):
+        def submit(self, works):
+            assert is_broken.wait(GUARD)
+            return super().submit(works)
+
+    broken = Broken(device.info)
+    broken.is_compiled = Other.is_compiled = lambda *_: True
+    outcomes = list(Batch(worker, [broken, Other(device.info)]).run(jobs))
     assert [o.status for o in outcomes] == ["done"] * 8
-    assert len(broken) == 1
     assert "it is given up; the other devices go on" in caplog.text
     for path in (tmp_path / "out").iterdir():
         path.unlink()
     with pytest.raises(DeviceError, match="it is given up"):
-        list(Batch(worker_of(tmp_path)[0], [None]).run(jobs))
+        list(Batch(worker_of(tmp_path)[0], [broken]).run(jobs))
 
 
 @pytest.mark.parametrize(("budget", "together"), [(1, 1), (2, 2), (100, 4)])

@@ -218,7 +218,7 @@ def test_no_buffer_is_replaced_while_an_image_is_on_the_device(device, monkeypat
 
     monkeypatch.setattr(Flow, "reserve", recording_flow)
     monkeypatch.setattr(Pool, "reserve", recording_reserve)
-    waits = [runner.submit(*image) for image in images]
+    waits = [fresh.submit([runner.work(*image)])[0] for image in images]
     assert before == [0, 1, 1]  # an image is on the device when the next one needs larger buffers
     assert replaced == [0, 0, 0]
     for wait in waits:

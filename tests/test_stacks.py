@@ -16,7 +16,8 @@ from clpipe.engine.check import check_stack, example
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.options import DEFAULTS, RunOptions
-from clpipe.engine.runner import Result, Runner, submit_batch
+from clpipe.engine.runner import Result, Runner
+from clpipe.engine.service import Frame, Service
 from clpipe.stage import Kind
 from tests.conftest import worker_of
 
@@ -61,16 +62,28 @@ class Asked(NamedTuple):
     noise_key: str
     options: RunOptions = DEFAULTS
 
+    @property
+    def frame(self):
+        runner = self.runner
+        results = runner.keep, runner.encode, runner.final
+        return Frame(runner.chain, self.image, self.noise_key, *results, self.options)
+
+
+def submit_batch(asked):
+    """Return functions that wait for images which a service develops together."""
+    service = Service([asked[0].runner.device])
+    return [each.result for each in service.develop([each.frame for each in asked])]
+
 
 def submissions(device, stages, sizes=SIZES):
     """An image of each size, each with an ISO, gains and curves of its own, in halves."""
-    first, all_ = None, []
+    all_ = []
     for number, size in enumerate(sizes):
         own = {"iso": 400 * 2**number, "gamma": {"method": "power", "exponent": 2.0 + number / 10}}
         chain = make_chain(settings_from({**own, **stages}))
-        first = first.for_chain(chain) if first else Runner(chain, device, ("normalize",), True)
+        runner = Runner(chain, device, ("normalize",), True)
         image = example(Kind.RGB, size, half=True, seed=number)
-        all_.append(Asked(first, image, f"key {number}"))
+        all_.append(Asked(runner, image, f"key {number}"))
     return all_
 
 

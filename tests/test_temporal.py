@@ -13,10 +13,11 @@ from clpipe.chain.settings import settings_from
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.ir import Launch
-from clpipe.engine.ops import Frame
+from clpipe.engine.ops import FrameKind
 from clpipe.engine.options import RunOptions
 from clpipe.engine.plan import make_plan
 from clpipe.engine.runner import Runner
+from clpipe.engine.service import Frame, Service
 from clpipe.engine.state import State
 from clpipe.reference.image import tap
 from clpipe.stages import DEFAULT_CHAIN
@@ -71,10 +72,12 @@ def test_devices_with_one_lane_or_their_own_memory_give_the_same_bits(device, ch
     other = Device(replace(device.info, **changes))
     chain, frames = chain_of(method="block_matching"), moving((37, 53), 5)
     expected = results(Runner(chain, device, encode=False, final=True), frames)
-    runner, state = Runner(chain, other, encode=False, final=True), State()
-    waits = [runner.submit(each, "", RunOptions(state=state)) for each in frames]  # all in flight
-    for wait, result in zip(waits, expected, strict=True):
-        np.testing.assert_array_equal(wait().final, result.final)
+    options = RunOptions(state=State())
+    wanted = [Frame(chain, each, "", encode=False, final=True, options=options) for each in frames]
+    service = Service([other])
+    developments = [each for frame in wanted for each in service.develop([frame])]  # in flight
+    for development, result in zip(developments, expected, strict=True):
+        np.testing.assert_array_equal(development.result().final, result.final)
 
 
 def test_bands_kept_images_and_patches_give_the_same_bits(device):
@@ -131,23 +134,23 @@ def test_a_stream_averages_its_frames(device):
 
 
 def test_plans_of_single_images_have_no_trace_of_the_stage():
-    plans = {frame: make_plan(chain_of(LONG), frame=frame) for frame in Frame}
+    plans = {frame: make_plan(chain_of(LONG), frame=frame) for frame in FrameKind}
     launches = {
         frame: [op.step for x in plan.launches if isinstance(x, Launch) for op in x.ops]
         for frame, plan in plans.items()
     }
-    assert STAGE not in launches[Frame.SINGLE]
-    assert STAGE not in launches[Frame.FIRST]
-    assert launches[Frame.LATER].count(STAGE) == 1
-    assert plans[Frame.SINGLE].states == ()
+    assert STAGE not in launches[FrameKind.SINGLE]
+    assert STAGE not in launches[FrameKind.FIRST]
+    assert launches[FrameKind.LATER].count(STAGE) == 1
+    assert plans[FrameKind.SINGLE].states == ()
     (_, no_image, first), (_, before, after) = (
-        plans[each].states[0] for each in (Frame.FIRST, Frame.LATER)
+        plans[each].states[0] for each in (FrameKind.FIRST, FrameKind.LATER)
     )
     assert no_image is None
-    assert plans[Frame.FIRST].border == plans[Frame.LATER].border
-    slots = [plans[Frame.LATER].slots[image.number] for image in (before, after)]
+    assert plans[FrameKind.FIRST].border == plans[FrameKind.LATER].border
+    slots = [plans[FrameKind.LATER].slots[image.number] for image in (before, after)]
     assert not set(slots[0]) & set(slots[1])
-    assert plans[Frame.FIRST].slots[first.number]
+    assert plans[FrameKind.FIRST].slots[first.number]
 
 
 def test_a_failure_ends_its_sequence_and_no_other(device, monkeypatch):

@@ -29,10 +29,10 @@ def flow_of(size, vector):
 
 def along(chain, frames, flows, device, **options):
     """Return the results of frames with their flows."""
-    state, runner, found = State(), Runner(chain, device, encode=False, final=True, **options), []
+    state, found = State(), []
     for frame, flow in zip(frames, flows, strict=True):
         layers = {STAGE: layer_of_array(chain, STAGE, flow, *frame.shape[1::-1])}
-        own = runner.for_chain(with_layers(chain, layers))
+        own = Runner(with_layers(chain, layers), device, encode=False, final=True, **options)
         found.append(own.run(frame, "key", RunOptions(state=state)).final)
     return found
 

@@ -70,7 +70,7 @@ def in_tiles(
         assert device.bytes_held <= memory
     same(whole, parts)
     for box in patches_in(whole):  # together they would have kernels of their own: test_stacks.py
-        same(cut(whole, [box]), runner.submit(image, "k", RunOptions(boxes=[box]))())
+        same(cut(whole, [box]), runner.run(image, "k", RunOptions(boxes=[box])))
     return whole, len(tiling.tiles)
 
 

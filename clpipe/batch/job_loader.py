@@ -172,4 +172,3 @@ class JobLoader:
             loaded = replace(loaded, source=replace(loaded.source, warnings=warnings))
         state.source = loaded.source
         state.recipes = recipes(renditions, loaded.chain, loaded.key)
-        state.unwritten = len(state.recipes)

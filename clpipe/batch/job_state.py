@@ -69,7 +69,6 @@ class JobState:
     stamps: Stamps = ()
     request: Mapping[str, Any] = field(default_factory=dict)  # record of the job's request
     recipes: list[Recipe] = field(default_factory=list)
-    unwritten: int = 0  # number of renditions that are not yet written
     status: str = DONE
     error: str = ""
     error_class: str = ""

@@ -18,10 +18,12 @@ from clpipe.batch.job_state import DecodedFrame
 from clpipe.batch.memory_budget import Lease, MemoryBudget, default_budget
 from clpipe.batch.outcome import Span
 from clpipe.batch.work import ImageWorker
-from clpipe.engine.device import Device, open_device
+from clpipe.engine.device import open_device
+from clpipe.engine.runner import Result
+from clpipe.engine.service import Frame, Service
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader, LoadedImage
-from clpipe.inputs.metering import OnDevice, metered_jobs
+from clpipe.inputs.metering import metered_jobs
 
 
 class Metering:
@@ -30,7 +32,7 @@ class Metering:
     Args:
         worker: does the work of each image.
         acquire: waits until a frame's image fits into memory, and takes the memory.
-        on_device: runs work on the device that meters.
+        develop: develops a frame, and returns its result.
         keeps: whether images are kept for :meth:`take`.
     """
 
@@ -38,12 +40,12 @@ class Metering:
         self,
         worker: ImageWorker,
         acquire: Callable[[Job], Lease],
-        on_device: OnDevice,
+        develop: Callable[[Frame], Result],
         keeps: bool = True,
     ) -> None:
         self._worker = worker
         self._acquire = acquire
-        self._on_device = on_device
+        self._develop = develop
         self._keeps = keeps
         self._kept: dict[str, DecodedFrame] = {}  # one at most, by the stem of its job
         self._is_closed = False
@@ -56,7 +58,7 @@ class Metering:
         If the code that iterates asks for the next frame before it has queued the last one, it
         collects frames. They would fill the memory, so their images are decoded again later.
         """
-        for job in metered_jobs(self._worker.loader, jobs, self._on_device, self._load):
+        for job in metered_jobs(self._worker.loader, jobs, self._develop, self._load):
             if not self._keeps:
                 self.drop(job)
             yield job
@@ -142,14 +144,17 @@ def metering_ahead(worker: ImageWorker, execution: ExecutionOptions) -> Metering
     """
 
     @cache
-    def opened() -> tuple[Device | None, MemoryBudget]:
+    def opened() -> tuple[Service, MemoryBudget]:
         device = open_device(next(iter(execution.devices), None), execution.memory)
         budget = MemoryBudget(default_budget(), [device])
         budget.device_ready()
-        return device, budget
+        return Service([device]), budget
 
     def acquire(job: Job) -> Lease:
-        device, budget = opened()
-        return budget.acquire(worker.bytes_of(job, 1, in_numpy=device is None))
+        service, budget = opened()
+        return budget.acquire(worker.bytes_of(job, 1, in_numpy=None in service.devices))
 
-    return Metering(worker, acquire, lambda work: work(opened()[0]), keeps=False)
+    def develop(frame: Frame) -> Result:
+        return opened()[0].run(frame)
+
+    return Metering(worker, acquire, develop, keeps=False)

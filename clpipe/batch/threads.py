@@ -13,14 +13,14 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence, Sized
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.errors import ImageError, OutputError, RequestError
 from clpipe.base.processors import available_processors
-from clpipe.batch.developing import MAX_STACK, Developers, depth_of
+from clpipe.batch.developing import Developing, discard
 from clpipe.batch.downloads import Downloads, Jobs
 from clpipe.batch.frames import Turns
 from clpipe.batch.job_state import DecodedFrame, JobState, Written
@@ -29,6 +29,7 @@ from clpipe.batch.metering import Metering
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.work import ImageWorker
 from clpipe.engine.device import Device
+from clpipe.engine.service import MAX_STACK, depth_of
 from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.find import Job
 
@@ -73,10 +74,11 @@ class Batch:
         self._failure: Exception | None = None
         self._stopping = threading.Event()
         self._decoding = threading.Semaphore(self.threads)  # limits the threads that decode
-        self._developers = Developers(
+        self._renditions = Developing(
             worker, self.devices, self.threads, self._budget, compiled, self._fail
         )
-        self._metering = Metering(worker, self._acquire_for_metering, self._developers.on_device)
+        develop = self._renditions.service.run
+        self._metering = Metering(worker, self._acquire_for_metering, develop)
         self._jobs: Jobs = queue.SimpleQueue()
         self._downloads = Downloads(self._begin)
         # Frames of sequences get memory, and then their device, in the order of the jobs.
@@ -113,7 +115,6 @@ class Batch:
             OutputError: nothing more can be written. The outcomes of images in flight come first.
             DeviceError: no device is usable any more. If one fails, the others take over its work.
         """
-        developers = self._developers
         count = max(len(jobs), 1) if isinstance(jobs, Sized) else self.in_flight
         codecs = max(available_processors() // min(self.threads, count), 1)
         set_codec_threads(codecs)
@@ -130,8 +131,6 @@ class Batch:
         threads: list[threading.Thread] = []
         started, is_over = 0, False
         try:
-            for number, device in enumerate(self.devices):
-                threads.append(self._start(f"device {number}", developers.develop_all, device))
             for started in range(1, self.in_flight + 1):
                 threads.append(self._start(f"image {started - 1}", self._make_all))
             while (outcome := self._outcomes.get()) is not None:
@@ -146,7 +145,7 @@ class Batch:
                 self._made.put(None)
             while not is_over and self._outcomes.get() is not None:
                 pass
-            developers.close()
+            self._renditions.close()
             for thread in (committer, *threads):
                 thread.join()
             self._downloads.close()
@@ -161,14 +160,29 @@ class Batch:
                 work(*arguments)
 
         thread = threading.Thread(target=timed, name=name, daemon=True)
-        try:
+        with self._starting(name):
             thread.start()
-        except RuntimeError:  # the system allows no more threads, or has no memory for their stacks
+        return thread
+
+    @contextmanager
+    def _starting(self, name: str) -> Iterator[None]:
+        """Explain the error if the system allows no more threads, or has no memory for one."""
+        try:
+            yield
+        except RuntimeError:
             raise RequestError(
                 f"--jobs: {self.threads}: no thread can be started for '{name}'; ask for fewer, or "
                 "allow more threads (ulimit -u) or memory (ulimit -v)"
             ) from None
-        return thread
+
+    def _begin_devices(self) -> None:
+        """Let the devices compile their kernels, if they have not begun.
+
+        Raises:
+            RequestError: the system allows no more threads.
+        """
+        with self._starting("device"):
+            self._renditions.begin()
 
     def _queue(self, jobs: Iterable[Job]) -> None:
         """Queue all jobs, until the run stops."""
@@ -223,7 +237,7 @@ class Batch:
                 if (
                     not job
                     or len(decoded) >= max_in_flight
-                    or not self._developers.is_small(decoded[-1])
+                    or not self._renditions.is_small(decoded[-1])
                 ):
                     self._make(decoded)
         except BaseException as error:  # an error of the run, not of one image
@@ -293,7 +307,7 @@ class Batch:
         if not self._is_checked:
             self._worker.writer.check_folder()
             self._is_checked = True
-        self._developers.begin()
+        self._begin_devices()
         if decoded:
             leases.append(decoded.lease)
             return
@@ -312,13 +326,13 @@ class Batch:
         Raises:
             ImageError: the image does not even fit alone, or the run has ended.
         """
-        self._developers.begin()
+        self._begin_devices()
         self._admitting.wait_for_all()
         return self._budget.acquire(self._bytes_of(job))
 
     def _bytes_of(self, job: Job) -> int:
         """Return the bytes that a job's image takes."""
-        return self._worker.bytes_of(job, self._developers.max_in_flight, None in self.devices)
+        return self._worker.bytes_of(job, self._renditions.max_in_flight, None in self.devices)
 
     def _make(self, decoded: list[JobState]) -> None:
         """Have the renditions of decoded jobs made, and hand the jobs to the committing thread.
@@ -336,17 +350,17 @@ class Batch:
             for state in decoded:
                 state.fail(ImageError("the run ended before it was developed"))
         try:
-            developed = self._developers.develop(decoded, end_turns)
+            made = self._renditions.develop(decoded, end_turns)
         finally:
             end_turns()
-        for state, orders in zip(decoded, developed, strict=True):
+        for state, renditions in zip(decoded, made, strict=True):
             state.free()
             try:
-                results = [develop.written.result() for develop in orders]
+                results = [files.result() for files in renditions]
             except Exception as error:
                 failure = error
-                for develop in orders:
-                    develop.discard()
+                for files in renditions:
+                    discard(files)
             else:
                 self._made.put((state, [written for written in results if written]))
         decoded.clear()

@@ -1,38 +1,35 @@
 """The work on one image: decode it, develop each of its renditions, encode the results."""
 
 import threading
-import time
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
-from typing import TypeVar
 
-from clpipe.base.errors import DeviceError, ImageError, OutputError, RequestError
+from clpipe.base.errors import ImageError, OutputError, RequestError
 from clpipe.base.files import FileGroup, deferred_files
 from clpipe.base.types import Array
 from clpipe.batch.job_loader import JobLoader
 from clpipe.batch.job_state import JobState, Written
 from clpipe.batch.memory_budget import host_bytes
 from clpipe.batch.outcome import Span
-from clpipe.batch.runners import Runners, SpareArrays
 from clpipe.batch.sinks import Folder
 from clpipe.chain.baseline import with_noise
 from clpipe.chain.chain import Chain
 from clpipe.chain.exposures import exposures_of
 from clpipe.chain.formats import DNG
 from clpipe.chain.layers import layer_steps
+from clpipe.chain.rendition import DEFAULT_RENDITION
 from clpipe.engine.clipping import clipped_share
 from clpipe.engine.device import Device
-from clpipe.engine.options import RunOptions, Timing
-from clpipe.engine.runner import Result, Runner, submit_batch
+from clpipe.engine.options import RunOptions
+from clpipe.engine.runner import Result, Runner
+from clpipe.engine.service import Development, Frame
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.recipes import Recipe
 from clpipe.outputs.record import picture_record
 from clpipe.outputs.sidecar import SIDECAR, write_sidecar
 from clpipe.stage import Kind
-
-T = TypeVar("T")
 
 
 class ImageWorker(JobLoader):
@@ -85,114 +82,73 @@ class ImageWorker(JobLoader):
         kinds = results, formats, writer.request.keep, extra_images, in_numpy
         return host_bytes(self.loader.claim(job), self.chain, *kinds)
 
-    def runners(self, device: Device | None) -> "Runners":
-        """Return the runners of a device, with the kernels of the first chain compiled.
+    def compile(self, device: Device | None) -> None:
+        """Compile the kernels of the first chain for a device.
 
         Raises:
             RequestError: the memory of the device is too small for any image.
             DeviceError: a kernel does not compile.
         """
         half = self.loader.kept is None and self.chain.source is Kind.RGB
-        return Runners(self.writer, device, self.chain, half)
+        results = self.writer.results(Recipe(DEFAULT_RENDITION, self.chain, (), ""))
+        try:
+            Runner(self.chain, device, *results).compile(half)
+        except ImageError as error:  # the memory is not enough for 8x8 pixels
+            raise RequestError(f"--memory: too little for any image: {error}") from None
 
-    @staticmethod
-    def with_matched_noise(state: JobState, recipe: Recipe) -> Recipe:
-        """Return a recipe with its noise, if that follows from the results of earlier recipes."""
-        if not recipe.matcher:
-            return recipe
-        method, estimates = recipe.matcher.method(recipe.rendition.role)
-        chain = with_noise(recipe.chain, method)
-        completed = replace(recipe, chain=chain, matcher=None, estimates=estimates)
-        state.recipes[state.recipes.index(recipe)] = completed
-        return completed
+    def order(self, state: JobState, recipe: Recipe, is_small: bool) -> tuple[Recipe, Frame] | None:
+        """Return the frame of a rendition, and its recipe with its noise. None if it fails.
 
-    def start(
-        self, requested: Sequence[tuple[JobState, Recipe, Runner]]
-    ) -> list[Callable[[], Result | None]]:
-        """Begin to develop renditions on one device. Small ones share launches.
-
-        Returns:
-            For each rendition, a function that waits for its result and returns it. Call them in
-            order. A function returns None if the rendition fails, and may raise DeviceError.
-
-        Raises:
-            DeviceError: the device cannot be used any more.
+        Call it for the frames of a sequence in temporal order.
         """
-        start = time.perf_counter()
-        orders = [self._attempt(each[0], partial(self._order, *each)) for each in requested]
-        ready = [order for order in orders if order]
-        waits: list[Callable[[], Result] | None]
-        if len(requested) == 1:
-            waits = [
-                self._attempt(requested[0][0], lambda: submit_batch(ready)[0]) if ready else None
-            ]
-        else:
-            try:
-                results = iter(submit_batch(ready) if ready else ())
-                waits = [next(results) if order else None for order in orders]
-            except DeviceError:
-                raise
-            except Exception:  # it does not identify the image, so each one is run separately
-                waits = [partial(o[0].run, *o[1:]) if o else None for o in orders]
-        return [
-            partial(self._finish, state, recipe, start, order[3].timings if order else None, wait)
-            for (state, recipe, _), order, wait in zip(requested, orders, waits, strict=True)
-        ]
-
-    def _order(
-        self, state: JobState, recipe: Recipe, runner: Runner
-    ) -> tuple[Runner, Array, str, RunOptions]:
-        """Return the arguments of a rendition's run. Nobody changes its image's pixels."""
         source = state.source
-        assert source
-        pixels, device = source.pixels, runner.device
-        width, height = runner.chain.size(*pixels.shape[1::-1])
-        boxes = [patch.box for patch in state.patches]
-        is_used_again = (
-            runner.encode and not boxes and device and not device.can_stack(width, height)
-        )
-        reused = self._spare.take((height, width, *pixels.shape[2:])) if is_used_again else None
-        timings: list[Timing] | None = [] if self._trace and device else None
-        options = RunOptions(
-            timings,
-            into=reused,
-            unchanged=True,
-            boxes=boxes,
-            later_exposures=source.later,
-            state=self.frames.state(state.job, recipe),
-        )
-        return runner, pixels, recipe.noise_key, options
+        if state.error or not source:
+            return None
+        try:
+            # Its noise may follow from the results of earlier recipes.
+            if recipe.matcher:
+                method, estimates = recipe.matcher.method(recipe.rendition.role)
+                matched = with_noise(recipe.chain, method)
+                completed = replace(recipe, chain=matched, matcher=None, estimates=estimates)
+                state.recipes[state.recipes.index(recipe)] = completed
+                recipe = completed
+            keep, encode, final = self.writer.results(recipe)
+            width, height = recipe.chain.size(*source.pixels.shape[1::-1])
+            boxes = [patch.box for patch in state.patches]
+            reused = None
+            if encode and not boxes and not is_small:
+                reused = self._spare.take((height, width, *source.pixels.shape[2:]))
+            options = RunOptions(
+                [] if self._trace else None,
+                into=reused,
+                unchanged=True,  # nobody changes the pixels of an image
+                boxes=boxes,
+                later_exposures=source.later,
+                state=self.frames.state(state.job, recipe),
+            )
+            key = recipe.noise_key
+            return recipe, Frame(recipe.chain, source.pixels, key, keep, encode, final, options)
+        except Exception as error:  # an error of an image must not end the thread
+            state.fail(error)
+            return None
 
-    def _finish(
-        self,
-        state: JobState,
-        recipe: Recipe,
-        start: float,
-        timings: list[Timing] | None,
-        wait: Callable[[], Result] | None,
-    ) -> Result | None:
-        """Wait for the result of a rendition."""
-        result = self._attempt(state, wait) if wait else None
-        state.note("device", start)
-        if result and result.final is not None:
+    def finish(self, state: JobState, recipe: Recipe, development: Development) -> Result | None:
+        """Return the result of a rendition that was developed. None if it failed."""
+        state.note("device", development.began)
+        if error := development.exception():
+            state.fail(error)
+            return None
+        result, timings = development.result(), development.frame.options.timings
+        if result.final is not None:
             for matcher in {each.matcher for each in state.recipes if each.matcher}:
                 matcher.take(recipe.rendition, result.final)
-        if result and recipe.estimates:
+        if recipe.estimates:
             result.estimates[recipe.chain.steps[-1].name] = dict(recipe.estimates)
         name = threading.current_thread().name
         state.spans += [Span(t.name, name, t.start, t.seconds) for t in timings or []]
-        if result and recipe is state.recipes[-1] and DNG not in self.writer.formats:
+        if recipe is state.recipes[-1] and DNG not in self.writer.formats:
             state.drop_pixels()
         return result
-
-    @staticmethod
-    def _attempt(state: JobState, work: Callable[[], T]) -> T | None:
-        """Return the result of some work. If it fails, note the state's error and return None."""
-        try:
-            return work()
-        except (ImageError, RequestError, MemoryError) as error:
-            state.fail(error)
-            return None
 
     def encode(
         self, state: JobState, recipe: Recipe, result: Result, device: Device | None
@@ -282,3 +238,32 @@ class ImageWorker(JobLoader):
         )
         write_sidecar(path, record)
         return [str(f.relative_to(writer.folder)) for f in (*files, path)]
+
+
+class SpareArrays:
+    """Arrays to be used again, because allocating new memory costs time.
+
+    >>> import numpy as np
+    >>> spare = SpareArrays(2)
+    >>> spare.give(np.zeros((2, 3)))
+    >>> spare.take((3, 2)) is None, spare.take((2, 3)).shape, spare.take((2, 3)) is None
+    (True, (2, 3), True)
+    """
+
+    def __init__(self, count: int) -> None:
+        self._arrays: deque[Array] = deque(maxlen=count)
+        self._lock = threading.Lock()  # guards the arrays
+
+    def take(self, shape: tuple[int, ...]) -> Array | None:
+        """Return an array of a shape, or None if there is none."""
+        with self._lock:
+            for place, array in enumerate(self._arrays):
+                if array.shape == shape:
+                    del self._arrays[place]
+                    return array
+        return None
+
+    def give(self, array: Array) -> None:
+        """Add an array. If there are more than ``count``, the oldest is dropped."""
+        with self._lock:
+            self._arrays.append(array)

@@ -368,19 +368,20 @@ class Chain:
         raise RequestError(unknown_name("stage in this chain", name, [s.name for s in self.steps]))
 
 
-def cached_by_structure(function: Callable[[Chain], T]) -> Callable[[Chain], T]:
+def cached_by_structure(function: Callable[..., T]) -> Callable[..., T]:
     """Return a function that is computed once for all chains that differ only in numbers.
 
-    Its result must depend only on names, stages and passes.
+    Its result must depend only on names, stages, passes and its other arguments.
     """
 
     @wraps(function)
-    def cached(chain: Chain) -> T:
+    def cached(chain: Chain, *others: Any) -> T:
         if chain.structure is None:
-            return function(chain)
-        if function not in chain.structure:
-            chain.structure[function] = function(chain)
-        found: T = chain.structure[function]
+            return function(chain, *others)
+        key = function, *others
+        if key not in chain.structure:
+            chain.structure[key] = function(chain, *others)
+        found: T = chain.structure[key]
         return found
 
     return cached

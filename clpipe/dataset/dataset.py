@@ -2,8 +2,9 @@
 
 import copy
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, Unpack
 
@@ -22,9 +23,9 @@ from clpipe.dataset.developer import Sample, SampleSpec
 from clpipe.dataset.inputs import cache_size, jobs_of
 from clpipe.dataset.numbering import Numbering
 from clpipe.dataset.passes import Passes, part_of
-from clpipe.dataset.prefetch import PATCHES_TOGETHER, BatchSize, prefetched
-from clpipe.dataset.samples import SampleBatch, SampleLoader
-from clpipe.inputs.loader import ImageLoader, LoadedImage
+from clpipe.dataset.prefetch import PATCHES_TOGETHER, BatchSize, attempted, prefetched
+from clpipe.dataset.samples import Read, SampleBatch, SampleLoader
+from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.patches import Patches
 
 if TYPE_CHECKING:
@@ -299,46 +300,45 @@ class Dataset(ReadOnly):
     ) -> Iterator[list[Sample]]:
         """Yield the samples of several images, each given by epoch, image and sample numbers.
 
-        If images fail together, each is developed alone to find the error. Raises the errors of
-        :meth:`_develop`.
+        Raises:
+            ImageError: as for :meth:`_develop_other`.
         """
         side = self._patches.size if self._patches else None
-        waiting: list[tuple[int, int, Sequence[int]]] = []
-        read: list[tuple[SampleBatch, LoadedImage, Sample]] = []
-        size, is_full = BatchSize(side), False
-        for last, each in enumerate(requested, 1 - len(requested)):
-            waiting.append(each)
+        read: list[tuple[SampleBatch, Read | ImageError]] = []
+        size, first = BatchSize(side), 0
+        for end, each in enumerate(requested, 1):
             batch = self._batch(*each)
-            with suppress(ImageError):
-                read.append((batch, *self._loader.read(batch)))
-                is_full = size.add(batch, read[-1][1].source.pixels)
-            if last and len(read) == len(waiting) and not is_full:
-                continue
-            results: list[Callable[[], list[Sample]]] = []
-            if len(read) == len(waiting):
-                with suppress(ImageError):
-                    results = self._loader.begin(read)
-            for number, image in enumerate(waiting):
-                developed: list[Sample] | None = None
-                with suppress(ImageError):
-                    developed = results[number]() if results else None
-                yield self._develop(*image) if developed is None else developed
-            waiting, read, size, is_full = [], [], BatchSize(side), False
+            image = attempted(partial(self._loader.read, batch))
+            read.append((batch, image))
+            is_full = isinstance(image, tuple) and size.add(batch, image[0].source.pixels)
+            if is_full or end == len(requested):
+                waits = self._loader.begin(read)
+                for place, wait in zip(requested[first:end], waits, strict=True):
+                    try:
+                        samples = wait()
+                    except ImageError as error:
+                        samples = self._develop_other(error, *place)
+                    yield samples
+                read, size, first = [], BatchSize(side), end
 
-    def _develop(self, epoch: int, image: int, numbers: Sequence[int]) -> list[Sample]:
-        """Return samples of an image. If it fails and errors are skipped, use the next valid image.
+    def _develop_other(
+        self, error: ImageError, epoch: int, image: int, numbers: Sequence[int]
+    ) -> list[Sample]:
+        """Return samples of the next valid image, if errors such as that of this one are skipped.
 
         Raises:
-            ImageError: the image, or every image, cannot be read or processed.
+            ImageError: the error, or no image can be read and developed.
         """
-        for offset in range(len(self._jobs)):
+        for offset in range(1, len(self._jobs) + 1):
+            if not self._skips:
+                raise error
+            warn(python_words(f"skipped: {error}"))
             batch = self._batch(epoch, (image + offset) % len(self._jobs), numbers)
-            try:
-                return self._loader.begin([(batch, *self._loader.read(batch))])[0]()
-            except ImageError as error:
-                if not self._skips:
-                    raise
-                warn(python_words(f"skipped: {error}"))
+            if offset < len(self._jobs):
+                try:
+                    return self._loader.begin([(batch, self._loader.read(batch))])[0]()
+                except ImageError as other:
+                    error = other
         raise ImageError("no image of the dataset can be read and developed")
 
     def _batch(self, epoch: int, image: int, numbers: Sequence[int]) -> SampleBatch:

@@ -1,30 +1,25 @@
 """Development of samples on a device: images with truth, raws, and the variance of noise."""
 
-import os
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
-from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Array
-from clpipe.chain.chain import Chain, Step
+from clpipe.chain.chain import Chain, Step, cached_by_structure
 from clpipe.chain.truth import noisy_mosaic, picture_without_noise
 from clpipe.dataset.arrays import UINT16_MAX, ArrayFormat
-from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions
-from clpipe.engine.runner import Result, Runner, submit_batch
+from clpipe.engine.runner import Result
+from clpipe.engine.service import Frame
 from clpipe.images.read import SourceImage
 from clpipe.outputs.patches import Patch, Patches, metadata_of, variance_at, variance_steps
 from clpipe.stage import Kind
 
 Sample = dict[str, Any]
-MAX_STRUCTURES = 256
 
 
 @dataclass(frozen=True)
@@ -67,6 +62,40 @@ class SampleSpec:
         if self.variance:
             variance_steps(chain)
 
+    def frames(
+        self, chain: Chain, source: SourceImage, noise_key: str, patches: Sequence[Patch]
+    ) -> dict[str, Frame]:
+        """Return the frames "image", "truth", and "signal", from which the variance follows.
+
+        Args:
+            chain: the chain of the image.
+            source: the image.
+            noise_key: the key of its noise.
+            patches: the patches that are samples. () is one sample of the whole picture.
+
+        Raises:
+            RequestError: the chain cannot make the samples.
+        """
+        boxes = [patch.box for patch in patches]
+        options = RunOptions(unchanged=True, boxes=boxes, later_exposures=source.later)
+        encode = chain.result is Kind.DISPLAY and self.arrays.dtype is None
+        raws = raws_of(chain, self)
+        chains = {"image": chain}
+        if self.truth:
+            chains["truth"] = picture_without_noise(self.truth, chain)
+
+        def frame(chain: Chain, keep: Sequence[str], encode: bool) -> Frame:
+            kept = tuple(step for step in chain.step_names if step in keep)
+            return Frame(chain, source.pixels, noise_key, kept, encode, not encode, options)
+
+        frames = {
+            name: frame(each, (*self.keep, *filter(None, [raws.get(name)])), encode)
+            for name, each in chains.items()
+        }
+        if self.variance:
+            frames["signal"] = frame(variance_steps(chain)[0], (), encode=False)
+        return frames
+
 
 def raw_step(chain: Chain, arrays: ArrayFormat) -> str:
     """Return the step of the raw: the last one in DN, or the noisy mosaic in signal.
@@ -92,174 +121,68 @@ def raw_step(chain: Chain, arrays: ArrayFormat) -> str:
 
 @dataclass(frozen=True)
 class DevelopTask:
-    """An image to develop for samples.
+    """Samples of an image that are developed.
 
     Args:
-        chain: the chain.
-        source: the image.
-        noise_key: the key of its noise.
-        patches: the patches that are samples. () is one sample of the whole picture.
-    """
-
-    chain: Chain
-    source: SourceImage
-    noise_key: str
-    patches: Sequence[Patch]
-
-    @property
-    def options(self) -> RunOptions:
-        """The options of the run."""
-        boxes = [patch.box for patch in self.patches]
-        return RunOptions(unchanged=True, boxes=boxes, later_exposures=self.source.later)
-
-
-class Developer:
-    """Develops images on a device, in the order of :meth:`begin`.
-
-    Args:
-        device: the device. None is NumPy.
         spec: the contents of samples.
+        chain: the chain of the image.
+        patches: the patches that are samples. () is one sample of the whole picture.
+        frames: the frames to develop, by name.
+        carried: the layers of the image, by name.
+        facts: the facts of the image that each sample contains.
     """
 
-    def __init__(self, device: Device | None, spec: SampleSpec) -> None:
-        self.process = os.getpid()
-        self._device = device
-        self._spec = spec
-        self._lock = threading.Lock()  # guards the runners and the device
-        self._raws: BoundedCache[dict[str, str]] = BoundedCache(MAX_STRUCTURES)
-        self._latest: dict[str, Runner] = {}
+    spec: SampleSpec
+    chain: Chain
+    patches: Sequence[Patch]
+    frames: Mapping[str, Frame]
+    carried: Sample
+    facts: Sample
 
-    def begin(self, tasks: Sequence[DevelopTask]) -> list[Callable[[], list[Sample]]]:
-        """Begin to develop samples of images. Small ones are developed together.
-
-        Returns:
-            For each image, a callable that waits for its samples. Call them in order. They raise
-            the same errors.
-
-        Raises:
-            ImageError, RequestError, MemoryError: an image cannot be developed.
-        """
-        with self._lock:
-            raws = [self._raws_of(task.chain) for task in tasks]
-            runs = [self._runs(o.chain, runners) for o, runners in zip(tasks, raws, strict=True)]
-            pending = submit_batch(
-                [
-                    (runner, task.source.pixels, task.noise_key, task.options)
-                    for task, runners in zip(tasks, runs, strict=True)
-                    for runner in runners.values()
-                ]
-            )
-        pending_results = iter(pending)
-        return [
-            partial(self._finish, task, names, dict(zip(runners, pending_results, strict=False)))
-            for task, names, runners in zip(tasks, raws, runs, strict=True)
-        ]
-
-    def _runs(self, chain: Chain, raws: Mapping[str, str]) -> dict[str, Runner]:
-        """Return the runners of "image", "truth", and "signal", from which the variance follows."""
-        spec = self._spec
-        encode = chain.result is Kind.DISPLAY and spec.arrays.dtype is None
-        chains = {"image": chain}
-        if spec.truth:
-            chains["truth"] = picture_without_noise(spec.truth, chain)
-        runs = {
-            name: self._runner(name, each, (*spec.keep, *filter(None, [raws.get(name)])), encode)
-            for name, each in chains.items()
-        }
-        if spec.variance:
-            signal, _ = variance_steps(chain)
-            runs["signal"] = self._runner("signal", signal, (), encode=False)
-        return runs
-
-    def _raws_of(self, chain: Chain) -> dict[str, str]:
-        """Return the steps of the raws of "image" and "truth"."""
-        spec = self._spec
-        if not spec.arrays.raw:
-            return {}
-
-        def find_raws() -> dict[str, str]:
-            last = raw_step(chain, spec.arrays)
-            if not spec.truth:
-                return {"image": last}
-            truth = picture_without_noise(spec.truth, chain)
-            return {"image": last, "truth": last_until(truth, chain, last)}
-
-        if chain.structure is None:
-            return find_raws()
-        return self._raws.get(Identity(chain.structure), find_raws)
-
-    def _runner(self, name: str, chain: Chain, keep: Sequence[str], encode: bool) -> Runner:
-        kept = tuple(step for step in chain.step_names if step in keep)
-        latest = self._latest.get(name)
-        if latest and latest.keep == kept and latest.encode == encode:
-            runner = latest.for_chain(chain)  # shares its plans
-        else:
-            runner = Runner(chain, self._device, kept, encode, final=not encode)
-        self._latest[name] = runner
-        return runner
-
-    def _finish(
-        self,
-        task: DevelopTask,
-        raws: Mapping[str, str],
-        pending: Mapping[str, Callable[[], Result]],
-    ) -> list[Sample]:
-        """Return the samples of a task that was started."""
-        results = {}
-        for name, wait in pending.items():
-            with self._lock:
-                results[name] = wait()
-        noise = variance_steps(task.chain)[1] if self._spec.variance else ()
-        if not task.patches:
-            samples = [self._sample(task.chain, raws, results, None, noise, lambda image: image)]
+    def samples(self, results: Mapping[str, Result]) -> list[Sample]:
+        """Return the samples, from the results of the frames."""
+        noise = variance_steps(self.chain)[1] if self.spec.variance else ()
+        if not self.patches:
+            samples = [self._sample(results, None, noise, lambda image: image)]
         else:
             samples = [
-                self._sample(task.chain, raws, results, patch, noise, itemgetter(i))
-                for i, patch in enumerate(task.patches)
+                self._sample(results, patch, noise, itemgetter(i))
+                for i, patch in enumerate(self.patches)
             ]
-        metadata = metadata_of(task.chain).items()
+        metadata = metadata_of(self.chain).items()
         for sample in samples:
-            sample |= {name: v.copy() if isinstance(v, np.ndarray) else v for name, v in metadata}
+            copied = {name: v.copy() if isinstance(v, np.ndarray) else v for name, v in metadata}
+            sample.update(copied, **self.facts)
         return samples
-
-    def drain(self) -> None:
-        """Wait for all tasks that were started."""
-        with self._lock:
-            if self._device:
-                self._device.drain()
 
     def _sample(
         self,
-        chain: Chain,
-        raws: Mapping[str, str],
         results: Mapping[str, Result],
         patch: Patch | None,
         noise: tuple[Step, ...],
         part: Callable[[Array], Array],
     ) -> Sample:
-        """Return the arrays of the sample of an image or patch.
+        """Return the arrays of one sample.
 
         Args:
-            chain: the chain of the image.
-            raws: the steps of the raws, by the names of results.
-            results: the results.
+            results: the results of the frames.
             patch: the patch. None is the whole picture.
             noise: the steps from which the variance follows.
             part: returns the part of an image that belongs to the sample.
         """
-        arrays = self._spec.arrays
-        pattern = chain.filter_array.pattern
+        arrays, raws = self.spec.arrays, raws_of(self.chain, self.spec)
+        pattern = self.chain.filter_array.pattern
 
         def orient(image: Array) -> Array:
             return patch.orient(part(image)) if patch else image
 
         sample: Sample = {}
-        for name in ("image", "truth") if self._spec.truth else ("image",):
+        for name in ("image", "truth") if self.spec.truth else ("image",):
             result, prefix = results[name], "" if name == "image" else f"{name}."
             for step, image in result.kept.items():
-                if step in self._spec.keep:
+                if step in self.spec.keep:
                     sample[prefix + step] = arrays.ordered(orient(image))
-            sample[name] = arrays.picture(orient(result.image), chain.result)
+            sample[name] = arrays.picture(orient(result.image), self.chain.result)
             if arrays.raw:
                 sample[f"{prefix}raw"] = arrays.mosaic(orient(result.kept[raws[name]]), pattern)
         if noise:
@@ -268,7 +191,25 @@ class Developer:
             sample["variance"] = arrays.variance(variance, pattern)
         if patch:
             sample |= {"place": np.array([patch.left, patch.top]), "turn": patch.orientation}
+        for name, layer in self.carried.items():
+            sample[name] = arrays.ordered(patch.crop(layer) if patch else layer)
         return sample
+
+
+@cached_by_structure
+def raws_of(chain: Chain, spec: SampleSpec) -> Mapping[str, str]:
+    """Return the steps of the raws of "image" and "truth".
+
+    Raises:
+        RequestError: there is no such step.
+    """
+    if not spec.arrays.raw:
+        return {}
+    last = raw_step(chain, spec.arrays)
+    if not spec.truth:
+        return {"image": last}
+    truth = picture_without_noise(spec.truth, chain)
+    return {"image": last, "truth": last_until(truth, chain, last)}
 
 
 def last_until(truth: Chain, chain: Chain, name: str) -> str:

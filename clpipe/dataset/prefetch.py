@@ -3,18 +3,15 @@
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from itertools import islice
 
 from clpipe.base.errors import ImageError
 from clpipe.base.processors import available_processors
 from clpipe.base.types import Array
 from clpipe.dataset.developer import Sample
-from clpipe.dataset.samples import SampleBatch, SampleLoader
+from clpipe.dataset.samples import Read, SampleBatch, SampleLoader
 from clpipe.images.openimageio import set_codec_threads
-from clpipe.inputs.loader import LoadedImage
 
-Read = Future[tuple[LoadedImage, Sample]]
 Pending = tuple[SampleBatch, Callable[[], list[Sample]]]
 
 PATCHES_TOGETHER = 16  # patches with their own draws in one batch
@@ -69,34 +66,31 @@ def prefetched(
     set_codec_threads(max(available_processors() // threads, 1))
     in_flight: deque[Future[list[Pending]]] = deque()
     decoders = ThreadPoolExecutor(threads, "decode")
-    developer = ThreadPoolExecutor(1, "device")
+    beginner = ThreadPoolExecutor(1, "begin")
     try:
         while group := list(islice(batches, group_size)):
             decoded = [decoders.submit(loader.read, batch) for batch in group]
-            in_flight.append(developer.submit(_begin, loader, group, decoded))
+            in_flight.append(beginner.submit(_begin, loader, group, decoded))
             if len(in_flight) > threads + 1:
                 yield from in_flight.popleft().result()
         while in_flight:
             yield from in_flight.popleft().result()
     finally:
         decoders.shutdown(cancel_futures=True)
-        developer.shutdown(cancel_futures=True)
-        loader.drain()
+        beginner.shutdown(cancel_futures=True)
 
 
 def _begin(
-    loader: SampleLoader, batches: Sequence[SampleBatch], decoded: Sequence[Read]
+    loader: SampleLoader, batches: Sequence[SampleBatch], decoded: Sequence[Future[Read]]
 ) -> list[Pending]:
-    """Start batches together. If that fails, each batch starts when its samples are requested."""
-    pairs = list(zip(batches, decoded, strict=True))
+    """Start batches together, when their images are decoded."""
+    read = [(batch, attempted(each.result)) for batch, each in zip(batches, decoded, strict=True)]
+    return list(zip(batches, loader.begin(read), strict=True))
+
+
+def attempted(read: Callable[[], Read]) -> Read | ImageError:
+    """Return the image that a function reads, or its error."""
     try:
-        pending = loader.begin([(batch, *read_future.result()) for batch, read_future in pairs])
-    except ImageError:
-        pending = [
-            partial(_develop_alone, loader, batch, read_future) for batch, read_future in pairs
-        ]
-    return list(zip(batches, pending, strict=True))
-
-
-def _develop_alone(loader: SampleLoader, batch: SampleBatch, decoded: Read) -> list[Sample]:
-    return loader.begin([(batch, *decoded.result())])[0]()
+        return read()
+    except ImageError as error:
+        return error

@@ -2,11 +2,10 @@
 
 import os
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NoReturn
 
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
@@ -14,14 +13,17 @@ from clpipe.base.user_warnings import Issued, warn
 from clpipe.chain.carry import VALID
 from clpipe.chain.identity import frame_key, noise_key
 from clpipe.chain.python_words import python_words
-from clpipe.dataset.developer import Developer, DevelopTask, Sample, SampleSpec
+from clpipe.dataset.developer import DevelopTask, Sample, SampleSpec
 from clpipe.dataset.render_cache import RenderCache
 from clpipe.engine.device import open_device
+from clpipe.engine.service import Development, Service
 from clpipe.images.read import SourceImage
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.inputs.raw import RawImage
 from clpipe.outputs.patches import Patch, Patches
+
+Read = tuple[LoadedImage, Sample]  # an image, and its layers
 
 _open_lock = threading.Lock()  # lets one thread open the device of a process
 
@@ -73,16 +75,11 @@ class SampleLoader:
         self._loader = loader
         self._spec = spec
         self._device = device
-        self._open_developer: Developer | None = None
+        self._opened: tuple[int, Service] | None = None  # with the process that opened the device
         self._warned = Issued()
 
     def __getstate__(self) -> Mapping[str, Any]:
-        return {**self.__dict__, "_open_developer": None}  # a device cannot leave its process
-
-    def drain(self) -> None:
-        """Wait for all samples whose development was started."""
-        if self._open_developer:
-            self._open_developer.drain()
+        return {**self.__dict__, "_opened": None}  # a device cannot leave its process
 
     def count(self, job: Job, epoch: int) -> int:
         """Return the number of samples of an image. A grid needs to read the image.
@@ -94,12 +91,18 @@ class SampleLoader:
             return 1
         if self.patches.per_image != "grid":
             return self.patches.per_image
-        with self._errors_of(job):
-            loaded, _ = self.read(SampleBatch(job, epoch, ()))
+        loaded, _ = self.read(SampleBatch(job, epoch, ()))
+        try:
             return self.patches.layout(loaded.chain, *loaded.source.pixels.shape[1::-1]).count
+        except RequestError as error:
+            raise ImageError(self._loader.error_text(job, error)) from None
 
-    def read(self, batch: SampleBatch) -> tuple[LoadedImage, Sample]:
-        """Read an image and its layers, which are warped like its picture."""
+    def read(self, batch: SampleBatch) -> Read:
+        """Read an image and its layers, which are warped like its picture.
+
+        Raises:
+            ImageError: it cannot be read, or does not fit the chain.
+        """
         job = batch.job
         loader = self._loader
         carried: Sample = {}
@@ -134,67 +137,65 @@ class SampleLoader:
         return self.renders.get(key, lambda: loader.read(job))
 
     def begin(
-        self, read: Sequence[tuple[SampleBatch, LoadedImage, Sample]]
+        self, read: Sequence[tuple[SampleBatch, Read | ImageError]]
     ) -> list[Callable[[], list[Sample]]]:
         """Begin to develop samples of images. Small ones are developed together.
 
         Args:
-            read: batches, each with the result of :meth:`read`.
+            read: batches, each with the result of :meth:`read`, or its error.
 
         Returns:
-            For each batch, a callable that waits for its samples. Call them in order.
+            For each batch, a callable that waits for its samples. It raises ImageError if its image
+            cannot be read or developed.
 
         Raises:
-            ImageError: an image cannot be developed. With several images, the error names none.
+            DeviceError: there is no usable device, or a parent process has opened it.
         """
-        tasks = [self._task(batch, loaded) for batch, loaded, _ in read]
-        with self._errors_of(*(batch.job for batch, *_ in read)):
-            pending = self._developer().begin(tasks)
-        return [
-            partial(self._finish, *each, task.patches, wait)
-            for each, task, wait in zip(read, tasks, pending, strict=True)
+        tasks = [self._task(*each) for each in read]
+        service = self._service()
+        frames = [
+            f for task in tasks if isinstance(task, DevelopTask) for f in task.frames.values()
         ]
+        pending = iter(service.develop(frames))
+        waits: list[Callable[[], list[Sample]]] = []
+        for (batch, _), task in zip(read, tasks, strict=True):
+            if isinstance(task, ImageError):
+                waits.append(partial(fail, task))
+            else:
+                results = {name: next(pending) for name in task.frames}
+                waits.append(partial(self._finish, batch, task, results))
+        return waits
 
-    def _task(self, batch: SampleBatch, loaded: LoadedImage) -> DevelopTask:
-        """Return the development task of a batch."""
-        job, chain, pixels = batch.job, loaded.chain, loaded.source.pixels
+    def _task(self, batch: SampleBatch, read: Read | ImageError) -> DevelopTask | ImageError:
+        """Return the development task of a batch, or the error of its image."""
+        if isinstance(read, ImageError):
+            return read
+        job, (loaded, carried) = batch.job, read
+        chain, source = loaded.chain, loaded.source
+        size = source.pixels.shape[1::-1]
         patches: list[Patch] = []
-        with self._errors_of(job):
+        try:
             if self.patches:
-                layout = self.patches.layout(chain, *pixels.shape[1::-1])
+                layout = self.patches.layout(chain, *size)
                 patches = layout.patches_for(batch.numbers, job.key, batch.epoch)
             else:
-                self._spec.arrays.check_size(*chain.size(*pixels.shape[1::-1]))
-        key = noise_key(chain.settings, loaded.key, batch.epoch)
-        return DevelopTask(chain, loaded.source, key, patches)
+                self._spec.arrays.check_size(*chain.size(*size))
+            key = noise_key(chain.settings, loaded.key, batch.epoch)
+            frames = self._spec.frames(chain, source, key, patches)
+        except (ImageError, RequestError, MemoryError) as error:
+            return ImageError(self._loader.error_text(job, error))
+        return DevelopTask(
+            self._spec, chain, patches, frames, carried, self._metadata(batch, loaded)
+        )
 
     def _finish(
-        self,
-        batch: SampleBatch,
-        loaded: LoadedImage,
-        carried: Sample,
-        patches: Sequence[Patch],
-        pending: Callable[[], list[Sample]],
+        self, batch: SampleBatch, task: DevelopTask, pending: Mapping[str, Development]
     ) -> list[Sample]:
         """Return the samples of a batch that was started."""
-        with self._errors_of(batch.job):
-            samples = pending()
-        arrays, metadata = self._spec.arrays, self._metadata(batch, loaded)
-        for i, sample in enumerate(samples):
-            for name, layer in carried.items():
-                sample[name] = arrays.ordered(patches[i].crop(layer) if patches else layer)
-            sample.update(metadata)
-        return samples
-
-    @contextmanager
-    def _errors_of(self, *jobs: Job) -> Iterator[None]:
-        """Add the name of the image to errors of the body, if there is one image."""
         try:
-            yield
+            return task.samples({name: each.result() for name, each in pending.items()})
         except (ImageError, RequestError, MemoryError) as error:
-            job, *others = jobs
-            text = str(error) if others else self._loader.error_text(job, error)
-            raise ImageError(text) from None
+            raise ImageError(self._loader.error_text(batch.job, error)) from None
 
     @staticmethod
     def _metadata(batch: SampleBatch, loaded: LoadedImage) -> Sample:
@@ -205,13 +206,18 @@ class SampleLoader:
         a, b = (noise.a, noise.b) if noise else (0.0, 0.0)
         return {"key": batch.job.key, "epoch": batch.epoch, "iso": chain.iso, "a": a, "b": b}
 
-    def _developer(self) -> Developer:
-        """Return the developer of this process.
+    def _service(self) -> Service:
+        """Return the service of this process.
 
         Raises:
             DeviceError: there is no usable device, or a parent process has opened it.
         """
         with _open_lock:
-            if self._open_developer is None or self._open_developer.process != os.getpid():
-                self._open_developer = Developer(open_device(self._device), self._spec)
-            return self._open_developer
+            if not self._opened or self._opened[0] != os.getpid():
+                self._opened = os.getpid(), Service([open_device(self._device)])
+            return self._opened[1]
+
+
+def fail(error: ImageError) -> NoReturn:
+    """Raise an error."""
+    raise error

@@ -12,8 +12,9 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages, stage_in
 from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
-from clpipe.engine.options import DEFAULTS, RunOptions
-from clpipe.engine.runner import Runner, submit_batch
+from clpipe.engine.options import RunOptions
+from clpipe.engine.runner import Runner
+from clpipe.engine.service import Frame, Service
 from clpipe.engine.state import State, has_state
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.stage import PERIOD, Kind, Method, Stage, StageRole, variant_label, variants
@@ -278,15 +279,14 @@ def check_stack(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Che
 
     The results must equal those of separate launches, bit for bit.
     """
-    total, images, separate = Difference(), [], []
+    total, frames, separate = Difference(), [], []
     for seed, size in enumerate(sizes):
         chain = make_chain(Settings(iso=ISO + 100 * seed, parameters=sensor_parameters()))
         image = example(chain.source, size, half=True, seed=seed)
-        runner = Runner(chain, device, final=True)
-        separate.append(runner.run(image, "check").final)
-        images.append((runner, image, "check", DEFAULTS))
-    for wait, expected in zip(submit_batch(images), separate, strict=True):
-        total += difference(wait().final, expected)
+        separate.append(Runner(chain, device, final=True).run(image, "check").final)
+        frames.append(Frame(chain, image, "check", final=True))
+    for development, expected in zip(Service([device]).develop(frames), separate, strict=True):
+        total += difference(development.result().final, expected)
     return Check("exposure..gamma", "common launches", len(sizes), total, 0.0)
 
 

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -41,7 +42,7 @@ log = logging.getLogger(__name__)
 class Device:
     """An open device with its queue, compiled kernels and buffers, which images share.
 
-    Only one thread may use it at a time. Several devices may run at once, each in its own thread.
+    Several threads may use it, one after the other.
 
     Args:
         info: the device to open.
@@ -58,6 +59,7 @@ class Device:
         self.info = info
         self.memory = memory or usable_memory(info)
         self._cl = cl
+        self._lock = threading.RLock()  # lets one thread use the flow
         self._process = os.getpid()
         self._recovery = Recovery(self)
         self._open()
@@ -95,8 +97,9 @@ class Device:
 
     def limit_memory(self, memory: int) -> None:
         """Limit the device's buffers to ``memory`` bytes. No image may be in flight."""
-        self.memory = memory
-        self._recovery.abandon()
+        with self._lock:
+            self.memory = memory
+            self._recovery.abandon()
 
     @property
     def depth(self) -> int:
@@ -124,6 +127,15 @@ class Device:
             DeviceError: a kernel does not compile, or the process was forked.
         """
         self.check_process()
+        with self._lock:
+            waits = self._submit(works)
+        return [partial(self._locked, waits[work]) for work in works]
+
+    def _locked(self, wait: Callable[[], R]) -> R:
+        with self._lock:
+            return wait()
+
+    def _submit(self, works: Sequence[Work[R]]) -> dict[Work[R], Callable[[], R]]:
         groups: dict[Any, list[Work[R]]] = {}
         for work in works:
             key = work if work.is_for_itself else work.plan.unscaled
@@ -133,7 +145,7 @@ class Device:
             flight = self.enqueue(group, self.memory)
             for work in group:
                 waits[work] = self._recovery.wait(work, flight)
-        return [waits[work] for work in works]
+        return waits
 
     def can_stack(self, width: int, height: int) -> bool:
         """Return whether images of this size share launches, :data:`MIN_MEMBERS` or more."""
@@ -197,7 +209,8 @@ class Device:
 
     def drain(self) -> None:
         """Wait for all enqueued commands, so that none of them uses the host's memory any more."""
-        self.flow.drain()
+        with self._lock:
+            self.flow.drain()
 
     def tiling(self, work: Work[Any], memory: int) -> Tiling:
         """Return the tiles of an image for a limit of ``memory`` bytes.

@@ -21,7 +21,7 @@ from clpipe.stage import (
 )
 
 
-class Frame(Enum):
+class FrameKind(Enum):
     """Which frame of a sequence an image is."""
 
     SINGLE = "it belongs to no sequence"
@@ -71,7 +71,9 @@ class Op:
 
 
 def chain_ops(
-    chain: Chain, arguments: Mapping[str, Mapping[str, Argument]], frame: Frame = Frame.SINGLE
+    chain: Chain,
+    arguments: Mapping[str, Mapping[str, Argument]],
+    frame: FrameKind = FrameKind.SINGLE,
 ) -> tuple[tuple[str, tuple[Op, ...]], ...]:
     """Return each step's name and passes. Chains with the same passes share a plan.
 
@@ -85,7 +87,7 @@ def chain_ops(
     for step in chain.steps:
         step_arguments = arguments[step.name]
         ops = ops_of(step, step_arguments)
-        if frame is not Frame.LATER and any(op.has_state for op in ops):
+        if frame is not FrameKind.LATER and any(op.has_state for op in ops):
             ops = ()
         if ops:
             if last and undoes(ops[0].pass_, step_arguments, last.pass_, arguments[last.step]):

@@ -23,7 +23,7 @@ from clpipe.engine.ir import (
     Read,
     Reduce,
 )
-from clpipe.engine.ops import Frame, Op, chain_ops
+from clpipe.engine.ops import FrameKind, Op, chain_ops
 from clpipe.engine.slots import assign_slots
 from clpipe.reference.resample import Resampler
 from clpipe.stage import (
@@ -193,7 +193,7 @@ def make_plan(
     fold: bool = True,
     planar: bool = False,
     cpu: Cpu | None = None,
-    frame: Frame = Frame.SINGLE,
+    frame: FrameKind = FrameKind.SINGLE,
 ) -> Plan:
     """Return the plan of a chain.
 
@@ -225,13 +225,13 @@ def make_plan(
     kept: dict[str, Image] = {}
     states: list[tuple[str, Image | None, Image]] = []
     arguments = chain.arguments
-    later = chain_ops(chain, arguments, Frame.LATER)
+    later = chain_ops(chain, arguments, FrameKind.LATER)
     with_state = {name for name, ops in later if any(op.has_state for op in ops)}
     for name, ops in chain_ops(chain, arguments, frame):
         array = arrays[name]
         planner.period = array.period if array and array.needs_border else None
         planner.add_step(ops)
-        if name in with_state and frame is not Frame.SINGLE:
+        if name in with_state and frame is not FrameKind.SINGLE:
             states.append((name, planner.previous.get(name), planner.keep()))
         if name in keep and name != last:
             kept[name] = planner.keep()
@@ -253,7 +253,7 @@ def make_plan(
     slots, count = assign_slots(launches, planner.images, pinned, before)
     stencils = [op for x in launches if isinstance(x, Launch) for op in x.ops]
     # The frames of a sequence have planes of the same layout.
-    stencils += [op for _, ops in later for op in ops if frame is Frame.FIRST]
+    stencils += [op for _, ops in later for op in ops if frame is FrameKind.FIRST]
     border = max((op.radius for op in stencils), default=0)
     return Plan(
         source=chain.source,

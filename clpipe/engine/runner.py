@@ -3,10 +3,12 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from clpipe.base.cache import BoundedCache, Identity
+from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain
@@ -16,7 +18,7 @@ from clpipe.engine.buffers import HostImages, allocate_results, crop_patches, is
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box, whole_image
 from clpipe.engine.ir import Plan
-from clpipe.engine.ops import Frame, chain_ops
+from clpipe.engine.ops import FrameKind, chain_ops
 from clpipe.engine.options import DEFAULTS, RunOptions
 from clpipe.engine.patches import check_sizes
 from clpipe.engine.plan import make_plan
@@ -25,6 +27,12 @@ from clpipe.engine.values import binding, size_estimates
 from clpipe.engine.work import Work
 from clpipe.reference.curve import to_8_bit
 from clpipe.stage import NoiseScope, ReferenceContext
+
+# Plans of chains, by what they depend on. Chains that differ only in run-time values share a plan,
+# so they are neither planned nor compiled again.
+PLANS: BoundedCache[Plan] = BoundedCache(512)
+# The plans of chains that share no structure.
+UNSHARED: WeakKeyDictionary[Chain, dict[Any, Plan]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
@@ -110,30 +118,13 @@ class Runner:
         self.encode = encode
         self.final = final
         self.bands = bands
-        self._arguments = chain.arguments
         self._exposures = exposures_of(chain)
-        # Shared with the runners of other chains, by a chain's structure.
-        self._plans: BoundedCache[Plan] = BoundedCache(256)
-        self._tables: BoundedCache[Array] = BoundedCache(32)
-
-    def for_chain(self, chain: Chain) -> "Runner":
-        """Return a runner for another chain that shares plans and tables with this one.
-
-        A chain that differs only in run-time values is neither planned nor compiled again.
-        """
-        results = self.keep, self.encode, self.final
-        other = Runner(chain, self.device, *results, self.bands)
-        other._plans, other._tables = self._plans, self._tables
-        return other
 
     @cached_property
     def _exposure_runners(self) -> list["Runner"]:
         """The runners of all exposures but the first, up to the step that merges them."""
         chains = self._exposures.later if self._exposures else ()
-        runners = [Runner(chain, self.device, encode=False, final=True) for chain in chains]
-        for runner in runners:
-            runner._plans = self._plans
-        return runners
+        return [Runner(chain, self.device, encode=False, final=True) for chain in chains]
 
     def plan(
         self,
@@ -141,7 +132,7 @@ class Runner:
         fold: bool = True,
         planar: bool = False,
         bands: bool = True,
-        frame: Frame = Frame.SINGLE,
+        frame: FrameKind = FrameKind.SINGLE,
     ) -> Plan:
         """Return the plan for a float16 or float32 source, interleaved or in planes.
 
@@ -149,20 +140,22 @@ class Runner:
         """
         bands &= self.bands
         cpu = self.device.info.cpu if self.device and bands else None
-        chain, key = self.chain, (half, fold, planar, cpu, frame)
+        chain, results = self.chain, (self.keep, self.encode, self.final)
+        key = *results, half, fold, planar, cpu, frame
 
         def plan() -> Plan:
-            ops = chain_ops(chain, self._arguments, Frame.LATER)
+            ops = chain_ops(chain, chain.arguments, FrameKind.LATER)
             structure = (*key, chain.source, chain.result, ops)
-            results = self.keep, self.encode, self.final
             options = chain, half, *results, fold, planar, cpu, frame
-            return self._plans.get(structure, lambda: make_plan(*options))
+            return PLANS.get(structure, lambda: make_plan(*options))
 
-        return self._plans.get(
-            (*key, Identity(chain if chain.structure is None else chain.structure)), plan
-        )
+        known = UNSHARED.setdefault(chain, {}) if chain.structure is None else chain.structure
+        if key not in known:
+            known[key] = plan()
+        found: Plan = known[key]
+        return found
 
-    def plan_for(self, image: Array, frame: Frame = Frame.SINGLE) -> Plan:
+    def plan_for(self, image: Array, frame: FrameKind = FrameKind.SINGLE) -> Plan:
         """Return the plan for an image."""
         size = image.shape[1::-1]
         options = image.dtype == np.float16, min(self.chain.size(*size)) > 1, is_planar(image)
@@ -172,11 +165,11 @@ class Runner:
     def _plan_for_frame(self, image: Array, state: State) -> Plan:
         """Return the plan for the next frame of a sequence."""
         assert self.device
-        plan = self.plan_for(image, Frame.LATER)
+        plan = self.plan_for(image, FrameKind.LATER)
         width, height = image.shape[1::-1]
         extents = whole_image(plan, width, height, self.device.info.lanes)
         is_first = state.is_first(plan, extents)
-        return self.plan_for(image, Frame.FIRST) if is_first else plan
+        return self.plan_for(image, FrameKind.FIRST) if is_first else plan
 
     def compile(self, half: bool = True) -> None:
         """Compile all kernels, so that the first image does not wait for the compiler.
@@ -209,13 +202,9 @@ class Runner:
             self.device.submit([self._work(plan, tiny, "", DEFAULTS)])[0]()
 
     def run(self, image: Array, noise_key: str, options: RunOptions = DEFAULTS) -> Result:
-        """Run the chain on one image, and return the result. See :meth:`submit`."""
-        return self.submit(image, noise_key, options)()
+        """Run the chain on one image, and return the result.
 
-    def submit(
-        self, image: Array, noise_key: str, options: RunOptions = DEFAULTS
-    ) -> Callable[[], Result]:
-        """Enqueue one image; see :meth:`clpipe.engine.device.Device.submit`.
+        Other code than tests and benchmarks uses :class:`clpipe.engine.service.Service`.
 
         Args:
             image: (height, width, 3) linear RGB, or (height, width) for a chain that starts on a
@@ -224,15 +213,16 @@ class Runner:
                 :func:`clpipe.chain.identity.noise_key`.
             options: the options of the run.
 
-        Returns:
-            A callable that waits for the result and returns it. It raises the same errors.
-
         Raises:
             ImageError: the image has the wrong shape, or does not fit into the device's memory.
             DeviceFailedError: the device failed for this image.
             DeviceError: a kernel does not compile, or the device failed for too many images.
         """
-        return submit_batch([(self, image, noise_key, options)])[0]
+        work = self.work(image, noise_key, options)
+        if isinstance(work, Work):
+            assert self.device
+            return self.device.submit([work])[0]()
+        return work()
 
     def work(
         self, image: Array, noise_key: str, options: RunOptions = DEFAULTS
@@ -240,7 +230,7 @@ class Runner:
         """Return the work of one image for :meth:`clpipe.engine.device.Device.submit`.
 
         This call already runs all exposures but the first. Arguments and errors are those of
-        :meth:`submit`.
+        :meth:`run`.
 
         Returns:
             The work; if no device is needed, a callable that returns the result.
@@ -275,7 +265,7 @@ class Runner:
         return Work(
             plan,
             image,
-            binding(self.chain, plan, (width, height), noise_key, self._tables),
+            binding(self.chain, plan, (width, height), noise_key),
             allocate_results(plan, width, height, options.into, options.boxes),
             options,
             partial(self._result, plan, size_estimates(self.chain, width, height)),
@@ -295,7 +285,7 @@ class Runner:
             The runner; this one if the chain has only one exposure.
 
         Raises:
-            ImageError, DeviceFailedError, DeviceError: as for :meth:`submit`.
+            ImageError, DeviceFailedError, DeviceError: as for :meth:`run`.
         """
         if not self._exposures or not (self.encode or self.final or self.keep):
             return self
@@ -305,7 +295,8 @@ class Runner:
             strict=True,
         )
         exposure_images = [runner.run(exposure, noise_key).image for runner, exposure in pairs]
-        return self.for_chain(self._exposures.merge_chain(exposure_images))
+        merged = self._exposures.merge_chain(exposure_images)
+        return Runner(merged, self.device, self.keep, self.encode, self.final, self.bands)
 
     def check(self, image: Array) -> None:
         """Check that an image has the shape that the chain starts on.
@@ -363,25 +354,3 @@ class Runner:
             estimates=estimates,
         )
         return result.cropped(options.boxes) if options.boxes else result
-
-
-def submit_batch(
-    images: Sequence[tuple[Runner, Array, str, RunOptions]],
-) -> list[Callable[[], Result]]:
-    """Enqueue images. Small images of similar chains share launches.
-
-    Args:
-        images: for each image, its runner and the arguments of :meth:`Runner.submit`. All runners
-            must use one device.
-
-    Returns:
-        For each image, a callable that waits for its result and returns it. Call each once, in
-        order.
-
-    Raises:
-        ImageError, DeviceFailedError, DeviceError: as for :meth:`Runner.submit`.
-    """
-    works = [runner.work(image, key, options) for runner, image, key, options in images]
-    device = images[0][0].device
-    submitted = iter(device.submit([w for w in works if isinstance(w, Work)]) if device else ())
-    return [next(submitted) if isinstance(work, Work) else work for work in works]

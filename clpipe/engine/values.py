@@ -21,13 +21,14 @@ from clpipe.reference.curve import compose, to_8_bit
 from clpipe.reference.random import Stream
 from clpipe.stage import Method, NoiseScope, Resample
 
+TABLES: BoundedCache[Array] = BoundedCache(32)  # composed curves, by the curves' tables
+
 
 def binding(
     chain: Chain,
     plan: Plan,
     size: tuple[int, int],
     noise_key: str,
-    tables: BoundedCache[Array],
 ) -> Bind:
     """Return a function that returns the values of kernel parameters for one image.
 
@@ -36,7 +37,6 @@ def binding(
         plan: the chain's plan.
         size: width and height of the image in px.
         noise_key: the text from which the noise is seeded.
-        tables: a cache of composed curves, which several chains may share.
     """
     arguments = chain.arguments
     streams: dict[tuple[str, NoiseScope], Stream] = {}
@@ -47,7 +47,7 @@ def binding(
             case ResamplingValue(level, name):
                 return plan.resamplings[level].values(*sizes[level])[name]
             case EncodedCurves(steps):
-                return encoding_table([np.asarray(arguments[s]["table"]) for s in steps], tables)
+                return encoding_table([np.asarray(arguments[s]["table"]) for s in steps])
             case StreamWord(step, scope, word):
                 if (step, scope) not in streams:
                     streams[step, scope] = chain.stream(step, scope, noise_key)
@@ -83,12 +83,10 @@ def size_estimates(chain: Chain, width: int, height: int) -> dict[str, dict[str,
     return found
 
 
-def encoding_table(curves: Sequence[Array], tables: BoundedCache[Array]) -> Array:
+def encoding_table(curves: Sequence[Array]) -> Array:
     """Return one table for curves in a row and the conversion to eight bits.
 
-    Args:
-        curves: the tables of the curves. Equal parameters must give the same table object.
-        tables: the cache of composed tables.
+    ``curves`` are the tables of the curves. Equal parameters must give the same table object.
     """
 
     def composed() -> Array:
@@ -98,4 +96,4 @@ def encoding_table(curves: Sequence[Array], tables: BoundedCache[Array]) -> Arra
             table = compose(curve, table)
         return table
 
-    return tables.get(tuple(map(Identity, curves)), composed)
+    return TABLES.get(tuple(map(Identity, curves)), composed)

@@ -25,7 +25,8 @@ from clpipe.engine.clipping import clipped_share
 from clpipe.engine.device import Device
 from clpipe.engine.ir import AnyLaunch
 from clpipe.engine.options import RunOptions, Timing
-from clpipe.engine.runner import Result, Runner
+from clpipe.engine.runner import Result
+from clpipe.engine.service import Service, picture
 from clpipe.explorer.controls import steps_of
 from clpipe.explorer.file_names import check_file_names, files_in
 from clpipe.explorer.view import UNITS, Sample, View, cut, display_pixels, measurable_part
@@ -34,7 +35,6 @@ from clpipe.images.tags import upright
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.outputs.writer import OutputWriter
-from clpipe.stage import Kind
 
 MAX_SOURCES = 2  # decoded images in memory
 MIN_RESULTS = 3  # results that are always kept
@@ -45,7 +45,7 @@ ALWAYS_RECORDED = ("camera", "iso", "seed", "stages", "skip")  # always in Setti
 class Explorer:
     """Develops the images of a request with any settings, on one device.
 
-    Several threads may use it. One at a time uses the device.
+    Several threads may use it.
 
     Args:
         jobs: the images.
@@ -65,9 +65,9 @@ class Explorer:
         self.jobs = tuple(jobs)
         self.device = device
         self._request = request
-        self._lock = threading.Lock()  # guards the samples and the device
+        self._lock = threading.Lock()  # guards the samples
+        self._service = Service([device])
         self._sources: BoundedCache[SourceImage] = BoundedCache(MAX_SOURCES)
-        self._runners: dict[bool, Runner] = {}
         self._samples: OrderedDict[int, Sample] = OrderedDict()
         self._number = 0
 
@@ -283,17 +283,9 @@ class Explorer:
             chain = chain.up_to([chain.step_named(view.step).name])
         pixels = loaded.source.pixels
         key = noise_key(chain.settings, loaded.key)
-        with self._lock:
-            runner = self._runner(chain)
-            result = runner.run(pixels, key, RunOptions(timings, unchanged=True))
-        return chain, result, runner.plan_for(pixels).launches
-
-    def _runner(self, chain: Chain) -> Runner:
-        """Return a runner of a chain. It shares plans with earlier runners."""
-        encode = chain.result is Kind.DISPLAY
-        if encode not in self._runners:
-            self._runners[encode] = Runner(chain, self.device, (), encode, not encode)
-        return self._runners[encode].for_chain(chain)
+        frame = picture(chain, pixels, key, options=RunOptions(timings, unchanged=True))
+        result = self._service.run(frame)
+        return chain, result, frame.runner(self.device).plan_for(pixels).launches
 
 
 def _steps(settings: Settings, chain: Chain) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -21,10 +21,10 @@ from clpipe.camera.control import AutoIso, ControlLoop
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.identity import noise_key
 from clpipe.chain.photometry import METERED
-from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.options import RunOptions
-from clpipe.engine.runner import Result, Runner
+from clpipe.engine.runner import Result
+from clpipe.engine.service import Frame
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.inputs.manifest import Row, manifest_text
@@ -38,15 +38,6 @@ CORNER = Box(0, 0, 1, 1)
 GAINS = ("red_gain", "blue_gain")  # what estimated white balance estimates
 
 DIGITS = 4  # decimal places of an EV and of a gain
-
-
-T = TypeVar("T")
-
-
-class OnDevice(Protocol):
-    """Runs work on a device, in the thread that may use it, and returns the result."""
-
-    def __call__(self, work: Callable[[Device | None], T], /) -> T: ...
 
 
 @dataclass(frozen=True)
@@ -79,12 +70,11 @@ class Meter:
     the metered values of the frame before. Until a frame is metered, the loops are at 0 EV.
 
     Args:
-        on_device: runs work on the device that meters; None is NumPy.
+        develop: develops a frame, and returns its result.
     """
 
-    def __init__(self, on_device: OnDevice) -> None:
-        self._on_device = on_device
-        self._runners: dict[Device | None, Runner] = {}
+    def __init__(self, develop: Callable[[Frame], Result]) -> None:
+        self._develop = develop
         # Each loop, and the place of the last frame that it followed.
         self._loops: dict[str, tuple[ControlLoop, float]] = {}
         self._iso: AutoIso | None = None
@@ -104,7 +94,7 @@ class Meter:
 
         Args:
             chain: the chain of the frame.
-            image: the frame, as for :meth:`clpipe.engine.runner.Runner.run`.
+            image: the frame, as for :class:`~clpipe.engine.service.Frame`.
             image_key: the key of its noise.
             place: its place in the sequence, in frames.
             chain_of: returns the chain of the frame with further settings.
@@ -168,24 +158,17 @@ class Meter:
         """Return the numbers that a step estimates from a frame.
 
         Raises:
-            ImageError, DeviceError: as for :meth:`clpipe.engine.runner.Runner.run`.
+            ImageError, DeviceError: as for :class:`~clpipe.engine.service.Development`.
         """
         part, key = chain.up_to([step.name]), noise_key(chain.settings, image_key)
-
-        def run(device: Device | None) -> Result:
-            known = self._runners.get(device)
-            runner = known.for_chain(part) if known else Runner(part, device)
-            self._runners[device] = runner
-            # The picture itself is not needed.
-            return runner.run(image, key, RunOptions(boxes=[CORNER]))
-
-        return self._on_device(run).estimates[step.name]
+        options = RunOptions(boxes=[CORNER])  # the picture itself is not needed
+        return self._develop(Frame(part, image, key, options=options)).estimates[step.name]
 
 
 def metered_jobs(
     loader: ImageLoader,
     jobs: Iterable[Job],
-    on_device: OnDevice,
+    develop: Callable[[Frame], Result],
     load: Callable[[ImageLoader, Job], LoadedImage],
 ) -> Iterator[Job]:
     """Yield the frames of sequences with the settings of their sequence.
@@ -197,11 +180,11 @@ def metered_jobs(
         loader: the loader of the run.
         jobs: the frames, each with its place, in the order of
             :func:`~clpipe.inputs.sequences.in_sequences`.
-        on_device: as for :class:`Meter`.
+        develop: as for :class:`Meter`.
         load: loads a frame that is metered, with its own loader.
     """
     for _, frames in groupby(jobs, key=sequence_of):
-        meter = Meter(on_device)
+        meter = Meter(develop)
         for job in frames:
             drawn = job
             values: Mapping[str, Any] = {}

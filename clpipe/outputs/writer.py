@@ -12,8 +12,7 @@ from clpipe.base.files import Stored, sync_folder
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.formats import DNG, FORMATS, NPY, Format, extension_of
-from clpipe.engine.device import Device
-from clpipe.engine.runner import Result, Runner
+from clpipe.engine.runner import Result
 from clpipe.images.dng import write_dng
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import Tags, from_attributes, orientation_of, upright
@@ -38,13 +37,18 @@ from clpipe.stage import Kind
 class OutputWriter(OutputPlan):
     """Writes the pictures of a request to a folder."""
 
-    def runner(self, recipe: Recipe, device: Device | None) -> Runner:
-        """Return a runner that computes only what the files of a rendition require."""
+    def results(self, recipe: Recipe) -> tuple[tuple[str, ...], bool, bool]:
+        """Return the results that the files of a rendition require.
+
+        Returns:
+            The steps whose images are required, whether the last image is required in 8 bits, and
+            whether it is required in floats.
+        """
         formats, keep = self.formats_of(recipe.rendition), self.kept_steps(recipe.rendition)
         steps, encode, final = required_results(recipe.chain, formats, keep)
         # The noise of baselines is measured on the final picture.
         final |= bool(self.request.baselines)
-        return Runner(recipe.chain, device, steps, encode, final)
+        return steps, encode, final
 
     def check_size(self, source: SourceImage, chain: Chain) -> None:
         """Check that the picture of an image fits into the formats.

@@ -17,7 +17,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.device import Device
-from clpipe.engine.runner import Runner
+from clpipe.engine.service import Service, picture
 from clpipe.images.write import write_png
 from clpipe.stage import StageRole
 
@@ -81,21 +81,18 @@ def simulate(
     efficiency = sensor.quantum_efficiency or 1.0
     series = _plan_exposures(text, sensor, saturation_of(sensor, settings.iso) / efficiency, size)
     photon = sensor.signal_of(efficiency, settings.iso)
-    runner: Runner | None = None
+    service = Service([device])
     exposures = (*series.bright, *series.dark, series.bright_stack, series.dark_stack)
     total, done = sum(len(each.frames) for each in exposures), 0
     samples = np.uint8 if series.bits <= 8 else np.uint16
     first, last = (stage_in(role).name for role in (StageRole.SENSOR, StageRole.RAW))
     for exposure in exposures:
         chain = make_chain(_simulate_exposure(settings, exposure), start_at=first, until=last)
-        runner = (
-            runner.for_chain(chain) if runner else Runner(chain, device, encode=False, final=True)
-        )
         light = np.full((size.height, size.width), photon * exposure.photons, np.float32)
         for frame in exposure.frames:
             key = noise_key(settings, image_key(frame.relative_to(folder).as_posix(), ""))
             create_parents(frame)
-            write_png(frame, runner.run(light, key).image.astype(samples))
+            write_png(frame, service.run(picture(chain, light, key)).image.astype(samples))
             done += 1
             watch(done, total)
     comment = f"A series of the camera {sensor.name} at ISO {settings.iso:g}, made by clpipe emva."

@@ -1,7 +1,6 @@
 """Develops a scene: converts the camera's picture to linear light, and runs a chain on it."""
 
 import math
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -17,10 +16,12 @@ from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
-from clpipe.engine.runner import Runner
+from clpipe.engine.options import RunOptions
+from clpipe.engine.service import Frame, Service
 from clpipe.images.jpeg import jpeg_round_trip
 from clpipe.stage import Kind, Method, ReferenceContext, StageRole
 
+SAME = RunOptions(unchanged=True)  # all frames have one render, which is uploaded once
 LINEAR = 16  # linear-light scenes that are cached for one tone curve
 # Stages that have already been applied to a picture.
 SEEN = (StageRole.SHUTTER, StageRole.LENS, StageRole.FALLOFF)
@@ -35,9 +36,7 @@ class Simulator:
 
     def __init__(self, device: Device | None) -> None:
         self.device = device
-        self._lock = threading.Lock()  # lets one thread use the device and its runners
-        self._noisy: Runner | None = None  # shares plans with all runners of noisy chains
-        self._quiet: Runner | None = None
+        self._service = Service([device])
         self._linear = BoundedCache[Floats](LINEAR)
 
     def noise(self, settings: Settings, scene: Scene, key: str, count: int | None = None) -> Noise:
@@ -55,14 +54,11 @@ class Simulator:
         seen = [name for name in settings.step_names if all_stages()[base_name(name)].role in SEEN]
         chain = make_chain(replace(settings, skip=(*settings.skip, *seen)))
         keys = [f"{key}:{scene.name}:{number}" for number in range(count or len(scene.frames))]
-        with self._lock:
-            linear = self._linear_light(chain, scene)
-            self._noisy = (self._noisy or Runner(chain, self.device)).for_chain(chain)
-            pictures = [self._noisy.run(linear, name).encoded for name in keys]
-            if not scene.own_mean:
-                clean = chain.without_noise()
-                self._quiet = (self._quiet or Runner(clean, self.device)).for_chain(clean)
-                pictures.append(self._quiet.run(linear, "").encoded)
+        linear = self._linear_light(chain, scene)
+        ordered = [Frame(chain, linear, name, options=SAME) for name in keys]
+        if not scene.own_mean:
+            ordered.append(Frame(chain.without_noise(), linear, "", options=SAME))
+        pictures = [each.result().encoded for each in self._service.develop(ordered)]
         frames = [finished(picture, scene) for picture in pictures]
         mean = None if scene.own_mean else frames.pop()
         return noise_of_frames(frames, mean, scene.noise.level)

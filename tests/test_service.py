@@ -1,0 +1,178 @@
+"""The service: frames of any thread and kind give the results that each gives alone."""
+
+import gc
+import multiprocessing
+import threading
+import weakref
+
+import numpy as np
+import pytest
+
+from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
+from clpipe.chain.making import make_chain
+from clpipe.chain.settings import settings_from
+from clpipe.engine.check import example
+from clpipe.engine.device import Device
+from clpipe.engine.options import RunOptions
+from clpipe.engine.runner import Runner
+from clpipe.engine.service import Frame, Service, picture
+from clpipe.stage import Kind
+
+SIZES = [(24, 32), (1, 40), (40, 1), (37, 53), (24, 32), (700, 900)]
+GUARD = 60  # s
+
+
+def frames(settings=(), sizes=SIZES):
+    """Return frames of several sizes, each with an ISO of its own."""
+    return [
+        picture(
+            make_chain(settings_from({**dict(settings), "iso": 200 * (number + 1)})),
+            example(Kind.RGB, size, half=True, seed=number),
+            f"key {number}",
+            ("normalize",),
+        )
+        for number, size in enumerate(sizes)
+    ]
+
+
+def alone(frame, device):
+    return frame.runner(device).run(frame.pixels, frame.noise_key, frame.options)
+
+
+def same(one, two):
+    assert np.array_equal(one.image, two.image)
+    assert one.kept.keys() == two.kept.keys()
+    assert all(np.array_equal(one.kept[name], two.kept[name]) for name in one.kept)
+
+
+def test_frames_of_several_threads_have_the_results_that_each_has_alone(device):
+    service, ordered, found = Service([device]), frames(), {}
+    expected = [alone(frame, device) for frame in ordered]
+
+    def ask(first):
+        developments = service.develop(ordered[first::2])
+        found[first] = [each.result(GUARD) for each in developments]
+
+    threads = [threading.Thread(target=ask, args=(first,)) for first in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for first, results in found.items():
+        for result, other in zip(results, expected[first::2], strict=True):
+            same(result, other)
+
+
+@pytest.mark.parametrize("numpy", [False, True])
+def test_a_frame_that_fails_does_not_disturb_those_with_it(device, numpy):
+    on = None if numpy else device
+    ordered = frames(sizes=SIZES[:4])
+    ordered[1] = picture(ordered[1].chain, np.zeros((8, 8, 5), np.float32), "five channels")
+    wrong, *right = [Service([on]).develop(ordered)[n] for n in (1, 0, 2, 3)]
+    with pytest.raises(ImageError, match=r"shape \(8, 8, 5\)"):
+        wrong.result(GUARD)
+    for development, number in zip(right, (0, 2, 3), strict=True):
+        same(development.result(GUARD), alone(ordered[number], on))
+
+
+def test_an_image_that_does_not_fit_fails_alone(device):
+    large = example(Kind.RGB, (600, 800), half=True, seed=0)
+    small = frames(sizes=[(8, 8), (8, 9)])
+    gray = make_chain(settings_from({"white_balance": {"method": "gray_world"}}))
+    on = Device(device.info, memory=600_000)
+    tall = Frame(gray, large, "", options=RunOptions(boxes=[*[_box(500)]]))
+    first, second, third = Service([on]).develop([small[0], tall, small[1]])
+    with pytest.raises(ImageError, match="memory"):
+        second.result(GUARD)
+    same(first.result(GUARD), alone(small[0], device))
+    same(third.result(GUARD), alone(small[1], device))
+
+
+def _box(size):
+    from clpipe.engine.extents import Box
+
+    return Box(0, 0, size, size)
+
+
+class Broken(Device):
+    """A device that fails for every image."""
+
+    def submit(self, works):
+        raise DeviceError("it is given up")
+
+
+def test_another_device_takes_over(device, caplog):
+    service = Service([Broken(device.info), device])
+    ordered = frames()
+    for _ in range(2):
+        for development, frame in zip(service.develop(ordered), ordered, strict=True):
+            same(development.result(GUARD), alone(frame, device))
+    assert caplog.text.count("it is given up; the other devices go on") <= 1
+
+
+def test_the_last_device_fails_its_frames_and_tries_the_next(device):
+    on = Broken(device.info)
+    service, (frame, *_) = Service([on]), frames()
+    for _ in range(2):
+        with pytest.raises(DeviceError, match="it is given up"):
+            service.run(frame)
+    on.submit = device.submit
+    same(service.run(frame), alone(frame, device))
+
+
+def test_nothing_is_developed_on_a_device_that_cannot_be_prepared():
+    def prepare(device):
+        raise DeviceFailedError("no kernels")
+
+    service, (frame, *_) = Service([None], prepare), frames()
+    for _ in range(2):
+        with pytest.raises(DeviceFailedError, match="no kernels"):
+            service.develop([frame])[0].result(GUARD)
+    service.close()
+
+
+def test_no_frame_follows_the_end(device):
+    service, ordered = Service([device]), frames()
+    assert service.develop([]) == []
+    developments = service.develop(ordered)
+    service.close()
+    assert all(each.done() for each in developments)
+    with pytest.raises(ImageError, match="the run ended before this image was developed"):
+        service.run(ordered[0])
+    service.close()
+
+
+def test_its_thread_ends_with_it():
+    service = Service([None])
+    service.run(frames()[0])
+    (thread,) = [each for each in threading.enumerate() if each in service._threads]
+    gone = weakref.ref(service)
+    del service
+    gc.collect()
+    thread.join(GUARD)
+    assert gone() is None and not thread.is_alive()
+
+
+def results_in(service, frame, queue):
+    queue.put(service.run(frame).image)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_numpy_serves_a_fork(device):
+    service, (frame, *_) = Service([None]), frames()
+    expected = service.run(frame).image
+    context = multiprocessing.get_context("fork")
+    queue = context.SimpleQueue()
+    process = context.Process(target=results_in, args=(service, frame, queue))
+    process.start()
+    assert np.array_equal(queue.get(), expected)
+    process.join(GUARD)
+    assert process.exitcode == 0
+
+
+def test_plans_are_shared_by_structure(device):
+    iso = [make_chain(settings_from({"iso": number})) for number in (100, 3200)]
+    one, two = (Runner(chain, device).plan() for chain in iso)
+    assert one is two
+    assert Runner(iso[0], device, ("normalize",)).plan() is not one
+    assert Runner(iso[0], None).plan() is not one  # no bands
