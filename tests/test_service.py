@@ -113,9 +113,9 @@ def test_another_device_takes_over(device, caplog):
 def test_the_last_device_fails_its_frames_and_tries_the_next(device):
     on = Broken(device.info)
     service, (frame, *_) = Service([on]), frames()
-    for _ in range(2):
+    for develop in (service.run, lambda each: service.develop([each])[0].result(GUARD)) * 2:
         with pytest.raises(DeviceError, match="it is given up"):
-            service.run(frame)
+            develop(frame)
     on.submit = device.submit
     same(service.run(frame), alone(frame, device))
 
@@ -144,7 +144,7 @@ def test_no_frame_follows_the_end(device):
 
 def test_its_thread_ends_with_it():
     service = Service([None])
-    service.run(frames()[0])
+    service.develop(frames()[:1])[0].result(GUARD)
     (thread,) = [each for each in threading.enumerate() if each in service._threads]
     gone = weakref.ref(service)
     del service
@@ -154,13 +154,14 @@ def test_its_thread_ends_with_it():
 
 
 def results_in(service, frame, queue):
-    queue.put(service.run(frame).image)
+    (development,) = service.develop([frame])
+    queue.put(development.result(GUARD).image)
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_numpy_serves_a_fork(device):
     service, (frame, *_) = Service([None]), frames()
-    expected = service.run(frame).image
+    expected = service.develop([frame])[0].result(GUARD).image
     context = multiprocessing.get_context("fork")
     queue = context.SimpleQueue()
     process = context.Process(target=results_in, args=(service, frame, queue))

@@ -182,10 +182,16 @@ class Service:
     def run(self, frame: Frame) -> Result:
         """Develop one frame, and return its result.
 
+        A single device that needs no preparation is used in the caller's thread. For a frame of
+        128x128 pixels, another thread would take a tenth longer.
+
         Raises:
             ImageError, RequestError, DeviceError, RuntimeError: it cannot be developed.
         """
-        return self.develop([frame])[0].result()
+        device, *others = self.devices
+        if others or self._is_closed or self._prepare is not no_preparation:
+            return self.develop([frame])[0].result()
+        return frame.runner(device).run(frame.pixels, frame.noise_key, frame.options)
 
     def close(self) -> None:
         """Finish all frames, and accept no others."""
