@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from clpipe.base.cache import cached_hash
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, Step, cached_by_structure
@@ -22,6 +23,7 @@ from clpipe.stage import Kind
 Sample = dict[str, Any]
 
 
+@cached_hash
 @dataclass(frozen=True)
 class SampleSpec:
     """The contents of a sample.
