@@ -14,7 +14,9 @@ from click.testing import CliRunner
 
 import clpipe
 from clpipe.batch.session import Run
+from clpipe.chain.making import make_chain
 from clpipe.chain.registry import load_stage_file
+from clpipe.chain.settings import settings_from
 from clpipe.commands.main import main
 from clpipe.engine.check import check_method
 from clpipe.engine.device import Device
@@ -41,6 +43,28 @@ def test_the_example_stage_works(device, tmp_path, monkeypatch):
         result = check_method(any_device, stage, stage.methods[0])
         assert result.difference.samples > 1000
         assert result.passed, result
+
+
+def test_its_numbers_are_recorded_whatever_numpy_computes(tmp_path, monkeypatch):
+    """Chains of drawn values share one structure, and have the values of chains without draws."""
+    monkeypatch.setattr("clpipe.chain.registry._from_files", {})
+    (tmp_path / "vignette.cl").write_text(block("c"))
+    text = block("python").replace("self.focal_length**-2", "1 / np.sqrt(self.focal_length**4)")
+    assert "np.sqrt" in text
+    (tmp_path / "vignette.py").write_text(text)
+    load_stage_file(tmp_path / "vignette.py")
+    values = {
+        "stages": ["exposure", "vignette"],
+        "vignette": {"focal_length": {"uniform": [9, 99]}},
+    }
+    drawn = [make_chain(settings_from(values).drawn(key)) for key in "abcdef"]
+    assert len({id(chain.structure) for chain in drawn[2:]}) == 1
+    assert drawn[-1].structure is not None
+    for chain in drawn:
+        focal_length = chain.step_named("vignette").method.focal_length
+        scale = chain.arguments["vignette"]["scale"]
+        assert scale == np.float32(1 / np.sqrt(focal_length**4))
+        assert type(scale) is np.float32
 
 
 @pytest.mark.slow

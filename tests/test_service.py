@@ -13,6 +13,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.check import example
 from clpipe.engine.device import Device
+from clpipe.engine.ops import chain_ops
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Runner
 from clpipe.engine.service import Frame, Service, picture
@@ -177,3 +178,16 @@ def test_plans_are_shared_by_structure(device):
     assert one is two
     assert Runner(iso[0], device, ("normalize",)).plan() is not one
     assert Runner(iso[0], None).plan() is not one  # no bands
+    # Borders of a mosaic are filled by its period, which no pass contains.
+    settings = {"stages": ["mosaic", "remosaic"], "remosaic": {"method": "linear_mmse"}}
+    arrays = [
+        make_chain(
+            settings_from({**settings, "mosaic": {"method": "array", "array": array}}),
+            start_at="remosaic",
+        )
+        for array in ("RGB/GBR/BRG", "x-trans")
+    ]
+    passes = [chain_ops(chain, chain.arguments) for chain in arrays]
+    assert passes[0] == passes[1]
+    wide, narrow = (Runner(chain, None, encode=False, final=True).plan() for chain in arrays)
+    assert wide is not narrow

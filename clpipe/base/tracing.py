@@ -6,12 +6,11 @@ precision, without the surrounding code. If a guard fails, the code would have t
 so it must be traced again. PyTorch's Dynamo and JAX work in the same way.
 """
 
-import math
 import operator
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial, wraps
+from functools import partial
 from types import FunctionType, MethodType
 from typing import Any, TypeVar
 
@@ -142,27 +141,6 @@ def call(function: Callable[..., Any], *arguments: Any) -> Any:
     if not isinstance(result, tuple):
         return number
     return tuple(call(operator.getitem, number, place) for place in range(len(result)))
-
-
-def traceable(function: Callable[..., T]) -> Callable[..., T]:
-    """Decorate a pure function of numbers, so that it is traced as a whole; see :func:`call`.
-
-    >>> traceable(math.hypot)(3.0, 4.0)
-    5.0
-    """
-
-    @wraps(function)
-    def traced(*arguments: Any) -> T:
-        result: T = call(function, *arguments)
-        return result
-
-    return traced
-
-
-float32 = traceable(np.float32)
-int32 = traceable(np.int32)
-hypot = traceable(math.hypot)
-sqrt = traceable(math.sqrt)
 
 
 class Trace:

@@ -97,6 +97,12 @@ def chain_ops(
     return tuple(steps)
 
 
+def border_periods(chain: Chain) -> dict[str, tuple[int, int] | None]:
+    """Return the period of each step's mosaic, if borders must be filled by it."""
+    arrays = {step.name: step.context.array for step in chain.steps}
+    return {n: a.period if a and a.needs_border else None for n, a in arrays.items()}
+
+
 def undoes(
     pass_: Pass,
     arguments: Mapping[str, Argument],

@@ -23,7 +23,7 @@ from clpipe.engine.ir import (
     Read,
     Reduce,
 )
-from clpipe.engine.ops import FrameKind, Op, chain_ops
+from clpipe.engine.ops import FrameKind, Op, border_periods, chain_ops
 from clpipe.engine.slots import assign_slots
 from clpipe.reference.resample import Resampler
 from clpipe.stage import (
@@ -221,15 +221,14 @@ def make_plan(
     last = chain.steps[-1].name
     final = final or last in keep
     planner = _Planner(chain.source, fold)
-    arrays = {step.name: step.context.array for step in chain.steps}
+    periods = border_periods(chain)
     kept: dict[str, Image] = {}
     states: list[tuple[str, Image | None, Image]] = []
     arguments = chain.arguments
     later = chain_ops(chain, arguments, FrameKind.LATER)
     with_state = {name for name, ops in later if any(op.has_state for op in ops)}
     for name, ops in chain_ops(chain, arguments, frame):
-        array = arrays[name]
-        planner.period = array.period if array and array.needs_border else None
+        planner.period = periods[name]
         planner.add_step(ops)
         if name in with_state and frame is not FrameKind.SINGLE:
             states.append((name, planner.previous.get(name), planner.keep()))

@@ -18,7 +18,7 @@ from clpipe.engine.buffers import HostImages, allocate_results, crop_patches, is
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box, whole_image
 from clpipe.engine.ir import Plan
-from clpipe.engine.ops import FrameKind, chain_ops
+from clpipe.engine.ops import FrameKind, border_periods, chain_ops
 from clpipe.engine.options import DEFAULTS, RunOptions
 from clpipe.engine.patches import check_sizes
 from clpipe.engine.plan import make_plan
@@ -145,7 +145,8 @@ class Runner:
 
         def plan() -> Plan:
             ops = chain_ops(chain, chain.arguments, FrameKind.LATER)
-            structure = (*key, chain.source, chain.result, ops)
+            periods = tuple(border_periods(chain).values())
+            structure = (*key, chain.source, chain.result, ops, periods)
             options = chain, half, *results, fold, planar, cpu, frame
             return PLANS.get(structure, lambda: make_plan(*options))
 

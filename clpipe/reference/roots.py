@@ -7,7 +7,7 @@ close to a root. The offset, in signal units, keeps the slope of the root finite
 
 import numpy as np
 
-from clpipe.base.tracing import traceable
+from clpipe.base.numbers import pure
 from clpipe.base.types import Floats
 
 
@@ -41,7 +41,7 @@ def in_steps(root: Floats) -> Floats:
     return (np.maximum(root, np.float32(0)) + np.float32(12)) - np.float32(12)
 
 
-@traceable
+@pure
 def noise_in_roots(sigma: float, level: float, offset: float) -> float:
     """Return the standard deviation in roots of noise of ``sigma`` at a level, in signal units.
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.base.tracing import float32, value_of
+from clpipe.base.numbers import float32, is_float
 from clpipe.base.types import Array
 from clpipe.reference.resample import Axis, Resampler
 
@@ -181,7 +181,7 @@ def typed_arguments(arguments: Arguments) -> dict[str, Argument]:
     {'gain': np.float32(0.5), 'count': np.uint32(3)}
     """
     typed: dict[str, Any] = {name: v for name, v in arguments.items() if v is not None}
-    floats = {name: float32(v) for name, v in typed.items() if isinstance(value_of(v), float)}
+    floats = {name: float32(v) for name, v in typed.items() if is_float(v)}
     return typed | floats
 
 

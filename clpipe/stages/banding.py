@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.tracing import float32
+from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.stage import (
     Arguments,

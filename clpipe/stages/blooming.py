@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from clpipe.base.tracing import float32
+from clpipe.base.numbers import float32
 from clpipe.stage import (
     Arguments,
     Backend,

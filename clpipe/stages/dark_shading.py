@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import field_validator
 
 from clpipe.base.errors import ImageError
+from clpipe.base.numbers import float32
 from clpipe.base.reading import cached_by_mtime, read_errors
-from clpipe.base.tracing import float32
 from clpipe.base.types import Array, Floats
 from clpipe.reference.random import Stream, normal_of, philox
 from clpipe.stage import (

@@ -3,14 +3,14 @@
 from functools import lru_cache
 from typing import ClassVar
 
-from clpipe.base.tracing import traceable
+from clpipe.base.numbers import pure
 from clpipe.base.types import Floats
 from clpipe.reference.curve import tabulate
 from clpipe.reference.transfer import srgb_curve
 from clpipe.stage import Curve, Kind, Stage, StageRole, parameter
 
 
-@traceable
+@pure
 @lru_cache(maxsize=16)
 def power_table(exponent: float) -> Floats:
     """Return the table of x^exponent; cached, so that it is uploaded once."""

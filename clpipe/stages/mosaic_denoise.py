@@ -5,7 +5,7 @@ from typing import ClassVar
 import numpy as np
 from pydantic import field_validator
 
-from clpipe.base.tracing import float32, sqrt
+from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import by_site
 from clpipe.reference.image import tap
@@ -118,7 +118,7 @@ class NonLocalMeans(Method):
             "blue_gain": float32(blue),
             "a": float32(self.a),
             "offset": float32(offset),
-            "root_of_offset": float32(sqrt(offset)),
+            "root_of_offset": float32(np.sqrt(offset)),
             "bias": bias_of(self.strength),
             "scale": decay_of(FACTOR * self.strength),
         }

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.errors import RequestError
-from clpipe.base.tracing import traceable
+from clpipe.base.numbers import pure
 from clpipe.base.types import Floats
 from clpipe.reference.convolve import convolve, tap_radius, taps_of
 from clpipe.reference.turning import BILINEAR, CameraRotation
@@ -31,7 +31,7 @@ MAX_LENGTH = 200.0  # px; the longest streak
 TAPS_PER_PIXEL = 64  # kernel taps per pixel of a streak's length
 
 
-@traceable
+@pure
 @lru_cache(maxsize=64)
 def streak(length: float, angle: float) -> Floats:
     """Return the taps of a straight streak with the same light along its length.

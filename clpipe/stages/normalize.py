@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.errors import RequestError
-from clpipe.base.tracing import float32
+from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.reference.companding import apply_pieces, parse_knots, pieces_of
 from clpipe.stage import (

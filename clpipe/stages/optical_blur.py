@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import field_validator
 
 from clpipe.base.errors import ImageError
-from clpipe.base.tracing import int32, traceable
+from clpipe.base.numbers import int32, pure
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.convolve import NEGLIGIBLE, blur, convolve, tap_radius, taps_of
 from clpipe.stage import (
@@ -133,7 +133,7 @@ def read_psf(path: str) -> Doubles:
     return np.asarray(pixels / total)
 
 
-@traceable
+@pure
 @lru_cache(maxsize=64)
 def half_line_spread(sigma: float, low_pass: float, pixel_area: float) -> Floats:
     """Return the middle and one side of :func:`line_spread`, without negligible weights.
@@ -148,7 +148,7 @@ def half_line_spread(sigma: float, low_pass: float, pixel_area: float) -> Floats
     return np.asarray(kept / (2 * kept.sum() - kept[0]), np.float32)
 
 
-@traceable
+@pure
 @lru_cache(maxsize=64)
 def line_taps(sigma: float, low_pass: float, pixel_area: float) -> tuple[Floats, Floats]:
     """Return the taps of :func:`half_line_spread` along a row, and those along a column."""
@@ -157,7 +157,7 @@ def line_taps(sigma: float, low_pass: float, pixel_area: float) -> tuple[Floats,
     return taps_of(row), taps_of(row.transpose(1, 0, 2))
 
 
-@traceable
+@pure
 @lru_cache(maxsize=64)
 def lens_taps(
     sigma: float, low_pass: float, pixel_area: float, f_number: float, pitch: float, psf: str

@@ -14,8 +14,8 @@ import numpy as np
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from clpipe.base.errors import RequestError
+from clpipe.base.numbers import float32
 from clpipe.base.reading import cached_by_mtime, parse_json, read_bytes
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.correlated import correlated_normals, mixing
 from clpipe.reference.curve import to_8_bit

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.tracing import float32
+from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stage
 from clpipe.stages.white_balance.gains import CameraGains, gain_parameter

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from pydantic import PrivateAttr
 
-from clpipe.base.tracing import float32, traceable
+from clpipe.base.numbers import float32, pure
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
 from clpipe.stage import (
@@ -24,7 +24,7 @@ from clpipe.stage import (
 )
 
 
-@traceable
+@pure
 def _sinc(x: float) -> float:
     return float(np.sinc(x))
 

@@ -4,7 +4,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from clpipe.base.tracing import float32, sqrt
+from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
@@ -130,7 +130,9 @@ class Bounded(Method):
 
     def resolve(self, context: Context) -> Self:
         _, green, _ = noise_of_colours(context)
-        return self.with_defaults(noise=sqrt(green.at(MID_GREY)), offset=offset_of_roots(context))
+        return self.with_defaults(
+            noise=np.sqrt(green.at(MID_GREY)), offset=offset_of_roots(context)
+        )
 
     @property
     def noise_margin(self) -> np.float32:

@@ -5,7 +5,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from clpipe.base.tracing import float32
+from clpipe.base.numbers import float32
 from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
 from clpipe.stage import Context, parameter
 from clpipe.stages.exposure.gain import Gain

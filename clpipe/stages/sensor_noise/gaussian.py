@@ -4,7 +4,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from clpipe.base.tracing import float32
+from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.stage import Backend, Context, NoiseScope, Numbers, Pass, Signal
 from clpipe.stages.sensor_noise.model import SensorNoise, unit_read_noise

@@ -5,7 +5,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from clpipe.base.errors import RequestError
-from clpipe.base.tracing import float32
+from clpipe.base.numbers import float32
 from clpipe.stage import Backend, Context, NoiseScope, Numbers, Pass, Signal
 from clpipe.stages.sensor_noise.model import SensorNoise, unit_read_noise
 from clpipe.stages.sensor_noise.no_noise import NEVER_FULL

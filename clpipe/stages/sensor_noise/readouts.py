@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from clpipe.base.errors import RequestError
-from clpipe.base.tracing import float32
+from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.camera.profile import Camera
 from clpipe.reference.math import square_root

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from pydantic import PrivateAttr
 
-from clpipe.base.tracing import float32, int32
+from clpipe.base.numbers import float32, int32
 from clpipe.base.types import Floats
 from clpipe.camera.lights import TOLERANCE, limited_to_lights, plausible_gains
 from clpipe.reference.cfa import Pattern, by_site
