@@ -31,7 +31,8 @@ class Key(NamedTuple):
     Args:
         name: its name in configurations and in Python. A command has the option ``--name``.
         type_: the type of the value. :class:`list` is a list of texts.
-        text: sentences for help and documentation. Brief help shows the start of the first one.
+        text: sentences for help and documentation. Brief help shows the start of the first one. ""
+            is the text in the docstring of :func:`clpipe.run`.
         metavar: what the help of a command writes in place of the value.
         default_text: the default in words; "" if there is none.
         choices: the texts that are allowed; () is any text.
@@ -43,7 +44,7 @@ class Key(NamedTuple):
 
     name: str
     type_: type
-    text: str
+    text: str = ""
     metavar: str | None = None
     default_text: str = ""
     choices: Sequence[str] = ()

@@ -1,10 +1,11 @@
 """Command-line options for the keys of a configuration and of a run.
 
-:mod:`clpipe.chain.keys` and :mod:`clpipe.chain.options` define the names, types, ranges, choices
-and texts.
+:mod:`clpipe.chain.keys` and :mod:`clpipe.chain.options` define the names, types, ranges and
+choices. The docstring of :func:`clpipe.run` describes the options of a run.
 """
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -14,11 +15,12 @@ from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
 from clpipe.base.text import whole_number
 from clpipe.chain.assignments import parse_assignment
-from clpipe.chain.formats import format_named
+from clpipe.chain.formats import ALL_FORMATS, format_named
 from clpipe.chain.keys import CODE, KEYS, Key
-from clpipe.chain.options import DEVICE, OPTIONS
+from clpipe.chain.options import OPTIONS
 from clpipe.chain.request import Request
 from clpipe.commands.completion import COMPLETIONS, parameters
+from clpipe.commands.docstrings import docstring_of
 from clpipe.commands.options import EXISTING, F, output_option
 
 
@@ -52,6 +54,23 @@ def patch_count(text: str) -> int | str:
     return text if text == "grid" else count
 
 
+# The entries of the docstring of :func:`clpipe.run`, by argument.
+ENTRIES = dict(re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", docstring_of("batch.api", "run"), re.M))
+
+
+def described(key: Key) -> Key:
+    """Return the key of an option with its text and default in the docstring of ``clpipe.run``.
+
+    >>> described(OPTIONS["bit_rate"]).text
+    'The mean bit rate of clips in bits per second, such as 8M, instead of --crf.'
+    """
+    entry = " ".join(ENTRIES[key.name].split())
+    words = re.sub(r"``(\w+)``", lambda match: f"--{match[1].replace('_', '-')}", entry)
+    described, _, default = words.partition(" None is ")
+    text, _, _ = described.partition(" The choices are ")
+    return key._replace(text=text[0].upper() + text[1:], default_text=default.removesuffix("."))
+
+
 # Keys whose options are not called --name, and keys whose options have special types.
 FLAGS = {"config": ("-c", "--config"), CODE: ("--stage-file",)}
 TYPES: dict[str, Any] = {
@@ -71,6 +90,7 @@ def option(key: Key, parameter: str = "", **others: Any) -> Callable[[F], F]:
         parameter: the parameter of the command's function, if it is not the key's name.
         **others: arguments of :func:`click.option` that replace those from the key.
     """
+    key = key if key.text else described(key)
     type_: Any = {int: int, float: float}.get(key.type_)
     if key.choices:
         choice = FormatName if key.name == "format" else click.Choice
@@ -118,8 +138,12 @@ set_option = click.option(
     help="Set a parameter. STAGE.method=NAME chooses a method. A value such as '{uniform=[1, 2]}' "
     "is drawn for each image. May be repeated.",
 )
-out_option = output_option("OUT", OPTIONS["output"].text)
-device_option = option(DEVICE, "selector")
+out_option = output_option("OUT", described(OPTIONS["output"]).text)
+DEVICE = described(OPTIONS["device"])._replace(type_=str)
+device_option = option(DEVICE._replace(default_text="the first GPU, else the CPU"), "selector")
+FORMAT = described(OPTIONS["format"])._replace(choices=ALL_FORMATS)
+# A sentence about clips follows, which only clpipe run writes.
+format_option = option(FORMAT._replace(text=FORMAT.text.partition(" mp4 and")[0]), "formats")
 
 # Settings with an option, in addition to the camera and the ISO.
 SETTINGS = tuple(key for name, key in KEYS.items() if name not in ("camera", "iso", "dump", CODE))

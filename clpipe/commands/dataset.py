@@ -18,13 +18,15 @@ from clpipe.batch.images import Images
 from clpipe.batch.run_log import Summary
 from clpipe.batch.session import Run
 from clpipe.chain.keys import CODE
-from clpipe.chain.options import FORMAT, TRUTH
+from clpipe.chain.options import OPTIONS
 from clpipe.chain.panorama import projection_of
 from clpipe.chain.registry import stage_in
+from clpipe.chain.rendition import CLEAN, TRUTHS
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import (
     SETTINGS,
     device_option,
+    format_option,
     option,
     options,
     set_option,
@@ -157,8 +159,16 @@ class SourcePath(ExistingPath):
 )
 @options("config", "camera", "iso", *SETTINGS, "start_at", "until", CODE, "carry", "poses")
 @set_option
-@option(TRUTH, default=(TRUTH.default_text,))
-@option(FORMAT, "formats")
+@option(
+    OPTIONS["truth"]._replace(
+        text="Write the picture without noise (development), without noise and denoising (clean), "
+        "the clean mosaic (mosaic), or its noise variance (variance).",
+        default_text=CLEAN,
+        choices=TRUTHS,
+    ),
+    default=(CLEAN,),
+)
+@format_option
 @click.option(
     "--licence",
     metavar="TEXT",
