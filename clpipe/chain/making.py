@@ -79,14 +79,11 @@ def _build_chain(
     for name in settings.parameters:
         if name not in names and name not in all_stages():
             raise KeyedError(name, unknown_name("stage in this chain", name, names))
-    first, last = 0, len(steps)
-    for name in (n for n in (start_at, until) if n is not None):
-        if name not in names:
-            raise RequestError(unknown_name("stage in this chain", name, names))
-    if start_at is not None:
-        first = names.index(start_at)
-    if until is not None:
-        last = names.index(until) + 1
+    for end in (start_at, until):
+        if end not in (None, *names):
+            raise RequestError(unknown_name("stage in this chain", str(end), names))
+    first = names.index(start_at) if start_at else 0
+    last = names.index(until) + 1 if until else len(steps)
     if first >= last:
         raise RequestError(
             f"no stage is left to run, because {start_at} comes after {until}; exchange --start-at "

@@ -36,7 +36,7 @@ UNITS = {
     "xyz_to_camera": "XYZ to camera RGB",
 }
 # Fields that only some sensors have. A profile without them has no unknown values.
-SPECIAL = ("aliases", "filter_array", "row_noise_ratio", "column_noise_ratio")
+SPECIAL: tuple[str, ...] = ("aliases", "filter_array", "row_noise_ratio", "column_noise_ratio")
 SPECIAL += ("readout_ratio", "readout_noise", "photodiode_ratio", "photodiode_crosstalk")
 DERIVED = ("bits",)  # computed from other fields
 # The fields that are the same at every ISO.
