@@ -68,12 +68,7 @@ def _raw_settings(settings: Settings, raw: Sequence[str], stages: tuple[str, ...
     validated = {step: table for step, table in settings.validated.items() if step in names}
     draws = {k: draw for k, draw in settings.draws.items() if k.rpartition(".")[0] in names}
     return replace(
-        settings,
-        stages=stages,
-        skip=skip,
-        parameters=parameters,
-        validated=validated,
-        draws=draws,
+        settings, stages=stages, skip=skip, parameters=parameters, validated=validated, draws=draws
     )
 
 

@@ -18,15 +18,7 @@ from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, stage_in, user_code_errors
 from clpipe.chain.settings import Settings
 from clpipe.reference.geometry import Scaling
-from clpipe.stage import (
-    Context,
-    Kind,
-    LensMethod,
-    Method,
-    Stage,
-    StageRole,
-    Unchanged,
-)
+from clpipe.stage import Context, Kind, LensMethod, Method, Stage, StageRole, Unchanged
 from clpipe.stages.projection import WideAngle
 
 
@@ -67,11 +59,7 @@ def make_chain(
 
 
 def _build_chain(
-    settings: Settings,
-    camera: Camera,
-    source: Kind | None,
-    start_at: str | None,
-    until: str | None,
+    settings: Settings, camera: Camera, source: Kind | None, start_at: str | None, until: str | None
 ) -> Chain:
     """Return the chain of settings without draws, see :func:`make_chain`."""
     steps = resolve_steps(settings, camera, source or (None if start_at else entry_kind(settings)))

@@ -50,15 +50,7 @@ from clpipe.reference.wide import MODELS
 from clpipe.scenes.blender import Rendering
 from clpipe.scenes.card import CardContents, write_card
 from clpipe.scenes.record import store_credits
-from clpipe.scenes.source import (
-    NOTE,
-    RENDERS,
-    UNIT,
-    Source,
-    from_folder,
-    from_leaves,
-    from_scene,
-)
+from clpipe.scenes.source import NOTE, RENDERS, UNIT, Source, from_folder, from_leaves, from_scene
 from clpipe.scenes.view_request import (
     DEFAULT_VIEWS,
     PATHS,
