@@ -103,7 +103,7 @@ def option(key: Key, parameter: str = "", **others: Any) -> Callable[[F], F]:
         "type": TYPES.get(key.name, type_),
         "metavar": key.metavar,
         "multiple": multiple,
-        "shell_complete": COMPLETIONS.get(key.name),
+        "shell_complete": COMPLETIONS.get(key.name) or COMPLETIONS.get(key.metavar or ""),
         "help": " ".join(
             filter(None, [*texts, f"[default: {key.default_text}]" * bool(key.default_text)])
         ),
