@@ -151,6 +151,15 @@ KEYS = {key.name: key for key in _ALL}
 LENS = ("lens", "focal_length", "aperture", "focus_distance")
 
 
+def setting_error(message: str) -> KeyedError:
+    """Return the error about a setting, for a message that begins with its dotted name.
+
+    >>> setting_error("iso: found 'fast', but expected a number").key
+    'iso'
+    """
+    return KeyedError(message.partition(":")[0], message)
+
+
 def check_type(key: str, value: Any) -> None:
     """Check that the value of a key has the key's type and is in its range.
 
@@ -163,7 +172,7 @@ def check_type(key: str, value: Any) -> None:
             is_range = known.type_ is float and len(value) == 2
             draw = {"log_uniform" if is_range else "choice": list(value)}
             hint = f"; to draw it for each image, use {key}={draw}"
-        raise KeyedError(key, f"{key}: found {value!r}, but expected {known.allowed}{hint}")
+        raise setting_error(f"{key}: found {value!r}, but expected {known.allowed}{hint}")
 
 
 def set_dotted(values: dict[str, Any], key: str, value: Any) -> None:
@@ -193,8 +202,8 @@ def string_list(values: Mapping[str, Any], key: str, what: str) -> tuple[str, ..
     if key == "skip" and isinstance(names, str):
         return (names,)
     if isinstance(names, str | Mapping) or not isinstance(names, Sequence):
-        raise KeyedError(key, f"{key}: found {names!r}, but expected a list of {what}")
+        raise setting_error(f"{key}: found {names!r}, but expected a list of {what}")
     for name in names:
         if not isinstance(name, str):
-            raise KeyedError(key, f"{key}: found {name!r} in the list, but expected only {what}")
+            raise setting_error(f"{key}: found {name!r} in the list, but expected only {what}")
     return tuple(names)

@@ -28,6 +28,7 @@ from clpipe.chain.keys import (
     TABLES,
     check_type,
     set_dotted,
+    setting_error,
     string_list,
 )
 from clpipe.chain.lens_presets import PRESETS, with_preset, without_preset
@@ -327,13 +328,12 @@ def _check_plain_values(settings: Settings, plain: Mapping[str, Any]) -> dict[st
             entry = (
                 f"'method': {value!r}" if key in all_stages() and isinstance(value, str) else "..."
             )
-            raise KeyedError(
-                key,
+            raise setting_error(
                 f"{key}: found {value!r}, but it is a table; in Python use {key}={{{entry}}}, in a "
-                f"file [{key}]",
+                f"file [{key}]"
             )
         if key == CODE:
-            raise KeyedError(key, f"{key}: set it in a configuration file, or use --stage-file")
+            raise setting_error(f"{key}: set it in a configuration file, or use --stage-file")
         if key not in KEYS:
             similar = [each for each in parameter_names() if each.endswith(f".{key}")]
             hint = f"; did you mean {quote_alternatives(similar)}?" if similar else ""
@@ -343,9 +343,7 @@ def _check_plain_values(settings: Settings, plain: Mapping[str, Any]) -> dict[st
         if key in plain:
             names = string_list(plain, key, "stage names")
             if key == "stages" and len(names) > MAX_STAGES:
-                raise KeyedError(
-                    key, f"{key}: found {len(names)} stages; list at most {MAX_STAGES}"
-                )
+                raise setting_error(f"{key}: found {len(names)} stages; list at most {MAX_STAGES}")
             for name in names:
                 check_step(key, name)
             checked[key] = (*settings.skip, *names) if key == "skip" else names
