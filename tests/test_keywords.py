@@ -9,9 +9,10 @@ import pytest
 from clpipe.batch.api import run
 from clpipe.camera.profile import DEFAULT_CAMERA
 from clpipe.chain.files import built_in_configs
-from clpipe.chain.keys import DEFAULT_ISO
+from clpipe.chain.keys import CODE, DEFAULT_ISO, KEYS
 from clpipe.chain.options import OPTIONS
-from clpipe.commands.chain_options import ENTRIES, described
+from clpipe.commands.chain_options import ARGUMENTS, described
+from clpipe.images.dump import TYPES
 from clpipe.images.pixels import DEFAULT_MAX_PIXELS
 from clpipe.images.video import DEFAULT_CRF
 from tools.pages.keywords import PATH, text_of
@@ -25,16 +26,20 @@ DEFAULTS = {"camera": DEFAULT_CAMERA, "iso": DEFAULT_ISO, "crf": DEFAULT_CRF}
 DEFAULTS |= {"max_pixels": DEFAULT_MAX_PIXELS}
 
 
-@pytest.mark.parametrize("name", sorted(ENTRIES.keys() & OPTIONS))
+@pytest.mark.parametrize("name", sorted(ARGUMENTS.keys() & OPTIONS))
 def test_the_docstring_names_choices_and_defaults(name):
-    entry, choices = " ".join(ENTRIES[name].split()), OPTIONS[name].choices
+    entry, choices = ARGUMENTS[name], OPTIONS[name].choices
     named = re.findall(r'"([a-z\d]+)"', entry.partition("The choices are")[2])
     assert named == list(choices)
     default = described(OPTIONS[name]).default_text
     assert name not in DEFAULTS or default == f"{DEFAULTS[name]}".removesuffix(".0")
     assert not choices or default == "" or default.partition(";")[0] in choices
-    if name == "config":
-        assert f"ones are {', '.join(built_in_configs())}." in described(OPTIONS[name]).text
+
+
+def test_docstrings_name_configurations_and_types():
+    assert f"ones are {', '.join(built_in_configs())}." in ARGUMENTS["config"]
+    assert f"types are {', '.join(TYPES)}." in KEYS["dump"].text
+    assert all(key.text for name, key in KEYS.items() if name != CODE)
 
 
 def test_types_of_arguments_are_those_of_the_options():

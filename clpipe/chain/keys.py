@@ -4,12 +4,15 @@ The options of a run have the same form, see :mod:`clpipe.chain.options`.
 """
 
 import math
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from inspect import cleandoc
 from typing import Any, NamedTuple
 
 from clpipe.base.errors import KeyedError
 from clpipe.camera.profile import DEFAULT_CAMERA
-from clpipe.images.dump import TYPES
+from clpipe.stages import DEFAULT_CHAIN
 
 CODE = "stage_files"  # the key that only a configuration file may have
 
@@ -78,74 +81,71 @@ class Key(NamedTuple):
         return isinstance(value, str) or self.above < value <= self.most
 
 
-def _lens_key(name: str, text: str, unit: str = "") -> Key:
-    """Return the key of a lens setting."""
-    return Key(name, float, text, unit=unit, above=0, most=10**6, is_drawn=True)
+@dataclass(frozen=True)
+class PlainSettings:
+    """The settings outside tables. None and "" are automatic.
+
+    The focal length is in mm, the distance in m. The help of commands has these descriptions.
+
+    Args:
+        camera: a built-in camera, by name or model, or a profile (.toml).
+        iso: the ISO. Noise and denoising depend on it.
+        lens: a lens in lensfun's database, with its distortion, lateral colour and vignetting; or
+            'typical', whose faults are drawn for each image; or 'none', without any blur.
+        focal_length: the focal length of the lens.
+        aperture: the f-number of the lens. Without it, a lens from lensfun's database has no
+            vignetting.
+        focus_distance: the distance to the plane in focus. By default, vignetting is that at
+            infinity, and the stage defocus uses 3.
+        seed: the seed of the noise.
+        noise_key: images with the same key have the same noise, at any ISO. Without a key, each
+            image and ISO has its own noise.
+        dump: the width, height and sample type of headerless dumps (.raw), such as
+            1920x1080:uint16le. The types are uint8, uint16le, uint16be, raw10, raw12.
+        stages: the stages to run, in order, in place of the default chain.
+        skip: a stage to skip, or 'noise'. This skips the noise of all stages; denoising stays as
+            strong as the ISO requires.
+    """
+
+    camera: str = DEFAULT_CAMERA
+    iso: float = DEFAULT_ISO
+    lens: str = ""
+    focal_length: float | None = None
+    aperture: float | None = None
+    focus_distance: float | None = None
+    seed: int = 0
+    noise_key: str = ""
+    dump: str = ""
+    stages: tuple[str, ...] = DEFAULT_CHAIN
+    skip: tuple[str, ...] = ()
+
+
+def arguments_in(docstring: str) -> dict[str, str]:
+    """Return the descriptions of the arguments in a docstring, as sentences in one line.
+
+    >>> arguments_in(PlainSettings.__doc__ or "")["seed"]
+    'The seed of the noise.'
+    """
+    entries = re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", cleandoc(docstring), re.M)
+    return {name: " ".join(f"{text[0].upper()}{text[1:]}".split()) for name, text in entries}
 
 
 _ALL = (
-    Key(
-        "camera",
-        str,
-        "A built-in camera, by name or model, or a profile (.toml).",
-        "NAME|FILE",
-        DEFAULT_CAMERA,
-        is_drawn=True,
-    ),
-    Key(
-        "iso",
-        float,
-        "The ISO. Noise and denoising depend on it.",
-        default_text=f"{DEFAULT_ISO:g}",
-        most=10**9,
-        is_drawn=True,
-    ),
-    Key(
-        "lens",
-        str,
-        "A lens in lensfun's database, with its distortion, lateral colour and vignetting; or "
-        "'typical', whose faults are drawn for each image; or 'none', without any blur.",
-        "NAME",
-        "a good lens without distortion",
-        is_drawn=True,
-    ),
-    _lens_key("focal_length", "The focal length of the lens.", "mm"),
-    _lens_key(
-        "aperture",
-        "The f-number of the lens. Without it, a lens from lensfun's database has no vignetting.",
-    ),
-    _lens_key(
-        "focus_distance",
-        "The distance to the plane in focus. By default, vignetting is that at infinity, and "
-        "the stage defocus uses 3.",
-        "m",
-    ),
-    Key("seed", int, "The seed of the noise.", default_text="0"),
-    Key(
-        "noise_key",
-        str,
-        "Images with the same key have the same noise, at any ISO. Without a key, each image and "
-        "ISO has its own noise.",
-        "TEXT",
-    ),
-    Key(
-        "dump",
-        str,
-        "The width, height and sample type of headerless dumps (.raw), such as "
-        f"1920x1080:uint16le. The types are {', '.join(TYPES)}.",
-        "WxH:TYPE",
-    ),
-    Key("stages", list, "The stages to run, in order, in place of the default chain.", "A,B,C"),
-    Key(
-        "skip",
-        list,
-        f"A stage to skip, or '{NOISE}'. This skips the noise of all stages; denoising stays as "
-        "strong as the ISO requires.",
-        "STAGE",
-    ),
-    Key(CODE, list, "A Python file that defines further stages.", "FILE.py"),
+    Key("camera", str, metavar="NAME|FILE", default_text=DEFAULT_CAMERA, is_drawn=True),
+    Key("iso", float, default_text=f"{DEFAULT_ISO:g}", most=10**9, is_drawn=True),
+    Key("lens", str, "", "NAME", "a good lens without distortion", is_drawn=True),
+    Key("focal_length", float, unit="mm", above=0, most=10**6, is_drawn=True),
+    Key("aperture", float, above=0, most=10**6, is_drawn=True),
+    Key("focus_distance", float, unit="m", above=0, most=10**6, is_drawn=True),
+    Key("seed", int, default_text="0"),
+    Key("noise_key", str, metavar="TEXT"),
+    Key("dump", str, metavar="WxH:TYPE"),
+    Key("stages", list, metavar="A,B,C"),
+    Key("skip", list, metavar="STAGE"),
+    Key(CODE, list, metavar="FILE.py"),
 )
-KEYS = {key.name: key for key in _ALL}
+_TEXTS = arguments_in(PlainSettings.__doc__ or "")
+KEYS = {key.name: key._replace(text=_TEXTS.get(key.name, "")) for key in _ALL}
 
 # The settings that select a lens and set it.
 LENS = ("lens", "focal_length", "aperture", "focus_distance")

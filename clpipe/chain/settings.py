@@ -16,16 +16,16 @@ from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import quote_alternatives, unknown_name
 from clpipe.base.tracing import with_changes
 from clpipe.camera.control import Control
-from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_name, load_camera
+from clpipe.camera.profile import Camera, built_in_name, load_camera
 from clpipe.chain.drawing import draw_extremes, draw_values, examples_of, parse_drawn
 from clpipe.chain.draws import Choice, Draw
 from clpipe.chain.keys import (
     CODE,
-    DEFAULT_ISO,
     KEYS,
     LENS,
     MAX_STAGES,
     TABLES,
+    PlainSettings,
     check_type,
     set_dotted,
     setting_error,
@@ -50,27 +50,15 @@ from clpipe.chain.render_camera import RenderCamera
 from clpipe.images.dump import Dump, parse_dump
 from clpipe.images.encoding import Encoding
 from clpipe.stage import Method
-from clpipe.stages import DEFAULT_CHAIN
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(PlainSettings):
     """Values that can be set. Nothing is resolved yet: None and missing values are automatic.
 
     The values in ``draws``, by dotted name ("sensor_noise.a"), are drawn by :meth:`drawn`.
     """
 
-    camera: str = DEFAULT_CAMERA
-    iso: float = DEFAULT_ISO
-    lens: str = ""  # a name in lensfun's database, or of a preset
-    focal_length: float | None = None  # mm
-    aperture: float | None = None  # f-number
-    focus_distance: float | None = None  # m
-    seed: int = 0
-    noise_key: str = ""  # "": derived from the image and the ISO
-    dump: str = ""  # format of headerless dumps, WIDTHxHEIGHT:TYPE
-    stages: tuple[str, ...] = DEFAULT_CHAIN
-    skip: tuple[str, ...] = ()
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     output: Encoding = field(default_factory=Encoding)
     render: RenderCamera = field(default_factory=RenderCamera)

@@ -16,7 +16,7 @@ from clpipe.base.memory import parse_size
 from clpipe.base.text import whole_number
 from clpipe.chain.assignments import parse_assignment
 from clpipe.chain.formats import ALL_FORMATS, format_named
-from clpipe.chain.keys import CODE, KEYS, Key
+from clpipe.chain.keys import CODE, KEYS, Key, arguments_in
 from clpipe.chain.options import OPTIONS
 from clpipe.chain.request import Request
 from clpipe.commands.completion import COMPLETIONS, parameters
@@ -54,8 +54,7 @@ def patch_count(text: str) -> int | str:
     return text if text == "grid" else count
 
 
-# The entries of the docstring of :func:`clpipe.run`, by argument.
-ENTRIES = dict(re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", docstring_of("batch.api", "run"), re.M))
+ARGUMENTS = arguments_in(docstring_of("batch.api", "run"))
 
 
 def described(key: Key) -> Key:
@@ -64,11 +63,11 @@ def described(key: Key) -> Key:
     >>> described(OPTIONS["bit_rate"]).text
     'The mean bit rate of clips in bits per second, such as 8M, instead of --crf.'
     """
-    entry = " ".join(ENTRIES[key.name].split())
+    entry = ARGUMENTS[key.name]
     words = re.sub(r"``(\w+)``", lambda match: f"--{match[1].replace('_', '-')}", entry)
     described, _, default = words.partition(" None is ")
     text, _, _ = described.partition(" The choices are ")
-    return key._replace(text=text[0].upper() + text[1:], default_text=default.removesuffix("."))
+    return key._replace(text=text, default_text=default.removesuffix("."))
 
 
 # Keys whose options are not called --name, and keys whose options have special types.

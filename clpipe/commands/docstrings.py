@@ -1,12 +1,11 @@
 """Read docstrings from source, because importing a module can take half a second."""
 
 import ast
-import inspect
 from pathlib import Path
 
 
 def docstring_of(module: str, function: str) -> str:
-    """Return the docstring of a function, without its indentation.
+    """Return the docstring of a function.
 
     Args:
         module: the name of the module inside the package, such as "batch.api".
@@ -16,4 +15,4 @@ def docstring_of(module: str, function: str) -> str:
     nodes = ast.parse(path.read_text("utf-8")).body
     functions = (node for node in nodes if isinstance(node, ast.FunctionDef))
     found = next(node for node in functions if node.name == function)
-    return inspect.cleandoc(ast.get_docstring(found) or "")
+    return ast.get_docstring(found) or ""
