@@ -43,6 +43,7 @@ class Key(NamedTuple):
         above: the value must be larger than this number.
         most: the largest number that is allowed.
         is_drawn: whether a draw is allowed in place of the value.
+        heading: the heading in the help of a command; "+" marks what brief help also shows.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Key(NamedTuple):
     above: float = -math.inf
     most: float = math.inf
     is_drawn: bool = False
+    heading: str = ""
 
     @property
     def allowed(self) -> str:
@@ -131,18 +133,22 @@ def arguments_in(docstring: str) -> dict[str, str]:
 
 
 _ALL = (
-    Key("camera", str, metavar="NAME|FILE", default_text=DEFAULT_CAMERA, is_drawn=True),
-    Key("iso", float, default_text=f"{DEFAULT_ISO:g}", most=10**9, is_drawn=True),
-    Key("lens", str, "", "NAME", "a good lens without distortion", is_drawn=True),
-    Key("focal_length", float, unit="mm", above=0, most=10**6, is_drawn=True),
-    Key("aperture", float, above=0, most=10**6, is_drawn=True),
-    Key("focus_distance", float, unit="m", above=0, most=10**6, is_drawn=True),
-    Key("seed", int, default_text="0"),
-    Key("noise_key", str, metavar="TEXT"),
-    Key("dump", str, metavar="WxH:TYPE"),
-    Key("stages", list, metavar="A,B,C"),
-    Key("skip", list, metavar="STAGE"),
-    Key(CODE, list, metavar="FILE.py"),
+    Key("camera", str, "", "NAME|FILE", DEFAULT_CAMERA, is_drawn=True, heading="+Camera"),
+    Key(
+        "iso", float, default_text=f"{DEFAULT_ISO:g}", most=10**9, is_drawn=True, heading="+Camera"
+    ),
+    Key(
+        "lens", str, "", "NAME", "a good lens without distortion", is_drawn=True, heading="+Camera"
+    ),
+    Key("focal_length", float, unit="mm", above=0, most=10**6, is_drawn=True, heading="Camera"),
+    Key("aperture", float, above=0, most=10**6, is_drawn=True, heading="Camera"),
+    Key("focus_distance", float, unit="m", above=0, most=10**6, is_drawn=True, heading="Camera"),
+    Key("seed", int, default_text="0", heading="+Camera"),
+    Key("noise_key", str, metavar="TEXT", heading="Camera"),
+    Key("dump", str, metavar="WxH:TYPE", heading="Inputs"),
+    Key("stages", list, metavar="A,B,C", heading="Chain"),
+    Key("skip", list, metavar="STAGE", heading="+Chain"),
+    Key(CODE, list, metavar="FILE.py", heading="Chain"),
 )
 _TEXTS = arguments_in(PlainSettings.__doc__ or "")
 KEYS = {key.name: key._replace(text=_TEXTS.get(key.name, "")) for key in _ALL}

@@ -21,7 +21,7 @@ from clpipe.chain.options import OPTIONS
 from clpipe.chain.request import Request
 from clpipe.commands.completion import COMPLETIONS, parameters
 from clpipe.commands.docstrings import docstring_of
-from clpipe.commands.options import EXISTING, F, output_option
+from clpipe.commands.options import EXISTING, F, Option, output_option
 
 
 class FormatName(click.Choice[str]):
@@ -99,6 +99,8 @@ def option(key: Key, parameter: str = "", **others: Any) -> Callable[[F], F]:
     multiple = key.type_ is list and key.name != "stages"
     texts = [key.text, f"In {key.unit}." * bool(key.unit), "May be repeated." * multiple]
     attributes: dict[str, Any] = {
+        "cls": Option,
+        "heading": key.heading,
         "type": TYPES.get(key.name, type_),
         "metavar": key.metavar,
         "multiple": multiple,
@@ -131,6 +133,8 @@ def options(*keys: Key | str) -> Callable[[F], F]:
 set_option = click.option(
     "--set",
     "assignments",
+    cls=Option,
+    heading="+Chain",
     multiple=True,
     metavar="STAGE.PARAM=VALUE",
     shell_complete=parameters,
