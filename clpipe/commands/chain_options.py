@@ -63,7 +63,7 @@ def described(key: Key) -> Key:
     >>> described(OPTIONS["bit_rate"]).text
     'The mean bit rate of clips in bits per second, such as 8M, instead of --crf.'
     """
-    entry = ARGUMENTS[key.name]
+    entry = ARGUMENTS.get(key.name, "")  # without docstrings (python -OO), settings have no text
     words = re.sub(r"``(\w+)``", lambda match: f"--{match[1].replace('_', '-')}", entry)
     described, _, default = words.partition(" None is ")
     text, _, _ = described.partition(" The choices are ")
